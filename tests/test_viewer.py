@@ -165,11 +165,10 @@ def test_count_is_of_the_gaussians_that_a_pixel_is_blended_of(opacities, count):
     camera = AXIS.camera(33, 33, 0.01)
     cut = v3dg.select(scene_view.scene, camera, device="cpu")
     window = (0, 0, 33, 33)
-    _, _, counts, in_view = scene_view._values(
-        _core.SceneFrame.count_cut, cut, camera, window, None, "appearance"
-    )
+    planes = scene_view._draw_on_cpu(cut, camera, window, "count", None)
+    counts = planes.depth
     assert counts[16, 16] == count
-    assert in_view == len(opacities)
+    assert planes.gaussians_in_frustum == len(opacities)
     alpha = v3dg.render(scene_view.scene, camera, device="cpu").alpha
     np.testing.assert_array_equal(counts > 0, alpha > 0)
 

@@ -2,15 +2,15 @@
 
 import os
 from collections.abc import Iterable
-from typing import Any
 
 from v3dg import _extras, _files
 from v3dg._numbers import check
+from v3dg.gaussians import Array
 from v3dg.pictures import to_8bit
 
 
 def write_video(
-    path: str | os.PathLike[str], pictures: Iterable[Any], *, fps: int = 30, quality: int = 18
+    path: str | os.PathLike[str], pictures: Iterable[Array], *, fps: int = 30, quality: int = 18
 ) -> int:
     """Encode pictures as H.264 in an .mp4 file, each as it comes; the file appears when all are in it.
 
@@ -29,7 +29,8 @@ def write_video(
     """
     av = _extras.load("av")
     check(path, os.fspath(path).endswith(".mp4"), "a file name ending in .mp4")
-    count, size = 0, None
+    num_pictures = 0
+    size: tuple[int, ...] | None = None
     with _files.replacing(path) as temporary, av.open(temporary, "w", format="mp4") as video:
         stream = video.add_stream("h264", rate=fps, options={"crf": str(quality)})
         stream.pix_fmt = "yuv420p"
@@ -39,10 +40,10 @@ def write_video(
                 size = pixels.shape
                 stream.height, stream.width = size[:2]
             check("pictures", pixels.shape == size, f"{size} as before, got {pixels.shape}")
-            is_even = len(size) == 3 and size[0] % 2 == 0 == size[1] % 2
+            is_even = len(size) == 3 and size[0] % 2 == 0 and size[1] % 2 == 0
             check("pictures", is_even, f"an even height and width, got {pixels.shape}")
             video.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
-            count += 1
-        check("pictures", count, "at least one, got none")
+            num_pictures += 1
+        check("pictures", num_pictures, "at least one, got none")
         video.mux(stream.encode())
-    return count
+    return num_pictures

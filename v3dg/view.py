@@ -1,19 +1,37 @@
 """The viewer, started from Python."""
 
+from __future__ import annotations
+
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypedDict
 
 from v3dg._device import Device
 from v3dg._numbers import one_of
 from v3dg._urls import beside
-from v3dg.cameras import AXES, Axis, VectorLike
+from v3dg.cameras import AXES, Axis, Camera, VectorLike
 from v3dg.opening import File, open_with_cameras
 from v3dg.scene import Subject
 from v3dg.upright import ASSUMED, direction_of, up_of
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from v3dg.viewer.server import Site
+
+
+class _SiteOptions(TypedDict, total=False):
+    """Options of `v3dg.viewer.server.Site`."""
+
+    name: str
+    cameras: Mapping[str, Camera] | None
+    photographs: Mapping[str, Path] | None
+    host: str
+    port: int
+    tolerance: float
+    budget: int | None
+    asks_up: bool
 
 
 def view(
@@ -22,8 +40,8 @@ def view(
     device: str | Device = "auto",
     memory: int | str | None = "auto",
     up: Axis | VectorLike | None = None,
-    **options: Any,
-) -> "Site":
+    **options: Unpack[_SiteOptions],
+) -> Site:
     """Show a scene, a bundle or an asset, or the file of one, in a web browser (docs/viewer.md).
 
     The viewer's server runs on threads of this process. Its address is printed, and is the `url` of what is
@@ -42,13 +60,15 @@ def view(
     from v3dg.viewer.frame import SceneView
     from v3dg.viewer.server import Site
 
-    path = Path(subject) if isinstance(subject, str | os.PathLike) else Path()
+    path = Path()
     if isinstance(subject, str | os.PathLike):
+        path = Path(subject)
         subject, cameras = open_with_cameras(path)
-        options = {"name": beside(path).stem, "cameras": cameras} | options
+        options.setdefault("name", beside(path).stem)
+        options.setdefault("cameras", cameras)
     if up is None:
-        up, how = up_of(subject, options.get("cameras"), path)
-        options = {"asks_up": how == ASSUMED} | options
+        up, reason = up_of(subject, options.get("cameras"), path)
+        options.setdefault("asks_up", reason == ASSUMED)
     if isinstance(up, str):
         one_of(up, "up", AXES)
         up = direction_of(up)

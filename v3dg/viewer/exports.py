@@ -4,9 +4,9 @@ import contextlib
 import os
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 from v3dg import _core
 from v3dg.scene import Scene
@@ -19,17 +19,25 @@ def bundle_names(scene: Scene) -> list[str]:
     return [os.path.relpath(path, folder) for path in paths]
 
 
+class Tell(Protocol):
+    """Sends a message to the page, with bytes that belong to it."""
+
+    def __call__(self, message: Mapping[str, object], data: bytes = b"") -> None: ...
+
+
 class Exporter:
     """Does one thing at a time, in a thread, until it is done or stopped.
 
     Args:
-        tell: Called with a dictionary for the page, and bytes that come with it; in any thread.
-        explain: Makes an error a line for the page.
+        tell: Called in any thread.
+        explain: Turns an error into a line for the page.
     """
 
-    def __init__(self, tell: Callable[..., None], explain: Callable[[Exception], str]) -> None:
-        self._tell, self._explain = tell, explain
-        self._lock, self._is_closed = threading.Lock(), False
+    def __init__(self, tell: Tell, explain: Callable[[Exception], str]) -> None:
+        self._tell = tell
+        self._explain = explain
+        self._lock = threading.Lock()
+        self._is_closed = False
         self._thread: threading.Thread | None = None
         self._stop = _core.Stop()
 
@@ -48,12 +56,12 @@ class Exporter:
         self._run(lambda _: self._tell({"type": "notice", "text": "Still at work: stop it first, or wait."}))
 
     def _run(self, work: Callable[[_core.Stop], None]) -> None:
-        answer: dict[str, Any] = {"type": "done"}
+        answer = {"type": "done"}
         try:
             work(self._stop)
         except Exception as error:
             answer = {"type": "notice", "text": f"Not done: {self._explain(error)}"}
-        with contextlib.suppress(Exception):  # whoever asked may be gone
+        with contextlib.suppress(Exception):  # the page may be closed
             self._tell(answer)
 
     def save(self, name: str, write: Callable[[Path], object]) -> None:

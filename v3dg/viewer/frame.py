@@ -3,13 +3,14 @@
 import threading
 import time
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core, _device
 from v3dg._device import CPU, Device
+from v3dg._numbers import Floats
 from v3dg._urls import beside, cleaned, shown
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
@@ -28,6 +29,7 @@ from v3dg.viewer.view import View
 
 Pixels: TypeAlias = npt.NDArray[np.uint8]
 Window: TypeAlias = tuple[int, int, int, int]
+_Float32: TypeAlias = npt.NDArray[np.float32]
 
 Shows: TypeAlias = Literal[
     "appearance", "level", "cluster", "error", "residency", "depth", "alpha", "count", "difference"
@@ -35,9 +37,8 @@ Shows: TypeAlias = Literal[
 
 # Gaussians in a pixel that get the brightest colour.
 MOST_COUNTED = 256
-_OF_POOLS_ON_CUDA: tuple[Shows, ...] = ("appearance", "depth", "alpha")
-_OF_CUT = ("level", "cluster", "residency", "error", "count")  # colours of clusters, and what is not colours
-# So many gaussians are drawn whole while the camera moves, too.
+_MODES_OF_POOLS_ON_CUDA: tuple[Shows, ...] = ("appearance", "depth", "alpha")
+# At most so many gaussians are all drawn while the camera moves, too.
 _FEW_GAUSSIANS = 500_000
 _SHADE = shade_of((0.0, 0.0, 0.0), None, is_asset=False, depth=True)
 
@@ -91,8 +92,13 @@ class Frame:
         return self.pixels.shape[1], self.pixels.shape[0]
 
 
-class _Asked(NamedTuple):
-    """How a picture is drawn: `chooser` is whose cut it is, None the camera's; `edge` where it is split."""
+class _Job(NamedTuple):
+    """How a picture is drawn.
+
+    Attributes:
+        chooser: The camera that the cut is selected for; None for the one that the picture is seen from.
+        edge: The column at which the picture is split, px.
+    """
 
     camera: Camera
     chooser: Camera | None
@@ -100,6 +106,46 @@ class _Asked(NamedTuple):
     settings: Settings
     stop: _core.Stop | None
     steps: _core.BudgetSteps | None
+
+
+class _Planes(NamedTuple):
+    """A window of a picture.
+
+    Attributes:
+        color: (H, W, 3).
+        alpha: (H, W).
+        depth: (H, W), or how many gaussians each pixel is blended of.
+        gaussians_in_frustum: Those of the whole picture.
+    """
+
+    color: _Float32
+    alpha: _Float32
+    depth: _Float32
+    gaussians_in_frustum: int
+
+
+class _Drawn(NamedTuple):
+    """What a picture is painted from.
+
+    Attributes:
+        color, alpha, depth: As in `_Planes`, of the part to the right of the split.
+        whole: Colours of all gaussians, from the left edge on, to compare with; None if nothing is compared.
+        figures: What drawing cost.
+    """
+
+    color: _Float32
+    alpha: _Float32
+    depth: _Float32
+    whole: _Float32 | None
+    figures: Stats
+
+
+class _Painting(NamedTuple):
+    """The colours to the right of the split; the other two are as in `Frame`."""
+
+    colors: _Float32
+    value_range: tuple[float, float] | None
+    distance: float | None
 
 
 class Stopped(Exception):
@@ -132,7 +178,9 @@ class SceneView:
         self.device = _device.resolve(device)
         if memory == "auto":
             memory = chosen_bytes(self.scene.bundles, self.device)
-        self.pool = None if memory is None else Renderer(self.scene, device=self.device, memory=memory)
+        self.pool: Renderer | None = None
+        if memory is not None:
+            self.pool = Renderer(self.scene, device=self.device, memory=memory)
         self._drawing = threading.Lock()
         self.center, self.radius = _bounds(self.scene)
         self.near = min(0.01, 1e-3 * self.radius)
@@ -158,7 +206,7 @@ class SceneView:
     def modes(self) -> tuple[Shows, ...]:
         """What can be shown."""
         if self.pool is not None and self.device.is_cuda:
-            return _OF_POOLS_ON_CUDA
+            return _MODES_OF_POOLS_ON_CUDA
         return tuple(mode for mode in get_args(Shows) if self.pool is not None or mode != "residency")
 
     @property
@@ -184,149 +232,228 @@ class SceneView:
             ValueError: The budget is too small for any cut, or a page that a pool lacks is damaged.
         """
         _check(stop)
-        if self.pool is not None and self.device.is_cuda:  # which a link may not know
-            shows = settings.shows if settings.shows in self.modes else "appearance"
+        if self.pool is not None and self.device.is_cuda:  # the settings of a link may ask for more
+            shows = settings.shows
+            if shows not in self.modes:
+                shows = "appearance"
             settings = replace(settings, shows=shows, split=0.0, frozen=None)
-        camera = view.camera(*size, self.near)
-        chooser = None if settings.frozen is None else settings.frozen.camera(*size, self.near)
-        start = 1e3 * time.perf_counter()
-        edge = round(settings.split * size[0])
-        asked = _Asked(camera, chooser, edge, settings, stop, steps)
+        width, height = size
+        camera = view.camera(width, height, self.near)
+        chooser: Camera | None = None
+        if settings.frozen is not None:
+            chooser = settings.frozen.camera(width, height, self.near)
+        start_ms = 1e3 * time.perf_counter()
+        edge = round(settings.split * width)
+        job = _Job(camera, chooser, edge, settings, stop, steps)
         if self.pool is None:
-            drawn = self._of_all(asked)
+            drawn = self._draw_resident(job)
         else:
             with self._drawing:
-                drawn = self._of_pool(asked, self.pool, patience)
-        picture = np.zeros((size[1], size[0], 3), np.float32)
-        colors, value_range, distance = _painted(drawn, settings)
-        picture[:, -colors.shape[1] :] = colors
+                drawn = self._draw_pool(job, self.pool, patience)
+        picture = np.zeros((height, width, 3), np.float32)
+        painting = _paint(drawn, settings)
+        picture[:, -painting.colors.shape[1] :] = painting.colors
         if edge > 0:
+            assert drawn.whole is not None
             picture[:, :edge] = drawn.whole[:, :edge]
             picture[:, max(edge - 1, 0) : edge + 1] = 1.0
-        figures = drawn.figures._replace(draw_ms=1e3 * time.perf_counter() - start - drawn.figures.select_ms)
-        return Frame(to_8bit(picture), figures, settings.shows, value_range, view, distance)
+        total_ms = 1e3 * time.perf_counter() - start_ms
+        figures = drawn.figures._replace(draw_ms=total_ms - drawn.figures.select_ms)
+        pixels = to_8bit(picture)
+        return Frame(pixels, figures, settings.shows, painting.value_range, view, painting.distance)
 
     def pick(self, view: View, size: tuple[int, int], x: int, y: int, settings: Settings) -> Pick | None:
         """Return what a pixel of a picture shows most of, of what is resident where there is a pool."""
-        cut: Any = {name: getattr(settings, name) for name in ("tolerance", "budget", "min_level")}
         camera = view.camera(*size, self.near)
         with self._drawing:
-            return pick(self.scene, camera, x, y, **cut, renderer=self.pool)
+            return pick(
+                self.scene,
+                camera,
+                x,
+                y,
+                tolerance=settings.tolerance,
+                budget=settings.budget,
+                min_level=settings.min_level,
+                renderer=self.pool,
+            )
 
-    def _of_pool(self, asked: _Asked, pool: Renderer, patience: float) -> "_Drawn":
-        """What a pool has; compared with the finest that it has room for, from whose pages both are drawn."""
-        settings = asked.settings
-        stop = asked.stop
-        edge = asked.edge
-        chooser = asked.chooser
-        frame = pool.pool_frame
-        assert frame is not None
-        wanted = CutRequest(settings.tolerance, settings.budget, settings.min_level, settings.fade)
+    def _draw_pool(self, job: _Job, pool: Renderer, patience: float) -> _Drawn:
+        """Draw from a pool, and what is compared with: the finest cut that the pool has room for.
+
+        Both are drawn from the pages of the finer cut.
+        """
+        settings = job.settings
+        pool_frame = pool.pool_frame
+        assert pool_frame is not None
+        request = CutRequest(settings.tolerance, settings.budget, settings.min_level, settings.fade)
         finest = CutRequest(tolerance=0.0)
-        compares = edge > 0 or settings.shows == "difference"
+        compares = job.edge > 0 or settings.shows == "difference"
         if patience:
-            settled = finest if compares else wanted
-            frame.settle(self.scene, chooser or asked.camera, settled, seconds=patience)
+            settled_request = request
+            if compares:
+                settled_request = finest
+            pool_frame.settle(self.scene, job.chooser or job.camera, settled_request, seconds=patience)
 
-        def draw(steps: _core.BudgetSteps | None, look: PoolLook, request: CutRequest) -> RenderedImage:
-            image = frame.draw(self.scene, asked.camera, request, _SHADE, steps=steps, stop=stop, look=look)
+        def draw(cut: CutRequest, look: PoolLook, steps: _core.BudgetSteps | None) -> RenderedImage:
+            image = pool_frame.draw(
+                self.scene, job.camera, cut, _SHADE, steps=steps, stop=job.stop, look=look
+            )
             assert isinstance(image, RenderedImage)
-            _check(stop)
+            _check(job.stop)
             return image
 
-        finer = draw(None, PoolLook(chooser=chooser), finest) if compares else None
-        by: Any = settings.shows if settings.shows in _OF_CUT else "appearance"
-        image = draw(asked.steps, PoolLook(by, chooser, aside=compares), wanted)
-        first = min(edge, asked.camera.width - 1)
-        planes = (image.color, image.alpha, image.depth)
-        color, alpha, depth = (_device.to_host(plane)[:, first:] for plane in planes)
-        levels = image.stats.levels and (*image.stats.levels, *[0] * self.num_levels)[: self.num_levels]
-        whole = None if finer is None else finer.color
-        return _Drawn(color, alpha, depth, whole, image.stats._replace(levels=levels))
+        whole: _Float32 | None = None
+        if compares:
+            whole = draw(finest, PoolLook(chooser=job.chooser), None).color
+        look = PoolLook(_look_of(settings.shows), job.chooser, aside=compares)
+        image = draw(request, look, job.steps)
+        first = min(job.edge, job.camera.width - 1)
+        figures = image.stats
+        if figures.levels:
+            no_gaussians = [0] * self.num_levels
+            levels = (*figures.levels, *no_gaussians)[: self.num_levels]
+            figures = figures._replace(levels=levels)
+        return _Drawn(
+            color=_device.to_host(image.color)[:, first:],
+            alpha=_device.to_host(image.alpha)[:, first:],
+            depth=_device.to_host(image.depth)[:, first:],
+            whole=whole,
+            figures=figures,
+        )
 
-    def _of_all(self, asked: _Asked) -> "_Drawn":
-        """What is resident, which is all; compared with all gaussians."""
-        camera, settings, stop, edge = asked.camera, asked.settings, asked.stop, asked.edge
-        rule = rule_of(settings.tolerance, settings.budget, settings.min_level, fade=settings.fade)
-        cut = select_by(rule, self.scene, asked.chooser or camera, settings.budget, self.device, asked.steps)
-        first, shows = min(edge, camera.width - 1), settings.shows
-        window = first, 0, camera.width, camera.height
-        if shows in ("count", "error"):
-            how: Any = _core.SceneFrame.count_cut if shows == "count" else _core.SceneFrame.draw_metrics
-            rules = [rule_of(cut.tolerance, None, 0)] if shows == "error" else []
-            planes = self._values(how, cut, camera, window, stop, "appearance", *rules)
-        else:
-            by: Any = shows if shows in _OF_CUT else "appearance"
-            planes = self._draw(cut, camera, window, by, stop)
-        whole, last = None, camera.width if shows == "difference" else edge
-        if last > 0:
+    def _draw_resident(self, job: _Job) -> _Drawn:
+        """Draw where all gaussians are resident, and all of them to compare with."""
+        camera = job.camera
+        settings = job.settings
+        budget = settings.budget
+        rule = rule_of(settings.tolerance, budget, settings.min_level, fade=settings.fade)
+        cut = select_by(rule, self.scene, job.chooser or camera, budget, self.device, job.steps)
+        first = min(job.edge, camera.width - 1)
+        window = (first, 0, camera.width, camera.height)
+        planes = self._draw(cut, camera, window, settings.shows, job.stop)
+        end_of_whole = job.edge
+        if settings.shows == "difference":
+            end_of_whole = camera.width
+        whole: _Float32 | None = None
+        if end_of_whole > 0:
             finest = select(self.scene, camera, tolerance=0.0, device=self.device)
-            whole = self._draw(finest, camera, (0, 0, last, camera.height), "appearance", stop)[0]
-        cost = cut.num_gaussians, planes[3], cut.tolerance, 1e3 * cut.seconds, 0.0
-        level, size = cut._per_pair(lambda c: c.level), cut._per_pair(lambda c: np.diff(c.offset))
-        levels = np.bincount(level, size, self.num_levels).astype(int).tolist()
-        return _Drawn(*planes[:3], whole, Stats(*cost, tuple(levels)))
+            window = (0, 0, end_of_whole, camera.height)
+            whole = self._draw(finest, camera, window, "appearance", job.stop).color
+        level = cut._per_pair(lambda clusters: clusters.level)
+        size = cut._per_pair(lambda clusters: np.diff(clusters.offset))
+        figures = Stats(
+            gaussians_selected=cut.num_gaussians,
+            gaussians_in_frustum=planes.gaussians_in_frustum,
+            tolerance=cut.tolerance,
+            select_ms=1e3 * cut.seconds,
+            draw_ms=0.0,
+            levels=tuple(np.bincount(level, size, self.num_levels).astype(int).tolist()),
+        )
+        return _Drawn(planes.color, planes.alpha, planes.depth, whole, figures)
 
     def _draw(
-        self, cut: Selection, camera: Camera, window: Window, color_by: ColorBy, stop: _core.Stop | None
-    ) -> tuple[Any, Any, Any, int]:
-        """Colour, alpha and depth of the window, and the gaussians in the frustum of the whole picture."""
-        if not self.device.is_cuda:
-            return self._values(_core.SceneFrame.draw_cut, cut, camera, window, stop, color_by)
-        how: Any = {"color_by": color_by, "depth": True, "device": self.device, "memory": None}
-        image = render(self.scene, camera, cut=cut, **how)
+        self, cut: Selection, camera: Camera, window: Window, shows: Shows, stop: _core.Stop | None
+    ) -> _Planes:
+        """Draw a window of the picture of a cut on the device, or on the CPU what only that draws."""
+        if not self.device.is_cuda or shows in ("count", "error"):
+            return self._draw_on_cpu(cut, camera, window, shows, stop)
+        image = render(
+            self.scene,
+            camera,
+            cut=cut,
+            color_by=_color_by(shows),
+            depth=True,
+            device=self.device,
+            memory=None,
+        )
         x0, y0, x1, y1 = window
-        planes = (_device.to_host(plane) for plane in (image.color, image.alpha, image.depth))
-        color, alpha, depth = (plane[y0:y1, x0:x1] for plane in planes)
-        return color, alpha, depth, image.stats.gaussians_in_frustum
+        return _Planes(
+            color=_device.to_host(image.color)[y0:y1, x0:x1],
+            alpha=_device.to_host(image.alpha)[y0:y1, x0:x1],
+            depth=_device.to_host(image.depth)[y0:y1, x0:x1],
+            gaussians_in_frustum=image.stats.gaussians_in_frustum,
+        )
 
-    def _values(
-        self, how: Any, cut: Selection, camera: Camera, window: Window, stop: Any, by: ColorBy, *rule: Any
-    ) -> tuple[Any, Any, Any, int]:
-        """As `_draw`, by a method of frames that are drawn on the CPU on any device."""
-        frame, resident = _core.SceneFrame(CPU.number), residency.scene(self.scene, CPU)
-        cut.check(resident.revision)  # it still has the instances of the cut
-        residency.set_models(frame, resident.bundles, CPU, by)
-        pairs, part = (cut.instance_ids, cut.cluster_ids), camera.core.window(*window)
-        drawing = how(frame, resident.core, part, *rule, *pairs, _SHADE, stop, cut.given_weights)
+    def _draw_on_cpu(
+        self, cut: Selection, camera: Camera, window: Window, shows: Shows, stop: _core.Stop | None
+    ) -> _Planes:
+        frame = _core.SceneFrame(CPU.number)
+        resident = residency.scene(self.scene, CPU)
+        cut.check(resident.revision)  # the scene still has the instances of the cut
+        residency.set_models(frame, resident.bundles, CPU, _color_by(shows))
+        scene = resident.core
+        part = camera.core.window(*window)
+        pairs = (cut.instance_ids, cut.cluster_ids)
+        weights = cut.given_weights
+        if shows == "count":
+            drawing = frame.count_cut(scene, part, *pairs, _SHADE, stop, weights)
+        elif shows == "error":
+            rule = rule_of(cut.tolerance, None, 0)
+            drawing = frame.draw_metrics(scene, part, rule, *pairs, _SHADE, stop, weights)
+        else:
+            drawing = frame.draw_cut(scene, part, *pairs, _SHADE, stop, weights)
         _check(stop)
-        return drawing.color, drawing.alpha, drawing.depth, drawing.finish().in_frustum
+        assert drawing.depth is not None
+        return _Planes(drawing.color, drawing.alpha, drawing.depth, drawing.finish().in_frustum)
 
 
-class _Drawn(NamedTuple):
-    """Planes of what is right of the split, what it is compared with from the left on, and what it cost."""
-
-    color: Any
-    alpha: Any
-    depth: Any  # or how many gaussians a pixel is blended of
-    whole: Any
-    figures: Stats
+def _color_by(shows: Shows) -> ColorBy:
+    """The colours that gaussians are drawn with, from which `_paint` makes those of the other modes."""
+    if shows in ("level", "cluster", "residency"):
+        return shows
+    return "appearance"
 
 
-def _painted(drawn: _Drawn, settings: Settings) -> tuple[Any, tuple[float, float] | None, float | None]:
-    """Colours right of the split, values of darkest and brightest, the distance."""
-    shows, alpha, depth = settings.shows, drawn.alpha, drawn.depth
+def _look_of(shows: Shows) -> ColorBy | Literal["error", "count"]:
+    """What `PoolLook` calls a mode."""
+    if shows in ("error", "count"):
+        return shows
+    return _color_by(shows)
+
+
+def _paint(drawn: _Drawn, settings: Settings) -> _Painting:
+    shows = settings.shows
+    alpha = drawn.alpha
+    depth = drawn.depth
     if shows == "count":
         values = np.log2(np.maximum(depth, 1)) / np.log2(MOST_COUNTED)
-        return _core.ramp(values) * (depth > 0)[..., None], (1.0, MOST_COUNTED), None
-    middle = tuple(slice(side * 3 // 8, side * 5 // 8 + 1) for side in alpha.shape)
-    covered = depth[middle][alpha[middle] > 0.5]
-    distance = float(np.median(covered)) if covered.size else None
+        colors = _core.ramp(values) * (depth > 0)[..., None]
+        return _Painting(colors, (1.0, MOST_COUNTED), None)
+    distance = _distance_in_middle(alpha, depth)
     if shows == "error":
         mean = np.clip(drawn.color[..., 0] / np.maximum(alpha, 1e-6), 0, 1)
-        return _core.ramp(mean) * alpha[..., None], (0.0, drawn.figures.tolerance), distance
+        colors = _core.ramp(mean) * alpha[..., None]
+        return _Painting(colors, (0.0, drawn.figures.tolerance), distance)
     if shows == "alpha":
-        return np.repeat(alpha[..., None], 3, axis=2), (0.0, 1.0), distance
+        return _Painting(np.repeat(alpha[..., None], 3, axis=2), (0.0, 1.0), distance)
     if shows == "depth":
-        covered = depth[alpha > 0.5]
-        # A few gaussians far from all others would take all the colours.
-        near, far = np.percentile(covered, (1, 99)) if covered.size else (0.0, 1.0)
+        near, far = _depth_range(alpha, depth)
         values = np.clip((far - depth) / max(far - near, 1e-12), 0, 1)
-        return _core.ramp(values) * alpha[..., None], (float(far), float(near)), distance
+        colors = _core.ramp(values) * alpha[..., None]
+        return _Painting(colors, (float(far), float(near)), distance)
     if shows == "difference":
+        assert drawn.whole is not None
         difference = np.abs(drawn.color - drawn.whole[:, -alpha.shape[1] :])
-        return np.minimum(settings.gain * difference, np.float32(1)), None, distance
-    return drawn.color, None, distance
+        return _Painting(np.minimum(settings.gain * difference, np.float32(1)), None, distance)
+    return _Painting(drawn.color, None, distance)
+
+
+def _distance_in_middle(alpha: _Float32, depth: _Float32) -> float | None:
+    """The median depth of the covered pixels around the middle; None if there are none."""
+    middle = tuple(slice(side * 3 // 8, side * 5 // 8 + 1) for side in alpha.shape)
+    covered = depth[middle][alpha[middle] > 0.5]
+    if not covered.size:
+        return None
+    return float(np.median(covered))
+
+
+def _depth_range(alpha: _Float32, depth: _Float32) -> tuple[float, float]:
+    """The depths of the nearest and the farthest colour; percentiles, which few far gaussians do not move."""
+    covered = depth[alpha > 0.5]
+    if not covered.size:
+        return 0.0, 1.0
+    near, far = np.percentile(covered, (1, 99))
+    return near, far
 
 
 def _check(stop: _core.Stop | None) -> None:
@@ -334,17 +461,21 @@ def _check(stop: _core.Stop | None) -> None:
         raise Stopped("it was stopped")
 
 
-def _bounds(scene: Scene) -> tuple[Any, float]:
+def _bounds(scene: Scene) -> tuple[npt.NDArray[np.floating], float]:
     """Centre and radius of a ball around nearly all of the scene: trained assets have a few far outliers."""
-    corners = [np.zeros((0, 3))]
-    for b, bundle in enumerate(scene.bundles):
-        mine = scene.instance_bundle == b
+    corners: list[Floats] = [np.zeros((0, 3))]
+    for number, bundle in enumerate(scene.bundles):
+        is_of_bundle = scene.instance_bundle == number
         leaves = bundle.clusters.box[: bundle.level_range(0).stop].reshape(-1, 3)
         if not len(leaves):
             continue
         low, high = np.percentile(leaves.astype(np.float64), (2, 98), axis=0)
         box = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
-        turned = np.einsum("i,iab,kb->ika", scene.scales[mine], scene.rotations[mine], box)
-        corners.append((turned + scene.positions[mine, None]).reshape(-1, 3))
+        scales = scene.scales[is_of_bundle]
+        rotations = scene.rotations[is_of_bundle]
+        turned = np.einsum("i,iab,kb->ika", scales, rotations, box)
+        corners.append((turned + scene.positions[is_of_bundle, None]).reshape(-1, 3))
     points = np.concatenate(corners)
-    return ball_of_most(points) if len(points) else (np.zeros(3), 1.0)
+    if not len(points):
+        return np.zeros(3), 1.0
+    return ball_of_most(points)

@@ -51,11 +51,18 @@ class Gate:
         self._names = {"localhost", host.lower(), str(address)}
         # Those of a machine that listens everywhere are not known: there the token alone decides.
         self._has_any_name = address.is_unspecified
-        self._token = "" if address.is_loopback else secrets.token_urlsafe(16)
+        self._token = ""
+        if not address.is_loopback:
+            self._token = secrets.token_urlsafe(16)
         self.is_secret = bool(self._token)
-        name = socket.gethostname() if address.is_unspecified else host
-        name = f"[{name}]" if ":" in name else name
-        self.url = f"http://{name}:{self.port}" + (f"/{self._token}/" if self._token else "")
+        name = host
+        if address.is_unspecified:
+            name = socket.gethostname()
+        if ":" in name:
+            name = f"[{name}]"
+        self.url = f"http://{name}:{self.port}"
+        if self._token:
+            self.url += f"/{self._token}/"
 
     def refusal(self, request: Request) -> str | None:
         """Why a request gets no answer; the token is taken off the path of one that does."""

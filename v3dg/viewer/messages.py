@@ -56,8 +56,19 @@ class _Settings(msgspec.Struct, forbid_unknown_fields=True):
     frozen: _View | None = None
 
     def settings(self) -> Settings:
-        given = {name: getattr(self, name) for name in self.__struct_fields__}
-        return Settings(**given | {"frozen": self.frozen and self.frozen.view()})
+        frozen: View | None = None
+        if self.frozen is not None:
+            frozen = self.frozen.view()
+        return Settings(
+            shows=self.shows,
+            tolerance=self.tolerance,
+            budget=self.budget,
+            min_level=self.min_level,
+            fade=self.fade,
+            gain=self.gain,
+            split=self.split,
+            frozen=frozen,
+        )
 
 
 class Look(msgspec.Struct, tag="look", forbid_unknown_fields=True):
@@ -81,7 +92,7 @@ class Pick(msgspec.Struct, tag="pick", forbid_unknown_fields=True):
     """
 
     look: Look
-    at: tuple[_Share, _Share] = (0.5, 0.5)
+    place: tuple[_Share, _Share] = msgspec.field(default=(0.5, 0.5), name="at")
     instance: Annotated[int, msgspec.Meta(ge=0)] | None = None
 
 
@@ -100,7 +111,7 @@ class Move(msgspec.Struct, tag="move", forbid_unknown_fields=True):
 class Save(msgspec.Struct, tag="save", forbid_unknown_fields=True):
     """Asks for a file; or, to play it, for the views of a path: stops with the seconds to each."""
 
-    what: Literal["picture", "film", "cameras", "scene", "play"]
+    output: Literal["picture", "film", "cameras", "scene", "play"] = msgspec.field(name="what")
     look: Look
     up: Axis | None
     path: Annotated[list[tuple[_Seconds, _View]], msgspec.Meta(max_length=_MOST_STOPS)]

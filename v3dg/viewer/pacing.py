@@ -61,7 +61,9 @@ class Pacer:
         """Take note of how long a picture took."""
         speed = math.prod(draft.size) / draft.coarser / max(milliseconds, 0.1)
         # Slower counts at once, faster only where it lasts.
-        share = 0.3 if speed > self._work_per_ms > 0 else 1.0
+        share = 1.0
+        if speed > self._work_per_ms > 0:
+            share = 0.3
         self._work_per_ms += share * (speed - self._work_per_ms)
 
     def rested(self) -> None:
@@ -79,8 +81,11 @@ def finer_sizes(drawn: Size, full: Size) -> list[Size]:
     width = drawn[0]
     while width < full[0]:
         # The last step is not worth a picture of its own where it is small.
-        width = 2 * width if 3 * width < full[0] else full[0]
-        sizes.append(full if width == full[0] else scaled(full, width / full[0]))
+        if 3 * width >= full[0]:
+            sizes.append(full)
+            break
+        width *= 2
+        sizes.append(scaled(full, width / full[0]))
     return sizes
 
 
@@ -113,12 +118,16 @@ class RenderLoop:
         fail: Callable[[Exception], None],
         pacer: Pacer | None = None,
     ) -> None:
-        self._scene_view, self._send, self._fail = scene_view, send, fail
-        self._pacer, self._steps = pacer or Pacer(), _core.BudgetSteps()
+        self._scene_view = scene_view
+        self._send = send
+        self._fail = fail
+        self._pacer = pacer or Pacer()
+        self._steps = _core.BudgetSteps()
         self._changed = threading.Condition()
         self._request: Request | None = None
         self._is_closed = False
-        self._stop, self._patience_ends = _core.Stop(), 0.0
+        self._stop = _core.Stop()
+        self._patience_ends = 0.0
         self._thread = threading.Thread(target=self._run, name="v3dg render loop", daemon=True)
         self._thread.start()
 
@@ -143,7 +152,8 @@ class RenderLoop:
         while True:
             with self._changed:
                 self._changed.wait_for(self._has_news)
-                request, self._request = self._request, None
+                request = self._request
+                self._request = None
             if self._is_closed or request is None:
                 return
             try:
@@ -157,49 +167,73 @@ class RenderLoop:
     def _draw(self, request: Request) -> None:
         draft = self._pacer.draft(request.size)
         settings = self._while_moving(request.settings, draft)
-        stop = self._begin(PATIENCE_SECONDS if draft.coarser < _COARSEST else math.inf)
-        start = time.perf_counter()
-        try:
-            frame = self._scene_view.frame(request.view, draft.size, settings, stop, self._steps)
-        finally:  # where it was stopped, it would have taken so long at least
-            self._pacer.drew(draft, 1e3 * (time.perf_counter() - start))
+        frame = self._draw_draft(request.view, draft, settings)
         sizes = finer_sizes(draft.size, request.size)
         if settings != request.settings and not sizes:
             sizes = [draft.size]
-        is_whole = self._scene_view.pool is None
-        self._send(frame, not sizes and is_whole, request.number)
+        has_pool = self._scene_view.pool is not None
+        self._send(frame, not sizes and not has_pool, request.number)
         with self._changed:
             if self._changed.wait_for(self._has_news, REST_SECONDS):
                 return
         self._pacer.rested()
-        is_larger, has_budget = draft.size != request.size, request.settings.budget is not None
-        steps = None if is_larger else self._steps
+        is_larger = draft.size != request.size
+        steps: _core.BudgetSteps | None = self._steps
+        if is_larger:
+            steps = None
         for size in sizes:
             frame = self._scene_view.frame(request.view, size, request.settings, self._begin(0.0), steps)
             if self._has_news():
                 return
-            self._send(frame, size == sizes[-1] and is_whole, request.number)
-        while not is_whole:
-            how = request.settings, self._begin(0.0), None, PAGES_SECONDS
-            frame = self._scene_view.frame(request.view, request.size, *how)
+            self._send(frame, size == sizes[-1] and not has_pool, request.number)
+        if has_pool:
+            self._draw_until_complete(request)
+        elif request.settings.budget is not None and not is_larger:
+            self._draw_until_settled(request, frame.figures.tolerance)
+
+    def _draw_draft(self, view: View, draft: Draft, settings: Settings) -> Frame:
+        patience = math.inf
+        if draft.coarser < _COARSEST:
+            patience = PATIENCE_SECONDS
+        stop = self._begin(patience)
+        start = time.perf_counter()
+        try:
+            return self._scene_view.frame(view, draft.size, settings, stop, self._steps)
+        finally:  # a picture that was stopped would have taken at least as long
+            self._pacer.drew(draft, 1e3 * (time.perf_counter() - start))
+
+    def _draw_until_complete(self, request: Request) -> None:
+        """Draw pictures from a pool until one misses no page."""
+        is_complete = False
+        while not is_complete:
+            stop = self._begin(0.0)
+            frame = self._scene_view.frame(
+                request.view, request.size, request.settings, stop, patience=PAGES_SECONDS
+            )
             if self._has_news():
                 return
-            is_whole = not frame.figures.missing
-            self._send(frame, is_whole, request.number)
-        is_on_way = has_budget and not is_larger and self._scene_view.pool is None
-        while is_on_way:  # for a budget's tolerance goes in steps
-            before, stop = frame.figures.tolerance, self._begin(0.0)
-            frame = self._scene_view.frame(request.view, draft.size, request.settings, stop, steps)
+            is_complete = not frame.figures.missing
+            self._send(frame, is_complete, request.number)
+
+    def _draw_until_settled(self, request: Request, tolerance: float) -> None:
+        """Draw pictures until the tolerance of a budget, which changes in steps, stays the same."""
+        is_settled = False
+        while not is_settled:
+            stop = self._begin(0.0)
+            frame = self._scene_view.frame(request.view, request.size, request.settings, stop, self._steps)
             self._send(frame, True, request.number)
-            is_on_way = frame.figures.tolerance != before
+            is_settled = frame.figures.tolerance == tolerance
+            tolerance = frame.figures.tolerance
 
     def _while_moving(self, settings: Settings, draft: Draft) -> Settings:
         """What of the settings there is time for."""
         draws_all = self._scene_view.draws_all_while_moving
         if not draws_all and (settings.split > 0 or settings.shows == "difference"):
             settings = replace(settings, shows="appearance", split=0.0)
-        least = 0.0 if draws_all and draft.coarser == 1 else DEFAULT_TOLERANCE
-        return replace(settings, tolerance=max(settings.tolerance, least) * draft.coarser)
+        smallest = DEFAULT_TOLERANCE
+        if draws_all and draft.coarser == 1:
+            smallest = 0.0
+        return replace(settings, tolerance=max(settings.tolerance, smallest) * draft.coarser)
 
     def _has_news(self) -> bool:
         return self._is_closed or self._request is not None
@@ -207,7 +241,8 @@ class RenderLoop:
     def _begin(self, patience: float) -> _core.Stop:
         """Return what ends the next picture once something new is asked for, after so many seconds."""
         with self._changed:
-            self._stop, self._patience_ends = _core.Stop(), time.monotonic() + patience
+            self._stop = _core.Stop()
+            self._patience_ends = time.monotonic() + patience
             if self._is_closed or (patience == 0 and self._request is not None):
                 self._stop.request()
             return self._stop

@@ -37,18 +37,20 @@ class CameraPath:
             ValueError: The path is empty.
         """
         check("path", self.stops, "at least one view, got none; add this one, or record while you fly")
-        times, views = self.times, [view for _, view in self.stops]
+        times = self.times
+        views = [view for _, view in self.stops]
         if len(views) == 1:
             return views * len(seconds)
         rows = _rows(views)
-        places = np.arange(len(times))
-        before, after = np.maximum(places - 1, 0), np.minimum(places + 1, places[-1])
-        slopes = (rows[after] - rows[before]) / (times[after] - times[before])[:, None]
-        now = np.clip(seconds, 0.0, times[-1])
-        last = np.clip(np.searchsorted(times, now, side="right"), 1, places[-1])
+        ids = np.arange(len(times))
+        previous = np.maximum(ids - 1, 0)
+        following = np.minimum(ids + 1, ids[-1])
+        slopes = (rows[following] - rows[previous]) / (times[following] - times[previous])[:, None]
+        clipped = np.clip(seconds, 0.0, times[-1])
+        last = np.clip(np.searchsorted(times, clipped, side="right"), 1, ids[-1])
         first = last - 1
         length = (times[last] - times[first])[:, None]
-        t = (now - times[first])[:, None] / length
+        t = (clipped - times[first])[:, None] / length
         curve = (2 * t**3 - 3 * t**2 + 1) * rows[first] + (3 * t**2 - 2 * t**3) * rows[last]
         curve += length * ((t**3 - 2 * t**2 + t) * slopes[first] + (t**3 - t**2) * slopes[last])
         curve[:, :4] /= np.linalg.norm(curve[:, :4], axis=1, keepdims=True)
@@ -70,7 +72,7 @@ def _rows(views: list[View]) -> Floats:
     """(K, 9): quaternion of the sign that is next to the one before, position, field of view, aspect."""
     rows = np.array([(*v.wxyz, *v.position, v.fov_y, v.aspect) for v in views], np.float64)
     rows[:, :4] = normalised(rows[:, :4])
-    for before, row in itertools.pairwise(rows):
-        if before[:4] @ row[:4] < 0:
+    for previous, row in itertools.pairwise(rows):
+        if previous[:4] @ row[:4] < 0:
             row[:4] *= -1
     return rows

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
@@ -93,8 +93,10 @@ class Site:
         from v3dg.viewer.tab import Tab
 
         self._make_tab = Tab
-        self._scene_view, self._name = scene_view, name
-        check_cameras(cameras := cameras or {})
+        self._scene_view = scene_view
+        self._name = name
+        cameras = cameras or {}
+        check_cameras(cameras)
         self._photographs = [dict(photographs or {}).get(camera) for camera in cameras]
         self._greeting = {
             "type": "hello",
@@ -103,17 +105,27 @@ class Site:
             "asks_up": asks_up,
             "home": asdict(start_view(scene_view, up)),
             "settings": {"tolerance": tolerance, "budget": budget, "fade": DEFAULT_FADE},
-            "cameras": [
-                {"name": camera, "photograph": photograph is not None, "view": asdict(View.of_camera(at))}
-                for (camera, at), photograph in zip(cameras.items(), self._photographs, strict=True)
-            ],
+            "cameras": self._describe_cameras(cameras),
         }
-        page = files("v3dg.viewer").joinpath("page")
-        self._page = {path.name: path.read_bytes() for path in page.iterdir()}
+        self._page = _read_page()
         self._tabs: set[Tab] = set()
         self._gate = Gate(host, port)
-        self.port, self.url, self.is_secret = self._gate.port, self._gate.url, self._gate.is_secret
-        self._closing, is_serving = asyncio.Event(), threading.Event()
+        self.port = self._gate.port
+        self.url = self._gate.url
+        self.is_secret = self._gate.is_secret
+        self._start()
+
+    def _describe_cameras(self, cameras: Mapping[str, Camera]) -> list[dict[str, object]]:
+        result: list[dict[str, object]] = []
+        for (name, camera), photograph in zip(cameras.items(), self._photographs, strict=True):
+            view = asdict(View.of_camera(camera))
+            result.append({"name": name, "photograph": photograph is not None, "view": view})
+        return result
+
+    def _start(self) -> None:
+        """Start the thread of the server, and wait until that accepts connections."""
+        self._closing = asyncio.Event()
+        is_serving = threading.Event()
         serving = self._serve(is_serving)
         self._thread = threading.Thread(target=asyncio.run, args=(serving,), name="v3dg viewer", daemon=True)
         self._thread.start()
@@ -135,16 +147,18 @@ class Site:
         self._loop.set_exception_handler(
             lambda _, context: _LOG.error(context["message"], exc_info=context.get("exception"))
         )
-        options: dict[str, Any] = {
-            "logger": _LOG,
-            "max_size": MOST_BYTES,
-            "compression": None,  # pictures are compressed
-            "close_timeout": 0.5,  # a client that does not answer does not hold up the end
-            "server_header": None,  # which versions answer is nobody's concern
-            "process_request": self._answer,
-            "process_response": _add_headers,
-        }
-        async with serve(self._talk, sock=self._gate.socket, **options):
+        server = serve(
+            self._talk,
+            sock=self._gate.socket,
+            logger=_LOG,
+            max_size=MOST_BYTES,
+            compression=None,  # pictures are compressed
+            close_timeout=0.5,  # a client that does not answer does not hold up the end
+            server_header=None,  # it would tell clients which versions answer
+            process_request=self._answer,
+            process_response=_add_headers,
+        )
+        async with server:
             is_serving.set()
             await self._closing.wait()
         await asyncio.to_thread(self._end_tabs)
@@ -158,19 +172,19 @@ class Site:
         """Serve one tab for as long as it is open."""
 
         def send(data: str | bytes) -> None:
-            away = connection.send(data)
+            coroutine = connection.send(data)
             try:
-                sending = asyncio.run_coroutine_threadsafe(away, self._loop)
+                sending = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
             except RuntimeError:  # the server has ended
-                away.close()
+                coroutine.close()
                 raise
             if threading.current_thread() is not self._thread:  # which would wait for itself
                 sending.result()
 
         def moved(scene_view: SceneView) -> None:
-            for other in self._tabs:
-                if other.scene_view is scene_view:
-                    other.ask_again()
+            for open_tab in self._tabs:
+                if open_tab.scene_view is scene_view:
+                    open_tab.ask_again()
 
         tab = self._make_tab(self._scene_view, self._name, send, moved)
         self._tabs.add(tab)
@@ -192,11 +206,13 @@ class Site:
         name = request.path.removeprefix("/") or "index.html"
         if "Upgrade" in request.headers and name == "connection":
             return None
-        body, kind = self._page.get(name), _KINDS.get(Path(name).suffix, "text/plain")
+        body = self._page.get(name)
+        kind = _KINDS.get(Path(name).suffix, "text/plain")
         folder, _, place = name.partition("/")
         if folder in _PHOTOGRAPH_PIXELS:
             side = _PHOTOGRAPH_PIXELS[folder]
-            body, kind = await asyncio.to_thread(self._photograph, place, side), "image/jpeg"
+            body = await asyncio.to_thread(self._photograph, place, side)
+            kind = "image/jpeg"
         if body is None:
             return connection.respond(http.HTTPStatus.NOT_FOUND, "There is no such page.\n")
         response = connection.respond(http.HTTPStatus.OK, "")
@@ -209,7 +225,9 @@ class Site:
     def _photograph(self, place: str, side: int) -> bytes | None:
         """JPEG of what the camera at that place took, if that can be read."""
         try:
-            path = self._photographs[int(place)] if place.isdecimal() else None
+            if not place.isdecimal():
+                return None
+            path = self._photographs[int(place)]
             if path is None:
                 return None
             with Image.open(path) as picture:
@@ -219,6 +237,12 @@ class Site:
                 return file.getvalue()
         except Exception:  # of whatever kind Pillow raises for a damaged file
             return None
+
+
+def _read_page() -> dict[str, bytes]:
+    """The files of the page by name."""
+    folder = files("v3dg.viewer").joinpath("page")
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def _add_headers(_connection: ServerConnection, _request: Request, response: Response) -> None:

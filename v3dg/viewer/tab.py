@@ -10,10 +10,10 @@ import resource
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import msgspec
 import numpy as np
@@ -23,6 +23,8 @@ from v3dg import _core
 from v3dg._urls import beside
 from v3dg.bundle import Bundle
 from v3dg.camera_file import write_cameras
+from v3dg.cameras import Camera
+from v3dg.gaussians import Gaussians
 from v3dg.io import read_asset
 from v3dg.pictures import to_8bit
 from v3dg.scene.file import write_scene
@@ -32,8 +34,12 @@ from v3dg.viewer.exports import Exporter, bundle_names
 from v3dg.viewer.frame import MOST_COUNTED, Frame, Pixels, SceneView
 from v3dg.viewer.pacing import RenderLoop
 
-# Pictures that pass by, and those that stay.
-_DRAFT_QUALITY, _FINAL_QUALITY = 75, 94
+# Quality of JPEG, of drafts and of final pictures.
+_DRAFT_QUALITY = 75
+_FINAL_QUALITY = 94
+# Pillow's numbers for JPEG whose colours have half the resolution, and the whole one.
+_HALF_COLORS = 2
+_WHOLE_COLORS = 0
 _FPS = 30
 # Of a pixel, for a click to mean the gaussian: what is fainter is hardly seen.
 _LEAST_WEIGHT = 0.05
@@ -55,7 +61,10 @@ class Tab:
     def __init__(
         self, scene_view: SceneView, name: str, send: _Send, moved: Callable[[SceneView], None]
     ) -> None:
-        self.scene_view, self._name, self._send, self._moved = scene_view, name, send, moved
+        self.scene_view = scene_view
+        self._name = name
+        self._send = send
+        self._moved = moved
         self._exporter = Exporter(self._tell, lambda error: self.scene_view.explain(error))
         self._loop = RenderLoop(scene_view, self._show, self._fail)
         self._look: messages.Look | None = None
@@ -89,49 +98,67 @@ class Tab:
             if self._picking.acquire(blocking=False):  # one at a time
                 threading.Thread(target=self._pick, args=(message,), name="v3dg pick", daemon=True).start()
         elif isinstance(message, messages.Move):
-            pose = {"quaternions": message.quaternion, "scales": message.scale}
-            self.scene_view.scene.move([message.instance], positions=[message.position], **pose)
+            self.scene_view.scene.move(
+                [message.instance],
+                positions=[message.position],
+                quaternions=message.quaternion,
+                scales=message.scale,
+            )
             self._moved(self.scene_view)
         elif isinstance(message, messages.Save):
-            self._exporter.begin(functools.partial(getattr(self, f"_save_{message.what}"), message))
+            self._exporter.begin(functools.partial(getattr(self, f"_save_{message.output}"), message))
         elif isinstance(message, messages.Stop):
             self._exporter.stop()
         else:
             self._begin_file(message)
 
-    def describe_scene(self) -> dict[str, Any]:
+    def describe_scene(self) -> dict[str, object]:
         """Return what the page has to know of what it shows."""
-        shown = self.scene_view
-        colors = (_core.level_colors(shown.num_levels), _core.ramp(np.linspace(0, 1, 7)))
-        levels, legend = (to_8bit(of).tolist() for of in colors)
+        scene_view = self.scene_view
+        bundles = scene_view.scene.bundles
         return {
             "type": "scene",
             "name": self._name,
-            "center": shown.center.tolist(),
-            "radius": shown.radius,
-            "near": shown.near,
-            "instances": len(shown.scene),
-            "has_files": self._folder is None and all(bundle.path for bundle in shown.scene.bundles),
-            "level_colors": levels,
-            "ramp": legend,
+            "center": scene_view.center.tolist(),
+            "radius": scene_view.radius,
+            "near": scene_view.near,
+            "instances": len(scene_view.scene),
+            "has_files": self._folder is None and all(bundle.path for bundle in bundles),
+            "level_colors": to_8bit(_core.level_colors(scene_view.num_levels)).tolist(),
+            "ramp": to_8bit(_core.ramp(np.linspace(0, 1, 7))).tolist(),
             "most_counted": MOST_COUNTED,
-            "modes": shown.modes,
-            "shows_cuts": shown.shows_cuts,
+            "modes": scene_view.modes,
+            "shows_cuts": scene_view.shows_cuts,
             "missing_colors": to_8bit(_core.missing_colors(4.0 ** np.arange(4))).tolist(),
         }
 
-    def _tell(self, message: dict[str, Any], data: bytes = b"") -> None:
-        """Send a message, with bytes behind it: its length, itself, the bytes."""
+    def _tell(self, message: Mapping[str, object], data: bytes = b"") -> None:
+        """Send a message; with bytes, as the length of the message, the message, and the bytes."""
         text = msgspec.json.encode(message)
-        self._send(len(text).to_bytes(4, "little") + text + data if data else text.decode())
+        if data:
+            self._send(len(text).to_bytes(4, "little") + text + data)
+        else:
+            self._send(text.decode())
 
     def _show(self, frame: Frame, is_final: bool, number: int) -> None:
-        picture, quality = io.BytesIO(), _FINAL_QUALITY if is_final else _DRAFT_QUALITY
-        Image.fromarray(frame.pixels).save(picture, "jpeg", quality=quality, subsampling=0 if is_final else 2)
-        figures = frame.figures._asdict() | {"memory_bytes": _resident_bytes()}
-        message = {"type": "picture", "final": is_final, "number": number, "size": frame.size}
-        message |= {"view": asdict(frame.view), "shows": frame.shows, "range": frame.value_range}
-        message |= {"distance": frame.distance, "figures": figures}
+        quality = _DRAFT_QUALITY
+        subsampling = _HALF_COLORS
+        if is_final:
+            quality = _FINAL_QUALITY
+            subsampling = _WHOLE_COLORS
+        picture = io.BytesIO()
+        Image.fromarray(frame.pixels).save(picture, "jpeg", quality=quality, subsampling=subsampling)
+        message = {
+            "type": "picture",
+            "final": is_final,
+            "number": number,
+            "size": frame.size,
+            "view": asdict(frame.view),
+            "shows": frame.shows,
+            "range": frame.value_range,
+            "distance": frame.distance,
+            "figures": {**frame.figures._asdict(), "memory_bytes": _resident_bytes()},
+        }
         self._tell(message, picture.getvalue())
 
     def _fail(self, error: Exception) -> None:
@@ -140,24 +167,26 @@ class Tab:
     def _pick(self, message: messages.Pick) -> None:
         """Tell what is at a place of the picture."""
         try:
-            view, (width, height), settings, _ = message.look.request()
-            answer: dict[str, Any] = {"type": "picked"}
-            if message.instance is None and self.scene_view.shows_cuts:
-                x = min(int(message.at[0] * width), width - 1)
-                y = min(int(message.at[1] * height), height - 1)
-                found = self.scene_view.pick(view, (width, height), x, y, settings)
-                if found is not None and found.weight >= _LEAST_WEIGHT:
-                    answer |= self._instance(found.instance) | {"point": found.position.tolist()}
-            elif message.instance is not None:
-                answer |= self._instance(message.instance)
+            request = message.look.request()
+            answer: dict[str, object] = {"type": "picked"}
+            if message.instance is not None:
+                answer.update(self._describe_instance(message.instance))
+            elif self.scene_view.shows_cuts:
+                width, height = request.size
+                x = min(int(message.place[0] * width), width - 1)
+                y = min(int(message.place[1] * height), height - 1)
+                picked = self.scene_view.pick(request.view, request.size, x, y, request.settings)
+                if picked is not None and picked.weight >= _LEAST_WEIGHT:
+                    answer.update(self._describe_instance(picked.instance))
+                    answer["point"] = picked.position.tolist()
             self._tell(answer)
         except Exception as error:
-            with contextlib.suppress(Exception):  # whoever asked may be gone
+            with contextlib.suppress(Exception):  # the page may be closed
                 self._tell({"type": "notice", "text": self.scene_view.explain(error)})
         finally:
             self._picking.release()
 
-    def _instance(self, number: int) -> dict[str, Any]:
+    def _describe_instance(self, number: int) -> dict[str, object]:
         scene = self.scene_view.scene
         if number >= len(scene):
             raise ValueError(f"instance: expected 0 to {len(scene) - 1}, got {number}")
@@ -175,7 +204,8 @@ class Tab:
         }
 
     def _save_picture(self, message: messages.Save, stop: _core.Stop) -> None:
-        frame = self.scene_view.frame(*message.look.request()[:3], stop, None, math.inf)
+        request = message.look.request()
+        frame = self.scene_view.frame(request.view, request.size, request.settings, stop, patience=math.inf)
         self._exporter.save(f"{self._name}.png", Image.fromarray(frame.pixels).save)
 
     def _save_play(self, message: messages.Save, _: _core.Stop) -> None:
@@ -183,19 +213,24 @@ class Tab:
         self._tell({"type": "play", "fps": _FPS, "views": views})
 
     def _save_film(self, message: messages.Save, stop: _core.Stop) -> None:
-        request, views = message.look.request(), message.camera_path().film(_FPS)
-        width, height = request.size
-        size = max(width // 2 * 2, 2), max(height // 2 * 2, 2)  # as H.264 needs it
+        request = message.look.request()
+        views = message.camera_path().film(_FPS)
+        # H.264 needs an even width and height.
+        width = max(request.size[0] // 2 * 2, 2)
+        height = max(request.size[1] // 2 * 2, 2)
         steps = _core.BudgetSteps()
 
         def pictures() -> Iterator[Pixels]:
-            told = 0.0
-            for place, view in enumerate(views):
-                if time.monotonic() - told > 0.2:
-                    self._tell({"type": "progress", "share": place / len(views)})
-                    told = time.monotonic()
-                view = replace(view, aspect=size[0] / size[1])
-                yield self.scene_view.frame(view, size, request.settings, stop, steps, math.inf).pixels
+            last_progress = 0.0
+            for number, view in enumerate(views):
+                if time.monotonic() - last_progress > 0.2:
+                    self._tell({"type": "progress", "share": number / len(views)})
+                    last_progress = time.monotonic()
+                view = replace(view, aspect=width / height)
+                frame = self.scene_view.frame(
+                    view, (width, height), request.settings, stop, steps, patience=math.inf
+                )
+                yield frame.pixels
 
         self._exporter.save(f"{self._name}.mp4", lambda file: write_video(file, pictures(), fps=_FPS))
 
@@ -205,9 +240,12 @@ class Tab:
         self._exporter.save("transforms.json", lambda file: write_cameras(file, cameras))
 
     def _save_scene(self, message: messages.Save, _: _core.Stop) -> None:
-        """The instances as they stand now, what is up, and the cameras of a path if there is one."""
-        size, path = message.look.request().size, message.camera_path()
-        cameras = path.cameras(_FPS, *size, self.scene_view.near) if len(path) else {}
+        """Save the instances as they are now, the axis that is up, and the cameras of a path, if any."""
+        width, height = message.look.request().size
+        path = message.camera_path()
+        cameras: dict[str, Camera] = {}
+        if len(path):
+            cameras = path.cameras(_FPS, width, height, self.scene_view.near)
         scene = copy.copy(self.scene_view.scene)
         scene.up = message.up
         names = bundle_names(scene)
@@ -235,13 +273,19 @@ class Tab:
 
     def _open(self, path: Path) -> None:
         try:
-            subject = Bundle.open(path) if path.suffix == ".v3dg" else read_asset(path)
-        except (OSError, ValueError) as error:  # which names a folder that is nobody's business
+            subject: Bundle | Gaussians
+            if path.suffix == ".v3dg":
+                subject = Bundle.open(path)
+            else:
+                subject = read_asset(path)
+        except (OSError, ValueError) as error:  # the page gets to see no folder of this machine
             raise ValueError(str(error).replace(f"{path.parent}{os.sep}", "")) from None
-        shown, before = SceneView(subject, device=self.scene_view.device), self._loop
-        self.scene_view, self._name = shown, path.stem
-        self._loop = RenderLoop(shown, self._show, self._fail)
-        before.close(0.0)
+        scene_view = SceneView(subject, device=self.scene_view.device)
+        old_loop = self._loop
+        self.scene_view = scene_view
+        self._name = path.stem
+        self._loop = RenderLoop(scene_view, self._show, self._fail)
+        old_loop.close(0.0)
         self._tell(self.describe_scene())
 
 

@@ -28,7 +28,8 @@ class View:
     @classmethod
     def of_camera(cls, camera: Camera) -> "View":
         """Take over pose and field of view; a principal point off the middle is lost."""
-        half_x, half_y = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
+        half_x = camera.width / 2 / camera.fx
+        half_y = camera.height / 2 / camera.fy
         wxyz = quaternion_from_rotation(camera.viewmat[:3, :3].T)
         return cls(wxyz, tuple(camera.position.tolist()), 2 * math.atan(half_y), half_x / half_y)
 
@@ -38,7 +39,8 @@ class View:
         rotation = rotation_from_quaternion(quaternion / np.linalg.norm(quaternion)).T
         viewmat = rigid(rotation, np.asarray(self.position, np.float64))
         half_y = math.tan(self.fov_y / 2)
-        fx, fy = width / 2 / (half_y * self.aspect), height / 2 / half_y
+        fx = width / 2 / (half_y * self.aspect)
+        fy = height / 2 / half_y
         K = np.array([[fx, 0.0, width / 2], [0.0, fy, height / 2], [0.0, 0.0, 1.0]])
         return Camera(viewmat, K, width, height, near)
 
