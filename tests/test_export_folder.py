@@ -455,8 +455,8 @@ def test_bundles_whose_names_clash_have_folders_of_their_own(tmp_path):
 
 
 def test_names_become_distinct():
-    assert _common.distinct(["_a", "_a", "_A_1", "_a"], taken=["B"]) == ["_a", "_a_1", "_A_1_2", "_a_3"]
-    assert _common.distinct(["b"], taken=["B"]) == ["b_0"]
+    assert _common.distinct(["_a", "_a", "_A_1", "_a"], reserved=["B"]) == ["_a", "_a_1", "_A_1_2", "_a_3"]
+    assert _common.distinct(["b"], reserved=["B"]) == ["b_0"]
 
 
 def test_usd_has_each_bundle_once_where_names_clash(tmp_path):

@@ -90,4 +90,6 @@ def _reach_of(address: _Address) -> Reach:
     is_private = any(address in network for network in (*_PRIVATE, *_PRIVATE_IPV6))
     if isinstance(address, ipaddress.IPv6Address):
         is_private |= address not in _PUBLIC_IPV6
-    return Reach.PRIVATE if is_private else Reach.PUBLIC
+    if is_private:
+        return Reach.PRIVATE
+    return Reach.PUBLIC

@@ -56,7 +56,9 @@ def naming_errors(url: str) -> Iterator[None]:
 
 
 def _failure_of(url: str, error: Exception) -> Exception:
-    problem = error if isinstance(error, Problem) else _problem_of(url, error)
+    problem = error
+    if not isinstance(problem, Problem):
+        problem = _problem_of(url, error)
     name = f"{shown(url)}: "
     return problem.kind(name + str(problem).removeprefix(name))
 
@@ -64,8 +66,10 @@ def _failure_of(url: str, error: Exception) -> Exception:
 def _problem_of(url: str, error: Exception) -> Problem:
     """Meaning of an error of the system, of fsspec or of aiohttp, whose types are known by their names."""
     names = {kind.__name__ for kind in type(error).__mro__}
-    reason = getattr(error, "os_error", None)  # of aiohttp, why a connection could not be made
-    cause = reason if isinstance(reason, OSError) else error
+    cause = error
+    system_error = getattr(error, "os_error", None)  # aiohttp's reason why a connection could not be made
+    if isinstance(system_error, OSError):
+        cause = system_error
     text = _text_of(url, error)
     if isinstance(error, ValueError) and "ClientError" not in names:
         return Problem(ValueError, text)
@@ -120,7 +124,10 @@ def _text_of(url: str, error: Exception) -> str:
 
 def no_room(folder: str, error: OSError | None = None) -> Problem:
     """What a full disk for temporary files means."""
-    reason = (error and error.strerror) or "no space left"
-    name = errno.errorcode.get(error.errno or 0, "") if error else ""
-    detail = f"{reason} ({name})" if name else reason
-    return Problem(OSError, f"no room for it in {folder}: {detail}; set TMPDIR to a folder with more")
+    reason = "no space left"
+    if error is not None:
+        reason = error.strerror or reason
+        name = errno.errorcode.get(error.errno or 0)
+        if name is not None:
+            reason += f" ({name})"
+    return Problem(OSError, f"no room for it in {folder}: {reason}; set TMPDIR to a folder with more")

@@ -13,12 +13,20 @@ import os
 import re
 import socket
 from collections.abc import AsyncIterator, Coroutine, Mapping, Sequence
-from typing import Any, TypeVar
+from types import ModuleType
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypedDict, TypeVar
 
 from v3dg import _extras
 from v3dg._urls.addresses import Reach, is_address, reach_of
 from v3dg._urls.failures import Problem, status_problem
 from v3dg._urls.others import Write, changed, too_long
+
+if TYPE_CHECKING:
+    import ssl
+
+    from aiohttp import ClientResponse, ClientSession, Fingerprint
+    from aiohttp.abc import AbstractResolver, ResolveResult
+    from yarl import URL
 
 T = TypeVar("T")
 
@@ -33,14 +41,63 @@ _TAGS = ("ETag", "Last-Modified", "Content-MD5", "Digest")
 _RANGE = re.compile(r"bytes (?:(\d{1,18})-(\d{1,18})|\*)/(?:(\d{1,18})|\*)")
 _IDENTITY = {"Accept-Encoding": "identity"}
 
-_sessions: dict[tuple[int, int, Reach, bool], Any] = {}
+
+class _SessionOptions(TypedDict, total=False):
+    """Options of aiohttp's sessions that users configure for fsspec."""
+
+    headers: Mapping[str, str]
+    trust_env: bool
+
+
+class _RequestOptions(TypedDict, total=False):
+    """Options of aiohttp's requests that users configure for fsspec."""
+
+    headers: Mapping[str, str]
+    ssl: "ssl.SSLContext | bool | Fingerprint"
+    proxy: "str | URL | None"
+
+
+class HttpFileSystem(Protocol):
+    """What is used of fsspec's file system of the web, which has no types."""
+
+    client_kwargs: _SessionOptions
+    kwargs: _RequestOptions
+
+    def encode_url(self, url: str, /) -> "URL": ...
+
+
+class _SessionKey(NamedTuple):
+    """Requests that share a session."""
+
+    process: int
+    loop: int
+    least_reach: Reach
+    trust_env: bool
+
+
+class _FileInfo(NamedTuple):
+    """What an answer says of the file: its size, if known, and its tag."""
+
+    num_bytes: int | None
+    tag: str
+
+
+class _ContentRange(NamedTuple):
+    """What an answer with a part says: first byte, the one behind the last, and the size of the file."""
+
+    first: int | None
+    last: int | None
+    num_bytes: int | None
+
+
+_sessions: dict[_SessionKey, "ClientSession"] = {}
 
 
 async def resolve(host: str, port: int) -> list[str]:
     """Addresses of a host; tests put others in place of this function."""
     loop = asyncio.get_running_loop()
-    found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_ADDRCONFIG)
-    return list(dict.fromkeys(str(entry[4][0]) for entry in found))
+    entries = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_ADDRCONFIG)
+    return list(dict.fromkeys(str(entry[4][0]) for entry in entries))
 
 
 class WebSource:
@@ -51,18 +108,18 @@ class WebSource:
         tag: Differs when the content does; empty where the server sends nothing of the kind.
     """
 
-    def __init__(self, there: Any, place: str) -> None:
-        self._aiohttp = _extras.load("aiohttp")
+    def __init__(self, file_system: HttpFileSystem, address: str) -> None:
+        self._aiohttp: ModuleType = _extras.load("aiohttp")
         try:
-            url: Any = there.encode_url(place)
+            url = file_system.encode_url(address)
         except ValueError:  # whose text may have a part of a password
             raise _wrong_url() from None
         if not url.host:
             raise _wrong_url()
-        self._url: Any = url.with_user(None).with_fragment(None)
+        self._url = url.with_user(None).with_fragment(None)
         # What users configure for fsspec; only the first host may see the headers.
-        session: Mapping[str, Any] = there.client_kwargs
-        request: Mapping[str, Any] = there.kwargs
+        session = file_system.client_kwargs
+        request = file_system.kwargs
         self._headers = {**session.get("headers", {}), **request.get("headers", {})}
         if url.user is not None:
             text = f"{url.user}:{url.password or ''}".encode()
@@ -72,32 +129,32 @@ class WebSource:
         self._trust_env = bool(session.get("trust_env", False))
         self._reach: Reach | None = None  # of the first host, once it is known
         self._gives_parts = False
-        self.num_bytes: int | None
-        self.tag: str
-        self.num_bytes, self.tag = _run(self._info())
+        info = _run(self._info())
+        self.num_bytes = info.num_bytes
+        self.tag = info.tag
 
     def read_parts(self, parts: Sequence[tuple[int, int]], write: Write) -> bool:
-        """Write the bytes from each first to each last; whether all of the file came instead."""
+        """Write the bytes from each first to each last; returns whether all of the file came instead."""
         return _run(self._read_parts(parts, write))
 
-    def read_all(self, most: int, write: Write) -> int:
-        """Write the whole file, of at most so many bytes; its size."""
-        return _run(self._read_all(most, write))
+    def read_all(self, max_bytes: int, write: Write) -> int:
+        """Write the whole file, which may have at most `max_bytes`, and return its size."""
+        return _run(self._read_all(max_bytes, write))
 
-    async def _info(self) -> tuple[int | None, str]:
-        async with self._asked("HEAD") as answer:
+    async def _info(self) -> _FileInfo:
+        async with self._answer("HEAD") as answer:
             if answer.status == 200 and answer.content_length is not None:
-                return answer.content_length, _tag_of(answer)
+                return _FileInfo(answer.content_length, _tag_of(answer))
         # Some servers know no HEAD, and some signatures are for GET alone.
-        async with self._asked("GET", "bytes=0-0") as answer:
+        async with self._answer("GET", "bytes=0-0") as answer:
             if answer.status == 200:
-                return answer.content_length, _tag_of(answer)
+                return _FileInfo(answer.content_length, _tag_of(answer))
             if answer.status not in (206, 416):
                 raise status_problem(answer.status)
-            total = _range_of(answer)[2]
-            if answer.status == 416 and total != 0:
+            num_bytes = _range_of(answer).num_bytes
+            if answer.status == 416 and num_bytes != 0:
                 raise status_problem(answer.status)
-            return total, _tag_of(answer)
+            return _FileInfo(num_bytes, _tag_of(answer))
 
     async def _read_parts(self, parts: Sequence[tuple[int, int]], write: Write) -> bool:
         tasks = [asyncio.ensure_future(self._read_part(first, last, write)) for first, last in parts]
@@ -109,7 +166,7 @@ class WebSource:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _read_part(self, first: int, last: int, write: Write) -> bool:
-        async with self._asked("GET", f"bytes={first}-{last - 1}") as answer:
+        async with self._answer("GET", f"bytes={first}-{last - 1}") as answer:
             if answer.status == 200 and not self._gives_parts and self.num_bytes is not None:
                 await _read(answer, 0, self.num_bytes, write)
                 return True
@@ -119,30 +176,35 @@ class WebSource:
                 raise Problem(ConnectionError, "the server gave parts of the file before and now does not")
             if answer.status != 206:
                 raise status_problem(answer.status)
-            found_first, found_last, total = _range_of(answer)
-            if total is not None and total != self.num_bytes:
-                got = f"one of {total}; it has changed, open it again"
-                raise Problem(ValueError, f"expected a file of {self.num_bytes} bytes, got {got}")
-            if (found_first, found_last) != (first, last):
-                got = f"an answer with those from {found_first} to {found_last}"
-                raise Problem(ConnectionError, f"expected the bytes from {first} to {last}, got {got}")
+            self._check_range(_range_of(answer), first, last)
             self._gives_parts = True
             await _read(answer, first, last, write)
             return False
 
-    async def _read_all(self, most: int, write: Write) -> int:
-        async with self._asked("GET") as answer:
+    def _check_range(self, content: _ContentRange, first: int, last: int) -> None:
+        """Refuse a part of a file of another size, and another part than the one that was asked for."""
+        if content.num_bytes is not None and content.num_bytes != self.num_bytes:
+            problem = f"one of {content.num_bytes}; it has changed, open it again"
+            raise Problem(ValueError, f"expected a file of {self.num_bytes} bytes, got {problem}")
+        if (content.first, content.last) != (first, last):
+            problem = f"an answer with those from {content.first} to {content.last}"
+            raise Problem(ConnectionError, f"expected the bytes from {first} to {last}, got {problem}")
+
+    async def _read_all(self, max_bytes: int, write: Write) -> int:
+        async with self._answer("GET") as answer:
             if answer.status != 200:
                 raise status_problem(answer.status)
             if self.num_bytes is None:
-                return await _read_to_end(answer, 0, most, write)
+                return await _read_to_end(answer, 0, max_bytes, write)
             await _read(answer, 0, self.num_bytes, write)
             return self.num_bytes
 
     @contextlib.asynccontextmanager
-    async def _asked(self, method: str, part: str = "") -> AsyncIterator[Any]:
+    async def _answer(self, method: str, part: str = "") -> "AsyncIterator[ClientResponse]":
         """The beginning of an answer that is no redirect; the caller reads its body, or leaves it."""
-        headers = {"Range": part} if part else {}
+        headers: dict[str, str] = {}
+        if part:
+            headers["Range"] = part
         answer = await asyncio.wait_for(self._follow(method, headers), PATIENCE_S)
         try:
             encoding = answer.headers.get("Content-Encoding", "identity").strip().lower()
@@ -152,19 +214,21 @@ class WebSource:
         finally:
             answer.close()  # also where it would go on, as the text of an error without end
 
-    async def _follow(self, method: str, headers: Mapping[str, str]) -> Any:
+    async def _follow(self, method: str, headers: Mapping[str, str]) -> "ClientResponse":
         url = self._url
         reach = self._reach
         for _ in range(_MOST_REDIRECTS + 1):
             reach = await _checked(url, reach)
             if self._reach is None:
                 self._reach = reach
-            own = self._headers if url.origin() == self._url.origin() else {}
+            configured: Mapping[str, str] = {}
+            if url.origin() == self._url.origin():
+                configured = self._headers
             session = self._session(reach)
             answer = await session.request(
                 method,
                 url,
-                headers={**own, **headers, **_IDENTITY},
+                headers={**configured, **headers, **_IDENTITY},
                 allow_redirects=False,
                 ssl=self._ssl,
                 proxy=self._proxy,
@@ -177,14 +241,14 @@ class WebSource:
             ConnectionError, f"expected at most {_MOST_REDIRECTS} redirects, got more; check the address"
         )
 
-    def _session(self, reach: Reach) -> Any:
-        """Session, with connections that are kept, to hosts that are reached from so far at least."""
+    def _session(self, reach: Reach) -> "ClientSession":
+        """A session whose connections stay open, to hosts that have at least this reach."""
         loop = asyncio.get_running_loop()
-        key = (os.getpid(), id(loop), reach, self._trust_env)
+        key = _SessionKey(os.getpid(), id(loop), reach, self._trust_env)
         if key not in _sessions:
             timeout = self._aiohttp.ClientTimeout(total=None, sock_connect=PATIENCE_S, sock_read=PATIENCE_S)
             session = self._aiohttp.ClientSession(
-                connector=self._aiohttp.TCPConnector(resolver=_resolver(self._aiohttp, reach)),
+                connector=self._aiohttp.TCPConnector(resolver=_resolver(reach)),
                 auto_decompress=False,
                 cookie_jar=self._aiohttp.DummyCookieJar(),
                 timeout=timeout,
@@ -195,8 +259,8 @@ class WebSource:
         return _sessions[key]
 
 
-def _run(work: Coroutine[Any, Any, T]) -> T:
-    """Do it on the event loop of fsspec; an interrupt of this thread ends it there, too."""
+def _run(work: Coroutine[None, None, T]) -> T:
+    """Run a coroutine on the event loop of fsspec; an interrupt of this thread cancels it."""
     future = asyncio.run_coroutine_threadsafe(work, _extras.load("fsspec.asyn").get_loop())
     try:
         return future.result()
@@ -205,20 +269,21 @@ def _run(work: Coroutine[Any, Any, T]) -> T:
         raise
 
 
-def _close(process: int, loop: asyncio.AbstractEventLoop, session: Any) -> None:
+def _close(process: int, loop: asyncio.AbstractEventLoop, session: "ClientSession") -> None:
     if process == os.getpid() and loop.is_running():
         with contextlib.suppress(Exception):
             asyncio.run_coroutine_threadsafe(session.close(), loop).result(1)
 
 
-def _resolver(aiohttp: Any, least: Reach) -> Any:
+def _resolver(least_reach: Reach) -> "AbstractResolver":
     """A resolver for aiohttp that knows no address of a shorter reach."""
+    from aiohttp.abc import AbstractResolver
 
-    class Resolver(aiohttp.abc.AbstractResolver):  # type: ignore[misc]
+    class Resolver(AbstractResolver):
         async def resolve(
             self, host: str, port: int = 0, family: int = socket.AF_INET
-        ) -> list[dict[str, Any]]:
-            addresses = [address for address in await resolve(host, port) if reach_of(address) >= least]
+        ) -> "list[ResolveResult]":
+            addresses = [address for address in await resolve(host, port) if reach_of(address) >= least_reach]
             if not addresses:
                 raise _refused()
             return [_entry(host, port, address) for address in addresses]
@@ -229,18 +294,31 @@ def _resolver(aiohttp: Any, least: Reach) -> Any:
     return Resolver()
 
 
-def _entry(host: str, port: int, address: str) -> dict[str, Any]:
-    family = socket.AF_INET6 if ":" in address else socket.AF_INET
-    flags = socket.AI_NUMERICHOST | socket.AI_NUMERICSERV
-    return {"hostname": host, "host": address, "port": port, "family": family, "proto": 0, "flags": flags}
+def _entry(host: str, port: int, address: str) -> "ResolveResult":
+    family = socket.AF_INET
+    if ":" in address:
+        family = socket.AF_INET6
+    return {
+        "hostname": host,
+        "host": address,
+        "port": port,
+        "family": family,
+        "proto": 0,
+        "flags": socket.AI_NUMERICHOST | socket.AI_NUMERICSERV,
+    }
 
 
-async def _checked(url: Any, least: Reach | None) -> Reach:
-    """Reach of a host, which is that of its farthest address; refused where it is shorter than `least`."""
+async def _checked(url: "URL", least_reach: Reach | None) -> Reach:
+    """Reach of a host, which is that of its farthest address; one below `least_reach` is refused."""
     host = url.host
-    addresses = [host] if is_address(host) else await resolve(host, url.port)
+    port = url.port
+    assert host is not None
+    assert port is not None  # which URLs of the web always have
+    addresses = [host]
+    if not is_address(host):
+        addresses = await resolve(host, port)
     reach = max(map(reach_of, addresses))
-    if least is not None and reach < least:
+    if least_reach is not None and reach < least_reach:
         raise _refused()
     return reach
 
@@ -255,35 +333,44 @@ def _refused() -> Problem:
     return Problem(PermissionError, f"refused to go on from a public server to a private address; {advice}")
 
 
-def _next_url(url: Any, location: str) -> Any:
-    """Where a redirect leads; another user or password in it is left out."""
+def _next_url(url: "URL", location: str) -> "URL":
+    """The address that a redirect leads to; another user or password in it is left out."""
     try:
-        found = url.join(type(url)(location)).with_user(None).with_fragment(None)
-        is_web = bool(location) and found.scheme in ("http", "https") and bool(found.host)
+        target = url.join(type(url)(location)).with_user(None).with_fragment(None)
+        is_web = bool(location) and target.scheme in ("http", "https") and bool(target.host)
     except ValueError:
         is_web = False
     if not is_web:
         raise Problem(
             ConnectionError, "the server sent us on to what is no address of the web; check the address"
         )
-    return found
+    return target
 
 
-def _tag_of(answer: Any) -> str:
+def _tag_of(answer: "ClientResponse") -> str:
     values = [f"{name}={answer.headers[name]}" for name in _TAGS if answer.headers.get(name)]
-    return " ".join([*values, f"size={answer.content_length}"]) if values else ""
+    if not values:
+        return ""
+    return " ".join([*values, f"size={answer.content_length}"])
 
 
-def _range_of(answer: Any) -> tuple[int | None, int | None, int | None]:
-    """First byte, the one behind the last, and the size of the file, as an answer with a part says."""
+def _range_of(answer: "ClientResponse") -> _ContentRange:
     match = _RANGE.fullmatch(answer.headers.get("Content-Range", "").strip())
     if not match:
         raise Problem(ConnectionError, "the server sent a part of the file and does not say which")
-    first, last, total = (None if text is None else int(text) for text in match.groups())
-    return first, None if last is None else last + 1, total
+    last = _number(match[2])
+    if last is not None:
+        last += 1
+    return _ContentRange(_number(match[1]), last, _number(match[3]))
 
 
-async def _read(answer: Any, first: int, last: int, write: Write) -> None:
+def _number(text: str | None) -> int | None:
+    if text is None:
+        return None
+    return int(text)
+
+
+async def _read(answer: "ClientResponse", first: int, last: int, write: Write) -> None:
     """Write a body that must have exactly the bytes from a first to a last."""
     length = answer.content_length
     if length is not None and length != last - first:
@@ -293,23 +380,23 @@ async def _read(answer: Any, first: int, last: int, write: Write) -> None:
         raise changed(first, last, num_bytes)
 
 
-async def _read_to_end(answer: Any, first: int, most: int, write: Write) -> int:
-    """Write a body of at most so many bytes, a step at a time, each of which must come in time; its size."""
-    done = 0
+async def _read_to_end(answer: "ClientResponse", first: int, max_bytes: int, write: Write) -> int:
+    """Write a body of at most `max_bytes` and return its size; each step of it must come in time."""
+    num_bytes = 0
 
     async def step() -> bool:
-        nonlocal done
-        end = done + STEP_BYTES
-        while done < end:
-            data: bytes = await answer.content.readany()
+        nonlocal num_bytes
+        end = num_bytes + STEP_BYTES
+        while num_bytes < end:
+            data = await answer.content.readany()
             if not data:
                 return False
-            if done + len(data) > most:
-                raise too_long(most)
-            write(data, first + done)
-            done += len(data)
+            if num_bytes + len(data) > max_bytes:
+                raise too_long(max_bytes)
+            write(data, first + num_bytes)
+            num_bytes += len(data)
         return True
 
     while await asyncio.wait_for(step(), PATIENCE_S):
         pass
-    return done
+    return num_bytes

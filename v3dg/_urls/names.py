@@ -23,7 +23,9 @@ def full(path: str | os.PathLike[str]) -> str:
 
 def shown(path: str | os.PathLike[str]) -> str:
     """The name of a file as messages and results show it; of a URL, nothing that may be secret."""
-    return _without_secrets(full(path)) if is_url(path) else os.fspath(path)
+    if is_url(path):
+        return _without_secrets(full(path))
+    return os.fspath(path)
 
 
 def cleaned(text: str) -> str:
@@ -39,7 +41,10 @@ def beside(path: str | os.PathLike[str]) -> Path:
 
 
 def _with_slashes(match: re.Match[str]) -> str:
-    return match[1] + ("://" if match[1] != "file" else ":///")
+    scheme = match[1]
+    if scheme == "file":
+        return f"{scheme}:///"
+    return f"{scheme}://"
 
 
 def _cleaned_match(match: re.Match[str]) -> str:
@@ -58,14 +63,14 @@ def _without_secrets(url: str) -> str:
 
 def _place_of(url: str) -> tuple[str, str]:
     """Host with its port, and path, of a URL."""
-    rest = url.partition("://")[2]
-    host = re.split("[/?#]", rest, maxsplit=1)[0]
+    address = url.partition("://")[2]
+    host = re.split("[/?#]", address, maxsplit=1)[0]
     if "@" in host:
         start = host.rindex("@") + 1
-    elif "@" in rest and not re.fullmatch(r"(\[.*\]|[^:]*)(:[0-9]*)?", host):
-        start = rest.rindex("@") + 1  # a password with a character that ends the host
+    elif "@" in address and not re.fullmatch(r"(\[.*\]|[^:]*)(:[0-9]*)?", host):
+        start = address.rindex("@") + 1  # a password with a character that ends the host
     else:
         start = 0
-    rest = re.split("[?#]", rest[start:], maxsplit=1)[0]
-    host, slash, path = rest.partition("/")
+    shown_part = re.split("[?#]", address[start:], maxsplit=1)[0]
+    host, slash, path = shown_part.partition("/")
     return host, slash + path

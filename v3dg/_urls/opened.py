@@ -54,9 +54,9 @@ def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUr
     check(shown(url), "::" not in url, f"{expected}, got a chain of places; fetch the file")
     with naming_errors(url):
         source = _source_of(url)
-    before = _opened.pop(url, None)
-    is_same = before is not None and bool(source.tag) and source.tag == before.tag
-    file = before if before is not None and is_same else FileAtUrl(url, source)
+    file = _opened.pop(url, None)
+    if file is None or not source.tag or source.tag != file.tag:
+        file = FileAtUrl(url, source)
     _opened[url] = file
     while len(_opened) > _MOST_OPENED:
         del _opened[next(iter(_opened))]
@@ -66,7 +66,9 @@ def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUr
 @contextlib.contextmanager
 def reading(path: "str | os.PathLike[str] | FileAtUrl") -> Iterator[str | os.PathLike[str]]:
     """A name under which a file, which is fetched whole from a URL, is read; errors inside name the URL."""
-    file = path if isinstance(path, FileAtUrl) else in_parts(path)
+    file = path
+    if not isinstance(file, FileAtUrl):
+        file = in_parts(file)
     if not isinstance(file, FileAtUrl):
         yield file
         return
@@ -87,9 +89,10 @@ def _renaming(local: str, name: str) -> Iterator[None]:
 
 
 def _source_of(url: str) -> Source:
-    there, place = _extras.load("fsspec").core.url_to_fs(url)
-    is_web = url.partition("://")[0].lower() in ("http", "https")
-    return WebSource(there, place) if is_web else OtherSource(there, place)
+    file_system, path = _extras.load("fsspec").core.url_to_fs(url)
+    if url.partition("://")[0].lower() in ("http", "https"):
+        return WebSource(file_system, path)
+    return OtherSource(file_system, path)
 
 
 class FileAtUrl(os.PathLike[str]):
@@ -113,10 +116,12 @@ class FileAtUrl(os.PathLike[str]):
         weakref.finalize(self, self.file.close)
         self._lock = threading.Lock()
         self._is_whole = False
-        self._is_here: dict[int, NDArray[np.bool_]] = {}  # by piece: which of its blocks are
-        self.num_bytes = -1 if source.num_bytes is None else source.num_bytes
+        self._is_fetched: dict[int, NDArray[np.bool_]] = {}  # by piece, for each of its blocks
+        self.num_bytes = -1
         if source.num_bytes is None:  # there are no parts of what has no size
             self._fetch_whole()
+        else:
+            self.num_bytes = source.num_bytes
 
     def __fspath__(self) -> str:
         return self._url
@@ -149,9 +154,9 @@ class FileAtUrl(os.PathLike[str]):
             return
         runs = self._missing(parts)
         for start in range(0, len(runs), _MOST_PIECES):
-            some = runs[start : start + _MOST_PIECES]
+            batch = runs[start : start + _MOST_PIECES]
             places = [
-                (first * _BLOCK_BYTES, min(last * _BLOCK_BYTES, self.num_bytes)) for first, last in some
+                (first * _BLOCK_BYTES, min(last * _BLOCK_BYTES, self.num_bytes)) for first, last in batch
             ]
             with naming_errors(self._url):
                 self._check_room(sum(last - first for first, last in places))
@@ -159,14 +164,14 @@ class FileAtUrl(os.PathLike[str]):
             if is_whole:
                 self._is_whole = True
                 return
-            for first, last in some:
+            for first, last in batch:
                 piece = first // _MOST_BLOCKS
-                here = self._is_here.setdefault(piece, np.zeros(_MOST_BLOCKS, np.bool_))
-                here[first - piece * _MOST_BLOCKS : last - piece * _MOST_BLOCKS] = True
+                is_fetched = self._is_fetched.setdefault(piece, np.zeros(_MOST_BLOCKS, np.bool_))
+                is_fetched[first - piece * _MOST_BLOCKS : last - piece * _MOST_BLOCKS] = True
 
     def _missing(self, parts: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Runs of blocks that parts need and that are not here, none longer than a piece."""
-        wanted: dict[int, NDArray[np.bool_]] = {}
+        """Runs of blocks that parts need and that are not fetched, none longer than a piece."""
+        is_needed: dict[int, NDArray[np.bool_]] = {}
         for first, last in parts:
             expected = f"parts of its {self.num_bytes} bytes, got {first} to {last}"
             check(shown(self), 0 <= first <= last <= self.num_bytes, expected)
@@ -174,13 +179,14 @@ class FileAtUrl(os.PathLike[str]):
             last_block = -(-last // _BLOCK_BYTES)
             for piece in range(first_block // _MOST_BLOCKS, -(-last_block // _MOST_BLOCKS)):
                 start = piece * _MOST_BLOCKS
-                blocks = wanted.setdefault(piece, np.zeros(_MOST_BLOCKS, np.bool_))
+                blocks = is_needed.setdefault(piece, np.zeros(_MOST_BLOCKS, np.bool_))
                 blocks[max(first_block - start, 0) : last_block - start] = True
         runs: list[tuple[int, int]] = []
-        for piece in sorted(wanted):
-            here = self._is_here.get(piece)
-            missing = wanted[piece] if here is None else wanted[piece] & ~here
-            numbers = np.flatnonzero(missing) + piece * _MOST_BLOCKS
+        for piece in sorted(is_needed):
+            is_missing = is_needed[piece]
+            if piece in self._is_fetched:
+                is_missing = is_missing & ~self._is_fetched[piece]
+            numbers = np.flatnonzero(is_missing) + piece * _MOST_BLOCKS
             cuts = np.flatnonzero(np.diff(numbers) > 1) + 1
             runs += [(int(run[0]), int(run[-1]) + 1) for run in np.split(numbers, cuts) if len(run)]
         return runs
@@ -189,11 +195,12 @@ class FileAtUrl(os.PathLike[str]):
         with self._lock:
             if self._is_whole:
                 return
-            is_known = self.num_bytes >= 0
+            max_bytes = self.num_bytes
+            if max_bytes < 0:
+                max_bytes = _MOST_UNKNOWN_BYTES
             with naming_errors(self._url):
-                self._check_room(self.num_bytes if is_known else 0)
-                most = self.num_bytes if is_known else _MOST_UNKNOWN_BYTES
-                self.num_bytes = self._source.read_all(most, self._write)
+                self._check_room(max(self.num_bytes, 0))
+                self.num_bytes = self._source.read_all(max_bytes, self._write)
             self._is_whole = True
 
     def _write(self, data: bytes, offset: int) -> None:

@@ -1,16 +1,16 @@
-"""Files at places that fsspec knows besides the web."""
+"""Files of the file systems that fsspec knows besides the web."""
 
 import contextlib
 import re
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, TypeAlias
+from typing import BinaryIO, Protocol, TypeAlias, cast
 
 from v3dg._urls.failures import Problem
 
 Write: TypeAlias = Callable[[bytes, int], None]
-"""Puts bytes at a place of the file that is read."""
+"""Writes bytes at an offset of the file that is read."""
 
 _STEP_BYTES = 1 << 20
 # What says which content a file has, by its name in the answers of fsspec's packages.
@@ -19,36 +19,51 @@ _TAG = re.compile(
 )
 
 
+class FileSystem(Protocol):
+    """What is used of a file system of fsspec, which has no types."""
+
+    async_impl: bool
+
+    def info(self, path: str, /) -> Mapping[str, object]: ...
+
+    def cat_ranges(
+        self, paths: Sequence[str], starts: Sequence[int], ends: Sequence[int], /
+    ) -> Sequence[bytes | Exception]: ...
+
+    def open(self, path: str, mode: str, /) -> AbstractContextManager[BinaryIO]: ...
+
+
 class OtherSource:
     """One file of a file system of fsspec.
 
     Attributes:
         num_bytes: Size; None where that is not known before all is read.
-        tag: Differs when the content does; empty where the place says nothing of the kind.
+        tag: Differs when the content does; empty where the file system says nothing of the kind.
     """
 
-    def __init__(self, there: Any, place: str) -> None:
-        info: dict[str, Any] = there.info(place)
-        self.num_bytes: int | None = info["size"]
-        is_known = any(value for name, value in info.items() if _TAG.search(name))
-        self.tag = str(info) if is_known else ""
-        self._there = there
-        self._place = place
+    def __init__(self, file_system: FileSystem, path: str) -> None:
+        info = file_system.info(path)
+        self.num_bytes = cast(int | None, info["size"])
+        self.tag = ""
+        if any(value for name, value in info.items() if _TAG.search(name)):
+            self.tag = str(info)
+        self._file_system = file_system
+        self._path = path
         # Only file systems of the asynchronous kind are for several threads.
-        self._lock: AbstractContextManager[Any] = (
-            contextlib.nullcontext() if there.async_impl else threading.Lock()
-        )
+        self._lock: AbstractContextManager[object] = threading.Lock()
+        if file_system.async_impl:
+            self._lock = contextlib.nullcontext()
 
     def read_parts(self, parts: Sequence[tuple[int, int]], write: Write) -> bool:
-        """Write the bytes from each first to each last; whether all of the file came instead."""
+        """Write the bytes from each first to each last; returns whether all of the file came instead."""
         firsts = [first for first, _ in parts]
         lasts = [last for _, last in parts]
         with self._lock:
-            answers = self._there.cat_ranges([self._place] * len(parts), firsts, lasts)
+            answers = self._file_system.cat_ranges([self._path] * len(parts), firsts, lasts)
         for (first, last), data in zip(parts, answers, strict=True):
             if isinstance(data, Exception):
                 raise data
-            if len(data) == self.num_bytes:  # this place gives no parts
+            if len(data) == self.num_bytes:  # this file system gives no parts
                 write(data, 0)
                 return True
             if len(data) != last - first:
@@ -56,26 +71,26 @@ class OtherSource:
             write(data, first)
         return False
 
-    def read_all(self, most: int, write: Write) -> int:
-        """Write the whole file, of at most so many bytes; its size."""
-        done = 0
-        with self._lock, self._there.open(self._place, "rb") as file:
+    def read_all(self, max_bytes: int, write: Write) -> int:
+        """Write the whole file, which may have at most `max_bytes`, and return its size."""
+        num_bytes = 0
+        with self._lock, self._file_system.open(self._path, "rb") as file:
             while data := file.read(_STEP_BYTES):
-                if done + len(data) > most:
-                    raise too_long(most)
-                write(data, done)
-                done += len(data)
-        return done
+                if num_bytes + len(data) > max_bytes:
+                    raise too_long(max_bytes)
+                write(data, num_bytes)
+                num_bytes += len(data)
+        return num_bytes
 
 
 def changed(first: int, last: int, num_bytes: int) -> Problem:
-    """What another number of bytes than was asked for means."""
-    got = f"{num_bytes}; it has changed, open it again"
-    return Problem(ValueError, f"expected {last - first} bytes at {first}, got {got}")
+    """The problem of a part that has another number of bytes than was asked for."""
+    text = f"expected {last - first} bytes at {first}, got {num_bytes}; it has changed, open it again"
+    return Problem(ValueError, text)
 
 
-def too_long(most: int) -> Problem:
-    """What a file means that does not end."""
+def too_long(max_bytes: int) -> Problem:
+    """The problem of a file that does not end."""
     return Problem(
-        ValueError, f"expected at most {most} bytes, got more; check the address, or fetch the file"
+        ValueError, f"expected at most {max_bytes} bytes, got more; check the address, or fetch the file"
     )

@@ -7,7 +7,8 @@ tables mean is checked by `v3dg.bundle.tables`.
 import os
 import re
 import weakref
-from typing import Any, NoReturn
+from collections.abc import Callable, Iterable
+from typing import Any, NoReturn, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,19 +29,33 @@ _FIRST_BYTES = 4096  # of the header: what a disk writes at once
 _MOST_FETCHED_TABLE_BYTES = 1 << 30
 _FREE_CLUSTERS = 1 << 18  # that may all be empty; others have a gaussian each
 
+_PageSource: TypeAlias = tuple[
+    str,
+    int,
+    str,
+    int,
+    NDArray[np.int64],
+    NDArray[np.generic],
+    Callable[[Iterable[tuple[int, int]]], None] | None,
+]
+"""The tuple that the core reads pages with: name, descriptor, codec, SH degree, places, hashes, fetch."""
+
 
 class BundlePlan:
-    """Where what is in a bundle's file; the layout, the codec and the config tell before the first page."""
+    """The places of all parts of a bundle's file, which follow from the layout, the codec and the config."""
 
     def __init__(self, layout: PageLayout, codec: Codec, config: dict[str, Any]) -> None:
-        self.layout, self.codec, self.config = layout, codec, config
+        self.layout = layout
+        self.codec = codec
+        self.config = config
         self._page_tables = page_tables(layout, codec)
         pages_bytes = int(layout.page_bytes(codec).sum())
-        num_clusters, num_pages = int(layout.first_cluster[-1]), layout.num_pages
+        num_clusters = int(layout.first_cluster[-1])
+        num_pages = layout.num_pages
         entries = entries_of(codec, num_clusters, max(num_pages - 1, 0), num_pages, pages_bytes)
         self.header = file_format.header_of(entries, codec, config)
-        ends = (entries[name]["data_offsets"][1] for name in ("pages", "hash"))
-        self._pages_end, self.num_bytes = (len(self.header) + int(end) for end in ends)
+        self._pages_end = len(self.header) + int(entries["pages"]["data_offsets"][1])
+        self.num_bytes = len(self.header) + int(entries["hash"]["data_offsets"][1])
         self._places = np.append(len(self.header) + self._page_tables["pages.offset"], self._pages_end)
 
     def run(self, first_page: int, last_page: int) -> PageRun:
@@ -67,7 +82,8 @@ class BundlePlan:
 
 def write_pages(descriptor: int, run: PageRun, codec: Codec, gaussians: Gaussians) -> NDArray[np.uint8]:
     """Write the gaussians of a run of pages, on any device, to their place; (n, 16) their hashes."""
-    host, sizes = gaussians.numpy(), np.diff(run.places)
+    host = gaussians.numpy()
+    sizes = np.diff(run.places)
     hashes = np.empty((len(run), HASH_BYTES), np.uint8)
 
     def write(page: int) -> None:
@@ -103,8 +119,12 @@ class BundleFile:
     def __init__(self, path: str | os.PathLike[str], reader: _core.HashedReader) -> None:
         self.name = os.fspath(path)
         self.path = _urls.shown(path)
-        self._at_url = path if isinstance(path, FileAtUrl) else None
-        self._fd = os.dup(self._at_url.file.fileno()) if self._at_url else _files.open_regular(path)
+        self._at_url: FileAtUrl | None = None
+        if isinstance(path, FileAtUrl):
+            self._at_url = path
+            self._fd = os.dup(path.file.fileno())
+        else:
+            self._fd = _files.open_regular(path)
         weakref.finalize(self, os.close, self._fd)
         with _files.naming_errors(self.path):
             self._read_header_and_tables(reader)
@@ -120,13 +140,16 @@ class BundleFile:
         check(f"{self.path}: {name}", holds, expected)
 
     def _read_header_and_tables(self, reader: _core.HashedReader) -> None:
-        self.num_bytes = self._at_url.num_bytes if self._at_url else os.fstat(self._fd).st_size
+        if self._at_url is not None:
+            self.num_bytes = self._at_url.num_bytes
+        else:
+            self.num_bytes = os.fstat(self._fd).st_size
         check(self.path, self.num_bytes >= 8, f"a bundle, got a file of {self.num_bytes} bytes")
         header_bytes = int.from_bytes(self._read(8, 0), "little")
         check(self.path, header_bytes > 0, "a bundle, got one that is not finished, or another kind of file")
-        found = f"a header length of {header_bytes} in a file of {self.num_bytes} bytes"
         fits = header_bytes <= min(self.num_bytes - 8, file_format.MAX_HEADER_BYTES)
-        expected = f"a bundle (safetensors), got {found}; it is truncated, or no bundle: see v3dg.open"
+        problem = f"a header length of {header_bytes} in a file of {self.num_bytes} bytes"
+        expected = f"a bundle (safetensors), got {problem}; it is truncated, or no bundle: see v3dg.open"
         self._check("header", fits, expected)
         text = header_bytes.to_bytes(8, "little") + self._read(header_bytes, 8)
         header = self._object("header", text[8:])
@@ -136,23 +159,31 @@ class BundleFile:
         self.pages_bytes = int(entries["pages"]["data_offsets"][1])
         self._read_tables(entries, text, reader)
 
-    def _read_metadata(self, metadata: Any) -> None:
-        metadata = metadata if isinstance(metadata, dict) else {}
-        names = ("format", "version", "sh_degree", "config", "codec")
-        kind, version, degree, config, codec = map(metadata.get, names)
-        is_ours = kind == file_format.FORMAT
-        self._check("format", is_ours, f"'{file_format.FORMAT}', got {shown(kind)}; not a bundle")
-        is_number = isinstance(version, str) and re.fullmatch("[1-9][0-9]{0,8}", version)
-        self._check("version", is_number, f"a number of 1 or more, got {shown(version)}")
+    def _read_metadata(self, metadata: object) -> None:
+        values: dict[str, object] = {}
+        if isinstance(metadata, dict):
+            values = metadata
+        kind = values.get("format")
+        if kind != file_format.FORMAT:
+            self._fail(f"format: expected '{file_format.FORMAT}', got {shown(kind)}; not a bundle")
+        version = values.get("version")
+        if not isinstance(version, str) or not re.fullmatch("[1-9][0-9]{0,8}", version):
+            self._fail(f"version: expected a number of 1 or more, got {shown(version)}")
         self.version = int(version)
         if self.version > VERSION:
             self._fail(f"version {self.version}, this build reads up to {VERSION}; update v3dg")
-        self._check("sh_degree", degree in ("0", "1", "2", "3"), f"'0' to '3', got {shown(degree)}")
-        name = codec if self.version > 1 else Codec.name
-        is_known = isinstance(name, str) and name in CODECS and (self.version, name) != (2, Codec.name)
-        self._check("codec", is_known, f"one that this build reads, got {shown(name)}; update v3dg")
+        degree = values.get("sh_degree")
+        if not isinstance(degree, str) or degree not in ("0", "1", "2", "3"):
+            self._fail(f"sh_degree: expected '0' to '3', got {shown(degree)}")
+        name: object = Codec.name
+        if self.version > 1:
+            name = values.get("codec")
+        if not isinstance(name, str) or name not in CODECS or (self.version, name) == (2, Codec.name):
+            self._fail(f"codec: expected one that this build reads, got {shown(name)}; update v3dg")
         self.codec = CODECS[name](int(degree))
-        self._check("config", isinstance(config, str), f"a string of JSON, got {shown(config)}")
+        config = values.get("config")
+        if not isinstance(config, str):
+            self._fail(f"config: expected a string of JSON, got {shown(config)}")
         self.config = self._object("config", config)
 
     def _object(self, name: str, text: str | bytes) -> dict[str, Any]:
@@ -168,13 +199,13 @@ class BundleFile:
         counts = []
         for name in ("clusters.level", "groups.parent", "pages.offset", "pages"):
             entry = header.get(name)
-            shape: Any = entry.get("shape") if isinstance(entry, dict) else None
-            has_side = isinstance(shape, list) and len(shape) == 1 and type(shape[0]) is int and shape[0] >= 0
-            self._check(name, has_side, f"a tensor with one side, got {shown(entry)}")
-            counts.append(shape[0])
-        wanted, given = max(counts), self.num_bytes
-        found = f"got {given}; the file is truncated"
-        self._check("size", wanted <= given, f"more than {shown(wanted)} bytes for tensors, {found}")
+            side = _only_side(entry)
+            if side is None:
+                self._fail(f"{name}: expected a tensor with one side, got {shown(entry)}")
+            counts.append(side)
+        largest = max(counts)
+        text = f"more than {shown(largest)} bytes for tensors, got {self.num_bytes}; the file is truncated"
+        self._check("size", largest <= self.num_bytes, text)
         expected = entries_of(self.codec, *counts)
         for name, entry in expected.items():
             if header.get(name) != entry:
@@ -186,17 +217,20 @@ class BundleFile:
         for name, value in (("header", self._data_start), ("pages", counts[3])):
             is_aligned = value % self.codec.alignment == 0
             self._check(name, is_aligned, f"to end at a multiple of {self.codec.alignment}, got {value}")
-        wanted = self._data_start + expected["hash"]["data_offsets"][1]
-        problem = "truncated" if wanted > given else "followed by other data"
-        self._check("size", wanted == given, f"{wanted} bytes, got {given}; the file is {problem}")
+        size = self._data_start + expected["hash"]["data_offsets"][1]
+        problem = "followed by other data"
+        if size > self.num_bytes:
+            problem = "truncated"
+        text = f"{size} bytes, got {self.num_bytes}; the file is {problem}"
+        self._check("size", size == self.num_bytes, text)
         return expected
 
     def _check_counts(self, num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int) -> None:
         """Refuse tables at a URL that are larger than the gaussians can need, before they are fetched."""
         if self._at_url is None:
             return
-        most = _FREE_CLUSTERS + pages_bytes // self.codec.gaussian_bytes
-        self._check("clusters", num_clusters <= most, f"at most {most} for its pages, got {num_clusters}")
+        limit = _FREE_CLUSTERS + pages_bytes // self.codec.gaussian_bytes
+        self._check("clusters", num_clusters <= limit, f"at most {limit} for its pages, got {num_clusters}")
         self._check("groups", num_groups <= num_clusters, f"at most {num_clusters}, got {num_groups}")
         self._check("pages", num_pages <= num_groups + 1, f"at most {num_groups + 1}, got {num_pages}")
 
@@ -211,7 +245,7 @@ class BundleFile:
         self._fetch(place, self.num_bytes)
         self._reading = reader.read(self.path, self._fd, text, place, num_bytes, self.version > 2)
         data = self._reading.wait()  # with the hash at the end
-        self.tables: dict[str, NDArray[Any]] = {}
+        self.tables: dict[str, NDArray[Any]] = {}  # whose types `schema_of` has
         for name, dtype, _, _ in schema_of(self.codec):
             first, last = (offset - self.pages_bytes for offset in entries[name]["data_offsets"])
             self.tables[name] = data[first:last].view(DTYPES[dtype]).reshape(entries[name]["shape"])
@@ -235,13 +269,36 @@ class BundleFile:
         return self._data_start + np.append(self.tables["pages.offset"], self.pages_bytes)
 
     @property
-    def source(self) -> tuple[Any, ...]:
-        """What the core reads pages with: name, descriptor, codec, SH degree, places, hashes, fetch."""
-        file, codec = (self.path, self._fd), (self.codec.name, self.codec.sh_degree)
-        return *file, *codec, self.places, self.tables["pages.hash"], self._at_url and self._at_url.fetch
+    def source(self) -> _PageSource:
+        """The source of pages for the core."""
+        fetch = None
+        if self._at_url is not None:
+            fetch = self._at_url.fetch
+        return (
+            self.path,
+            self._fd,
+            self.codec.name,
+            self.codec.sh_degree,
+            self.places,
+            self.tables["pages.hash"],
+            fetch,
+        )
 
     def read(self, run: PageRun, out: _core.Rows | NDArray[np.int32]) -> None:
         """Fill rows with the gaussians of a run of pages, or words with quantised pages; verified."""
         self._fetch(*run.places[[0, -1]])
         hashes = self.tables["pages.hash"][run.first_page :][: len(run)]
         _core.read_pages(self.path, self._fd, out, self.codec.name, hashes, **vars(run))
+
+
+def _only_side(entry: object) -> int | None:
+    """The length of a tensor with one side, from its entry in a header; None for anything else."""
+    if not isinstance(entry, dict):
+        return None
+    shape = entry.get("shape")
+    if not isinstance(shape, list) or len(shape) != 1:
+        return None
+    side = shape[0]
+    if type(side) is not int or side < 0:
+        return None
+    return side

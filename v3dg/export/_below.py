@@ -21,11 +21,11 @@ def folders_above(name: str) -> list[str]:
 class Folder(AbstractContextManager["Folder"]):
     """An open folder. All names are relative to it, with `/` between folders, and no link is followed.
 
-    A folder on the way that is a link or a file is an OSError. Errors have `shown` in place of the path.
+    A folder on the way that is a link or a file is an OSError. Errors name `display_path`, not the path.
     """
 
-    def __init__(self, path: Path, shown: Path) -> None:
-        self._shown = shown
+    def __init__(self, path: Path, display_path: Path) -> None:
+        self._display_path = display_path
         self.descriptor = os.open(path, _FOLDER)
 
     def __exit__(self, *_: object) -> None:
@@ -38,14 +38,15 @@ class Folder(AbstractContextManager["Folder"]):
         descriptor = os.dup(self.descriptor)
         try:
             for folder in folders:
-                below = os.open(folder, _FOLDER | os.O_NOFOLLOW, dir_fd=descriptor)
+                subfolder = os.open(folder, _FOLDER | os.O_NOFOLLOW, dir_fd=descriptor)
                 os.close(descriptor)
-                descriptor = below
+                descriptor = subfolder
             yield descriptor, last
         except OSError as error:
             if error.errno is None:
                 raise
-            raise OSError(error.errno, os.strerror(error.errno), os.fspath(self._shown / name)) from error
+            path = os.fspath(self._display_path / name)
+            raise OSError(error.errno, os.strerror(error.errno), path) from error
         finally:
             os.close(descriptor)
 
@@ -63,7 +64,7 @@ class Folder(AbstractContextManager["Folder"]):
             descriptor = os.open(last, _FILE, dir_fd=folder)
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             os.close(descriptor)
-            raise ValueError(f"{self._shown / name}: expected a file, got a folder or a device")
+            raise ValueError(f"{self._display_path / name}: expected a file, got a folder or a device")
         return descriptor
 
     def make_folder(self, name: str) -> None:
@@ -73,8 +74,8 @@ class Folder(AbstractContextManager["Folder"]):
 
     def move(self, source: str, target: str) -> None:
         """Rename a file, and make the folders above its new name; FileExistsError where that is taken."""
-        for above in folders_above(target):
-            self.make_folder(above)
+        for parent in folders_above(target):
+            self.make_folder(parent)
         with self._folder_of(source) as (folder, last), self._folder_of(target) as (new_folder, new_last):
             with suppress(FileNotFoundError):
                 os.stat(new_last, dir_fd=new_folder, follow_symlinks=False)

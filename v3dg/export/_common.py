@@ -2,10 +2,11 @@
 
 import json
 import math
-from collections.abc import Collection, Iterable
+import re
+from collections.abc import Collection, Iterable, Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,8 @@ from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Floats
 from v3dg.rotations import rotation_from_quaternion
 from v3dg.scene import Scene
+
+_OTHER_LETTERS = re.compile("[^A-Za-z0-9]")  # than names of folders have
 
 # Quaternions w x y z that turn an axis to -y, which is up where y is down, as viewers take it.
 _HALF = math.sqrt(0.5)
@@ -42,18 +45,16 @@ def rotation_to(up: Axis, frame: Literal["y", "z"]) -> Floats:
     return np.asarray(_FROM_UPRIGHT[frame] @ rotation_from_quaternion(turn_upright(up))) + 0.0
 
 
-def names_of(scene: Scene, taken: Collection[str] = ()) -> list[str]:
-    """A folder for each bundle, after its file, other than those that are taken."""
+def names_of(scene: Scene, reserved: Collection[str] = ()) -> list[str]:
+    """The name of a folder for each bundle, made from that of its file; no reserved name is used."""
     stems = [beside(bundle.path or "bundle").stem[:80] for bundle in scene.bundles]
-    return distinct(
-        ("".join(c if c.isascii() and c.isalnum() else "_" for c in stem) for stem in stems), taken
-    )
+    return distinct([_OTHER_LETTERS.sub("_", stem) for stem in stems], reserved)
 
 
-def distinct(names: Iterable[str], taken: Collection[str] = ()) -> list[str]:
-    """The names, of which those that are taken by then get a number: also where case makes no difference."""
+def distinct(names: Iterable[str], reserved: Collection[str] = ()) -> list[str]:
+    """The names with a number added to each that is reserved or repeats an earlier one, whatever its case."""
     results: list[str] = []
-    used = {name.casefold() for name in taken}
+    used = {name.casefold() for name in reserved}
     for number, name in enumerate(names):
         result = name
         while result.casefold() in used:
@@ -64,7 +65,7 @@ def distinct(names: Iterable[str], taken: Collection[str] = ()) -> list[str]:
     return results
 
 
-def rows_by(numbers: NDArray[Any], count: int) -> list[NDArray[np.intp]]:
+def rows_by(numbers: NDArray[np.int32] | NDArray[np.int64], count: int) -> list[NDArray[np.intp]]:
     """The rows that have each of the numbers 0 to `count` - 1, in ascending order."""
     order = np.argsort(numbers, kind="stable")
     return np.split(order, np.searchsorted(numbers[order], np.arange(count + 1)))[1:-1]
@@ -84,7 +85,7 @@ def detail_of(bundle: Bundle) -> dict[str, float]:
     return {"reach": reach[0], "ratio": max(ratio, 1.2)}  # the engine takes no less
 
 
-def write_document(path: Path, document: Any) -> None:
+def write_document(path: Path, document: Mapping[str, object]) -> None:
     """JSON without spaces, into a folder that is not in its place yet."""
     path.write_text(json.dumps(document, separators=(",", ":")), encoding="utf-8")
 

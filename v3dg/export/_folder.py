@@ -56,8 +56,8 @@ def check_outside(folder: Path, inputs: Iterable[str | os.PathLike[str] | None])
     for path in inputs:
         if path is None or is_url(path):
             continue
-        above = [parent for parent in Path(os.path.realpath(path)).parents if parent.exists()]
-        if any(os.path.samestat(parent.stat(), status) for parent in above):
+        parents = [parent for parent in Path(os.path.realpath(path)).parents if parent.exists()]
+        if any(os.path.samestat(parent.stat(), status) for parent in parents):
             raise ValueError(f"{folder}: {os.fspath(path)}, which is read, is in it; choose another folder")
 
 
@@ -137,21 +137,24 @@ def _naming_errors(folder: Path, target: Path) -> Iterator[None]:
         if error.errno is None or not isinstance(name, str) or not Path(name).is_relative_to(target):
             raise
         parts = Path(name).relative_to(target).parts
-        shown = folder.joinpath(*parts[2:] if parts and _HIDDEN.fullmatch(parts[0]) else parts)
-        raise OSError(error.errno, os.strerror(error.errno), os.fspath(shown)) from error
+        if parts and _HIDDEN.fullmatch(parts[0]):
+            parts = parts[2:]
+        raise OSError(error.errno, os.strerror(error.errno), os.fspath(folder.joinpath(*parts))) from error
 
 
 class _Place:
     """A folder that an export is written to, and what an earlier one wrote there."""
 
     def __init__(self, folder: Path, target: Path, root: Folder, overwrite: bool) -> None:
-        self._folder, self._root, self._overwrite = folder, root, overwrite
+        self._folder = folder
+        self._root = root
+        self._overwrite = overwrite
         self.hidden = f".v3dg-export.{secrets.token_hex(8)}.tmp"
-        left = [name for name in os.listdir(root.descriptor) if _HIDDEN.fullmatch(name)]
-        for name in left:
+        unfinished = [name for name in os.listdir(root.descriptor) if _HIDDEN.fullmatch(name)]
+        for name in unfinished:
             _clear_up(root, name, folder)
         record = read_record(root, RECORD, folder / RECORD)
-        is_empty = not set(os.listdir(root.descriptor)) - set(left)
+        is_empty = not set(os.listdir(root.descriptor)) - set(unfinished)
         advice = "choose another, or overwrite, which replaces files of the same names and removes none"
         expected = f"a new folder, or one with an earlier export, got one without {RECORD}; {advice}"
         check(folder, overwrite or is_empty or record is not None, expected)
@@ -163,23 +166,24 @@ class _Place:
     def check(self, names: Iterable[str]) -> None:
         """Refuse, with ValueError, to write files of these names where something has them that may not go."""
         for name in names:
-            for above in folders_above(name):
-                status = self._root.status(above)
+            for parent in folders_above(name):
+                status = self._root.status(parent)
                 is_ready = status is None or stat.S_ISDIR(status.st_mode)
                 expected = "a folder, got a file or a link, which an export does not replace"
-                check(self._folder / above, is_ready, f"{expected}; move it elsewhere")
+                check(self._folder / parent, is_ready, f"{expected}; move it elsewhere")
             status = self._root.status(name)
             if status is None or self.earlier.get(name) == stamp_of_status(status):
                 continue
             expected = "a file, got a folder, a link or a device, which an export does not replace"
             check(self._folder / name, is_file(status), f"{expected}; move it elsewhere")
-            got = "one that was changed, or that no export wrote"
+            expected = "a file of an earlier export, got one that was changed, or that no export wrote"
             advice = "move it elsewhere, or overwrite"
-            check(self._folder / name, self._overwrite, f"a file of an earlier export, got {got}; {advice}")
+            check(self._folder / name, self._overwrite, f"{expected}; {advice}")
 
     def put(self, record: Record, path: Path) -> None:
         """Have the new files take the place of the earlier ones; `path` is for the new record until then."""
-        root, hidden = self._root, self.hidden
+        root = self._root
+        hidden = self.hidden
         self.check([*record.files, RECORD])
         earlier = self._record.folders
         folders = [name for name in folders_of(record.files) if name in earlier or root.status(name) is None]
@@ -244,7 +248,9 @@ def _clear_up(root: Folder, hidden: str, folder: Path) -> None:
         _remove_unused_folders(root, hidden, folder)
         # It went back and has a record, or it ended, and that of the earlier one is left.
         present = read_record(root, RECORD, folder / RECORD)
-        folders = set(folders_of(present.files if present else ()))
+        folders: set[str] = set()
+        if present is not None:
+            folders.update(folders_of(present.files))
         for part, name in (("new", f"{hidden}/{RECORD}"), ("old", f"{hidden}/old/{RECORD}")):
             record = read_record(root, name, folder / name)
             if record is not None:
@@ -252,8 +258,8 @@ def _clear_up(root: Folder, hidden: str, folder: Path) -> None:
                     root.remove_file(f"{hidden}/{part}/{file}")
                 folders.update(folders_of(record.files))
                 root.remove_file(name)
-        for below in sorted(folders, reverse=True):
+        for subfolder in sorted(folders, reverse=True):
             for part in ("new", "old"):
-                root.remove_empty_folder(f"{hidden}/{part}/{below}")
+                root.remove_empty_folder(f"{hidden}/{part}/{subfolder}")
         for name in (f"{hidden}/new", f"{hidden}/old", hidden):
             root.remove_empty_folder(name)

@@ -13,14 +13,15 @@ import stat
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple
 
 from v3dg._json import Node, parse_json
 from v3dg._numbers import check
 from v3dg.export._below import Folder
 
 RECORD = "v3dg-export.json"
-_FORMAT, _VERSION = "v3dg-export", 1
+_FORMAT = "v3dg-export"
+_VERSION = 1
 _MOST_BYTES = 64 << 20  # of a record: that of a million files
 _PIECE_BYTES = 1 << 20
 _HASH_BYTES = 16
@@ -30,8 +31,14 @@ _FILE_NAME = re.compile(
 )
 _HASH = re.compile(f"[0-9a-f]{{{2 * _HASH_BYTES}}}")
 
-Stamp: TypeAlias = tuple[int, int, int, int]
-"""Of a file: another one, or one that was written to, has another."""
+
+class Stamp(NamedTuple):
+    """The identity of a file: another file, or one that was written to, has another stamp."""
+
+    inode: int
+    num_bytes: int
+    modified_ns: int
+    changed_ns: int
 
 
 @dataclass(frozen=True)
@@ -75,13 +82,13 @@ class Record:
         return stamps
 
 
-def read_record(root: Folder, name: str, shown: Path) -> Record | None:
+def read_record(root: Folder, name: str, display_path: Path) -> Record | None:
     """Read a record; None where there is none.
 
     Args:
         root: The folder that the record is below.
         name: Of the record, relative to that.
-        shown: The path that errors begin with.
+        display_path: The path that errors begin with.
 
     Raises:
         ValueError: It is no record, or names what no export writes.
@@ -90,16 +97,17 @@ def read_record(root: Folder, name: str, shown: Path) -> Record | None:
     status = root.status(name)
     if status is None:
         return None
-    check(
-        shown, is_file(status), "the record of an export, got a folder, a link or a device; move it elsewhere"
-    )
+    expected = "the record of an export, got a folder, a link or a device; move it elsewhere"
+    check(display_path, is_file(status), expected)
     with open(root.open_file(name), "rb") as file:
         text = file.read(_MOST_BYTES + 1)
-    check(shown, len(text) <= _MOST_BYTES, f"a record of at most {_MOST_BYTES >> 20} MiB, got more")
+    check(display_path, len(text) <= _MOST_BYTES, f"a record of at most {_MOST_BYTES >> 20} MiB, got more")
     try:
-        document = Node(parse_json(text), str(shown), "")
+        document = Node(parse_json(text), str(display_path), "")
     except ValueError as error:
-        raise ValueError(f"{shown}: expected the record of an export, could not read it ({error})") from None
+        raise ValueError(
+            f"{display_path}: expected the record of an export, could not read it ({error})"
+        ) from None
     fields = document.fields(("format", "version", "folders", "files"))
     if fields["format"].value != _FORMAT or fields["version"].value != _VERSION:
         raise document.problem(
@@ -144,7 +152,7 @@ def stamp_of_content(root: Folder, name: str, content: Content) -> Stamp | None:
 
 
 def stamp_of_status(status: os.stat_result) -> Stamp:
-    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+    return Stamp(status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
 
 
 def is_file(status: os.stat_result) -> bool:

@@ -1,8 +1,10 @@
 """How far the coarser levels of chunks are from the finest, in pictures of them: `errors` of streamed SOG."""
 
 from collections import defaultdict
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from v3dg.cameras import Camera, Floats
 from v3dg.cleaning import ball_of_most
@@ -13,6 +15,13 @@ _SIDE_PX = 64
 _FOV = 0.3  # narrow, so that all of a chunk is about as large
 _DIRECTIONS = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
 _FILTER_PX2 = 0.3  # with which viewers of the format draw
+
+
+class _Finest(NamedTuple):
+    """The cameras of a chunk, and the pictures of its finest level."""
+
+    cameras: list[Camera]
+    pictures: NDArray[np.float16]
 
 
 class ChunkErrors:
@@ -27,21 +36,40 @@ class ChunkErrors:
 
     def __init__(self) -> None:
         self.of_chunk: defaultdict[int, list[float]] = defaultdict(list)
-        self._finest: dict[int, tuple[list[Camera], Floats]] = {}
+        self._finest: dict[int, _Finest] = {}
 
     def add(self, chunk: int, gaussians: Gaussians) -> None:
         """Add the next level of a chunk, which need not have gaussians."""
-        errors, error = self.of_chunk[chunk], 0.0
+        errors = self.of_chunk[chunk]
+        error = 0.0
         if len(gaussians) and chunk not in self._finest:
-            middle, radius = ball_of_most(gaussians.means.astype(np.float64))
-            far = max(radius, 1e-6) / np.sin(_FOV / 2)
-            how = {"fov_x": _FOV, "width": _SIDE_PX, "height": _SIDE_PX, "near": far / 100}
-            cameras = [Camera.look_at(middle + far * side, middle, **how) for side in _DIRECTIONS]
-            self._finest[chunk] = cameras, _pictures(gaussians, cameras).astype(np.float16)
+            cameras = _cameras_around(gaussians)
+            pictures = _pictures(gaussians, cameras).astype(np.float16)
+            self._finest[chunk] = _Finest(cameras, pictures)
         elif len(gaussians):
-            cameras, finest = self._finest[chunk]
-            error = float(np.square(_pictures(gaussians, cameras) - finest).mean())
-        errors.append(max(error, *errors[-1:]) if errors else error)
+            finest = self._finest[chunk]
+            difference = _pictures(gaussians, finest.cameras) - finest.pictures
+            error = float(np.square(difference).mean())
+        if errors:
+            error = max(error, errors[-1])
+        errors.append(error)
+
+
+def _cameras_around(gaussians: Gaussians) -> list[Camera]:
+    """Cameras on four sides that show most of the gaussians."""
+    centre, radius = ball_of_most(gaussians.means.astype(np.float64))
+    distance = max(radius, 1e-6) / np.sin(_FOV / 2)
+    return [
+        Camera.look_at(
+            centre + distance * side,
+            centre,
+            fov_x=_FOV,
+            width=_SIDE_PX,
+            height=_SIDE_PX,
+            near=distance / 100,
+        )
+        for side in _DIRECTIONS
+    ]
 
 
 def _pictures(gaussians: Gaussians, cameras: list[Camera]) -> Floats:

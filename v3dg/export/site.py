@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -17,12 +17,12 @@ from v3dg import _files
 from v3dg._numbers import check
 from v3dg._progress import Bar, Progress
 from v3dg.bundle import Bundle
-from v3dg.cameras import Axis, Camera, check_cameras
+from v3dg.cameras import Axis, Camera, Floats, check_cameras
 from v3dg.export import _common
 from v3dg.export._folder import NewFiles, check_outside, replacing_export
-from v3dg.export.streamed_sog import DEFAULT_CHUNK, INDEX, SETTINGS, Plan, write_levels
+from v3dg.export.streamed_sog import DEFAULT_CHUNK, INDEX, SETTINGS, Export, Plan, write_levels
 from v3dg.opening import File, open_with_cameras
-from v3dg.scene import Scene
+from v3dg.scene import Scene, Subject
 from v3dg.select import DEFAULT_TOLERANCE
 from v3dg.upright import up_of
 
@@ -84,67 +84,105 @@ def write_site(
         RuntimeError: Another export is using the folder.
         OSError: A file cannot be written.
     """
+    content: object = subject
     if isinstance(subject, str | os.PathLike):
         check_outside(Path(folder), [subject])
-        opened: Any
-        opened, file_cameras = open_with_cameras(Path(subject))
+        content, file_cameras = open_with_cameras(Path(subject))
         cameras = cameras or file_cameras
-        return write_site(opened, folder, cameras, chunk=chunk, up=up, progress=progress, overwrite=overwrite)
-    check_cameras(cameras := cameras or {})
-    folder, is_scene, scene = Path(folder), isinstance(subject, Scene), Scene.of(subject)
-    axis = up or up_of(subject, cameras)[0]
-    # A bundle alone is turned to what viewers take to be up; a scene's stay as its instances have them.
-    turn = _common.turn_upright("-y" if is_scene else axis)
+    cameras = cameras or {}
+    check_cameras(cameras)
+    scene = Scene.of(cast(Scene | Bundle, content))  # which refuses all else
+    is_scene = isinstance(content, Scene)
+    axes = _axes(is_scene, up or up_of(cast(Subject, content), cameras)[0])
+    turn = _common.turn_upright(axes.asset)
     check("scene", len(scene), "instances to export, got none")
     plans = [Plan.of(bundle, chunk) for bundle in scene.bundles]
-    certain = (SITE, "index.html") if is_scene else (SITE, "index.html", INDEX, SETTINGS)
-    with replacing_export(folder, scene, certain, overwrite=overwrite) as new:
-        place = new.path
-        listed, counts = [], []
-        with Bar(sum(bundle.num_gaussians for bundle in scene.bundles), "export", progress) as bar:
-            for name, plan in zip(_common.names_of(scene) if is_scene else ["."], plans, strict=True):
-                (place / name).mkdir(exist_ok=True)
-                done = write_levels(plan, place / name, turn, bar.update)
-                url = INDEX if name == "." else f"{name}/{INDEX}"
-                listed.append({"url": url, "counts": done.counts, **_common.detail_of(plan.bundle)})
-                counts.append((done.counts[0], done.counts[-1]))
-        document = {
-            "version": 1,
-            "tolerance": DEFAULT_TOLERANCE,
-            # By columns: of the files' world, and of the cameras', to one with y up.
-            "rotation": _common.rotation_to(axis if is_scene else "-y", "y").T.tolist(),
-            "camera_rotation": _common.rotation_to(axis, "y").T.tolist(),
-            "bundles": listed,
-            "instances": _instances(scene),
-            "cameras": _cameras(cameras),
-        }
-        _common.write_document(place / SITE, document)
-        _common.write_page(place, "site.html")
-        has_engine = _bring_engine(folder, new)
-        num_bytes = _common.bytes_below(place)
-    finest, coarsest = np.array(counts)[scene.instance_bundle].sum(axis=0).tolist()
-    return Site(len(listed), len(scene), finest, coarsest, num_bytes, has_engine)
+    names = ["."]
+    certain = [SITE, "index.html", INDEX, SETTINGS]
+    if is_scene:
+        names = _common.names_of(scene)
+        certain = [SITE, "index.html"]
+    with replacing_export(Path(folder), scene, certain, overwrite=overwrite) as new:
+        levels = _write_bundles(plans, names, new.path, turn, progress)
+        bundles = [
+            _bundle(name, plan, export) for name, plan, export in zip(names, plans, levels, strict=True)
+        ]
+        _common.write_document(new.path / SITE, _document(scene, bundles, axes, cameras))
+        _common.write_page(new.path, "site.html")
+        has_engine = _bring_engine(Path(folder), new)
+        num_bytes = _common.bytes_below(new.path)
+    counts = np.array([(export.counts[0], export.counts[-1]) for export in levels])
+    finest, coarsest = counts[scene.instance_bundle].sum(axis=0).tolist()
+    return Site(len(levels), len(scene), finest, coarsest, num_bytes, has_engine)
 
 
-def _instances(scene: Scene) -> dict[str, list[Any]]:
+class _Axes(NamedTuple):
+    """What is up."""
+
+    asset: Axis  # in the assets, which are turned so that it is -y
+    files: Axis  # in the world, after that
+    cameras: Axis
+
+
+def _axes(is_scene: bool, up: Axis) -> _Axes:
+    """A bundle alone is turned to what viewers take to be up; a scene's stay as its instances have them."""
+    if is_scene:
+        return _Axes(asset="-y", files=up, cameras=up)
+    return _Axes(asset=up, files="-y", cameras=up)
+
+
+def _write_bundles(
+    plans: list[Plan], names: list[str], folder: Path, turn: Floats, progress: Progress
+) -> list[Export]:
+    """Write the levels of each bundle to the folder of its name, which is made unless it is `.`."""
+    levels: list[Export] = []
+    with Bar(sum(plan.bundle.num_gaussians for plan in plans), "export", progress) as bar:
+        for name, plan in zip(names, plans, strict=True):
+            (folder / name).mkdir(exist_ok=True)
+            levels.append(write_levels(plan, folder / name, turn, bar.update))
+    return levels
+
+
+def _document(
+    scene: Scene, bundles: list[dict[str, object]], axes: _Axes, cameras: Mapping[str, Camera]
+) -> dict[str, object]:
+    """What the page reads first."""
+    return {
+        "version": 1,
+        "tolerance": DEFAULT_TOLERANCE,
+        # By columns: of the files' world, and of the cameras', to one with y up.
+        "rotation": _common.rotation_to(axes.files, "y").T.tolist(),
+        "camera_rotation": _common.rotation_to(axes.cameras, "y").T.tolist(),
+        "bundles": bundles,
+        "instances": _instances(scene),
+        "cameras": [_camera(name, camera) for name, camera in cameras.items()],
+    }
+
+
+def _bundle(name: str, plan: Plan, levels: Export) -> dict[str, object]:
+    url = INDEX
+    if name != ".":
+        url = f"{name}/{INDEX}"
+    return {"url": url, "counts": levels.counts, **_common.detail_of(plan.bundle)}
+
+
+def _instances(scene: Scene) -> dict[str, list[int] | list[float]]:
     """Columns, in a few digits more than float32 has."""
-    names = ("positions", "quaternions", "scales", "importance")
-    columns = {name: getattr(scene, name).ravel().tolist() for name in names}
-    short = {name: [float(f"{value:.9g}") for value in values] for name, values in columns.items()}
-    return {"bundle": scene.instance_bundle.tolist(), **short}
+    columns: dict[str, list[int] | list[float]] = {"bundle": scene.instance_bundle.tolist()}
+    for name in ("positions", "quaternions", "scales", "importance"):
+        values = getattr(scene, name).ravel().tolist()
+        columns[name] = [float(f"{value:.9g}") for value in values]
+    return columns
 
 
-def _cameras(cameras: Mapping[str, Camera]) -> list[dict[str, Any]]:
-    return [
-        {
-            "name": name,
-            "position": camera.position.tolist(),
-            "axes": camera.viewmat[:3, :3].tolist(),  # right, down, forward
-            "fov_y": 2 * math.atan(camera.height / 2 / camera.fy),
-            "near": camera.near,
-        }
-        for name, camera in cameras.items()
-    ]
+def _camera(name: str, camera: Camera) -> dict[str, object]:
+    return {
+        "name": name,
+        "position": camera.position.tolist(),
+        "axes": camera.viewmat[:3, :3].tolist(),  # right, down, forward
+        "fov_y": 2 * math.atan(camera.height / 2 / camera.fy),
+        "near": camera.near,
+    }
 
 
 def _bring_engine(folder: Path, new: NewFiles) -> bool:
@@ -157,8 +195,10 @@ def _bring_engine(folder: Path, new: NewFiles) -> bool:
         return True
     start = Path.cwd()
     modules = [parent / "node_modules" / "playcanvas" / "build" for parent in (start, *start.parents)]
-    engine = next((file for file in (d / ENGINE for d in (folder, *modules)) if file.is_file()), None)
-    if engine is not None:
-        with _files.naming_errors(engine):
-            shutil.copyfile(engine, new.path / ENGINE)
-    return engine is not None
+    for place in (folder, *modules):
+        engine = place / ENGINE
+        if engine.is_file():
+            with _files.naming_errors(engine):
+                shutil.copyfile(engine, new.path / ENGINE)
+            return True
+    return False

@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple, TypeAlias, TypedDict
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from v3dg import _core
 from v3dg._numbers import check, check_type, whole
@@ -42,6 +42,48 @@ DEFAULT_CHUNK = 16384
 # A folder is filled chunk by chunk until it holds so many gaussians: about a megabyte to load at once.
 _FOLDER_GAUSSIANS = 1 << 17
 _FOV_DEGREES = 50.0  # vertical, of the camera that a viewer starts with
+
+
+class _Lod(TypedDict):
+    """The gaussians of a chunk at a level: rows of one of the folders of SOG."""
+
+    file: int
+    offset: int
+    count: int
+
+
+class _Leaf(TypedDict):
+    """The levels of a chunk, by their numbers as text, and how far each is from the finest."""
+
+    lods: dict[str, _Lod]
+    errors: list[float]
+
+
+class _Bound(TypedDict):
+    min: list[float]
+    max: list[float]
+
+
+class _BoundedLeaf(TypedDict):
+    bound: _Bound
+    lods: dict[str, _Lod]
+    errors: list[float]
+
+
+class _Branch(TypedDict):
+    bound: _Bound
+    children: "list[_TreeNode]"
+
+
+_TreeNode: TypeAlias = _BoundedLeaf | _Branch
+
+
+class _Folders(NamedTuple):
+    """Folders of SOG."""
+
+    names: list[str]
+    leaves: list[_Leaf]  # by chunk
+    counts: list[int]  # gaussians of each level
 
 
 @dataclass(frozen=True)
@@ -95,19 +137,21 @@ def write_streamed_sog(
 
     Source: PlayCanvas, the streamed SOG format, version 1.
     """
-    found = opened(bundle)
-    plan, turn = Plan.of(found, chunk), _common.turn_upright(up or up_of(found)[0])
-    scene, names = Scene.of(found), (INDEX, SETTINGS)
+    content = opened(bundle)
+    plan = Plan.of(content, chunk)
+    turn = _common.turn_upright(up or up_of(content)[0])
+    certain = (INDEX, SETTINGS)
     with (
-        replacing_export(Path(folder), scene, names, overwrite=overwrite) as new,
-        Bar(found.num_gaussians, "export", progress) as bar,
+        replacing_export(Path(folder), Scene.of(content), certain, overwrite=overwrite) as new,
+        Bar(plan.bundle.num_gaussians, "export", progress) as bar,
     ):
         return write_levels(plan, new.path, turn, bar.update)
 
 
-def write_levels(plan: "Plan", place: Path, turn: Floats, advance: Callable[[int], Any]) -> Export:
+def write_levels(plan: "Plan", place: Path, turn: Floats, advance: Callable[[int], object]) -> Export:
     """Fill a folder with the levels of a bundle, turned by a quaternion (4,)."""
-    names, leaves, counts = _write_folders(place, plan, turn, advance)
+    folders = _write_folders(place, plan, turn, advance)
+    counts = folders.counts
     index = {
         "version": 1,
         "asset": {"generator": f"v3dg {__version__}"},
@@ -115,27 +159,29 @@ def write_levels(plan: "Plan", place: Path, turn: Floats, advance: Callable[[int
         "counts": counts,
         "lodLevels": len(counts),
         "lodErrors": True,
-        "filenames": [f"{name}/meta.json" for name in names],
-        "tree": plan.tree(leaves, turn),
+        "filenames": [f"{name}/meta.json" for name in folders.names],
+        "tree": plan.tree(folders.leaves, turn),
     }
     _common.write_document(place / INDEX, index)
-    # Of a few gaussians it does not show how far the asset reaches.
+    # A level of few gaussians does not show how far the asset reaches.
     framed = next((level for level in range(plan.top, 0, -1) if counts[level] >= 1000), 0)
-    shown = plan.bundle.level_gaussians(framed).transform(turn)
-    _common.write_document(place / SETTINGS, _viewer_settings(shown))
-    return Export(counts, plan.num_chunks, len(names), _common.bytes_below(place))
+    gaussians = plan.bundle.level_gaussians(framed).transform(turn)
+    _common.write_document(place / SETTINGS, _viewer_settings(gaussians))
+    return Export(counts, plan.num_chunks, len(folders.names), _common.bytes_below(place))
 
 
-def _write_folders(
-    place: Path, plan: "Plan", turn: Floats, advance: Callable[[int], Any]
-) -> tuple[list[str], list[dict[str, Any]], list[int]]:
-    """Write a folder of SOG after another: their names, chunks as leaves of the tree, gaussians by level."""
-    names, errors = list[str](), ChunkErrors()
-    leaves: list[Any] = [{"lods": {}, "errors": errors.of_chunk[c]} for c in range(plan.num_chunks)]
+def _write_folders(place: Path, plan: "Plan", turn: Floats, advance: Callable[[int], object]) -> _Folders:
+    """Write the gaussians of all levels to one folder of SOG after another."""
+    names: list[str] = []
+    errors = ChunkErrors()
+    leaves: list[_Leaf] = [
+        {"lods": {}, "errors": errors.of_chunk[number]} for number in range(plan.num_chunks)
+    ]
     counts = [0] * plan.bundle.num_levels
     for level in range(plan.bundle.num_levels):
+        num_earlier = len(names)
         parts: list[Gaussians] = []
-        first, size = len(names), 0
+        size = 0
         for number, part in enumerate(plan.parts(level)):
             chunk = check_writable(part).transform(turn)
             errors.add(number, chunk)
@@ -143,17 +189,24 @@ def _write_folders(
             parts.append(chunk.subset(_core.morton_order(chunk.means)))
             size += len(chunk)
             if size >= _FOLDER_GAUSSIANS or number == plan.num_chunks - 1:
-                names.append(f"{level}_{len(names) - first}")
-                (place / names[-1]).mkdir()
-                for file, content in sog.encode(Gaussians.concatenate(parts)).items():
-                    (place / names[-1] / file).write_bytes(content)
+                name = f"{level}_{len(names) - num_earlier}"
+                _write_sog(place / name, Gaussians.concatenate(parts))
+                names.append(name)
                 counts[level] += size
                 advance(size)
-                parts, size = [], 0
-    return names, leaves, counts
+                parts = []
+                size = 0
+    return _Folders(names, leaves, counts)
 
 
-def _viewer_settings(gaussians: Gaussians) -> dict[str, Any]:
+def _write_sog(folder: Path, gaussians: Gaussians) -> None:
+    """Make a folder with gaussians as SOG."""
+    folder.mkdir()
+    for name, content in sog.encode(gaussians).items():
+        (folder / name).write_bytes(content)
+
+
+def _viewer_settings(gaussians: Gaussians) -> dict[str, object]:
     """What SuperSplat's viewer reads beside an asset: a camera that shows most of it, and no effects."""
     # Viewers have y up and turn an asset, whose y is taken to be down, by half a turn about z.
     centre, radius = ball_of_most(gaussians.means.astype(np.float64) * (-1.0, -1.0, 1.0))
@@ -184,18 +237,21 @@ class Plan:
         check_type("bundle", bundle, Bundle, "a Bundle")
         check("bundle", bundle.num_gaussians, "gaussians to export, got none")
         chunk = whole(chunk, "chunk", "gaussians, 1 or more", 1, 1 << 62)
-        clusters, groups = bundle.clusters, bundle.groups
+        clusters = bundle.clusters
+        groups = bundle.groups
         if bundle.num_levels == 1:
             return cls(bundle, 0, 1, np.zeros(len(clusters), np.int64), np.zeros(0, np.int64))
         leaves = bundle.level_range(0)
         sizes = np.diff(clusters.offset[: leaves.stop + 1])
-        top, ancestor = 0, np.arange(len(groups))
+        top = 0
+        ancestor = np.arange(len(groups))
         for level in range(1, bundle.num_levels):
-            above = np.where(groups.level[ancestor] < level, groups.parent[ancestor], ancestor)
-            largest = int(np.bincount(above[clusters.parent_group[: leaves.stop]], sizes).max())
+            candidate = np.where(groups.level[ancestor] < level, groups.parent[ancestor], ancestor)
+            largest = int(np.bincount(candidate[clusters.parent_group[: leaves.stop]], sizes).max())
             if largest > chunk:
                 break
-            top, ancestor = level, above
+            top = level
+            ancestor = candidate
         expected = f"at least {largest} gaussians, the size of a group of the asset"
         check("chunk", top > 0, f"{expected}, got {chunk}")
         number = np.full(len(groups), -1, np.int64)
@@ -214,50 +270,76 @@ class Plan:
                 yield Gaussians.concatenate([self.bundle.cluster_gaussians(int(c)) for c in ids])
             return
         gaussians = self.bundle.level_gaussians(level)
-        table, groups = self.bundle.clusters, self.bundle.groups
-        tops = np.flatnonzero(self.chunk_of_group >= 0)
-        above: NDArray[Any] = tops
-        for _ in range(level - self.top):
-            above = groups.parent[above]
-        group = np.repeat(table.own_group[clusters], np.diff(table.offset[clusters[0] : clusters[-1] + 2]))
-        chunk = np.empty(len(gaussians), np.int64)
-        for g in np.unique(group):
-            candidates, rows = tops[above == g], np.flatnonzero(group == g)
-            apart = gaussians.means[rows, None].astype(np.float64) - groups.ball[candidates, :3]
-            chunk[rows] = self.chunk_of_group[candidates[np.square(apart).sum(axis=2).argmin(axis=1)]]
+        chunk = self._nearest_chunks(gaussians, clusters, level)
         for number in range(self.num_chunks):
             yield gaussians.subset(chunk == number)
+
+    def _nearest_chunks(
+        self, gaussians: Gaussians, clusters: NDArray[np.int64], level: int
+    ) -> NDArray[np.int64]:
+        """The chunk of each gaussian of a level above `top`: the nearest one below the gaussian's group."""
+        table = self.bundle.clusters
+        groups = self.bundle.groups
+        tops = np.flatnonzero(self.chunk_of_group >= 0)
+        ancestor: NDArray[np.intp] | NDArray[np.int32] = tops
+        for _ in range(level - self.top):
+            ancestor = groups.parent[ancestor]
+        sizes = np.diff(table.offset[clusters[0] : clusters[-1] + 2])
+        group_of_gaussian = np.repeat(table.own_group[clusters], sizes)
+        chunk = np.empty(len(gaussians), np.int64)
+        for group in np.unique(group_of_gaussian):
+            candidates = tops[ancestor == group]
+            rows = np.flatnonzero(group_of_gaussian == group)
+            offsets = gaussians.means[rows, None].astype(np.float64) - groups.ball[candidates, :3]
+            nearest = np.square(offsets).sum(axis=2).argmin(axis=1)
+            chunk[rows] = self.chunk_of_group[candidates[nearest]]
+        return chunk
 
     def by_chunk(self, clusters: NDArray[np.int64]) -> list[NDArray[np.int64]]:
         """Ids of clusters, by the chunk that they are in."""
         chunks = _common.rows_by(self.chunk_of_cluster[clusters], self.num_chunks)
         return [clusters[rows] for rows in chunks]
 
-    def tree(self, leaves: list[dict[str, Any]], turn: Floats) -> dict[str, Any]:
+    def tree(self, leaves: list[_Leaf], turn: Floats) -> _TreeNode:
         """The spatial index: the groups above the chunks, with bounds, in boxes that stay along the axes."""
-        clusters, parent = self.bundle.clusters, self.bundle.groups.parent
+        parent = self.bundle.groups.parent
+        nodes = self._leaf_nodes(leaves, turn)
+        node_of_group = {
+            group: nodes[chunk] for group, chunk in enumerate(self.chunk_of_group.tolist()) if chunk in nodes
+        }
+        if not node_of_group:
+            node_of_group = {-1: nodes[0]}
+        while node_of_group.keys() != {-1}:
+            children: dict[int, list[_TreeNode]] = {}
+            for group, node in node_of_group.items():
+                children.setdefault(int(parent[group]), []).append(node)
+            node_of_group = {group: _joined(siblings) for group, siblings in children.items()}
+        return node_of_group[-1]
+
+    def _leaf_nodes(self, leaves: list[_Leaf], turn: Floats) -> dict[int, _TreeNode]:
+        """The leaves with their bounds, by the numbers of those chunks that have gaussians."""
+        clusters = self.bundle.clusters
         used = np.flatnonzero((self.chunk_of_cluster >= 0) & (np.diff(clusters.offset) > 0))
         corners = clusters.box.astype(np.float64) @ rotation_from_quaternion(turn).T
-        chunks = enumerate(self.by_chunk(used))
-        nodes = {c: _node(corners[ids].reshape(-1, 3), **leaves[c]) for c, ids in chunks if len(ids)}
-        of_group = {g: nodes[c] for g, c in enumerate(self.chunk_of_group.tolist()) if c in nodes}
-        of_group = of_group or {-1: nodes[0]}
-        while of_group.keys() != {-1}:
-            children: dict[int, list[dict[str, Any]]] = {}
-            for group, node in of_group.items():
-                children.setdefault(int(parent[group]), []).append(node)
-            of_group = {group: _above(below) for group, below in children.items()}
-        return of_group[-1]
+        nodes: dict[int, _TreeNode] = {}
+        for number, ids in enumerate(self.by_chunk(used)):
+            if len(ids):
+                bound = _bound(corners[ids].reshape(-1, 3))
+                leaf = leaves[number]
+                nodes[number] = {"bound": bound, "lods": leaf["lods"], "errors": leaf["errors"]}
+        return nodes
 
 
-def _above(nodes: list[dict[str, Any]]) -> dict[str, Any]:
+def _joined(nodes: list[_TreeNode]) -> _TreeNode:
     """One node, or a node that bounds several."""
     if len(nodes) == 1:
         return nodes[0]
-    return _node([corner for node in nodes for corner in node["bound"].values()], children=nodes)
+    corners: list[list[float]] = []
+    for node in nodes:
+        corners += [node["bound"]["min"], node["bound"]["max"]]
+    return {"bound": _bound(corners), "children": nodes}
 
 
-def _node(points: Any, **content: Any) -> dict[str, Any]:
-    """A node of the tree that bounds points."""
-    bound = {"min": np.min(points, axis=0).tolist(), "max": np.max(points, axis=0).tolist()}
-    return {"bound": bound, **content}
+def _bound(points: ArrayLike) -> _Bound:
+    """The lowest and the highest of the coordinates of points."""
+    return {"min": np.min(points, axis=0).tolist(), "max": np.max(points, axis=0).tolist()}

@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,12 +37,32 @@ CESIUM = "cesium"
 TILES_NEED = "npm install cesium@1.145.0", f"cp -r node_modules/cesium/Build/Cesium {{}}/{CESIUM}"
 """Commands that bring CesiumJS, in the version that the page is tested with, to a folder."""
 
-_Tile: TypeAlias = dict[str, Any]
 _SCREEN_SPACE_ERROR = 16.0  # px, CesiumJS's limit where none is given
 # The content's y is up, the tiles' z.
 _TO_Y_UP = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
 _CONTENT = "3DTILES_content_gltf"
 _EXTENSIONS = ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
+
+
+class _Volume(TypedDict):
+    box: list[float]
+
+
+class _Content(TypedDict):
+    uri: str
+
+
+class _OptionalFields(TypedDict, total=False):
+    transform: list[float]
+    content: _Content
+    children: "list[_Tile]"
+
+
+class _Tile(_OptionalFields):
+    """A tile, as it stands in a tileset."""
+
+    boundingVolume: _Volume
+    geometricError: float
 
 
 @dataclass(frozen=True)
@@ -94,63 +114,82 @@ def write_tiles(
     """
     if isinstance(subject, str | os.PathLike):
         check_outside(Path(folder), [subject])
-    found, root = opened(subject), np.eye(4)
-    scene = Scene.of(found)
-    root[:3, :3] = _common.rotation_to(up or up_of(found)[0], "z")
+    content = opened(subject)
+    scene = Scene.of(content)
+    root = np.eye(4)
+    root[:3, :3] = _common.rotation_to(up or up_of(content)[0], "z")
     check("scene", len(scene), "instances to export, got none")
     for bundle in scene.bundles:
         check("bundle", bundle.num_gaussians, "gaussians to export, got none")
-    names, trees = _common.names_of(scene, taken=[CESIUM]), []
+    names = _common.names_of(scene, reserved=[CESIUM])
     with replacing_export(Path(folder), scene, (TILESET, "index.html"), overwrite=overwrite) as new:
-        place = new.path
-        with Bar(sum(bundle.num_gaussians for bundle in scene.bundles), "export", progress) as bar:
-            for name, bundle in zip(names, scene.bundles, strict=True):
-                (place / name).mkdir()
-                writer = _Writer(bundle, place / name, bar.update)
-                trees.append(_above([writer.tile_of(g) for g in writer.tops]))
-                _write_tileset(place / name / TILESET, trees[-1])
-        instances = [
-            {
-                "transform": transform.T.ravel().tolist(),
-                "boundingVolume": trees[b]["boundingVolume"],
-                "geometricError": trees[b]["geometricError"],
-                "content": {"uri": f"{names[b]}/{TILESET}"},
-            }
-            for b, transform in zip(scene.instance_bundle.tolist(), _transforms(scene), strict=True)
-        ]
-        _write_tileset(place / TILESET, {"transform": root.T.ravel().tolist(), **_above(instances)})
-        _common.write_page(place, "tiles.html")
-        size, tiles = _common.bytes_below(place), sum(1 for _ in place.rglob("*.glb"))
-    return Tiles(len(trees), len(scene), tiles, size)
+        trees = _write_bundles(scene, names, new.path, progress)
+        world = _parent(_instances(scene, names, trees))
+        _write_tileset(new.path / TILESET, {"transform": root.T.ravel().tolist(), **world})
+        _common.write_page(new.path, "tiles.html")
+        num_bytes = _common.bytes_below(new.path)
+        num_tiles = len(list(new.path.rglob("*.glb")))
+    return Tiles(len(trees), len(scene), num_tiles, num_bytes)
+
+
+def _write_bundles(scene: Scene, names: list[str], folder: Path, progress: Progress) -> list[_Tile]:
+    """Write a tileset of each bundle to a folder of its name; returns their root tiles."""
+    trees: list[_Tile] = []
+    with Bar(sum(bundle.num_gaussians for bundle in scene.bundles), "export", progress) as bar:
+        for name, bundle in zip(names, scene.bundles, strict=True):
+            (folder / name).mkdir()
+            writer = _Writer(bundle, folder / name, bar.update)
+            tree = _parent([writer.tile_of(group) for group in writer.tops])
+            _write_tileset(folder / name / TILESET, tree)
+            trees.append(tree)
+    return trees
+
+
+def _instances(scene: Scene, names: list[str], trees: list[_Tile]) -> list[_Tile]:
+    """A tile for each instance, whose content is the tileset of its bundle."""
+    return [
+        {
+            "transform": transform.T.ravel().tolist(),
+            "boundingVolume": trees[bundle]["boundingVolume"],
+            "geometricError": trees[bundle]["geometricError"],
+            "content": {"uri": f"{names[bundle]}/{TILESET}"},
+        }
+        for bundle, transform in zip(scene.instance_bundle.tolist(), _transforms(scene), strict=True)
+    ]
 
 
 class _Writer:
     """Writes the contents of a bundle's tiles."""
 
-    def __init__(self, bundle: Bundle, folder: Path, advance: Callable[[int], Any]) -> None:
-        self._bundle, self._folder, self._advance = bundle, folder, advance
-        groups, clusters = bundle.groups, bundle.clusters
-        ball, weight = groups.ball.astype(np.float64), groups.weight.astype(np.float64)
+    def __init__(self, bundle: Bundle, folder: Path, advance: Callable[[int], object]) -> None:
+        self._bundle = bundle
+        self._folder = folder
+        self._advance = advance
+        groups = bundle.groups
+        clusters = bundle.clusters
+        radius = groups.ball[:, 3].astype(np.float64)
         limit = _SCREEN_SPACE_ERROR / math.sqrt(DEFAULT_TOLERANCE)
-        self._error = limit * ball[:, 3] * np.sqrt(math.pi * weight)
-        # Of each group: the groups below, the clusters that it made, and those that it replaces.
-        columns = groups.parent, clusters.own_group, clusters.parent_group
-        self._below, self._made, self._replaced = (_common.rows_by(links, len(groups)) for links in columns)
+        self._error = limit * radius * np.sqrt(math.pi * groups.weight.astype(np.float64))
+        # By group: the groups below it, the clusters that it made, and those that it replaces.
+        self._children = _common.rows_by(groups.parent, len(groups))
+        self._clusters = _common.rows_by(clusters.own_group, len(groups))
+        self._replaced = _common.rows_by(clusters.parent_group, len(groups))
         self.tops = np.flatnonzero(groups.parent < 0).tolist() or [-1]
 
-    def tile_of(self, g: int) -> _Tile:
-        """The tile of a group with all below; of -1, that of a bundle without groups."""
-        if g < 0:
+    def tile_of(self, group: int) -> _Tile:
+        """The tile of a group with all tiles below it; of -1, that of a bundle without groups."""
+        if group < 0:
             return self._tile("asset", np.arange(len(self._bundle.clusters)), 0.0, [])
-        below = [self.tile_of(child) for child in self._below[g].tolist()]
-        if self._bundle.groups.level[g] == 1:
-            below = [self._tile(f"0_{g}", self._replaced[g], 0.0, [])]
-        return self._tile(f"{self._bundle.groups.level[g]}_{g}", self._made[g], float(self._error[g]), below)
+        level = self._bundle.groups.level[group]
+        children = [self.tile_of(child) for child in self._children[group].tolist()]
+        if level == 1:
+            children = [self._tile(f"0_{group}", self._replaced[group], 0.0, [])]
+        return self._tile(f"{level}_{group}", self._clusters[group], float(self._error[group]), children)
 
-    def _tile(self, name: str, clusters: NDArray[Any], error: float, children: list[_Tile]) -> _Tile:
+    def _tile(self, name: str, clusters: NDArray[np.intp], error: float, children: list[_Tile]) -> _Tile:
         boxes = self._bundle.clusters.box[clusters].astype(np.float64)
-        bounds = [np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])]
-        volume = _box(bounds + [_bounds(child) for child in children])
+        bounds = np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+        volume = _box([bounds, *map(_bounds, children)])
         tile: _Tile = {"boundingVolume": volume, "geometricError": error}
         gaussians = Gaussians.concatenate([self._bundle.cluster_gaussians(int(c)) for c in clusters])
         self._advance(len(gaussians))
@@ -158,10 +197,12 @@ class _Writer:
             content = gltf.encode(check_writable(gaussians).transform(_TO_Y_UP), compressed=True)
             (self._folder / f"{name}.glb").write_bytes(content)
             tile["content"] = {"uri": f"{name}.glb"}
-        return tile | ({"children": children} if children else {})
+        if children:
+            tile["children"] = children
+        return tile
 
 
-def _above(tiles: list[_Tile]) -> _Tile:
+def _parent(tiles: list[_Tile]) -> _Tile:
     """One tile, or a tile without content that is always refined to all of several."""
     if len(tiles) == 1 and "transform" not in tiles[0]:
         return tiles[0]
@@ -171,9 +212,10 @@ def _above(tiles: list[_Tile]) -> _Tile:
     return {"boundingVolume": volume, "geometricError": error, "children": tiles}
 
 
-def _box(bounds: list[Floats]) -> dict[str, list[float]]:
+def _box(bounds: list[Floats]) -> _Volume:
     """A bounding volume around boxes, each of a lower and an upper corner (2, 3)."""
-    low, high = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
+    low = np.min([corners[0] for corners in bounds], axis=0)
+    high = np.max([corners[1] for corners in bounds], axis=0)
     half = np.maximum((high - low) / 2, np.finfo(np.float32).tiny)
     return {"box": [*((low + high) / 2).tolist(), *np.diag(half).ravel().tolist()]}
 

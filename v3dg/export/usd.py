@@ -3,6 +3,7 @@
 import math
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,8 +20,12 @@ from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
 from v3dg.upright import up_of
 
+if TYPE_CHECKING:
+    from pxr import Usd
+
 _PIXELS = 1920 * 1080  # of the picture for which levels have the default tolerance
 _LEAST = 1e-30  # of a distance
+_INSTANCES = "/world/instances"
 
 
 def write_usd(subject: Scene | Bundle | File, path: str | os.PathLike[str], *, up: Axis | None = None) -> int:
@@ -45,40 +50,51 @@ def write_usd(subject: Scene | Bundle | File, path: str | os.PathLike[str], *, u
     """
     one_of(Path(path).suffix.lower(), "path", usd.SUFFIXES)
     _files.check_folder(Path(path))
-    found = opened(subject)
-    pxr, scene = usd.pxr(), Scene.of(found)
+    content = opened(subject)
+    pxr = usd.pxr()
+    scene = Scene.of(content)
     check("scene", len(scene), "instances to export, got none")
     stage = usd.new_stage("Z")
     world = pxr.UsdGeom.Xform.Define(stage, "/world")
     stage.SetDefaultPrim(world.GetPrim())
-    w, *xyz = quaternion_from_rotation(_common.rotation_to(up or up_of(found)[0], "z"))
+    w, *xyz = quaternion_from_rotation(_common.rotation_to(up or up_of(content)[0], "z"))
     world.AddOrientOp().Set(pxr.Gf.Quatf(w, *xyz))
-    above = "/world/instances" if isinstance(found, Scene) else "/world"
     names = _common.distinct(pxr.Tf.MakeValidIdentifier(name) for name in _common.names_of(scene))
-    paths = [f"{above}/{name}" for name in names]
-    if isinstance(found, Scene):
-        vectors, quats = pxr.Vt.Vec3fArray.FromNumpy, np.roll(scene.quaternions, -1, axis=1)
-        instancer = pxr.UsdGeom.PointInstancer.Define(stage, "/world/instances")
-        instancer.CreatePrototypesRel().SetTargets(paths)
-        instancer.CreateProtoIndicesAttr(pxr.Vt.IntArray.FromNumpy(scene.instance_bundle))
-        instancer.CreatePositionsAttr(vectors(scene.positions.astype(np.float32)))
-        instancer.CreateOrientationsfAttr(pxr.Vt.QuatfArray.FromNumpy(quats.astype(np.float32)))
-        instancer.CreateScalesAttr(vectors(np.repeat(scene.scales[:, None], 3, axis=1).astype(np.float32)))
-    for place, bundle in zip(paths, scene.bundles, strict=True):
+    if isinstance(content, Scene):
+        places = [f"{_INSTANCES}/{name}" for name in names]
+        _define_instances(stage, places, scene)
+    else:
+        places = [f"/world/{name}" for name in names]
+    for place, bundle in zip(places, scene.bundles, strict=True):
         _define_levels(stage, place, bundle)
     usd.export(stage, path)
     return os.stat(path).st_size
 
 
-def _define_levels(stage: object, place: str, bundle: Bundle) -> None:
+def _define_instances(stage: "Usd.Stage", prototypes: list[str], scene: Scene) -> None:
+    pxr = usd.pxr()
+    vectors = pxr.Vt.Vec3fArray.FromNumpy
+    quaternions = np.roll(scene.quaternions, -1, axis=1).astype(np.float32)  # x y z w
+    scales = np.repeat(scene.scales[:, None], 3, axis=1).astype(np.float32)
+    instancer = pxr.UsdGeom.PointInstancer.Define(stage, _INSTANCES)
+    instancer.CreatePrototypesRel().SetTargets(prototypes)
+    instancer.CreateProtoIndicesAttr(pxr.Vt.IntArray.FromNumpy(scene.instance_bundle))
+    instancer.CreatePositionsAttr(vectors(scene.positions.astype(np.float32)))
+    instancer.CreateOrientationsfAttr(pxr.Vt.QuatfArray.FromNumpy(quaternions))
+    instancer.CreateScalesAttr(vectors(scales))
+
+
+def _define_levels(stage: "Usd.Stage", place: str, bundle: Bundle) -> None:
     pxr = usd.pxr()
     root = pxr.UsdGeom.Xform.Define(stage, place).GetPrim()
     for level in range(bundle.num_levels):
         usd.define(stage, f"{place}/level_{level}", check_writable(bundle.level_gaussians(level)))
     if bundle.num_levels < 2:
         return
-    low, high = bundle.clusters.box[:, 0].min(axis=0), bundle.clusters.box[:, 1].max(axis=0)
-    detail, radius = _common.detail_of(bundle), float(np.linalg.norm(high - low)) / 2
+    low = bundle.clusters.box[:, 0].min(axis=0)
+    high = bundle.clusters.box[:, 1].max(axis=0)
+    radius = float(np.linalg.norm(high - low)) / 2
+    detail = _common.detail_of(bundle)
     # Share of the picture that the ball around the box covers from where level 1 is enough.
     share = math.pi * DEFAULT_TOLERANCE / _PIXELS * (radius / max(detail["reach"], _LEAST)) ** 2
     sizes = [share / detail["ratio"] ** (2 * level) for level in range(bundle.num_levels - 1)]
