@@ -13,6 +13,7 @@ from v3dg import _device
 from v3dg._device import Device
 from v3dg._progress import Progress, counted
 from v3dg.build import build_bundle
+from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.donut import make_donut, place_field
 from v3dg.metrics import draw_truth, errors_of
@@ -61,9 +62,7 @@ def run_demo(
     asset = make_donut(num_gaussians, seed=seed)
     bundle = build_bundle(asset, seed=seed, progress=progress, device=chosen_device)
     build_seconds = time.perf_counter() - start
-    positions, quaternions, scales = place_field(instances, seed=seed)
-    scene = Scene()
-    scene.add(bundle, positions=positions, quaternions=quaternions, scales=scales)
+    scene = _field(bundle, instances, seed)
     columns: list[JsonObject] = []
     full_row: list[tuple[str, Picture]] = []
     bundle_row: list[tuple[str, Picture]] = []
@@ -88,6 +87,13 @@ def run_demo(
         "seconds": time.perf_counter() - start,
         "columns": columns,
     }
+
+
+def _field(bundle: Bundle, count: int, seed: int) -> Scene:
+    positions, quaternions, scales = place_field(count, seed=seed)
+    scene = Scene()
+    scene.add(bundle, positions=positions, quaternions=quaternions, scales=scales)
+    return scene
 
 
 def _camera(distance: float, elevation: float, size: tuple[int, int]) -> Camera:

@@ -56,6 +56,13 @@ class PoolLook:
     chooser: Camera | None = None
     aside: bool = False
 
+    @property
+    def core_chooser(self) -> _core.Camera | None:
+        """The chooser for the compiled operations."""
+        if self.chooser is None:
+            return None
+        return self.chooser.core
+
     def palettes(self, bundles: Sequence[Bundle]) -> list[NDArray[np.float32]]:
         """The colours of each bundle's clusters; none where the bundles have no colours of their own."""
         if self.shows not in ("level", "cluster"):

@@ -168,9 +168,6 @@ class PoolFrame:
         bytes_in_at_start = pool.core.status().bytes_in
         if look is None:
             look = self._look
-        chooser = None
-        if look.chooser is not None:
-            chooser = look.chooser.core
         drawing = self._core.draw_resident(
             resident.core,
             pool.core,
@@ -181,7 +178,7 @@ class PoolFrame:
             steps,
             shows=look.shows,
             colors=look.palettes(resident.bundles),
-            chooser=chooser,
+            chooser=look.core_chooser,
             aside=look.aside,
         )
         status = pool.core.status()
