@@ -67,10 +67,7 @@ def run_demo(
     full_row: list[tuple[str, Picture]] = []
     bundle_row: list[tuple[str, Picture]] = []
     for distance, elevation in counted(views, len(views), "draw", progress):
-        camera = _camera(distance, elevation, size)
-        truth = draw_truth(scene, camera, chosen_device, background=_SKY)
-        full = _drawn(scene, camera, 0.0, truth, chosen_device)
-        selected = _drawn(scene, camera, tolerance, truth, chosen_device)
+        full, selected = _panels(scene, _camera(distance, elevation, size), tolerance, chosen_device)
         full_row.append((f"full, distance {distance:g}: {full.text}", full.picture))
         bundle_row.append((f"bundle, distance {distance:g}: {selected.text}", selected.picture))
         columns.append({"distance": distance, "full": full.numbers, "bundle": selected.numbers})
@@ -112,6 +109,14 @@ class _Panel(NamedTuple):
     numbers: JsonObject
     text: str
     picture: Picture
+
+
+def _panels(scene: Scene, camera: Camera, tolerance: float, device: Device) -> tuple[_Panel, _Panel]:
+    """The pictures of the full asset and of the selected cut."""
+    truth = draw_truth(scene, camera, device, background=_SKY)
+    full = _drawn(scene, camera, 0.0, truth, device)
+    selected = _drawn(scene, camera, tolerance, truth, device)
+    return full, selected
 
 
 def _drawn(scene: Scene, camera: Camera, tolerance: float, truth: Picture, device: Device) -> _Panel:

@@ -164,15 +164,13 @@ class PoolFrame:
         stop: _core.Stop | None,
         look: PoolLook | None,
     ) -> Picture:
-        rule = request.rule
         bytes_in_at_start = pool.core.status().bytes_in
-        if look is None:
-            look = self._look
+        look = look or self._look
         drawing = self._core.draw_resident(
             resident.core,
             pool.core,
             camera.core,
-            rule,
+            request.rule,
             shade,
             stop,
             steps,
