@@ -185,7 +185,7 @@ def test_small_bundles_are_decoded_once_while_they_fit(monkeypatch, num_decoded)
     where = _device.resolve("cuda")
     pairs = [both(lod_bundle(seed, 1)) for seed in (3, 3, 3)]
     row_bytes = residency.model(pairs[0][1], where).bytes
-    taken = sum(of.get(("decoded", where), 0) for of in residency._kept.values())
+    taken = sum(entries.get(("decoded", where), 0) for entries in residency._entries.values())
     monkeypatch.setattr("v3dg.residency.MOST_DECODED_BYTES", taken + int((num_decoded + 0.5) * row_bytes))
     camera = scenes_lod.random_camera(np.random.default_rng(0))
     for k, (codes, rows) in enumerate(pairs):

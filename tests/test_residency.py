@@ -191,7 +191,7 @@ def test_no_lock_is_held_for_ever_in_a_child():
     kept = Residency()
     with ThreadPoolExecutor(1) as pool:
         pool.submit(kept.lock.acquire).result()  # by a thread that a child has not
-        kept._renew_lock()
+        kept._after_fork()
         assert kept.table(bundle(0)) is not None
 
 

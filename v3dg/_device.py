@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any, cast
 
 import numpy as np
@@ -25,15 +26,17 @@ class Device:
         return self.number >= 0
 
     def __str__(self) -> str:
-        return f"cuda:{self.number}" if self.is_cuda else "cpu"
+        if self.is_cuda:
+            return f"cuda:{self.number}"
+        return "cpu"
 
-    def current(self) -> AbstractContextManager[Any]:
+    def current(self) -> AbstractContextManager[object]:
         """Make it torch's current device inside the context; does nothing for the CPU."""
         if not self.is_cuda:
             return nullcontext()
         import torch
 
-        return cast(AbstractContextManager[Any], torch.cuda.device(self.number))
+        return cast(AbstractContextManager[object], torch.cuda.device(self.number))
 
 
 CPU = Device()
@@ -132,7 +135,7 @@ def all_like(device: Device) -> list[Device]:
     return devices
 
 
-def library_of(array: Array) -> Any:
+def library_of(array: Array) -> ModuleType:
     """numpy or torch; many functions have the same names and arguments in both."""
     if isinstance(array, np.ndarray):
         return np
@@ -159,14 +162,14 @@ def memory_errors() -> Iterator[None]:
         raise MemoryError(str(error)) from error
 
 
-def own_stream(device: Device) -> AbstractContextManager[Any]:
+def own_stream(device: Device) -> AbstractContextManager[object]:
     """Make a device current, and on it a stream that no other thread uses."""
     if not device.is_cuda:
         return nullcontext()
     import torch
 
-    stream: Any = torch.cuda.Stream
-    return torch.cuda.stream(stream(device.number))
+    make_stream = cast(Callable[[int], torch.cuda.Stream], torch.cuda.Stream)
+    return torch.cuda.stream(make_stream(device.number))
 
 
 def with_this_stream(work: Callable[[], None], device: Device) -> Callable[[], None]:

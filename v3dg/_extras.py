@@ -1,7 +1,8 @@
 """Optional packages: the purpose of each, and how to install it."""
 
 import importlib
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import NamedTuple
 
 
 class Extra(NamedTuple):
@@ -28,12 +29,12 @@ EXTRAS = {
 def missing(module: str) -> str:
     """The message for a package that is not installed, or too old."""
     extra = EXTRAS[module]
-    together = [other.requirement for other in EXTRAS.values() if other.purpose == extra.purpose]
-    needed = " ".join(f"'{requirement}'" for requirement in together)
+    packages = [package for package in EXTRAS.values() if package.purpose == extra.purpose]
+    needed = " ".join(f"'{package.requirement}'" for package in packages)
     return f"{extra.purpose}: expected {extra.requirement}, got none or an older one; pip install {needed}"
 
 
-def load(module: str) -> Any:
+def load(module: str) -> ModuleType:
     """Import a module; ImportError says how to install its package."""
     try:
         return importlib.import_module(module)

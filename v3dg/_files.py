@@ -9,7 +9,6 @@ import stat
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -74,8 +73,9 @@ def file_mode_mask(status_path: str = "/proc/self/status") -> int:
     """The permissions that new files of this process do not get (umask)."""
     with contextlib.suppress(OSError):
         status = Path(status_path).read_text(encoding="ascii", errors="replace")
-        if found := re.search(r"^Umask:\s*([0-7]+)$", status, re.MULTILINE):
-            return int(found[1], 8)
+        match = re.search(r"^Umask:\s*([0-7]+)$", status, re.MULTILINE)
+        if match:
+            return int(match[1], 8)
     # Without /proc it can be read by setting it alone. What another thread makes meanwhile is private.
     with _MASK_LOCK:
         mask = os.umask(0o077)
@@ -129,7 +129,7 @@ def write_at(descriptor: int, data: bytes | bytearray | memoryview, offset: int)
         offset += count
 
 
-def read_at(descriptor: int, out: npt.NDArray[Any], offset: int) -> bool:
+def read_at(descriptor: int, out: npt.NDArray[np.generic], offset: int) -> bool:
     """Fill an array with the bytes from an offset of a file on; False if the file ends before."""
     view = out.reshape(-1).view(np.uint8).data
     while view:

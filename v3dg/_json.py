@@ -25,20 +25,20 @@ def parse_json(text: str | bytes) -> Any:
         raise ValueError("nested too deep") from None
 
 
-def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    keys: dict[str, Any] = {}
+def _unique_keys(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    fields: dict[str, object] = {}
     for key, value in pairs:
-        if key in keys:
+        if key in fields:
             raise ValueError(f"the key {shown(key)} appears twice")
-        keys[key] = value
-    return keys
+        fields[key] = value
+    return fields
 
 
 def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is not a JSON number")
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """A JSON value as a short text for a message of one line."""
     if isinstance(value, dict) and len(value) > 8:
         return f"an object of {len(value)} values"
@@ -69,7 +69,7 @@ def read_json(path: str | os.PathLike[str]) -> Node:
         raise ValueError(f"{path.name}: expected JSON, got a file that does not parse: {error}") from error
 
 
-def write_json(path: str | os.PathLike[str], document: Any) -> None:
+def write_json(path: str | os.PathLike[str], document: object) -> None:
     """Write a JSON file, which replaces an existing one once it is complete."""
     with _files.replacing(path) as temporary:
         Path(temporary).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
@@ -88,15 +88,19 @@ class Node:
         return ValueError(f"{self.file}: {self.path or 'top level'}: {text}")
 
     def error(self, expected: str, advice: str = "") -> ValueError:
-        end = f"; {advice}" if advice else ""
-        return self.problem(f"expected {expected}, got {shown(self.value)}{end}")
+        text = f"expected {expected}, got {shown(self.value)}"
+        if advice:
+            text = f"{text}; {advice}"
+        return self.problem(text)
 
     def attempt(self, make: Callable[[], T]) -> T:
         """What ``make`` makes of the fields; its ValueErrors, which begin with a field, get their place."""
         try:
             return make()
         except ValueError as error:
-            place = f"{self.path}." if self.path else ""
+            place = ""
+            if self.path:
+                place = f"{self.path}."
             raise ValueError(f"{self.file}: {place}{error}") from error
 
     def field(self, key: str) -> Node:
@@ -105,7 +109,9 @@ class Node:
             raise self.error("an object")
         if key not in self.value:
             raise self.problem(f"expected the field {key}, got an object without it")
-        path = key if is_one_line(key) and len(key) <= 60 else shown(key)
+        path = key
+        if not is_one_line(key) or len(key) > 60:
+            path = shown(key)
         if self.path:
             path = f"{self.path}.{path}"
         return Node(self.value[key], self.file, path)

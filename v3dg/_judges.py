@@ -1,4 +1,4 @@
-"""Many pictures measured, a core each, and means of what was found."""
+"""Measuring many pictures, each on a core of its own, and means of the results."""
 
 import contextlib
 import multiprocessing
@@ -6,10 +6,11 @@ import os
 import signal
 import statistics
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
-from typing import Any, TypeVar
+from multiprocessing.context import SpawnProcess
+from typing import Any, NamedTuple, TypeVar, cast
 
 from v3dg._start import SIGNALS
 
@@ -17,57 +18,70 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
+class _Judge(NamedTuple):
+    """A process that measures, and this process's end of the pipe to it."""
+
+    process: SpawnProcess
+    pipe: Connection
+
+
 class Judges:
-    """Processes that measure what they are given: started when they are first needed, there until `close`."""
+    """Processes that measure items: each starts when it is first needed, and ends at `close`."""
 
     def __init__(self) -> None:
         self._cores = len(os.sched_getaffinity(0))
-        self._processes: list[tuple[Any, Any]] = []  # each with the pipe to it
+        self._judges: list[_Judge] = []
 
     def measured(self, items: Iterable[T], measure: Callable[[T], R]) -> Iterator[tuple[T, R]]:
-        """Items with what a function of a module says of each, in order; later ones are made meanwhile."""
-        waiting: deque[tuple[T, Any]] = deque()
+        """Items with the result of ``measure`` for each, in order; later items are made meanwhile.
+
+        ``measure`` is a function of a module, for other processes import it.
+        """
+        waiting: deque[tuple[T, Connection]] = deque()
         try:
             for number, item in enumerate(items):
                 if len(waiting) == self._cores:
-                    yield _answered(*waiting.popleft())
+                    measured_item, pipe = waiting.popleft()
+                    yield measured_item, cast(R, _answer(pipe))
                 pipe = self._pipe(number % self._cores)
                 pipe.send((measure, item))
                 waiting.append((item, pipe))
             while waiting:
-                yield _answered(*waiting.popleft())
-        except BaseException:  # answers that nobody waits for would be taken for the next ones
+                measured_item, pipe = waiting.popleft()
+                yield measured_item, cast(R, _answer(pipe))
+        except BaseException:  # answers that are still to come would be taken for those of later items
             self.close()
             raise
 
-    def _pipe(self, number: int) -> Any:
+    def _pipe(self, number: int) -> Connection:
         """The pipe to a process, which is started if it is the next one."""
-        if number == len(self._processes):
-            resource_tracker.ensure_running()  # which hears signals again once it has started
-            # Ctrl-C is for this process alone: one that is started has no time for it, even to ignore it.
-            heard = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+        if number == len(self._judges):
+            resource_tracker.ensure_running()  # it unblocks signals once it has started
+            # Ctrl-C is for this process alone: a process that starts must not be interrupted before it can
+            # ignore it.
+            previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
             try:
                 # A forked process would inherit CUDA and OpenMP in a state that neither survives.
                 context = multiprocessing.get_context("spawn")
-                ours, theirs = context.Pipe()
-                process = context.Process(target=_judge, args=(theirs,), daemon=True)
+                pipe, pipe_of_judge = context.Pipe()
+                process = context.Process(target=_judge, args=(pipe_of_judge,), daemon=True)
                 process.start()
-                theirs.close()
-                self._processes.append((process, ours))
+                pipe_of_judge.close()
+                self._judges.append(_Judge(process, pipe))
             finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, heard)
-        return self._processes[number][1]
+                signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
+        return self._judges[number].pipe
 
     def close(self) -> None:
-        for process, _ in self._processes:
-            process.kill()
-        for process, _ in self._processes:
-            process.join()
-        self._processes = []
+        for judge in self._judges:
+            judge.process.kill()
+        for judge in self._judges:
+            judge.process.join()
+        self._judges = []
 
 
 def _judge(pipe: Connection) -> None:
-    """Measure what comes, until whoever asks has gone."""
+    """Measure the items that arrive, until the other end of the pipe is closed."""
     with contextlib.suppress(EOFError, OSError):
         while True:
             measure, item = pipe.recv()
@@ -77,20 +91,24 @@ def _judge(pipe: Connection) -> None:
                 pipe.send((None, error))
 
 
-def _answered(item: T, pipe: Any) -> tuple[T, Any]:
+def _answer(pipe: Connection) -> object:
+    result: object
+    error: Exception | None
     try:
         result, error = pipe.recv()
     except (EOFError, ConnectionError):
         raise RuntimeError("a process that measures pictures was ended from outside") from None
     if error is not None:
         raise error
-    return item, result
+    return result
 
 
-def mean_of(rows: Sequence[dict[str, Any]], *names: str) -> dict[str, Any]:
+def mean_of(rows: Sequence[Mapping[str, float | None]], *names: str) -> dict[str, Any]:
     """Means of columns, to six digits; None where every value is missing."""
-    means: dict[str, Any] = {}
+    means: dict[str, float | None] = {}
     for name in names:
-        values = [row[name] for row in rows if row.get(name) is not None]
-        means[name] = float(f"{statistics.fmean(values):.6g}") if values else None
+        values = [value for row in rows if (value := row.get(name)) is not None]
+        means[name] = None
+        if values:
+            means[name] = float(f"{statistics.fmean(values):.6g}")
     return means

@@ -4,7 +4,7 @@ import math
 import operator
 import os
 from collections.abc import Callable
-from typing import Any, NoReturn, TypeAlias
+from typing import NoReturn, Protocol, SupportsFloat, SupportsIndex, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -16,12 +16,22 @@ LEAST_FLOAT = 1.4e-45
 """The smallest positive float32."""
 MOST_FLOAT = float(np.finfo(np.float32).max)
 """The largest float32."""
+MOST_DOUBLE = float(np.finfo(np.float64).max)
+"""The largest float64."""
 
 
-def floats(values: Any, name: str, expected: str = "numbers") -> Floats:
+class _Tensor(Protocol):
+    """A tensor of torch."""
+
+    def numpy(self, *, force: bool) -> npt.NDArray[np.generic]: ...
+
+
+def floats(values: object, name: str, expected: str = "numbers") -> Floats:
     """A new array of doubles, from numbers, arrays or torch's tensors; ValueError unless all are finite."""
     try:
-        array = np.asarray(values.numpy(force=True)) if hasattr(values, "detach") else np.asarray(values)
+        if hasattr(values, "detach"):
+            values = cast(_Tensor, values).numpy(force=True)
+        array = np.asarray(values)
         if array.dtype.kind not in "biufO":
             raise TypeError
         with np.errstate(over="ignore"):
@@ -39,17 +49,21 @@ def floats(values: Any, name: str, expected: str = "numbers") -> Floats:
     return array
 
 
-def vector(values: Any, name: str, shape: tuple[int, ...] = (3,)) -> Floats:
+def vector(values: object, name: str, shape: tuple[int, ...] = (3,)) -> Floats:
     """As `floats`, of this shape."""
-    is_plain = type(values) is np.ndarray and values.shape == shape and values.dtype == np.float64
-    if is_plain and math.isfinite(sum(values.ravel().tolist())):
+    if (
+        type(values) is np.ndarray
+        and values.shape == shape
+        and values.dtype == np.float64
+        and math.isfinite(sum(values.ravel().tolist()))
+    ):
         return np.array(values, order="C")  # the quick way, for every frame
     array = floats(values, name, f"numbers of shape {shape}")
     check(name, array.shape == shape, f"shape {shape}, got {array.shape}")
     return array
 
 
-def color(values: Any, name: str) -> list[float]:
+def color(values: object, name: str) -> list[float]:
     """Three numbers that the core can hold."""
     if type(values) is tuple and len(values) == 3 and all(type(v) is float and 0 <= v <= 1 for v in values):
         return list(values)  # the quick way, for every frame
@@ -60,44 +74,50 @@ def color(values: Any, name: str) -> list[float]:
 
 
 def real(
-    value: Any, name: str, expected: str = "a number", least: float = -math.inf, most: float = math.inf
+    value: object,
+    name: str,
+    expected: str = "a number",
+    lower_bound: float = -math.inf,
+    upper_bound: float = math.inf,
 ) -> float:
-    """One number of ``least`` to ``most``; ValueError otherwise."""
+    """One number of ``lower_bound`` to ``upper_bound``; ValueError otherwise."""
     number = math.nan
     try:
         if not getattr(value, "ndim", 0) and not isinstance(value, str):
-            number = float(value)
+            number = float(cast(SupportsFloat, value))
     except OverflowError:
-        number = math.inf if value > 0 else -math.inf
+        number = math.inf
+        if cast(int, value) < 0:
+            number = -math.inf
     except (TypeError, ValueError, RuntimeError):
         number = math.nan
-    if not least <= number <= most:
+    if not lower_bound <= number <= upper_bound:
         refuse(name, f"{expected}, got {shown(value)}")
     return number
 
 
-def positive(value: Any, name: str) -> float:
+def positive(value: object, name: str) -> float:
     """One positive number that is finite; ValueError otherwise."""
-    return real(value, name, "a positive number", least=5e-324, most=1.7976931348623157e308)
+    return real(value, name, "a positive number", 5e-324, MOST_DOUBLE)
 
 
-def whole(value: Any, name: str, expected: str, least: int, most: int = MOST_INT) -> int:
-    """One whole number of ``least`` to ``most``; ValueError otherwise."""
+def whole(value: object, name: str, expected: str, lower_bound: int, upper_bound: int = MOST_INT) -> int:
+    """One whole number of ``lower_bound`` to ``upper_bound``; ValueError otherwise."""
     try:
-        number = operator.index(value)
+        number = operator.index(cast(SupportsIndex, value))
     except TypeError:
         refuse(name, f"{expected}, got {shown(value)}")
-    if isinstance(value, bool) or number < least:
+    if isinstance(value, bool) or number < lower_bound:
         refuse(name, f"{expected}, got {shown(value)}")
-    if number > most:
-        refuse(name, f"at most {most}, got {shown(value)}")
+    if number > upper_bound:
+        refuse(name, f"at most {upper_bound}, got {shown(value)}")
     return number
 
 
-def whole_number(value: Any, name: str) -> int:
+def whole_number(value: object, name: str) -> int:
     """One whole number of any size; TypeError for what is none."""
     try:
-        return operator.index(value)
+        return operator.index(cast(SupportsIndex, value))
     except TypeError:
         raise TypeError(f"{name}: expected a whole number, got {shown(value)}") from None
 
@@ -116,13 +136,17 @@ def refuse(name: str | os.PathLike[str], expected: str) -> NoReturn:
 def check_type(name: str, value: object, kind: type, expected: str) -> None:
     """Raise TypeError unless a value is an instance of ``kind``, which messages call ``expected``."""
     if not isinstance(value, kind):
-        is_file = isinstance(value, str | os.PathLike) and kind.__name__ == "Camera"
-        advice = "; v3dg.read_cameras reads files" if is_file else ""
+        advice = ""
+        if isinstance(value, str | os.PathLike) and kind.__name__ == "Camera":
+            advice = "; v3dg.read_cameras reads files"
         raise TypeError(f"{name}: expected {expected}, got {type(value).__name__}{advice}")
 
 
 def check_all(
-    name: str, values: npt.NDArray[Any], good: npt.NDArray[np.bool_], expected: str | Callable[..., str]
+    name: str,
+    values: npt.NDArray[np.generic],
+    good: npt.NDArray[np.bool_],
+    expected: str | Callable[..., str],
 ) -> None:
     """Raise ValueError for the first row that is not good.
 
@@ -130,17 +154,18 @@ def check_all(
     """
     if not good.all():
         row = int(np.argmin(good.reshape(len(good), -1).all(1)))
-        text = expected(row) if callable(expected) else expected
-        raise ValueError(f"{name}[{row}]: expected {text}, got {values[row].tolist()}")
+        if callable(expected):
+            expected = expected(row)
+        raise ValueError(f"{name}[{row}]: expected {expected}, got {values[row].tolist()}")
 
 
-def one_of(value: Any, name: str, choices: tuple[str, ...]) -> None:
+def one_of(value: object, name: str, choices: tuple[str, ...]) -> None:
     """Raise ValueError unless ``value`` is one of the texts ``choices``."""
     if not (isinstance(value, str) and value in choices):
         refuse(name, f"{' or '.join(map(repr, choices))}, got {shown(value)}")
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """A value as text for a message of one line."""
     if isinstance(value, int) and value.bit_length() > 128:
         return f"a whole number of {value.bit_length()} bits"

@@ -3,7 +3,10 @@
 import logging
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
+
+if TYPE_CHECKING:
+    from tqdm import tqdm as TerminalBar
 
 T = TypeVar("T")
 Progress: TypeAlias = bool | Callable[[int, int, str], object]
@@ -30,9 +33,11 @@ class Bar:
         self._name = name
         self._text = name
         self._num_logged = self._num_lines
-        self._call = progress if callable(progress) else None
+        self._call: Callable[[int, int, str], object] | None = None
+        if not isinstance(progress, bool):
+            self._call = progress
         self._is_shown = progress is True
-        self._bar: Any = None
+        self._bar: TerminalBar | None = None
         if self._is_shown and sys.stderr.isatty():
             from tqdm import tqdm
 

@@ -14,8 +14,8 @@ from v3dg._numbers import Floats as Floats
 from v3dg._numbers import check, check_type, positive, real, refuse, vector, whole
 
 T = TypeVar("T")
-VectorLike: TypeAlias = Sequence[float] | npt.NDArray[Any]
-MatrixLike: TypeAlias = Sequence[Sequence[float]] | npt.NDArray[Any]
+VectorLike: TypeAlias = Sequence[float] | npt.NDArray[np.generic]
+MatrixLike: TypeAlias = Sequence[Sequence[float]] | npt.NDArray[np.generic]
 Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 AXES: tuple[Axis, ...] = get_args(Axis)
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -94,7 +93,7 @@ def outliers(means: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
     return np.asarray(distance > OUTLIER_DISTANCE * np.median(distance))
 
 
-def ball_of_most(points: npt.NDArray[np.floating[Any]]) -> tuple[npt.NDArray[np.floating[Any]], float]:
+def ball_of_most(points: npt.NDArray[np.floating]) -> tuple[npt.NDArray[np.floating], float]:
     """Centre (3,) and radius, above 0, of a ball around nearly all of N > 0 points (N, 3).
 
     It is the part to look at: trained assets have a few gaussians far away from all others.

@@ -7,12 +7,13 @@ gaussians drawn, the time, and the error to the full asset at twice the resoluti
 import math
 import os
 import time
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 from v3dg import _device
 from v3dg._device import Device
 from v3dg._progress import Progress, counted
 from v3dg.build import build_bundle
+from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.donut import make_donut, place_field
 from v3dg.metrics import draw_truth, errors_of
@@ -20,6 +21,8 @@ from v3dg.pictures import Picture, check_picture_path, contact_sheet, to_8bit, w
 from v3dg.render import render
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
+
+JsonObject: TypeAlias = dict[str, Any]
 
 # Distance from the eye to the donut in the middle, in radii of a donut, and height of the view in radians.
 VIEWS = ((3.3, 0.36), (8.0, 0.36), (20.0, 0.36), (46.0, 0.38), (95.0, 0.42))
@@ -38,7 +41,7 @@ def run_demo(
     views: tuple[tuple[float, float], ...] = VIEWS,
     progress: Progress = True,
     device: str = "auto",
-) -> dict[str, Any]:
+) -> JsonObject:
     """Make an asset, build and place it, draw and measure every distance, and write the picture.
 
     Args:
@@ -54,41 +57,82 @@ def run_demo(
         ValueError: The picture cannot be written to ``output``, or an argument is out of range.
     """
     path = check_picture_path(output)
-    where = _device.resolve(device)
+    chosen_device = _device.resolve(device)
     start = time.perf_counter()
     asset = make_donut(num_gaussians, seed=seed)
-    bundle = build_bundle(asset, seed=seed, progress=progress, device=where)
+    bundle = build_bundle(asset, seed=seed, progress=progress, device=chosen_device)
     build_seconds = time.perf_counter() - start
-    positions, quaternions, scales = place_field(instances, seed=seed)
+    scene = _field(bundle, instances, seed)
+    columns: list[JsonObject] = []
+    full_row: list[tuple[str, Picture]] = []
+    bundle_row: list[tuple[str, Picture]] = []
+    for distance, elevation in counted(views, len(views), "draw", progress):
+        full, selected = _panels(scene, _camera(distance, elevation, size), tolerance, chosen_device)
+        full_row.append((f"full, distance {distance:g}: {full.text}", full.picture))
+        bundle_row.append((f"bundle, distance {distance:g}: {selected.text}", selected.picture))
+        columns.append({"distance": distance, "full": full.numbers, "bundle": selected.numbers})
+    write_picture(path, contact_sheet([full_row, bundle_row]))
+    return {
+        "picture": str(path),
+        "asset_gaussians": len(asset),
+        "instances": instances,
+        "levels": bundle.num_levels,
+        "bundle_gaussians": bundle.num_gaussians,
+        "tolerance": tolerance,
+        "device": str(chosen_device),
+        "build_seconds": build_seconds,
+        "seconds": time.perf_counter() - start,
+        "columns": columns,
+    }
+
+
+def _field(bundle: Bundle, count: int, seed: int) -> Scene:
+    positions, quaternions, scales = place_field(count, seed=seed)
     scene = Scene()
     scene.add(bundle, positions=positions, quaternions=quaternions, scales=scales)
-    columns: list[dict[str, Any]] = []
-    rows: tuple[list[tuple[str, Picture]], ...] = ([], [])
-    for distance, elevation in counted(views, len(views), "draw", progress):
-        # Of the middle of the field: from near a donut, from far the whole hill.
-        across, target = distance * math.cos(elevation), 0.42 / (1 + (distance / 12) ** 2)
-        x, y, z = math.sin(_AZIMUTH) * across, -math.cos(_AZIMUTH) * across, distance * math.sin(elevation)
-        camera = Camera.look_at((x, y, target + z), (0, 0, target), width=size[0], height=size[1])
-        truth = draw_truth(scene, camera, where, background=_SKY)
-        columns.append({"distance": distance})
-        for name, row, px2 in (("full", rows[0], 0.0), ("bundle", rows[1], tolerance)):
-            columns[-1][name], text, picture = _drawn(scene, camera, px2, truth, where)
-            row.append((f"{name}, distance {distance:g}: {text}", picture))
-    write_picture(path, contact_sheet(rows))
-    result = {"picture": str(path), "asset_gaussians": len(asset), "instances": instances}
-    result |= {"levels": bundle.num_levels, "bundle_gaussians": bundle.num_gaussians}
-    result |= {"tolerance": tolerance, "device": str(where), "build_seconds": build_seconds}
-    return result | {"seconds": time.perf_counter() - start, "columns": columns}
+    return scene
 
 
-def _drawn(
-    scene: Scene, camera: Camera, tolerance: float, truth: Picture, device: Device
-) -> tuple[dict[str, Any], str, Picture]:
-    """Numbers and text of one picture, and the picture."""
+def _camera(distance: float, elevation: float, size: tuple[int, int]) -> Camera:
+    """A camera that looks at the middle of the field: at a donut from near, at the whole hill from far."""
+    horizontal = distance * math.cos(elevation)
+    target = 0.42 / (1 + (distance / 12) ** 2)
+    x = math.sin(_AZIMUTH) * horizontal
+    y = -math.cos(_AZIMUTH) * horizontal
+    z = distance * math.sin(elevation)
+    return Camera.look_at((x, y, target + z), (0, 0, target), width=size[0], height=size[1])
+
+
+class _Panel(NamedTuple):
+    """One picture of the result, with what was measured of it."""
+
+    numbers: JsonObject
+    text: str
+    picture: Picture
+
+
+def _panels(scene: Scene, camera: Camera, tolerance: float, device: Device) -> tuple[_Panel, _Panel]:
+    """The pictures of the full asset and of the selected cut."""
+    truth = draw_truth(scene, camera, device, background=_SKY)
+    full = _drawn(scene, camera, 0.0, truth, device)
+    selected = _drawn(scene, camera, tolerance, truth, device)
+    return full, selected
+
+
+def _drawn(scene: Scene, camera: Camera, tolerance: float, truth: Picture, device: Device) -> _Panel:
     image = render(scene, camera, tolerance=tolerance, background=_SKY, device=device)
-    picture, stats = to_8bit(image.color), image.stats
-    numbers = {name: getattr(stats, name) for name in ("gaussians_selected", "select_ms", "draw_ms")}
-    numbers |= {"gaussians": stats.gaussians_in_frustum, **errors_of(truth, picture)}
-    name = "SSIM" if numbers["flip"] is None else "FLIP"
+    picture = to_8bit(image.color)
+    stats = image.stats
+    errors = errors_of(truth, picture)
+    numbers = {
+        "gaussians_selected": stats.gaussians_selected,
+        "select_ms": stats.select_ms,
+        "draw_ms": stats.draw_ms,
+        "gaussians": stats.gaussians_in_frustum,
+        **errors,
+    }
+    name = "FLIP"
+    if errors["flip"] is None:
+        name = "SSIM"
     cost = f"{stats.gaussians_in_frustum:,} gaussians, {stats.select_ms + stats.draw_ms:,.0f} ms"
-    return numbers, f"{cost}, {name} {numbers[name.lower()]:.3f}", picture
+    return _Panel(numbers, f"{cost}, {name} {errors[name.lower()]:.3f}", picture)

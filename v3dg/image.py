@@ -1,11 +1,21 @@
-"""Image: what drawing gives."""
+"""Image: the result of drawing."""
 
 from collections.abc import Callable
-from types import SimpleNamespace
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 from v3dg import _core
+from v3dg.gaussians import Array
 from v3dg.pictures import encode_png
+
+
+@dataclass(frozen=True, eq=False)
+class Planes:
+    """The arrays of an `Image`; depth is None where it was not asked for."""
+
+    color: Array
+    alpha: Array
+    depth: Array | None
 
 
 class Image:
@@ -18,23 +28,27 @@ class Image:
             unless it was asked for.
     """
 
-    def __init__(self, color: Any, alpha: Any, depth: Any) -> None:
-        self._planes: Any = SimpleNamespace(color=color, alpha=alpha, depth=depth)
+    def __init__(self, color: Array, alpha: Array, depth: Array | None) -> None:
+        self._drawn = Planes(color, alpha, depth)
+
+    @property
+    def _planes(self) -> Planes | _core.Drawing | _core.Picture:
+        return self._drawn
 
     def _repr_png_(self) -> bytes:
         """The picture, for notebooks."""
         return encode_png(self.color)
 
     @property
-    def color(self) -> Any:
+    def color(self) -> Array:
         return self._planes.color
 
     @property
-    def alpha(self) -> Any:
+    def alpha(self) -> Array:
         return self._planes.alpha
 
     @property
-    def depth(self) -> Any:
+    def depth(self) -> Array:
         depth = self._planes.depth
         if depth is None:
             raise AttributeError("depth: expected a picture that was drawn with depth=True, got one without")
@@ -85,13 +99,17 @@ class RenderedImage(Image):
     def __init__(
         self, drawing: _core.Drawing, finish: Callable[[], Stats], *, is_right: bool = False
     ) -> None:
-        self._drawing, self._finish, self._is_right = drawing, finish, is_right
+        self._drawing = drawing
+        self._finish = finish
+        self._is_right = is_right
 
     @property
-    def _planes(self) -> Any:
+    def _planes(self) -> _core.Drawing | _core.Picture:
         if self._drawing.finish().exceeds_budget:
-            self._finish()  # which says so
-        return self._drawing.right if self._is_right else self._drawing
+            self._finish()  # raises the error
+        if self._is_right:
+            return self._drawing.right
+        return self._drawing
 
     @property
     def stats(self) -> Stats:

@@ -90,7 +90,9 @@ def read_asset(path: Path) -> Gaussians:
 
 def loaded(asset: Gaussians | Path) -> Gaussians:
     """An asset, or the one in a file."""
-    return read_asset(asset) if isinstance(asset, str | os.PathLike) else asset
+    if isinstance(asset, str | os.PathLike):
+        return read_asset(asset)
+    return asset
 
 
 def open_asset(path: Path) -> AssetFile:
@@ -101,14 +103,18 @@ def open_asset(path: Path) -> AssetFile:
     """
     reader = _by_name(path, _READERS)
     at_url = in_parts(path)
-    return _open_fetched(at_url, reader) if isinstance(at_url, FileAtUrl) else reader(at_url)
+    if isinstance(at_url, FileAtUrl):
+        return _open_fetched(at_url, reader)
+    return reader(at_url)
 
 
 def _open_fetched(at_url: FileAtUrl, reader: Callable[[Path], AssetFile]) -> AssetFile:
     """An asset at a URL, which is whole here as long as this lives; its errors name the URL."""
     with reading(at_url) as local:
         file = reader(local)
-        whole = file.read(0, file.num_gaussians) if at_url.needs_name else None
+        whole = None
+        if at_url.needs_name:
+            whole = file.read(0, file.num_gaussians)
 
     def read(first: int, last: int) -> Gaussians:
         if whole is not None:
@@ -124,16 +130,23 @@ def run_files(folder: pathlib.Path) -> list[pathlib.Path]:
     steps: dict[int, list[pathlib.Path]] = {}
     for pattern in _RUNS:
         for file in sorted(folder.glob(pattern)):
-            number = re.search(r"(?:step-|ckpt_|iteration_)(\d+)", "/".join(file.parts[-2:]))
-            steps.setdefault(int(number[1]) if number else -1, []).append(file)
-    return steps[max(steps)] if steps else []
+            match = re.search(r"(?:step-|ckpt_|iteration_)(\d+)", "/".join(file.parts[-2:]))
+            step = -1
+            if match:
+                step = int(match[1])
+            steps.setdefault(step, []).append(file)
+    if not steps:
+        return []
+    return steps[max(steps)]
 
 
 def asset_bytes(path: Path) -> int:
     """Bytes on disk of an asset that can be read: of all files that it names and that are there."""
     names = _by_name(path, _FILES)
     at_url = in_parts(path)
-    return at_url.num_bytes if isinstance(at_url, FileAtUrl) else bytes_of(names(pathlib.Path(path)))
+    if isinstance(at_url, FileAtUrl):
+        return at_url.num_bytes
+    return bytes_of(names(pathlib.Path(path)))
 
 
 def write_asset(
@@ -187,5 +200,7 @@ def _by_name(path: Path, formats: Mapping[str, Format]) -> Format:
     for ending, function in formats.items():
         if name.endswith(ending):
             return function
-    advice = "; v3dg.open opens bundles (.v3dg) and scenes (.json)" if formats is not _WRITERS else ""
+    advice = ""
+    if formats is not _WRITERS:
+        advice = "; v3dg.open opens bundles (.v3dg) and scenes (.json)"
     raise ValueError(f"{shown(path)}: expected a file name that ends in {', '.join(formats)}{advice}")

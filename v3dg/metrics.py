@@ -5,7 +5,7 @@ NumPy arrays or torch tensors, and are means over the whole picture. Nothing is 
 """
 
 import importlib.util
-from typing import Any
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,11 @@ from v3dg import _core, _extras
 from v3dg._device import Device
 from v3dg._numbers import check
 from v3dg.cameras import Camera
+from v3dg.gaussians import Array
+from v3dg.opening import File
 from v3dg.pictures import Picture, checked, to_8bit
 from v3dg.render import render
+from v3dg.scene import Subject
 
 FLIP_PIXELS_PER_DEGREE = 67.0
 """A 0.7 m wide 4K display seen from 0.7 m: the viewing condition that FLIP's authors use."""
@@ -26,16 +29,17 @@ MIN_TRANSMITTANCE = 1e-4
 FLIP_MISSING = _extras.missing("flip_evaluator")
 
 
-def _pair(reference: Any, test: Any) -> tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]]:
-    """The pictures as `pictures.checked` has them, of floats and of one size."""
-    a, b = checked("reference", reference), checked("test", test)
+def _pair(reference: Array, test: Array) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Both pictures as `pictures.checked` returns them; raises unless they are floats and of one size."""
+    a = checked("reference", reference)
+    b = checked("test", test)
     for name, dtype in (("reference", a.dtype), ("test", b.dtype)):
         check(name, dtype.kind == "f", f"floats in [0, 1], got {dtype}; divide 8-bit pictures by 255")
     check("test", a.shape == b.shape, f"the reference's shape {a.shape}, got {b.shape}")
-    return a, b
+    return cast(NDArray[np.floating], a), cast(NDArray[np.floating], b)
 
 
-def psnr(reference: Any, test: Any) -> float:
+def psnr(reference: Array, test: Array) -> float:
     """Compute the peak signal-to-noise ratio in dB, for a peak of 1; infinite for equal pictures.
 
     Values are compared as they are: clip both to [0,1] first to compare what a screen shows.
@@ -43,10 +47,12 @@ def psnr(reference: Any, test: Any) -> float:
     a, b = _pair(reference, test)
     difference = a.astype(np.float64) - b
     mean_square = float(np.mean(difference * difference))
-    return float("inf") if mean_square == 0 else -10 * float(np.log10(mean_square))
+    if mean_square == 0:
+        return float("inf")
+    return -10 * float(np.log10(mean_square))
 
 
-def ssim(reference: Any, test: Any) -> float:
+def ssim(reference: Array, test: Array) -> float:
     """Compute the structural similarity, 1 for equal pictures.
 
     Convention (others differ in the third digit): Gaussian window of 11×11 px with sigma 1.5 px, population
@@ -59,8 +65,9 @@ def ssim(reference: Any, test: Any) -> float:
     """
     a, b = _pair(reference, test)
     check("reference", min(a.shape[:2]) >= 6, f"at least 6 px a side, got {a.shape}")
-    dtype = np.float32 if a.dtype == b.dtype == np.float32 else np.float64
-    return _core.ssim(np.ascontiguousarray(a, dtype), np.ascontiguousarray(b, dtype))
+    if a.dtype == b.dtype == np.float32:
+        return _core.ssim(np.ascontiguousarray(a, np.float32), np.ascontiguousarray(b, np.float32))
+    return _core.ssim(np.ascontiguousarray(a, np.float64), np.ascontiguousarray(b, np.float64))
 
 
 def has_flip() -> bool:
@@ -68,16 +75,16 @@ def has_flip() -> bool:
     return importlib.util.find_spec("flip_evaluator") is not None
 
 
-def _flip(reference: Any, test: Any, *, magma: bool) -> NDArray[np.float32]:
+def _flip(reference: Array, test: Array, *, magma: bool) -> NDArray[np.float32]:
     flip_evaluator = _extras.load("flip_evaluator")
-    # Fresh arrays: the evaluator is free to write into what it gets.
-    a, b = (np.clip(x, 0, 1).astype(np.float32, order="C") for x in _pair(reference, test))
+    # These are new arrays, because the evaluator may write into its arguments.
+    a, b = (np.clip(picture, 0, 1).astype(np.float32, order="C") for picture in _pair(reference, test))
     parameters = {"ppd": FLIP_PIXELS_PER_DEGREE}
     error, _, _ = flip_evaluator.evaluate(a, b, "LDR", applyMagma=magma, parameters=parameters)
     return np.asarray(error, dtype=np.float32)
 
 
-def flip_map(reference: Any, test: Any) -> NDArray[np.float32]:
+def flip_map(reference: Array, test: Array) -> NDArray[np.float32]:
     """Compute LDR-FLIP per pixel at 67 pixels per degree: (H,W), 0 where no difference is seen, at most 1.
 
     Pictures are clipped to [0,1] first.
@@ -91,24 +98,24 @@ def flip_map(reference: Any, test: Any) -> NDArray[np.float32]:
     return _flip(reference, test, magma=False).reshape(reference.shape[0], reference.shape[1])
 
 
-def flip(reference: Any, test: Any) -> float:
+def flip(reference: Array, test: Array) -> float:
     """Compute the mean of `flip_map`."""
     return float(np.mean(flip_map(reference, test), dtype=np.float64))
 
 
-def error_image(reference: Any, test: Any) -> NDArray[np.float32]:
+def error_image(reference: Array, test: Array) -> NDArray[np.float32]:
     """Draw `flip_map` in the magma colours that FLIP is usually shown in, (H,W,3): black is no difference."""
     return _flip(reference, test, magma=True)
 
 
-def box_downsample(image: Any, factor: int) -> Any:
-    """Average ``factor`` × ``factor`` blocks: (H,W,...) to (H/factor,W/factor,...), array kind kept.
+def box_downsample(image: Array, factor: int) -> Array:
+    """Average ``factor`` × ``factor`` blocks: (H,W,...) to (H/factor,W/factor,...), of the same array kind.
 
     Raises:
         ValueError: ``factor`` is not positive, or does not divide the height and the width.
     """
     check("factor", factor >= 1, f"at least 1, got {factor}")
-    height, width = image.shape[0], image.shape[1]
+    height, width = image.shape[:2]
     is_divisible = height % factor == 0 == width % factor
     check("image", is_divisible, f"a height and width divisible by {factor}, got {height} x {width}")
     return image.reshape(height // factor, factor, width // factor, factor, *image.shape[2:]).mean((1, 3))
@@ -117,24 +124,32 @@ def box_downsample(image: Any, factor: int) -> Any:
 def errors_of(reference: Picture, test: Picture) -> dict[str, float | None]:
     """FLIP (None without its extra), PSNR (None for equal pictures) and SSIM of pictures in 8 bits."""
     a, b = (picture.astype(np.float32) / np.float32(255) for picture in (reference, test))
-    return {
-        "flip": flip(a, b) if has_flip() else None,
-        "psnr": psnr(a, b) if (reference != test).any() else None,
-        "ssim": ssim(a, b),
-    }
+    errors: dict[str, float | None] = {"flip": None, "psnr": None, "ssim": ssim(a, b)}
+    if has_flip():
+        errors["flip"] = flip(a, b)
+    if (reference != test).any():
+        errors["psnr"] = psnr(a, b)
+    return errors
 
 
 def draw_truth(
-    subject: Any,
+    subject: Subject | File,
     camera: Camera,
     device: str | Device = "auto",
     supersampling: int = 2,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Picture:
-    """Draw what the others are compared with, in 8 bits: all gaussians, with so many samples a pixel's side.
+    """Draw the picture that others are compared with, in 8 bits, from all gaussians.
 
+    A pixel has ``supersampling`` × ``supersampling`` samples.
     Each sample is clipped to [0,1] as a screen does, before it is averaged over its pixel.
     """
-    how: Any = {"background": background, "min_transmittance": MIN_TRANSMITTANCE, "device": device}
-    color = render(subject, camera.scaled(supersampling), tolerance=0.0, **how).color
-    return to_8bit(box_downsample(color.clip(0, 1), supersampling))
+    image = render(
+        subject,
+        camera.scaled(supersampling),
+        tolerance=0.0,
+        background=background,
+        min_transmittance=MIN_TRANSMITTANCE,
+        device=device,
+    )
+    return to_8bit(box_downsample(image.color.clip(0, 1), supersampling))

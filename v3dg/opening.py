@@ -31,9 +31,11 @@ def open(path: str | os.PathLike[str]) -> Subject:
     return open_with_cameras(Path(path))[0]
 
 
-def opened(subject: Any) -> Any:
-    """What a file is, where one is given, and all else as it is, for whoever checks it."""
-    return open(subject) if isinstance(subject, str | os.PathLike) else subject
+def opened(subject: object) -> Any:
+    """The subject in a file; everything but a file is returned unchecked."""
+    if isinstance(subject, str | os.PathLike):
+        return open(subject)
+    return subject
 
 
 def open_with_cameras(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
@@ -47,7 +49,9 @@ def open_with_cameras(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
     if beside(path).suffix.lower() not in usd.SUFFIXES:
         return read_asset(path), None
     with reading(path) as local:
-        return (read_usd_scene(local) if usd.has_instances(local) else read_asset(local)), None
+        if usd.has_instances(local):
+            return read_usd_scene(local), None
+        return read_asset(local), None
 
 
 def read_usd_scene(
@@ -69,11 +73,12 @@ def read_usd_scene(
         OSError: It cannot be read.
     """
     with reading(path) as local:
-        assets, which, poses, up = usd.read_world(local)
+        assets, asset_from_instance, poses, up = usd.read_world(local)
     config = config or BuildConfig(steps=0)
     bundles = [build_bundle(asset, config=config, device=device, progress=False) for asset in assets]
     scene = Scene()
     quaternions, positions, scales = zip(*poses, strict=True)
-    scene.add([bundles[number] for number in which], positions, quaternions, scales)
+    bundle_from_instance = [bundles[asset] for asset in asset_from_instance]
+    scene.add(bundle_from_instance, positions, quaternions, scales)
     scene.up = up
     return scene

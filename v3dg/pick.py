@@ -65,45 +65,71 @@ def pick(
         ValueError: The pixel is not in the image, or another argument is not as in `v3dg.render`.
     """
     check_type("camera", camera, Camera, "a Camera")
-    x, y = whole(x, "x", "a column", 0), whole(y, "y", "a row", 0)
+    x = whole(x, "x", "a column", 0)
+    y = whole(y, "y", "a row", 0)
     is_inside = x < camera.width and y < camera.height
     check("x, y", is_inside, f"a pixel of {camera.width} x {camera.height}, got ({x}, {y})")
-    scene = copy.copy(Scene.of(opened(subject)))  # which stays as it is
-    if budget is not None:  # which is for the whole picture
+    scene = copy.copy(Scene.of(opened(subject)))  # another thread may change the scene meanwhile
+    if budget is not None:  # the budget is that of the whole picture
         cut = select(scene, camera, tolerance=tolerance, budget=budget, min_level=min_level, device=CPU)
         tolerance = cut.tolerance
     rule = rule_of(tolerance, None, min_level, "solid_angle", True)
     pixel = camera.core.window(x, y, x + 1, y + 1)
     if renderer is not None:
-        check_type("renderer", renderer, Renderer, "a Renderer")
-        expected = "one of this subject, got one of another; make a renderer of what is picked from"
-        check("renderer", _is_of(renderer, scene), expected)
-        pool = renderer.pool_frame
-        if pool is None or pool.device.is_cuda:
-            refuse("renderer", f"one with a pool on the CPU, got {renderer}")
-        found = pool.pick(renderer.subject, pixel, rule)
+        hit = _pick_from_pool(renderer, scene, pixel, rule)
     else:
-        resident = residency.scene(scene, CPU)
-        pairs = resident.core.select(pixel, rule)
-        frame = _core.SceneFrame(CPU.number)
-        residency.set_models(frame, resident.bundles, CPU, "appearance")
-        found = frame.pick_cut(resident.core, pixel, pairs.instance_ids, pairs.cluster_ids)
-    if found is None:
+        hit = _pick_from_scene(scene, pixel, rule)
+    if hit is None:
         return None
-    instance, cluster, weight, depth = found
+    instance, cluster, weight, depth = hit
     level = int(scene.bundles[scene.instance_bundle[instance]].clusters.level[cluster])
     ray = np.array([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1.0])
     position = camera.position + depth * ray @ camera.viewmat[:3, :3]
     return Pick(instance, cluster, level, weight, depth, position)
 
 
-def _is_of(renderer: Renderer, scene: Scene) -> bool:
+def _pick_from_scene(
+    scene: Scene, pixel: _core.Camera, rule: _core.Rule
+) -> tuple[int, int, float, float] | None:
+    """Instance, cluster, weight and depth of what a pixel shows most of, from all gaussians."""
+    resident = residency.scene(scene, CPU)
+    pairs = resident.core.select(pixel, rule)
+    frame = _core.SceneFrame(CPU.number)
+    residency.set_models(frame, resident.bundles, CPU, "appearance")
+    return frame.pick_cut(resident.core, pixel, pairs.instance_ids, pairs.cluster_ids)
+
+
+def _pick_from_pool(
+    renderer: Renderer, scene: Scene, pixel: _core.Camera, rule: _core.Rule
+) -> tuple[int, int, float, float] | None:
+    """As `_pick_from_scene`, from what is resident in the renderer's pool.
+
+    Raises:
+        TypeError: This is no renderer.
+        ValueError: The renderer is one of another scene, or has no pool on the CPU.
+    """
+    check_type("renderer", renderer, Renderer, "a Renderer")
+    expected = "one of this subject, got one of another; make a renderer of what is picked from"
+    check("renderer", _draws(renderer, scene), expected)
+    pool = renderer.pool_frame
+    if pool is None or pool.device.is_cuda:
+        refuse("renderer", f"one with a pool on the CPU, got {renderer}")
+    return pool.pick(renderer.subject, pixel, rule)
+
+
+def _draws(renderer: Renderer, scene: Scene) -> bool:
     """Whether a renderer draws the instances of this scene, from the same bundles or the same files."""
     if isinstance(renderer.subject, Gaussians):
         return False
     drawn = Scene.of(renderer.subject)
     if not np.array_equal(drawn.instance_bundle, scene.instance_bundle):
         return False
-    pairs = zip(drawn.bundles, scene.bundles, strict=False)
-    is_same = (one is other or (one.path is not None and one.path == other.path) for one, other in pairs)
-    return len(drawn.bundles) == len(scene.bundles) and all(is_same)
+    if len(drawn.bundles) != len(scene.bundles):
+        return False
+    return all(map(_is_same_bundle, drawn.bundles, scene.bundles))
+
+
+def _is_same_bundle(first: Bundle, second: Bundle) -> bool:
+    if first is second:
+        return True
+    return first.path is not None and first.path == second.path

@@ -5,13 +5,14 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _files
 from v3dg._numbers import check
+from v3dg.gaussians import Array
 
 Picture: TypeAlias = NDArray[np.uint8]
 """(H, W, 3)"""
@@ -24,11 +25,13 @@ MOST_PIXELS_DRAWN = 1 << 27
 MOST_PIXELS_COMPARED = 1 << 25
 """A screen of 8K; measuring takes 200 bytes each."""
 
-_GAP_PX, _TEXT_PX = 6, 18
-_PAPER, _INK = (16, 18, 22), (238, 240, 243)
+_GAP_PX = 6
+_TEXT_PX = 18
+_PAPER = (16, 18, 22)
+_INK = (238, 240, 243)
 
 
-def to_8bit(image: Any) -> Picture:
+def to_8bit(image: Array) -> Picture:
     """Round display values in [0,1] to 0..255, where the array is; what lies outside is clipped."""
     if hasattr(image, "detach"):
         import torch
@@ -38,7 +41,7 @@ def to_8bit(image: Any) -> Picture:
     return np.asarray((clipped * np.float32(255) + np.float32(0.5)).astype(np.uint8))
 
 
-def checked(name: str, image: Any) -> NDArray[Any]:
+def checked(name: str, image: Array) -> NDArray[np.generic]:
     """A picture as a NumPy array (H,W,3), on the host, without gradient; TypeError or ValueError if none."""
     if hasattr(image, "detach"):
         image = image.detach().cpu().numpy()
@@ -57,7 +60,8 @@ def contact_sheet(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
     widths = [sum(picture.shape[1] + _GAP_PX for _, picture in row) for row in rows]
     size = max(widths) + _GAP_PX, sum(h + _TEXT_PX + _GAP_PX for h in heights) + _GAP_PX
     canvas = Image.new("RGB", size, _PAPER)
-    draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(12)
+    draw = ImageDraw.Draw(canvas)
+    font = ImageFont.load_default(12)
     top = _GAP_PX
     for row, height in zip(rows, heights, strict=True):
         left = _GAP_PX
@@ -115,7 +119,7 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
             return np.asarray(image.convert("RGB"))
 
 
-def encode_png(image: Any) -> bytes:
+def encode_png(image: Array) -> bytes:
     """A PNG of (H,W,3) floats in [0,1]."""
     from PIL import Image
 
@@ -124,7 +128,7 @@ def encode_png(image: Any) -> bytes:
     return stream.getvalue()
 
 
-def write_picture(path: str | os.PathLike[str], image: Any) -> None:
+def write_picture(path: str | os.PathLike[str], image: Array) -> None:
     """Write (H,W,3) floats in [0,1] or 8-bit values as PNG or JPEG; the file appears when it is complete."""
     from PIL import Image
 
@@ -134,6 +138,8 @@ def write_picture(path: str | os.PathLike[str], image: Any) -> None:
         check("image", pixels.dtype.kind == "f", f"uint8, or floats in [0,1], got {pixels.dtype}")
         check("image", not np.isnan(pixels).any(), "colours, got some that are no numbers (nan)")
         pixels = to_8bit(pixels)
-    kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
+    kind = "JPEG"
+    if path.suffix.lower() == ".png":
+        kind = "PNG"
     with _files.replacing(path) as temporary:
-        Image.fromarray(pixels).save(temporary, kind, quality=90)  # of JPEG
+        Image.fromarray(pixels).save(temporary, kind, quality=90)  # for JPEG

@@ -4,7 +4,10 @@ import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from v3dg import _core, _device
 from v3dg._device import Device
@@ -14,10 +17,9 @@ from v3dg.cameras import Camera
 from v3dg.false_color import ColorBy
 from v3dg.residency import ResidentScene, residency
 
-_RESERVE_BYTES = 1 << 30  # at most, for frames, tables and whatever else
-_View: TypeAlias = tuple[_core.Camera | _core.Eyes, _core.Rule]
-NUM_THREADS = 8  # that read pages; a disk answers several at once
-_WAIT_SECONDS = 0.05  # until Ctrl-C is heard
+_RESERVE_BYTES = 1 << 30  # the most that stays free for frames, tables and everything else
+NUM_THREADS = 8  # threads that read pages; a disk answers several at once
+_WAIT_SECONDS = 0.05  # the longest time until Ctrl-C is heard
 
 
 def free_on(device: Device) -> int:
@@ -31,9 +33,9 @@ def free_on(device: Device) -> int:
 
 
 def chosen_bytes(bundles: Sequence[Bundle], device: Device) -> int | None:
-    """Of a pool of half of what is free on the device, where not all fits there; None where it does."""
-    for where, num_bytes in residency.bytes_to_add(bundles, device).items():
-        free = free_on(where)
+    """Half of the free bytes of the device, for a pool, if not everything fits there; None if it does."""
+    for memory, num_bytes in residency.bytes_to_add(bundles, device).items():
+        free = free_on(memory)
         if num_bytes > free - min(free // 4, _RESERVE_BYTES):
             return free_on(device) // 2
     return None
@@ -44,30 +46,41 @@ class PoolLook:
     """What a picture of a pool shows, and of which cut; anything but "appearance" is for the CPU alone.
 
     Attributes:
-        shows: Colours as in `v3dg.render`, the share of the tolerance that metrics take as grey, or how many
-            gaussians a pixel is blended of, in place of depth.
-        chooser: Whose cut it is; None: that of the camera.
-        aside: Draw what was there for the last picture, and neither bring pages nor ask for any.
+        shows: Colours as in `v3dg.render`; "error" shows the share of the tolerance that metrics take, as
+            grey, and "count" the number of gaussians that a pixel is blended of, in place of depth.
+        chooser: The camera whose cut is drawn; None for the camera of the picture.
+        aside: Draw what was resident for the last picture, and neither bring pages in nor ask for any.
     """
 
     shows: ColorBy | Literal["error", "count"] = "appearance"
     chooser: Camera | None = None
     aside: bool = False
 
-    def options(self, bundles: Sequence[Bundle]) -> dict[str, Any]:
-        """What the core takes."""
-        by: Any = self.shows if self.shows in ("level", "cluster") else None
-        palettes = [] if by is None else [residency.palette(bundle, by) for bundle in bundles]
-        chooser = self.chooser and self.chooser.core
-        return {"shows": self.shows, "colors": palettes, "chooser": chooser, "aside": self.aside}
+    @property
+    def core_chooser(self) -> _core.Camera | None:
+        """The chooser for the compiled operations."""
+        if self.chooser is None:
+            return None
+        return self.chooser.core
+
+    def palettes(self, bundles: Sequence[Bundle]) -> list[NDArray[np.float32]]:
+        """The colours of each bundle's clusters; none where the bundles have no colours of their own."""
+        if self.shows not in ("level", "cluster"):
+            return []
+        palettes = []
+        for bundle in bundles:
+            palette = residency.palette(bundle, self.shows)
+            assert palette is not None
+            palettes.append(palette)
+        return palettes
 
 
 class Pool:
     """Pages of bundles in a fixed amount of memory of one device, which come and go as views need them.
 
     Attributes:
-        tables: Those of its bundles.
-        num_bytes: The memory that it was given.
+        tables: The tables of its bundles.
+        num_bytes: The size of its memory.
         lease: Held by a thread from `settle` until its picture is drawn, so that no other thread's view takes
             the place of what it has settled.
     """
@@ -81,15 +94,21 @@ class Pool:
         sources = [bundle.page_source for bundle in bundles]
         self.core = _core.PagePool(tables, sources, device.number, num_bytes, NUM_THREADS)
 
-    def settle(self, resident: ResidentScene, view: _View, timeout: float, seconds: float) -> None:
-        """Bring in what a view needs, or as much of it as comes in so many seconds.
+    def settle(
+        self,
+        resident: ResidentScene,
+        camera: _core.Camera | _core.Eyes,
+        rule: _core.Rule,
+        timeout: float,
+        seconds: float,
+    ) -> None:
+        """Bring in the pages that a view needs, or as many of them as arrive within ``seconds``.
 
         Raises:
             ValueError: A page is damaged.
             OSError: A page cannot be read; TimeoutError when none came in for `timeout` seconds.
         """
         core = self.core
-        camera, rule = view
         start = time.monotonic()
         last_arrival = start
         pages_in = -1
@@ -99,18 +118,20 @@ class Pool:
                 step = core.settle_step(resident.core, camera, rule, begins)
             begins = False
             status = core.status()
-            now = time.monotonic()
+            time_of_step = time.monotonic()
+            if status.failed and status.is_damage:
+                raise ValueError(status.error)
             if status.failed:
-                raise (ValueError if status.is_damage else OSError)(status.error)
+                raise OSError(status.error)
             if step.is_decided and core.raise_tolerance(step.tolerance_px2):
                 continue
             is_settled = step.is_decided and step.num_absent == 0
-            if is_settled or now - start > seconds:
+            if is_settled or time_of_step - start > seconds:
                 return
             if status.pages_in != pages_in:
                 pages_in = status.pages_in
-                last_arrival = now
-            elif now - last_arrival > timeout:
+                last_arrival = time_of_step
+            elif time_of_step - last_arrival > timeout:
                 raise TimeoutError(
                     f"settle: {step.num_absent} pages are missing and none came in for {timeout:g} s; "
                     "is the disk or the server at work?"
@@ -126,8 +147,10 @@ class PoolSlot:
 
     @property
     def num_bytes(self) -> int | None:
-        """The size of the pool that is there; None without one."""
-        return None if self._pool is None else self._pool.num_bytes
+        """The size of the pool; None without one."""
+        if self._pool is None:
+            return None
+        return self._pool.num_bytes
 
     def pool(
         self,
@@ -143,7 +166,8 @@ class PoolSlot:
         pool = self._pool
         if pool is not None and pool.tables == tables and pool.num_bytes == num_bytes:
             return pool
-        self._pool = pool = None
+        pool = None
+        self._pool = None
         pool = Pool(bundles, tables, device, num_bytes)
         self._pool = pool
         return pool

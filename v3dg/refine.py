@@ -1,10 +1,10 @@
 """Levels of a bundle made better together: as cuts show them, next to what hides parts of them."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,11 +21,13 @@ from v3dg.gaussians import Gaussians
 from v3dg.opening import File
 from v3dg.residency import residency
 
-_T = TypeVar("_T")
+_T = TypeVar("_T", covariant=True)
 _RATE = 0.2  # of the step sizes of a fit, from whose result this starts
-# Pictures that tell how much is seen of each gaussian, and how many of them must have it in their cuts: of a
-# very large asset windows show parts, and what none of them looks at is not known.
-_WEIGHED, _LEAST_LOOKS = 2_000, 8
+# The number of pictures that measure how much is seen of each gaussian.
+_NUM_WEIGHING_PICTURES = 2_000
+# A gaussian is measured if it is in the cuts of at least this many of them. Pictures show only parts of a
+# very large asset, so some gaussians are in too few.
+_LEAST_LOOKS = 8
 
 
 def refine_bundle(
@@ -65,35 +67,58 @@ def refine_bundle(
         RuntimeError: The device is "cuda", and something is missing for it.
         KeyboardInterrupt: Ctrl-C; threads have stopped.
     """
-    bundle = Bundle.open(bundle) if isinstance(bundle, str | os.PathLike) else bundle
+    if isinstance(bundle, str | os.PathLike):
+        bundle = Bundle.open(bundle)
     check_type("bundle", bundle, Bundle, "a Bundle")
-    cameras = list(cameras.values() if isinstance(cameras, Mapping) else cameras)
+    if isinstance(cameras, Mapping):
+        cameras = cameras.values()
+    cameras = list(cameras)
     for number, camera in enumerate(cameras):
         check_type(f"cameras[{number}]", camera, Camera, "a Camera")
     steps = whole(steps, "steps", "1 step or more", 1, 1_000_000)
     drop = real(drop, "drop", "a share of 0 to 0.5", 0, 0.5)
-    seed, where = whole(seed, "seed", "0 to 2^58 - 1", 0, (1 << 58) - 1), _device.resolve(device)
+    seed = whole(seed, "seed", "0 to 2^58 - 1", 0, (1 << 58) - 1)
+    chosen_device = _device.resolve(device)
     if bundle.num_levels < 2 or bundle.clusters.offset[bundle.level_range(0).stop] == 0:
         return bundle
     if drop > 0:
-        seen, looks = _Cuts(bundle, cameras, seed, where, progress).run("weigh", _WEIGHED, _core.weigh_cuts)
-        bundle = _without_least(bundle, np.where(looks < _LEAST_LOOKS, np.nan, seen), drop)
-    refined = _Cuts(bundle, cameras, seed, where, progress).refined(steps)
-    about = {"steps": steps, "drop": drop, "seed": seed} | ({"cameras": len(cameras)} if cameras else {})
-    made: dict[str, Any] = {**bundle.config, "refined": about}
-    return Bundle(bundle.clusters.around(refined), bundle.groups, refined, made, bundle.codec)
+        cuts = _Cuts(bundle, cameras, seed, chosen_device, progress)
+        weights, looks = cuts.run("weigh", _NUM_WEIGHING_PICTURES, _core.weigh_cuts)
+        bundle = _without_least(bundle, np.where(looks < _LEAST_LOOKS, np.nan, weights), drop)
+    refined = _Cuts(bundle, cameras, seed, chosen_device, progress).refined(steps)
+    record: dict[str, int | float] = {"steps": steps, "drop": drop, "seed": seed}
+    if cameras:
+        record["cameras"] = len(cameras)
+    config = {**bundle.config, "refined": record}
+    return Bundle(bundle.clusters.around(refined), bundle.groups, refined, config, bundle.codec)
+
+
+class _CutOperation(Protocol[_T]):
+    """An operation of the core on pictures of cuts."""
+
+    def __call__(
+        self,
+        *,
+        config: _core.FitConfig,
+        gaussians: _core.Rows,
+        pictures: _core.CutPictures,
+        progress: _core.FitProgress,
+    ) -> _T: ...
 
 
 class _Cuts:
-    """Pictures of a bundle's cuts, and copies of its gaussians on a device, which are moved by them."""
+    """Pictures of a bundle's cuts, and copies of its gaussians on a device, which they move."""
 
     def __init__(
-        self, bundle: Bundle, cameras: Sequence[Camera], seed: int, where: Device, progress: Progress
+        self, bundle: Bundle, cameras: Sequence[Camera], seed: int, device: Device, progress: Progress
     ) -> None:
-        self._bundle, self._seed, self._where, self._progress = bundle, seed, where, progress
+        self._bundle = bundle
+        self._seed = seed
+        self._device = device
+        self._progress = progress
         everything = bundle.gaussians
         self._leaves = slice(0, int(bundle.clusters.offset[bundle.level_range(0).stop]))
-        self._gaussians = _device.place(everything.subset(np.arange(len(everything))), where)
+        self._gaussians = _device.place(everything.subset(np.arange(len(everything))), device)
         self._pictures = _core.CutPictures(
             table=residency.table(bundle),
             asset=everything.subset(self._leaves).rows,
@@ -102,40 +127,55 @@ class _Cuts:
         )
 
     def refined(self, steps: int) -> Gaussians:
-        groups, of_cluster = self._bundle.groups, self._bundle.clusters.own_group
-        radius = np.where(of_cluster < 0, np.float32(1), groups.ball[of_cluster, 3])
-        radius = np.repeat(radius, np.diff(self._bundle.clusters.offset))
+        clusters = self._bundle.clusters
+        ball = self._bundle.groups.ball
+        radius = np.where(clusters.own_group < 0, np.float32(1), ball[clusters.own_group, 3])
+        radius = np.repeat(radius, np.diff(clusters.offset))
         target = _core.FitTarget(self._gaussians.subset(self._leaves).rows, 0.0, False)
         self.run("refine", steps, partial(_core.refine_cuts, target=target, radius=radius))
         return self._gaussians.numpy()
 
-    def run(self, name: str, steps: int, operation: Callable[..., _T]) -> _T:
-        """Do something by so many pictures; what it returns."""
-        sizes: Any = {k: _RATE * v for k, v in vars(BuildConfig()).items() if k.startswith("step_")}
+    def run(self, name: str, steps: int, operation: _CutOperation[_T]) -> _T:
+        """Run an operation on this number of pictures, and return its result."""
         filter_px2 = float(self._bundle.clusters.filter_px2[self._bundle.level_range(1).start])
-        config = BuildConfig(steps=steps, first_steps=steps, filter_px2=filter_px2, **sizes)
-        given = {"gaussians": self._gaussians.rows, "pictures": self._pictures}
-        work = partial(operation, config=fit_config(config, self._seed, 1), **given)
+        config = BuildConfig(steps=steps, first_steps=steps, filter_px2=filter_px2)
+        config = replace(
+            config,
+            step_position=_RATE * config.step_position,
+            step_log_scale=_RATE * config.step_log_scale,
+            step_quat=_RATE * config.step_quat,
+            step_logit=_RATE * config.step_logit,
+            step_sh0=_RATE * config.step_sh0,
+            step_sh_rest=_RATE * config.step_sh_rest,
+        )
+        work = partial(
+            operation,
+            config=fit_config(config, self._seed, 1),
+            gaussians=self._gaussians.rows,
+            pictures=self._pictures,
+        )
         with Bar(steps, name, self._progress) as bar:
 
             def show(state: _core.FitProgress) -> None:
                 bar.update(state.groups_done - bar.done)
 
-            return run_fit(lambda state: work(progress=state), self._where, show)
+            return run_fit(lambda state: work(progress=state), self._device, show)
 
 
 def _without_least(bundle: Bundle, weight: npt.NDArray[np.float64], share: float) -> Bundle:
-    """Drop, of each level but the first, those of least weight that have this share of it together.
+    """Drop from each level but the first its gaussians of least weight, up to a share of the level's weight.
 
-    What has no number stays, and has none of it.
+    Gaussians whose weight is not a number stay, and count for nothing in the sum.
     """
-    offset, is_kept = bundle.clusters.offset, np.ones(bundle.num_gaussians, bool)
+    offset = bundle.clusters.offset
+    is_kept = np.ones(bundle.num_gaussians, bool)
     for level in range(1, bundle.num_levels):
-        here = bundle.level_range(level)
-        rows = slice(offset[here.start], offset[here.stop])
+        clusters_of_level = bundle.level_range(level)
+        rows = slice(offset[clusters_of_level.start], offset[clusters_of_level.stop])
         order = np.argsort(weight[rows], kind="stable")
-        below = np.cumsum(weight[rows][order])
-        is_kept[rows][order[below < share * np.nansum(weight[rows])]] = False
-    kept = np.flatnonzero(is_kept)
-    clusters = replace(bundle.clusters, offset=np.searchsorted(kept, offset))
-    return Bundle(clusters, bundle.groups, bundle.gaussians.subset(kept), bundle.config, bundle.codec)
+        cumulated = np.cumsum(weight[rows][order])
+        is_kept[rows][order[cumulated < share * np.nansum(weight[rows])]] = False
+    kept_rows = np.flatnonzero(is_kept)
+    clusters = replace(bundle.clusters, offset=np.searchsorted(kept_rows, offset))
+    gaussians = bundle.gaussians.subset(kept_rows)
+    return Bundle(clusters, bundle.groups, gaussians, bundle.config, bundle.codec)

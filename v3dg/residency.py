@@ -1,6 +1,6 @@
-"""Residency: what of which bundle and scene is on which device. The only cache of the package.
+"""Residency: which data of bundles and scenes is on which device. It is the only cache of the package.
 
-What is there is freed with its bundle or scene, or by `residency.clear()`.
+Data is freed with its bundle or scene, or by `residency.clear()`.
 """
 
 import atexit
@@ -10,7 +10,7 @@ import threading
 import weakref
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +21,10 @@ from v3dg._urls import is_url
 from v3dg.bundle import Bundle
 from v3dg.bundle.codec import Codec
 from v3dg.false_color import ColorBy, palette_of
-from v3dg.gaussians import Gaussians, gaussian_bytes
+from v3dg.gaussians import Array, Gaussians, gaussian_bytes
 from v3dg.scene import Scene, Subject
 
-_Kept = TypeVar("_Kept")
+_T = TypeVar("_T")
 
 # A GPU decodes quantised bundles once, rather than in each frame and for each instance, up to so many bytes:
 # about what its second-level cache holds. Above, codes are as fast, and take a seventh of the memory.
@@ -32,54 +32,57 @@ MOST_DECODED_BYTES = 48 << 20
 _PACKED_BYTES = 64  # of a gaussian, which frames of a GPU read besides its rows
 _TOO_MANY_BYTES = 1 << 62  # what no memory holds, so that pages come one by one
 
-
-# What a child of a fork makes anew, because threads that it does not have may have been at work on it.
+# Kinds of entries that a child of a fork makes anew, because threads that it does not have may have been at
+# work on them.
 _NOT_INHERITED = ("frame", "pool", "scene")
 
+_NO_VALUE = object()
 
-_NOTHING = object()
 
-
-class _LastOne:
-    """What is kept of the last value that was asked for."""
+class _LastResult:
+    """The result for the last value that was asked for."""
 
     def __init__(self) -> None:
-        self.value: Hashable = _NOTHING
-        self.kept: object = None
+        self.value: Hashable = _NO_VALUE
+        self.result: object = None
 
 
 class ResidentScene:
-    """What selection and frames read of a scene on one device. On the CPU it stays as it is.
+    """The data of a scene that selection and frames read on one device. On the CPU it never changes.
 
     Attributes:
-        core: The compiled module's part.
-        references: To the bundles, another tuple where they have changed.
-        revision: The scene's that is there.
+        core: The part of the compiled module.
+        references: Weak references to the bundles; another tuple where the bundles have changed.
+        revision: The revision of the scene whose data this is.
     """
 
     def __init__(self, device: Device) -> None:
         self.device = device
         self.core = _core.ResidentScene(device.number)
-        # Weak, for a bundle that is drawn by itself would else keep itself alive.
+        # The references are weak, because a bundle that is drawn by itself would keep itself alive otherwise.
         self.references: tuple[weakref.ref[Bundle], ...] = ()
-        self._drawings: weakref.WeakSet[_core.Drawing] = weakref.WeakSet()  # that may be under way
-        self._lock = threading.Lock()  # of that set
+        self._drawings: weakref.WeakSet[_core.Drawing] = weakref.WeakSet()  # drawings that may be under way
+        self._lock = threading.Lock()  # guards that set
         self.revision = (-1, -1, -1)
 
     @property
     def bundles(self) -> tuple[Bundle, ...]:
-        """The bundles whose tables are there."""
+        """The bundles whose tables are on the device."""
         return tuple(bundle for reference in self.references if (bundle := reference()) is not None)
 
     def is_of(self, subject: Subject) -> bool:
-        """Whether the subject is there as it is now; a bundle stays as it is."""
-        return self.revision == subject.revision if isinstance(subject, Scene) else self.revision[0] >= 0
+        """Whether this is the data of the subject's current revision; a bundle never changes."""
+        if isinstance(subject, Scene):
+            return self.revision == subject.revision
+        return self.revision[0] >= 0
 
     def update(self, scene: Scene, tables: list[_core.ClusterTable]) -> None:
-        """Take over what has changed since the last time: the poses, or all instances.
+        """Update what has changed since the last time: the poses, or all instances.
 
-        Frames under way are finished first: one that found a buffer too small will be drawn again. It is a
-        RuntimeError while a CUDA graph is captured.
+        Frames under way are finished first: one that found a buffer too small will be drawn again.
+
+        Raises:
+            RuntimeError: A CUDA graph is being captured.
         """
         if self.device.is_cuda:
             import torch
@@ -96,7 +99,7 @@ class ResidentScene:
             self.core.set_bundles(tables)
             self.references = tuple(map(weakref.ref, scene.bundles))
         if self.device.is_cuda:
-            poses = tuple(self._here(rows) for rows in scene.poses)
+            poses = tuple(self._on_device(rows) for rows in scene.poses)
         else:
             poses = scene.positions, scene.quaternions, scene.scales
         if self.revision[0] == scene.revision[0]:
@@ -111,39 +114,56 @@ class ResidentScene:
             with self._lock:
                 self._drawings.add(drawing)
 
-    def _here(self, rows: Any) -> Any:
-        is_elsewhere = getattr(rows, "is_cuda", False) and rows.device.index != self.device.number
-        return rows.to(str(self.device)) if is_elsewhere else rows
+    def _on_device(self, rows: Array) -> Array:
+        """The rows on this device if they are on another CUDA device, else as they are."""
+        if getattr(rows, "is_cuda", False) and rows.device.index != self.device.number:
+            return rows.to(str(self.device))
+        return rows
 
 
 class Residency:
-    """What is on which device, as long as its bundle or scene lives.
+    """The data of bundles and scenes on devices, as long as the bundle or scene lives.
 
-    Whatever is asked for and is not there is made; several devices may hold the same bundle at once. Adding a
-    bundle to a scene leaves the gaussians of the others where they are.
+    Data that is asked for and does not exist yet is made; several devices may hold the same bundle at once.
+    Adding a bundle to a scene leaves the gaussians of the others where they are.
     """
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
-        self._kept = weakref.WeakKeyDictionary[Scene | Bundle, dict[Hashable, Any]]()
-        self._abandoned: list[Any] = []
+        self._entries = weakref.WeakKeyDictionary[Scene | Bundle, dict[Hashable, object]]()
+        self._abandoned: list[object] = []
         os.register_at_fork(after_in_child=self._after_fork)
 
     def table(self, bundle: Bundle) -> _core.ClusterTable:
         """What selection and drawing read of the bundle's clusters, on the host."""
+        clusters = bundle.clusters
         groups = bundle.groups
-        of_groups = {"ball": groups.ball, "weight": groups.weight, "level": groups.level}
-        columns: dict[str, Any] = vars(bundle.clusters) | of_groups  # the level is that of the groups
-        return self.once(bundle, "table", lambda: _core.ClusterTable(**columns))
 
-    def turn(self, device: Device) -> AbstractContextManager[Any]:
-        """Meanwhile a scene that is on the device stays as it is, for which on CUDA other threads wait."""
-        return self.lock if device.is_cuda else nullcontext()
+        def make() -> _core.ClusterTable:
+            return _core.ClusterTable(
+                ball=groups.ball,
+                weight=groups.weight,
+                level=groups.level,
+                own_group=clusters.own_group,
+                parent_group=clusters.parent_group,
+                box=clusters.box,
+                filter_px2=clusters.filter_px2,
+                antialiased=clusters.antialiased,
+                offset=clusters.offset,
+            )
+
+        return self.once(bundle, "table", make)
+
+    def turn(self, device: Device) -> AbstractContextManager[object]:
+        """Keep scenes that are on the device unchanged inside the context; on CUDA, other threads wait."""
+        if device.is_cuda:
+            return self.lock
+        return nullcontext()
 
     def scene(self, subject: Subject, device: Device, last: ResidentScene | None = None) -> ResidentScene:
-        """The scene on a device as it is now; a bundle as a scene of one.
+        """The data of the current scene on a device; a bundle is a scene of one instance.
 
-        Mostly it is what it was the last time, which is found sooner where that is given.
+        It is mostly the same as the last time, so passing that as ``last`` saves the search.
         """
         if last is not None and last.is_of(subject):
             return last
@@ -157,13 +177,13 @@ class Residency:
             if resident.revision[0] >= 0 and not device.is_cuda:  # on the CPU it stays as it is
                 resident = ResidentScene(device)
             resident.update(scene, [self.table(bundle) for bundle in scene.bundles])
-            self._kept[subject]["scene", device] = resident
+            self._entries[subject]["scene", device] = resident
             return resident
 
     def rows(
         self, bundle: Bundle, clusters: NDArray[np.int32], device: Device
     ) -> tuple[_core.Rows, NDArray[np.int64]]:
-        """Gaussians of the bundle on a device, and where those of (S,) clusters begin among them: (S,)."""
+        """Gaussians of the bundle on a device, and the first row of each of S clusters among them, (S,)."""
         if not self._draws_codes(bundle, device):
             return self.gaussians(bundle, device).rows, bundle.clusters.offset[clusters]
         ids, place = np.unique(clusters, return_inverse=True)
@@ -203,16 +223,19 @@ class Residency:
         return self.once(bundle, ("palette", color_by), lambda: palette_of(bundle, color_by))
 
     def bytes_to_add(self, bundles: Sequence[Bundle], device: Device) -> dict[Device, int]:
-        """What it takes, on the device and on the host, to have all gaussians there that are not yet.
+        """Bytes, by device and host, that the gaussians need which are not on the device yet.
 
-        Those at URLs take more than there is: their pages are fetched as pictures need them."""
+        Bundles at URLs count as more than any memory holds: their pages are fetched as pictures need them.
+        """
         add = {device: 0, CPU: 0}
         for bundle in bundles:
-            if ("model", device) in self._kept.get(bundle, {}):
+            if ("model", device) in self._entries.get(bundle, {}):
                 continue
             is_coded = bundle.codec != Codec.name
-            of_pages = bundle.page_bytes if not is_url(bundle.path or "") else _TOO_MANY_BYTES
-            add[CPU] += 0 if bundle.is_in_memory else of_pages
+            if is_url(bundle.path or "") and not bundle.is_in_memory:
+                add[CPU] += _TOO_MANY_BYTES
+            elif not bundle.is_in_memory:
+                add[CPU] += bundle.page_bytes
             if device.is_cuda or not is_coded:  # the CPU draws codes where they are
                 add[device] += bundle.page_bytes
             if device.is_cuda and not is_coded:
@@ -222,15 +245,21 @@ class Residency:
     def num_bytes(self, device: Device) -> int:
         """Memory that gaussians and tables of all bundles take on a device beside the bundles themselves."""
         with self.lock:
-            kept = list(self._kept.values())
-        models: list[_core.Model] = [of["model", device] for of in kept if ("model", device) in of]
-        tables: list[_core.ClusterTable] = [of["table"] for of in kept if "table" in of]
-        return sum(m.bytes for m in models) + sum(t.bytes_on(device.number) for t in tables)
+            all_entries = list(self._entries.values())
+        num_bytes = 0
+        for entries in all_entries:
+            model = entries.get(("model", device))
+            if isinstance(model, _core.Model):
+                num_bytes += model.bytes
+            table = entries.get("table")
+            if isinstance(table, _core.ClusterTable):
+                num_bytes += table.bytes_on(device.number)
+        return num_bytes
 
     def clear(self) -> None:
-        """Give everything back; what is asked for later is made again."""
+        """Free everything; what is asked for later is made again."""
         with self.lock:
-            self._kept.clear()
+            self._entries.clear()
 
     def _draws_codes(self, bundle: Bundle, device: Device) -> bool:
         """Whether a bundle's gaussians are codes on the device, and not rows."""
@@ -239,38 +268,43 @@ class Residency:
 
         def decoded_bytes() -> int:
             size = bundle.num_gaussians * (_PACKED_BYTES + gaussian_bytes(bundle.sh_degree))
-            taken = sum(of.get(("decoded", device), 0) for of in self._kept.values())
-            return size if size + taken <= MOST_DECODED_BYTES else 0
+            total = size
+            for entries in self._entries.values():
+                total += cast(int, entries.get(("decoded", device), 0))
+            if total > MOST_DECODED_BYTES:
+                return 0
+            return size
 
         return self.once(bundle, ("decoded", device), decoded_bytes) == 0
 
-    def once(self, owner: Scene | Bundle, key: Hashable, make: Callable[[], _Kept]) -> _Kept:
-        """What is kept for a bundle or scene, made where it is not there."""
+    def once(self, owner: Scene | Bundle, key: Hashable, make: Callable[[], _T]) -> _T:
+        """The entry of a bundle or scene with this key, which is made if there is none."""
         with self.lock:
-            owner = owner if isinstance(owner, Bundle) else Scene.of(owner)  # which refuses others
-            kept = self._kept.setdefault(owner, {})
-            if key not in kept:
-                kept[key] = make()
-            return cast(_Kept, kept[key])
+            if not isinstance(owner, Bundle):
+                owner = Scene.of(owner)  # raises for what is no scene
+            entries = self._entries.setdefault(owner, {})
+            if key not in entries:
+                entries[key] = make()
+            return cast(_T, entries[key])
 
-    def last(self, owner: Scene | Bundle, key: Hashable, value: Hashable, make: Callable[[], _Kept]) -> _Kept:
-        """What was made for this value; what was made for another value is given up first."""
+    def last(self, owner: Scene | Bundle, key: Hashable, value: Hashable, make: Callable[[], _T]) -> _T:
+        """The result of ``make`` for this value. The result for another value is given up first."""
         with self.lock:
-            value_and_kept = self.once(owner, key, _LastOne)
-            if value_and_kept.value != value:
-                value_and_kept.kept = None
-                value_and_kept.value = _NOTHING
-                value_and_kept.kept = make()
-                value_and_kept.value = value
-            return cast(_Kept, value_and_kept.kept)
+            last = self.once(owner, key, _LastResult)
+            if last.value != value:
+                last.result = None
+                last.value = _NO_VALUE
+                last.result = make()
+                last.value = value
+            return cast(_T, last.result)
 
     def _after_fork(self) -> None:
         """In the child of a fork: another thread of the parent may have held a lock, or been at work."""
         self.lock = threading.RLock()
-        for kept in self._kept.values():
-            for key in [key for key in kept if isinstance(key, tuple) and key[0] in _NOT_INHERITED]:
-                # Not destroyed: that would wait for threads that the child does not have.
-                self._abandoned.append(kept.pop(key))
+        for entries in self._entries.values():
+            for key in [key for key in entries if isinstance(key, tuple) and key[0] in _NOT_INHERITED]:
+                # They are not destroyed: that would wait for threads that the child does not have.
+                self._abandoned.append(entries.pop(key))
 
 
 residency = Residency()

@@ -317,7 +317,7 @@ def rule_of(
     if tolerance != np.inf:
         tolerance = min(tolerance, MOST_FLOAT)
     if budget is not None:
-        budget = whole(budget, "budget", "a whole number of gaussians, 0 or more", 0, most=(1 << 63) - 1)
+        budget = whole(budget, "budget", "a whole number of gaussians, 0 or more", 0, (1 << 63) - 1)
     one_of(footprint, "footprint", get_args(Footprint))
     factor = 1.0
     if fade is not None:

@@ -8,7 +8,7 @@ import json
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,12 +26,18 @@ from v3dg.rotations import normalised
 
 _NAME = "KHR_gaussian_splatting"
 _SPZ = "KHR_gaussian_splatting_compression_spz_2"
-_MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
-_BYTE, _FLOAT = 5121, 5126
+_MAGIC = 0x46546C67  # "glTF"
+_JSON = 0x4E4F534A  # "JSON"
+_BINARY = 0x004E4942  # "BIN\0"
+_BYTE = 5121
+_FLOAT = 5126
+_ARRAY_BUFFER = 34962
 _DTYPES = {5120: "i1", _BYTE: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _MOST_GAUSSIANS = 1 << 40
 _MOST_JSON = 1 << 20  # bytes
+
+JsonObject: TypeAlias = dict[str, object]
 
 
 def open_file(path: AnyPath) -> AssetFile:
@@ -54,8 +60,42 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
 
 
 def encode(host: Gaussians, *, compressed: bool = False) -> bytes:
-    """A `.glb` file, of NumPy gaussians with values that can be held."""
-    columns: dict[str, NDArray[Any]] = {"POSITION": host.means, f"{_NAME}:SCALE": host.scales}
+    """A `.glb` file of NumPy gaussians, whose values the format can hold."""
+    columns = _columns(host, compressed=compressed)
+    if compressed:
+        parts = [b"".join(spz.encode(host))]
+    else:
+        parts = [values.tobytes() for values in columns.values()]
+    accessors = []
+    for i, (name, values) in enumerate(columns.items()):
+        view: int | None = i
+        if compressed:
+            view = None
+        accessors.append(_accessor(name, values, view))
+    extension: JsonObject = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    document: JsonObject = {"asset": {"version": "2.0", "generator": f"v3dg {__version__}"}}
+    document["extensionsUsed"] = [_NAME]
+    if compressed:
+        extension["extensions"] = {_SPZ: {"bufferView": 0}}
+        document["extensionsUsed"] = [_NAME, _SPZ]
+        document["extensionsRequired"] = [_NAME, _SPZ]
+    attributes = {name: i for i, name in enumerate(columns)}
+    primitive = {"mode": 0, "attributes": attributes, "extensions": {_NAME: extension}}
+    document["scene"] = 0
+    document["scenes"] = [{"nodes": [0]}]
+    document["nodes"] = [{"mesh": 0}]
+    document["meshes"] = [{"primitives": [primitive]}]
+    document["accessors"] = accessors
+    document["bufferViews"] = _buffer_views(parts, are_arrays=not compressed)
+    document["buffers"] = [{"byteLength": sum(map(len, parts))}]
+    text = json.dumps(document, separators=(",", ":")).encode()
+    chunks = _chunk(_JSON, text, b" ") + _chunk(_BINARY, b"".join(parts), b"\0")
+    return struct.pack("<III", _MAGIC, 2, 12 + len(chunks)) + chunks
+
+
+def _columns(host: Gaussians, *, compressed: bool) -> dict[str, NDArray[np.generic]]:
+    """The attributes of gaussians by name, (N, width); if compressed, those that `.spz` does not replace."""
+    columns: dict[str, NDArray[np.generic]] = {"POSITION": host.means, f"{_NAME}:SCALE": host.scales}
     columns[f"{_NAME}:ROTATION"] = np.roll(normalised(host.quats), -1, axis=1).astype(np.float32)
     if compressed:
         color = np.concatenate([host.sh[:, 0] * SH_C0 + 0.5, host.opacities[:, None]], axis=1)
@@ -65,41 +105,40 @@ def encode(host: Gaussians, *, compressed: bool = False) -> bytes:
     for i, name in enumerate(_coefficients(host.sh_degree)):
         if i or not compressed:
             columns[name] = host.sh[:, i]
-    packed = [b"".join(spz.encode(host))] if compressed else [values.tobytes() for values in columns.values()]
-    ends = np.cumsum([0, *map(len, packed)]).tolist()
-    accessors: list[dict[str, Any]] = []
-    for i, (name, values) in enumerate(columns.items()):
-        kind = _FLOAT if values.dtype == np.float32 else _BYTE
-        shape = {"componentType": kind, "count": len(host), "type": _TYPES[values.shape[1]]}
-        place = {} if compressed else {"bufferView": i}
-        accessors.append(shape | place | ({"normalized": True} if kind == _BYTE else {}))
-        if name == "POSITION" and len(host):
-            accessors[-1] |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
-    extension: dict[str, Any] = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    used: dict[str, Any] = {"extensionsUsed": [_NAME]}
-    if compressed:
-        extension["extensions"] = {_SPZ: {"bufferView": 0}}
-        used = {"extensionsUsed": [_NAME, _SPZ], "extensionsRequired": [_NAME, _SPZ]}
-    attributes = {name: i for i, name in enumerate(columns)}
-    primitive = {"mode": 0, "attributes": attributes, "extensions": {_NAME: extension}}
-    document = {
-        "asset": {"version": "2.0", "generator": f"v3dg {__version__}"},
-        **used,
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": first, "byteLength": len(part)}
-            | ({} if compressed else {"target": 34962})  # ARRAY_BUFFER, which validators ask for
-            for first, part in zip(ends, packed, strict=False)
-        ],
-        "buffers": [{"byteLength": ends[-1]}],
+    return columns
+
+
+def _accessor(name: str, values: NDArray[np.generic], view: int | None) -> JsonObject:
+    """The accessor of an attribute and its buffer view; None for gaussians that are compressed."""
+    kind = _BYTE
+    if values.dtype == np.float32:
+        kind = _FLOAT
+    accessor: JsonObject = {
+        "componentType": kind,
+        "count": len(values),
+        "type": _TYPES[values.shape[1]],
     }
-    text = json.dumps(document, separators=(",", ":")).encode()
-    chunks = _chunk(_JSON, text, b" ") + _chunk(_BINARY, b"".join(packed), b"\0")
-    return struct.pack("<III", _MAGIC, 2, 12 + len(chunks)) + chunks
+    if view is not None:
+        accessor["bufferView"] = view
+    if kind == _BYTE:
+        accessor["normalized"] = True
+    if name == "POSITION" and len(values):
+        accessor["min"] = values.min(axis=0).tolist()
+        accessor["max"] = values.max(axis=0).tolist()
+    return accessor
+
+
+def _buffer_views(parts: list[bytes], *, are_arrays: bool) -> list[JsonObject]:
+    """The views of the parts of the binary chunk, one after another."""
+    views = []
+    offset = 0
+    for part in parts:
+        view: JsonObject = {"buffer": 0, "byteOffset": offset, "byteLength": len(part)}
+        if are_arrays:
+            view["target"] = _ARRAY_BUFFER  # validators ask for it
+        views.append(view)
+        offset += len(part)
+    return views
 
 
 def _chunk(kind: int, content: bytes, padding: bytes) -> bytes:
@@ -117,7 +156,9 @@ class _Glb:
     """A file: its JSON, its binary chunk, and the primitives in it that are gaussians, of one SH degree."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._claims, self._expanded = path, Claims(), 0
+        self._path = path
+        self._claims = Claims()
+        self._expanded = 0  # bytes of `.spz` that were decoded
         content = self._claims.read(path)
         check(path, len(content) >= 20, f"a .glb file, glTF 2.0 that is whole, got {len(content)} bytes")
         with telling(path, "a .glb file, glTF 2.0 that is whole"):
@@ -129,21 +170,33 @@ class _Glb:
         kinds = ("accessors", "bufferViews", "buffers")
         self._arrays = {kind: list(self._root.field(kind).items()) for kind in kinds}
         meshes = self._root.field("meshes").items()
-        primitives = (p for mesh in meshes for p in mesh.field("primitives").items())
-        self.primitives = [p for p in primitives if p.has("extensions") and p.field("extensions").has(_NAME)]
+        self.primitives = []
+        for mesh in meshes:
+            for primitive in mesh.field("primitives").items():
+                if primitive.has("extensions") and primitive.field("extensions").has(_NAME):
+                    self.primitives.append(primitive)
         check(path, self.primitives, f"a primitive with {_NAME}, got none; meshes are not read")
-        for node in self._root.field("nodes").items() if self._root.has("nodes") else ():
+        self._check_nodes()
+        self.degree = self._sh_degree()
+
+    def _check_nodes(self) -> None:
+        """Raise ValueError for a node with a transform."""
+        if not self._root.has("nodes"):
+            return
+        for node in self._root.field("nodes").items():
             for name in ("matrix", "translation", "rotation", "scale"):
                 if node.has(name):
                     raise node.problem(f"expected a node without a transform, got {name}; apply it first")
+
+    def _sh_degree(self) -> int:
+        """The SH degree of the primitives; ValueError if they differ."""
         attributes = [primitive.field("attributes") for primitive in self.primitives]
-        names = {f"{_NAME}:SH_DEGREE_{d}_COEF_0": d for d in (1, 2, 3)}
-        degrees = sorted({max((names[n] for n in names if a.has(n)), default=0) for a in attributes})
-        check(path, len(degrees) == 1, f"one SH degree in all primitives, got {degrees}")
-        self.degree = degrees[0]
+        degrees = sorted(set(map(_sh_degree_of, attributes)))
+        check(self._path, len(degrees) == 1, f"one SH degree in all primitives, got {degrees}")
+        return degrees[0]
 
     def _item(self, kind: str, node: Node, field: str) -> Node:
-        """One of the root's arrays' values, by the number in a field."""
+        """The item of one of the root's arrays whose number is in a field of the node."""
         items = self._arrays[kind]
         return items[whole(node.field(field), f"0 to {len(items) - 1}", 0, len(items) - 1)]
 
@@ -156,25 +209,28 @@ class _Glb:
         if extension.has("extensions") and extension.field("extensions").has(_SPZ):
             view = self._item("bufferViews", extension.field("extensions").field(_SPZ), "bufferView")
             content = bytes(self._view(view))
-            self._expanded += len(content)  # so that many primitives cannot have one large stream
-            most = len(self._blob)
-            check(self._path, self._expanded <= most, f"{most} bytes of .spz, got {self._expanded}")
+            self._expanded += len(content)  # limited, so that many primitives cannot share one large stream
+            limit = len(self._blob)
+            check(self._path, self._expanded <= limit, f"{limit} bytes of .spz, got {self._expanded}")
             return spz.decode(self._path, content, self._claims)
-        count, attributes = self.count_of(primitive), primitive.field("attributes")
+        count = self.count_of(primitive)
+        attributes = primitive.field("attributes")
         self._claims.add(self._path, count)
 
         def column(name: str, width: int) -> Callable[[slice], Floats]:
             return self._column(self._item("accessors", attributes, name), count, width)
 
-        mean, scale = column("POSITION", 3), column(f"{_NAME}:SCALE", 3)
-        opacity, quat = column(f"{_NAME}:OPACITY", 1), column(f"{_NAME}:ROTATION", 4)
+        mean = column("POSITION", 3)
+        scale = column(f"{_NAME}:SCALE", 3)
+        opacity = column(f"{_NAME}:OPACITY", 1)
+        quat = column(f"{_NAME}:ROTATION", 4)
         sh = [column(name, 3) for name in _coefficients(self.degree)]
 
-        def decode(rows: slice) -> tuple[NDArray[np.floating[Any]], ...]:
+        def decode(rows: slice) -> tuple[NDArray[np.floating], ...]:
             widths = scale(rows)
             advice = "drafts of the extension had their logs; write the file with a newer program"
             check(self._path, not (widths < 0).any(), f"scales of 0 or more, got less; {advice}")
-            colors = np.stack([of(rows) for of in sh], axis=1)
+            colors = np.stack([coefficient(rows) for coefficient in sh], axis=1)
             return mean(rows), normalised(np.roll(quat(rows), 1, axis=1)), widths, opacity(rows)[:, 0], colors
 
         return assemble(count, self.degree, decode)
@@ -183,28 +239,46 @@ class _Glb:
         """The bytes of a view of the binary chunk."""
         whole(view.field("buffer"), "0, the file's own buffer", 0, 0)
         first = _offset(view, len(self._blob))
-        most = len(self._blob) - first
-        return self._blob[first : first + whole(view.field("byteLength"), f"at most {most} bytes", 0, most)]
+        limit = len(self._blob) - first
+        num_bytes = whole(view.field("byteLength"), f"at most {limit} bytes", 0, limit)
+        return self._blob[first : first + num_bytes]
 
     def _column(self, accessor: Node, count: int, width: int) -> Callable[[slice], Floats]:
-        """What gives an attribute's rows, in double precision."""
-        kind, view = accessor.field("componentType"), self._item("bufferViews", accessor, "bufferView")
+        """A function from a slice to these rows of an attribute, in double precision."""
+        kind = accessor.field("componentType")
+        view = self._item("bufferViews", accessor, "bufferView")
         if not isinstance(kind.value, int) or kind.value not in _DTYPES:
             raise kind.error(f"one of {', '.join(map(str, _DTYPES))}")
         if accessor.field("type").value != _TYPES[width]:
             raise accessor.field("type").error(_TYPES[width])
         whole(accessor.field("count"), f"{count}, as POSITION has", count, count)
-        dtype, content = np.dtype(_DTYPES[kind.value]), self._view(view)
+        dtype = np.dtype(_DTYPES[kind.value])
+        content = self._view(view)
         size = dtype.itemsize * width
-        stride = whole(view.field("byteStride"), "4 to 252", 4, 252) if view.has("byteStride") else size
+        stride = size
+        if view.has("byteStride"):
+            stride = whole(view.field("byteStride"), "4 to 252", 4, 252)
         first = _offset(accessor, len(content))
         if count and first + (count - 1) * stride + size > len(content):
             raise accessor.problem(f"expected {count} values in its view, got {len(content)} bytes")
         rows = np.ndarray((count, width), dtype, content, first, (stride, dtype.itemsize))
-        is_share = dtype.kind != "f" and accessor.has("normalized") and accessor.field("normalized").value
-        largest, least = (float(np.iinfo(dtype).max), -1.0) if is_share else (1.0, -np.inf)
-        return lambda block: np.maximum(rows[block].astype(np.float64) / largest, least)
+        divisor = 1.0
+        lower_bound = -np.inf
+        if dtype.kind != "f" and accessor.has("normalized") and accessor.field("normalized").value:
+            divisor = float(np.iinfo(dtype).max)
+            lower_bound = -1.0
+        return lambda block: np.maximum(rows[block].astype(np.float64) / divisor, lower_bound)
 
 
-def _offset(node: Node, most: int) -> int:
-    return whole(node.field("byteOffset"), f"0 to {most}", 0, most) if node.has("byteOffset") else 0
+def _sh_degree_of(attributes: Node) -> int:
+    """The SH degree of a primitive, by the names of its attributes."""
+    for degree in (3, 2, 1):
+        if attributes.has(f"{_NAME}:SH_DEGREE_{degree}_COEF_0"):
+            return degree
+    return 0
+
+
+def _offset(node: Node, limit: int) -> int:
+    if not node.has("byteOffset"):
+        return 0
+    return whole(node.field("byteOffset"), f"0 to {limit}", 0, limit)

@@ -96,15 +96,15 @@ def render(
         RuntimeError: `device` is "cuda" and something is missing for it.
     """
     chosen_device = _device.resolve(device)
-    shown = opened(subject)
+    opened_subject = opened(subject)
     one_of(color_by, "color_by", get_args(ColorBy))
-    frame = _still_frame(shown, color_by, chosen_device, pool_bytes(memory))
+    frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     request = CutRequest(tolerance, budget, min_level, fade)
-    shade = shade_of(background, min_transmittance, isinstance(shown, Gaussians), depth)
+    shade = shade_of(background, min_transmittance, isinstance(opened_subject, Gaussians), depth)
 
     def picture(view: Camera | StereoCamera) -> Picture:
         check_camera(view)
-        return frame.draw_settled(shown, view, request, shade, cut)
+        return frame.draw_settled(opened_subject, view, request, shade, cut)
 
     pictures: Picture | list[Picture] = for_each(camera, picture)
     return cast("RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]", pictures)

@@ -87,7 +87,8 @@ class AutoFrame:
     def chosen(self, subject: Subject) -> SceneFrame | PoolFrame:
         """The frame that the subject is drawn with now."""
         with residency.turn(self.device):
-            self._resident = resident = residency.scene(subject, self.device, self._resident)
+            resident = residency.scene(subject, self.device, self._resident)
+            self._resident = resident
             if self._references is not resident.references:
                 self._choose(resident)
             return self._frame

@@ -65,7 +65,8 @@ class PoolFrame:
         with residency.lock:
             bundles = resident.bundles
             tables = [residency.table(bundle) for bundle in bundles]
-            self._pool = pool = None  # Its memory may be needed.
+            pool = None  # both references end, because the memory of the pool may be needed
+            self._pool = None
             pool = self._slot.pool(bundles, tables, self.device, self._num_bytes)
             self._pool = pool
             self._references = resident.references
@@ -91,7 +92,8 @@ class PoolFrame:
         """
         _refuse_cut(cut)
         with residency.turn(self.device):
-            self._resident = resident = residency.scene(subject, self.device, self._resident)
+            resident = residency.scene(subject, self.device, self._resident)
+            self._resident = resident
             pool = self.take(resident)
             picture = self._enqueue(resident, pool, camera, request, shade, steps, stop, look)
         if not self.device.is_cuda:
@@ -117,7 +119,7 @@ class PoolFrame:
                 revision = resident.revision
                 pool = self.take(resident)
             with pool.lease:
-                pool.settle(resident, (camera.core, request.rule), _STILL_TIMEOUT_SECONDS, math.inf)
+                pool.settle(resident, camera.core, request.rule, _STILL_TIMEOUT_SECONDS, math.inf)
                 with residency.turn(self.device):
                     if resident.revision != revision:  # Another thread has changed the scene meanwhile.
                         continue
@@ -140,7 +142,7 @@ class PoolFrame:
             resident = residency.scene(subject, self.device)
             pool = self.take(resident)
         with pool.lease:
-            pool.settle(resident, (camera.core, rule), timeout, seconds)
+            pool.settle(resident, camera.core, rule, timeout, seconds)
         self._has_settled = True
 
     def pick(
@@ -162,11 +164,20 @@ class PoolFrame:
         stop: _core.Stop | None,
         look: PoolLook | None,
     ) -> Picture:
-        rule = request.rule
-        before = pool.core.status().bytes_in
-        shown = (look or self._look).options(resident.bundles)
+        bytes_in_at_start = pool.core.status().bytes_in
+        look = look or self._look
         drawing = self._core.draw_resident(
-            resident.core, pool.core, camera.core, rule, shade, stop, steps, **shown
+            resident.core,
+            pool.core,
+            camera.core,
+            request.rule,
+            shade,
+            stop,
+            steps,
+            shows=look.shows,
+            colors=look.palettes(resident.bundles),
+            chooser=look.core_chooser,
+            aside=look.aside,
         )
         status = pool.core.status()
         resident.add_drawing(drawing)
@@ -179,7 +190,7 @@ class PoolFrame:
             return stats_of(stats, stats.tolerance_px2)._replace(
                 missing=status.missing,
                 failed=status.failed,
-                bytes_in=status.bytes_in - before,
+                bytes_in=status.bytes_in - bytes_in_at_start,
                 memory=pool.num_bytes,
             )
 
@@ -188,8 +199,9 @@ class PoolFrame:
 
 def _finish(picture: Picture) -> None:
     """Wait for a picture, and raise what went wrong."""
-    first = picture[0] if isinstance(picture, tuple) else picture
-    first.stats  # noqa: B018
+    if isinstance(picture, tuple):
+        picture = picture[0]
+    picture.stats  # noqa: B018
 
 
 def _refuse_cut(cut: Selection | None) -> None:

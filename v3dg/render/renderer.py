@@ -84,7 +84,9 @@ class Renderer:
         return self._frame.memory
 
     def __repr__(self) -> str:
-        memory = "all is resident" if self.memory is None else f"a pool of {in_mib(self.memory)}"
+        memory = "all is resident"
+        if self.memory is not None:
+            memory = f"a pool of {in_mib(self.memory)}"
         return f"Renderer({self._subject!r}, {self._frame.device}, {memory})"
 
     @property
@@ -98,7 +100,9 @@ class Renderer:
         frame = self._frame
         if isinstance(frame, AutoFrame):
             frame = frame.chosen(self._subject)
-        return frame if isinstance(frame, PoolFrame) else None
+        if isinstance(frame, PoolFrame):
+            return frame
+        return None
 
     @overload
     def render(self, camera: Camera, **options: Unpack[_Options]) -> RenderedImage: ...

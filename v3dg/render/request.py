@@ -62,5 +62,7 @@ def shade_of(
         stop = -1.0
     else:
         stop = DEFAULT_MIN_TRANSMITTANCE
-    behind = list(BLACK) if background is BLACK else color(background, "background")
-    return _core.Shade(background=behind, min_transmittance=stop, with_depth=bool(depth))
+    checked_background = list(BLACK)
+    if background is not BLACK:
+        checked_background = color(background, "background")
+    return _core.Shade(background=checked_background, min_transmittance=stop, with_depth=bool(depth))

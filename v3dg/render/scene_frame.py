@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from v3dg import _core
 from v3dg._device import Device
@@ -10,6 +10,7 @@ from v3dg._numbers import check, check_type
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, StereoCamera
 from v3dg.false_color import ColorBy
+from v3dg.gaussians import Array
 from v3dg.image import RenderedImage, Stats
 from v3dg.render.picture import Picture, picture_of, stats_of
 from v3dg.render.request import CutRequest
@@ -77,7 +78,8 @@ class SceneFrame:
             return self.draw_cut(subject, camera, request, shade, cut)
         rule = request.rule
         with residency.turn(self.device):
-            self._resident = resident = residency.scene(subject, self.device, self._resident)
+            resident = residency.scene(subject, self.device, self._resident)
+            self._resident = resident
             self.take(resident)
             drawing = self.core.draw(resident.core, camera.core, rule, shade, stop, steps)
             resident.add_drawing(drawing)
@@ -106,16 +108,20 @@ class SceneFrame:
     ) -> RenderedImage:
         """Draw a cut that was selected before."""
         with residency.turn(self.device):
-            self._resident = resident = residency.scene(subject, self.device, self._resident)
+            resident = residency.scene(subject, self.device, self._resident)
+            self._resident = resident
             self.take(resident)
             _check_cut(cut, subject, resident, request)
+            weights = None
+            if cut.given_weights is not None:
+                weights = self._on_device(cut.given_weights)
             drawing = self.core.draw_cut(
                 resident.core,
                 camera.core,
                 self._on_device(cut.instance_ids),
                 self._on_device(cut.cluster_ids),
                 shade,
-                weights=None if cut.given_weights is None else self._on_device(cut.given_weights),
+                weights=weights,
             )
             resident.add_drawing(drawing)
 
@@ -126,7 +132,7 @@ class SceneFrame:
             finish()
         return RenderedImage(drawing, finish)
 
-    def _on_device(self, values: Any) -> Any:
+    def _on_device(self, values: Array) -> Array:
         if not self.device.is_cuda:
             return values
         import torch
