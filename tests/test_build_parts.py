@@ -251,7 +251,7 @@ def test_what_a_killed_build_left_of_a_file_is_written_over(asset, tmp_path):
     v3dg.write_asset(tmp_path / "asset.ply", asset)
     left = [levels_path(tmp_path / f"{name}.v3dg") for name in "ab"]
     for path in left:
-        path.write_bytes(bytes(10_000_000))
+        path.write_bytes(bytes(8) + b"unfinished v3dg 1\n" + bytes(10_000_000))
     options = {"config": SMALL, "progress": False, "device": "cpu"}
     bundle, _ = build_file(tmp_path / "asset.ply", tmp_path / "a.v3dg", **options)
     assert bundle.info()["bytes"] == (tmp_path / "a.v3dg").stat().st_size

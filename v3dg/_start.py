@@ -8,6 +8,7 @@ clean up and ends the process at once; from then on it raises KeyboardInterrupt.
 from __future__ import annotations
 
 import _signal as signal  # type: ignore[import-not-found] # all but enumerations of its names
+import importlib
 import os
 import sys
 
@@ -29,7 +30,7 @@ def refuse_sub_interpreter() -> None:
     """
     for name in ("_interpreters", "_xxsubinterpreters"):  # since Python 3.13, and before
         try:
-            interpreters = __import__(name)
+            interpreters = importlib.import_module(name)
         except ImportError:
             continue
         if interpreters.get_current() != interpreters.get_main():
