@@ -1,5 +1,6 @@
-"""The C++ example: the core draws a scene without Python."""
+"""The core without Python: the C++ example draws a scene, and the library is configured alone."""
 
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -24,3 +25,20 @@ def test_core_draws_a_scene_without_python(tmp_path):
     # A ball on either side, the right one smaller.
     left, right = shown[:, :160].sum(), shown[:, 160:].sum()
     assert 0.1 < right / shown.size < left / shown.size < 0.4
+
+
+def test_the_library_is_configured_without_what_it_is_measured_with(tmp_path):
+    """As a package of the system may have it: neither benchmarks/ nor examples/ are there."""
+    pybind11 = pytest.importorskip("pybind11")
+    if shutil.which("cmake") is None or shutil.which("ninja") is None:
+        pytest.skip("needs cmake and ninja")
+    for name in ("CMakeLists.txt", "csrc"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    arguments = ["-G", "Ninja", "-DV3DG_CUDA=OFF", f"-Dpybind11_DIR={pybind11.get_cmake_dir()}"]
+    done = subprocess.run(
+        ["cmake", "-S", tmp_path, "-B", tmp_path / "build", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
