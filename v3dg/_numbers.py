@@ -30,8 +30,9 @@ def floats(values: object, name: str, expected: str = "numbers") -> Floats:
     """A new array of doubles, from numbers, arrays or torch's tensors; ValueError unless all are finite."""
     try:
         if hasattr(values, "detach"):
-            values = cast(_Tensor, values).numpy(force=True)
-        array = np.asarray(values)
+            array = np.asarray(cast(_Tensor, values).numpy(force=True))
+        else:
+            array = np.asarray(values)
         if array.dtype.kind not in "biufO":
             raise TypeError
         with np.errstate(over="ignore"):
