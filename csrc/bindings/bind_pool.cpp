@@ -284,8 +284,7 @@ void bind_pool(py::module_& m) {
         .def(
             "wait", [](BoundPool& p, double seconds) { return p.pool().wait(seconds); }, "seconds"_a,
             py::call_guard<Unlocked>(), "Waits for pages; whether there are any to bring.")
-        .def(
-            "read_one", [](BoundPool& p) { return p.pool().read_one(); }, py::call_guard<Unlocked>());
+        .def("read_one", [](BoundPool& p) { return p.pool().read_one(); }, py::call_guard<Unlocked>());
 }
 
 }  // namespace v3dg

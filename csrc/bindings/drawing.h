@@ -59,9 +59,9 @@ struct FrameStats {
 };
 
 inline FrameStats stats_of(const SceneFrameCounts& c) {
-    return {c.gaussians,     c.render.in_frustum, c.render.records,       c.render.entries,     0,
-            c.tolerance_px2, c.exceeds_budget,    1e3 * c.select_seconds, 1e3 * c.draw_seconds, c.levels,
-            1};
+    return {
+        c.gaussians,      c.render.in_frustum,    c.render.records,     c.render.entries, 0, c.tolerance_px2,
+        c.exceeds_budget, 1e3 * c.select_seconds, 1e3 * c.draw_seconds, c.levels,         1};
 }
 
 // The pictures of a frame: of a camera, or of two eyes, left first.

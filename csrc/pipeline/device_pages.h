@@ -60,8 +60,8 @@ class DevicePages {
     // What the pool says that the frame which began last is drawn with.
     SelectRule raised(SelectRule rule) const;
 
-    // Cuts the scene without drawing, and waits until the pool has decided about what that needs. `begins`: it
-    // forgets earlier frames before (PagePool::begin_settling).
+    // Cuts the scene without drawing, and waits until the pool has decided about what that needs. `begins`:
+    // it forgets earlier frames before (PagePool::begin_settling).
     SettlingStep settle_step(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, bool begins,
                              cudaStream_t stream);
 

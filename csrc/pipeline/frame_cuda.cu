@@ -78,15 +78,15 @@ void Frame::enlarge(const FrameCounters& counters) {
         throw std::length_error("gaussians: expected at most " + std::to_string(kMostFrameRecords) +
                                 " in one frame, got " + std::to_string(counters.gaussians));
     // Growing takes as long as several frames. So buffers grow seldom, all that are nearly full together, by
-    // some more than was counted, and before the next frame of a moving camera exceeds one and is drawn twice.
+    // some more than was counted, and before the next frame of a moving camera exceeds one and is drawn
+    // twice.
     const auto is_full = [](unsigned long long capacity, unsigned long long count, unsigned free_part) {
         return count > capacity - capacity / free_part;
     };
-    const bool grows = is_full(capacity_.items, counters.items, 32) ||
-                       is_full(capacity_.records, counters.gaussians, 32) ||
-                       is_full(capacity_.large, counters.large, 32) ||
-                       is_full(capacity_.entries, counters.entries, 32) ||
-                       is_full(capacity_.spread, counters.spread, 32);
+    const bool grows =
+        is_full(capacity_.items, counters.items, 32) || is_full(capacity_.records, counters.gaussians, 32) ||
+        is_full(capacity_.large, counters.large, 32) || is_full(capacity_.entries, counters.entries, 32) ||
+        is_full(capacity_.spread, counters.spread, 32);
     if (!grows) return;
     const Capacity before = capacity_;
     const auto grow = [is_full](unsigned long long& capacity, unsigned long long count) {
