@@ -161,10 +161,9 @@ def frame_of(
         frame = SceneFrame(color_by, device)
     else:
         frame = AutoFrame(color_by, device, slot)
+    if isinstance(frame, AutoFrame):
+        frame.chosen(subject)
+        return frame
     with residency.turn(device):
-        resident = residency.scene(subject, device)
-        if isinstance(frame, AutoFrame):
-            frame.chosen(subject)
-        else:
-            frame.take(resident)
+        frame.take(residency.scene(subject, device))
     return frame
