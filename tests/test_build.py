@@ -20,11 +20,11 @@ from benchmarks.worlds.procedural import make_asset
 from reference import project as reference_project
 from v3dg import BuildConfig, Camera, Gaussians, _core, build_bundle, metrics, rasterize, render, select
 from v3dg._device import CPU, place, resolve
-from v3dg.build.leaves import MemoryLeaves
-from v3dg.build.plan import Plan
-from v3dg.build.simplify import Level, LevelTables
-from v3dg.build.smooth import measured_config
 from v3dg.bundle.codec import codec_of
+from v3dg.levels.leaves import MemoryLeaves
+from v3dg.levels.plan import Plan
+from v3dg.levels.simplify import Level, LevelTables
+from v3dg.levels.smooth import measured_config
 
 SMALL = BuildConfig(cluster_size=32, steps=10)
 TABLES = {"clusters": v3dg.Clusters, "groups": v3dg.Groups}
@@ -246,7 +246,7 @@ def test_level_1_is_selected_later_where_it_is_worse_than_its_leaves(device):
 
 
 def test_level_1_of_what_is_built_in_parts_is_selected_at_half_the_size(device, monkeypatch):
-    monkeypatch.setattr("v3dg.build.whole.UNIT_LEAVES", 400)
+    monkeypatch.setattr("v3dg.levels.whole.UNIT_LEAVES", 400)
     options = {"asset": shell(1.1, 1.1), "device": device}
     smooth, plain = (
         build(config=replace(SMOOTH, smooth=s, filter_px2=0.0), **options) for s in ("yes", "no")
@@ -315,7 +315,7 @@ def test_smoothness_is_measured_all_over_the_asset(num_gaussians, missed, is_smo
         error[:, 0] *= missed if builder.config.filter_px2 == 0 else 1
         yield from [Level(asset, LevelTables(None, None, None, error))] * len(builder.plan.levels)
 
-    monkeypatch.setattr("v3dg.build.simplify.LevelBuilder.levels", levels)
+    monkeypatch.setattr("v3dg.levels.simplify.LevelBuilder.levels", levels)
     found = measured_config(config, plan, leaves, 5, codec_of("float32", 1), CPU)
     assert found == (replace(config, smooth="yes", filter_px2=0.0) if is_smooth else config)
     count = min(32, num_groups)

@@ -19,7 +19,7 @@ import v3dg
 from benchmarks.worlds.procedural import make_asset
 from command_line import ENVIRONMENT, PACKAGE, fails, run
 from v3dg import BuildConfig, _core, build_bundle
-from v3dg.build import build_file, levels_path, scheduler
+from v3dg.levels import build_file, levels_path, scheduler
 
 CONFIG = BuildConfig(cluster_size=32, steps=150, first_steps=150)
 OPTIONS = {"config": CONFIG, "progress": False, "device": "cpu"}
@@ -40,7 +40,7 @@ def folder(tmp_path_factory):
 def small_units():
     """For the driver alone: workers get the plan of their unit with it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("v3dg.build.whole.UNIT_LEAVES", 500)
+        patch.setattr("v3dg.levels.whole.UNIT_LEAVES", 500)
         yield
 
 
@@ -103,7 +103,7 @@ def test_a_process_that_dies_leaves_what_can_be_gone_on_with(folder, tmp_path, a
 
 def test_an_executor_goes_on_in_the_midst_of_units(folder, tmp_path, monkeypatch):
     """Where one process was interrupted."""
-    output, left, simplify = tmp_path / "out.v3dg", [8], v3dg.build.simplify.LevelBuilder._simplify
+    output, left, simplify = tmp_path / "out.v3dg", [8], v3dg.levels.simplify.LevelBuilder._simplify
 
     def some(*arguments):
         left[0] -= 1
@@ -112,7 +112,7 @@ def test_an_executor_goes_on_in_the_midst_of_units(folder, tmp_path, monkeypatch
         return simplify(*arguments)
 
     with small_units(), monkeypatch.context() as patch:
-        patch.setattr("v3dg.build.simplify.LevelBuilder._simplify", some)
+        patch.setattr("v3dg.levels.simplify.LevelBuilder._simplify", some)
         with pytest.raises(KeyboardInterrupt):
             build_file(folder / "a.ply", output, **OPTIONS)
     with ThreadPoolExecutor(2) as executor:
@@ -310,8 +310,8 @@ def goes_on_alone(folder, output):
 @pytest.mark.slow
 def test_a_scheduler_that_stops_in_the_midst_is_not_waited_for(meddled_build, folder, monkeypatch):
     build, output, address = meddled_build
-    monkeypatch.setattr("v3dg.build.scheduler._MOST_SILENCE_S", 4)
-    monkeypatch.setattr("v3dg.build.scheduler._TICK_S", 0.5)
+    monkeypatch.setattr("v3dg.levels.scheduler._MOST_SILENCE_S", 4)
+    monkeypatch.setattr("v3dg.levels.scheduler._TICK_S", 0.5)
     with pytest.raises(RuntimeError, match=rf"^scheduler {address}: no answer for 4 s; .*units are kept"):
         build(lambda pid: os.kill(pid, signal.SIGSTOP))
     goes_on_alone(folder, output)
@@ -319,8 +319,8 @@ def test_a_scheduler_that_stops_in_the_midst_is_not_waited_for(meddled_build, fo
 
 @pytest.mark.slow
 def test_a_scheduler_that_is_slow_to_answer_is_waited_for(meddled_build, monkeypatch):
-    monkeypatch.setattr("v3dg.build.scheduler._MOST_SILENCE_S", 30)
-    monkeypatch.setattr("v3dg.build.scheduler._TICK_S", 0.2)
+    monkeypatch.setattr("v3dg.levels.scheduler._MOST_SILENCE_S", 30)
+    monkeypatch.setattr("v3dg.levels.scheduler._TICK_S", 0.2)
     build, _, _ = meddled_build
     went_on = threading.Event()
 

@@ -10,16 +10,16 @@ import scenes
 import v3dg
 from benchmarks.worlds.procedural import make_asset
 from v3dg import BuildConfig, Gaussians, _core, build_bundle
-from v3dg.build import build_file, levels_path
-from v3dg.build.assemble import assemble
-from v3dg.build.fit import fit_config
-from v3dg.build.leaves import MemoryLeaves
-from v3dg.build.plan import Plan
-from v3dg.build.simplify import Level, LevelBuilder, LevelTables
 from v3dg.bundle.codec import CODECS, codec_of
 from v3dg.bundle.file import BundlePlan, write_pages
 from v3dg.bundle.format import HASH_BYTES
 from v3dg.bundle.pages import PageLayout
+from v3dg.levels import build_file, levels_path
+from v3dg.levels.assemble import assemble
+from v3dg.levels.fit import fit_config
+from v3dg.levels.leaves import MemoryLeaves
+from v3dg.levels.plan import Plan
+from v3dg.levels.simplify import Level, LevelBuilder, LevelTables
 
 SMALL = BuildConfig(cluster_size=32, steps=4, num_views=4, supersample=2)
 CONFIGS = {
@@ -185,7 +185,7 @@ def test_subtrees_in_any_order_make_the_same_file(asset, name, codec, tmp_path):
 def test_units_are_the_same_on_any_number_of_threads(asset, name, codec, monkeypatch, tmp_path):
     """And an interrupted build goes on to the same bytes, whichever units were finished."""
     config = CONFIGS[name]
-    monkeypatch.setattr("v3dg.build.whole.UNIT_LEAVES", 160)
+    monkeypatch.setattr("v3dg.levels.whole.UNIT_LEAVES", 160)
     whole = build_bundle(asset, config=config, seed=SEED, progress=False, device="cpu", codec=codec)
     whole.write(tmp_path / "one.v3dg")
     monkeypatch.setattr("v3dg._device.all_like", lambda device: [device] * 3)
@@ -202,9 +202,9 @@ def test_units_are_the_same_on_any_number_of_threads(asset, name, codec, monkeyp
             raise KeyboardInterrupt
         return simplify(*arguments)
 
-    simplify = v3dg.build.simplify.LevelBuilder._simplify
+    simplify = v3dg.levels.simplify.LevelBuilder._simplify
     with monkeypatch.context() as patch:
-        patch.setattr("v3dg.build.simplify.LevelBuilder._simplify", some)
+        patch.setattr("v3dg.levels.simplify.LevelBuilder._simplify", some)
         with pytest.raises(KeyboardInterrupt):
             build_bundle(asset, resume_path=tmp_path / "levels", **three)
     build_bundle(asset, resume_path=tmp_path / "levels", **three).write(tmp_path / "resumed.v3dg")
@@ -286,11 +286,11 @@ def test_an_interrupted_file_leaves_its_levels_alone(asset, tmp_path, monkeypatc
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("v3dg.build.whole.assemble", interrupt)
+        patch.setattr("v3dg.levels.whole.assemble", interrupt)
         with pytest.raises(KeyboardInterrupt):
             build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", **options)
     assert {p.name for p in tmp_path.iterdir()} == {"asset.ply", levels_path("out.v3dg").name}
-    monkeypatch.setattr("v3dg.build.simplify.LevelBuilder._simplify", interrupt)
+    monkeypatch.setattr("v3dg.levels.simplify.LevelBuilder._simplify", interrupt)
     bundle, is_built = build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options)
     assert is_built
     assert bundle.num_levels == len(Plan.of(len(asset), SMALL).levels)

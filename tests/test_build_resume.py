@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 
 import v3dg
-import v3dg.build
+import v3dg.levels
 from benchmarks.worlds.procedural import make_asset
 from random_bundle import random_gaussians
 from v3dg import BuildConfig, _files, build_bundle
-from v3dg.build import leaves_on_disk
-from v3dg.build.digest import digest_of
-from v3dg.build.unfinished import _open_locked
 from v3dg.bundle.file import BundlePlan
+from v3dg.levels import leaves_on_disk
+from v3dg.levels.digest import digest_of
+from v3dg.levels.unfinished import _open_locked
 
 CONFIG = BuildConfig(cluster_size=32, steps=400, first_steps=400)
 # Runs for days; only the first level's checkpoint would end it.
@@ -153,7 +153,7 @@ def checkpoint(asset, tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("v3dg.build.whole.assemble", interrupt)
+        patch.setattr("v3dg.levels.whole.assemble", interrupt)
         with pytest.raises(KeyboardInterrupt):
             build_bundle(asset, config=QUICK, progress=False, resume_path=tmp_path / "levels")
     return tmp_path / "levels"
@@ -169,7 +169,7 @@ def test_finished_levels_are_not_built_again(asset, checkpoint, monkeypatch):
     def fail(*_):
         raise AssertionError("built a level again")
 
-    monkeypatch.setattr("v3dg.build.simplify.LevelBuilder._simplify", fail)
+    monkeypatch.setattr("v3dg.levels.simplify.LevelBuilder._simplify", fail)
     assert build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint).num_levels > 3
 
 
@@ -217,7 +217,7 @@ def test_a_kill_while_it_becomes_a_bundle_loses_nothing(
     def fail(*_):
         raise AssertionError("built a level again")
 
-    monkeypatch.setattr("v3dg.build.simplify.LevelBuilder._simplify", fail)
+    monkeypatch.setattr("v3dg.levels.simplify.LevelBuilder._simplify", fail)
     with monkeypatch.context() as patch:
         patch.setattr(target, killed)
         with pytest.raises(KeyboardInterrupt):
@@ -244,7 +244,7 @@ def test_checkpoint_of_another_build_is_refused(asset, checkpoint, changed, monk
     elif changed == "device":
         monkeypatch.setattr("v3dg._device.describe", lambda _: "another")
     else:
-        monkeypatch.setattr("v3dg.build.unfinished.__version__", "0.0.0")
+        monkeypatch.setattr("v3dg.levels.unfinished.__version__", "0.0.0")
     with pytest.raises(ValueError, match="another asset, config, seed, device or version; remove it"):
         build_bundle(asset, config=config, seed=seed, progress=False, resume_path=checkpoint)
     assert checkpoint.read_bytes() == before
@@ -290,14 +290,14 @@ def test_a_second_build_to_the_same_place_is_refused(asset, tmp_path):
         wait_for_growth(tmp_path / "levels", process)
         for use in (
             lambda: build_bundle(asset, config=QUICK, progress=False, resume_path=tmp_path / "levels"),
-            lambda: v3dg.build.discard_levels(tmp_path / "levels"),
+            lambda: v3dg.levels.discard_levels(tmp_path / "levels"),
         ):
             with pytest.raises(RuntimeError, match="levels: another build is using it; wait for it"):
                 use()
         assert process.poll() is None
         assert names_in(tmp_path) == ["levels"]
-    v3dg.build.discard_levels(tmp_path / "levels")
-    v3dg.build.discard_levels(tmp_path / "levels")
+    v3dg.levels.discard_levels(tmp_path / "levels")
+    v3dg.levels.discard_levels(tmp_path / "levels")
     assert names_in(tmp_path) == []
 
 
@@ -323,7 +323,7 @@ def test_links_at_the_levels_are_refused(asset, checkpoint, tmp_path, target):
     checkpoint.symlink_to(tmp_path / target)
     for use in (
         lambda: build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint),
-        lambda: v3dg.build.discard_levels(checkpoint),
+        lambda: v3dg.levels.discard_levels(checkpoint),
     ):
         with pytest.raises(ValueError, match="levels: expected a file of levels, got a link; remove it"):
             use()
@@ -345,7 +345,7 @@ def test_a_lock_on_a_file_that_was_removed_is_none(tmp_path, monkeypatch):
         locked.append(name)
 
     locked = []
-    monkeypatch.setattr("v3dg.build.unfinished.lock", lock)
+    monkeypatch.setattr("v3dg.levels.unfinished.lock", lock)
     with _open_locked(path) as file:
         assert os.path.samestat(os.fstat(file.fileno()), path.stat())
     assert len(locked) == 2
@@ -354,9 +354,11 @@ def test_a_lock_on_a_file_that_was_removed_is_none(tmp_path, monkeypatch):
 def test_levels_that_a_kill_left_beside_a_bundle_are_removed(asset, tmp_path):
     v3dg.write_asset(tmp_path / "asset.ply", asset)
     options = {"config": QUICK, "progress": False}
-    v3dg.build.build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", **options)
+    v3dg.levels.build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", **options)
     (tmp_path / "out.v3dg.partial").touch()
-    _, is_built = v3dg.build.build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options)
+    _, is_built = v3dg.levels.build_file(
+        tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options
+    )
     assert not is_built
     assert names_in(tmp_path) == ["asset.ply", "out.v3dg"]
 
@@ -367,7 +369,7 @@ def test_what_is_no_levels_stays(asset, tmp_path):
     (tmp_path / "out.v3dg.partial").write_text("a download that goes on")
     for resume in (False, True):
         with pytest.raises(ValueError, match=r"out\.v3dg\.partial: .*(move it elsewhere|something else)"):
-            v3dg.build.build_file(
+            v3dg.levels.build_file(
                 tmp_path / "asset.ply", tmp_path / "out.v3dg", config=QUICK, progress=False, resume=resume
             )
     assert (tmp_path / "out.v3dg.partial").read_text() == "a download that goes on"
@@ -376,7 +378,7 @@ def test_what_is_no_levels_stays(asset, tmp_path):
 def test_a_bundle_that_was_not_moved_yet_is_discarded(asset, tmp_path):
     v3dg.build_bundle(asset, config=QUICK, progress=False).write(tmp_path / "out.v3dg")
     (tmp_path / "out.v3dg").rename(tmp_path / "out.v3dg.partial")
-    v3dg.build.discard_levels(tmp_path / "out.v3dg.partial")
+    v3dg.levels.discard_levels(tmp_path / "out.v3dg.partial")
     assert names_in(tmp_path) == []
 
 
@@ -420,13 +422,13 @@ def tiles(tmp_path_factory):
 @pytest.fixture
 def bounded(tiles, monkeypatch):
     """Builds the tiles on the disk and in several units, as if they were many and memory small."""
-    monkeypatch.setattr("v3dg.build.whole.UNIT_LEAVES", 400)
+    monkeypatch.setattr("v3dg.levels.whole.UNIT_LEAVES", 400)
     sizes = leaves_on_disk._Sizes(in_memory=0, in_block=1 << 16, in_node=700, in_bucket=300)
     monkeypatch.setattr(leaves_on_disk._Sizes, "of", lambda *_: sizes)
     config = BuildConfig(cluster_size=32, steps=0, num_views=1)
 
     def build(output):
-        v3dg.build.build_file(tiles, output, config=config, progress=False, device="cpu", resume=True)
+        v3dg.levels.build_file(tiles, output, config=config, progress=False, device="cpu", resume=True)
         return output.read_bytes()
 
     return build

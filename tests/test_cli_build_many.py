@@ -10,8 +10,8 @@ import pytest
 import v3dg
 from benchmarks.worlds.procedural import make_asset
 from command_line import COMMAND, ENVIRONMENT, fails, run
-from v3dg.build import build_file
 from v3dg.io import run_files
+from v3dg.levels import build_file
 
 FAST = ("--quiet", "--cluster-size", 64)
 
@@ -186,7 +186,7 @@ def test_several_files_make_one_asset(tmp_path):
 
 
 def test_an_asset_larger_than_memory_makes_the_same_bundle(tmp_path, monkeypatch):
-    from v3dg.build import leaves_on_disk
+    from v3dg.levels import leaves_on_disk
 
     asset = make_asset(num_gaussians=3000, seed=1)
     v3dg.write_asset(tmp_path / "a.ply", asset)
@@ -194,7 +194,7 @@ def test_an_asset_larger_than_memory_makes_the_same_bundle(tmp_path, monkeypatch
     build_file(tmp_path / "a.ply", tmp_path / "whole.v3dg", **options)
     sizes = leaves_on_disk._Sizes(in_memory=100, in_block=1 << 16, in_node=700, in_bucket=300)
     monkeypatch.setattr(leaves_on_disk._Sizes, "of", lambda *_: sizes)
-    monkeypatch.setattr("v3dg.build.whole.UNIT_LEAVES", 1 << 20)
+    monkeypatch.setattr("v3dg.levels.whole.UNIT_LEAVES", 1 << 20)
     build_file(tmp_path / "a.ply", tmp_path / "disk.v3dg", **options)
     assert (tmp_path / "disk.v3dg").read_bytes() == (tmp_path / "whole.v3dg").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ply", "disk.v3dg", "whole.v3dg"]

@@ -21,8 +21,8 @@ from benchmarks.studies import fades_scenes
 from benchmarks.studies.fades import Stays
 from benchmarks.worlds.procedural import make_asset
 from reference.project import project
-from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
+from v3dg.levels import BuildConfig, build_bundle
 
 TINY = replace(
     evaluation.PRESETS["small"],

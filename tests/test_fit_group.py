@@ -10,7 +10,7 @@ import scenes
 from compare import DSSIM_FLOAT, FIT_FLOAT, assert_close
 from devices import host, on
 from v3dg import BuildConfig, Camera, Gaussians, _core, rasterize
-from v3dg.build.fit import fit_config
+from v3dg.levels.fit import fit_config
 
 torch = pytest.importorskip("torch")
 

@@ -157,7 +157,7 @@ def test_nothing_is_written_that_cannot_be_opened(bundle, tmp_path):
     before = sorted(tmp_path.iterdir())
     for write in (
         lambda: bundle.write(tmp_path / "x.ply"),
-        lambda: v3dg.build.build_file(tmp_path / "a.ply", tmp_path / "x.ply"),
+        lambda: v3dg.levels.build_file(tmp_path / "a.ply", tmp_path / "x.ply"),
     ):
         with pytest.raises(ValueError, match=r"x\.ply: expected a file name ending in \.v3dg"):
             write()

@@ -17,14 +17,14 @@ import pytest
 
 import v3dg
 from v3dg import BuildConfig, Gaussians, _core, _files, cleaning
-from v3dg.build import external_split
-from v3dg.build import leaves_on_disk as on_disk
-from v3dg.build.digest import digest_of
-from v3dg.build.leaves import MemoryLeaves
-from v3dg.build.leaves_on_disk import DiskLeaves, leaves_on_disk
-from v3dg.build.scratch import RowFile
 from v3dg.gaussians import gaussian_bytes
 from v3dg.io import open_asset
+from v3dg.levels import external_split
+from v3dg.levels import leaves_on_disk as on_disk
+from v3dg.levels.digest import digest_of
+from v3dg.levels.leaves import MemoryLeaves
+from v3dg.levels.leaves_on_disk import DiskLeaves, leaves_on_disk
+from v3dg.levels.scratch import RowFile
 
 CONFIG = BuildConfig(cluster_size=7)
 PLENTY = 1 << 30
@@ -425,7 +425,7 @@ CHILD = """
     import sys, time, resource
     import numpy as np
     import v3dg
-    from v3dg.build.leaves_on_disk import leaves_on_disk, DiskLeaves
+    from v3dg.levels.leaves_on_disk import leaves_on_disk, DiskLeaves
     import concurrent.futures, tqdm
     def peak():
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10

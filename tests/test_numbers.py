@@ -12,8 +12,8 @@ import scenes
 import v3dg
 from random_bundle import random_bundle
 from v3dg import _core
-from v3dg.build.fit import fit_config
-from v3dg.build.memory import in_bytes
+from v3dg.levels.fit import fit_config
+from v3dg.levels.memory import in_bytes
 
 CAMERA = v3dg.Camera.look_at((0.5, -9, 4), (3, 4, 5), width=24, height=16)
 BUNDLE = random_bundle(1)

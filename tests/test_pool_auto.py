@@ -142,7 +142,7 @@ def test_what_needs_all_is_drawn_of_all(path, device, free):
 
 
 def test_what_is_free_on_the_host_follows_the_container(monkeypatch):
-    from v3dg.build import memory
+    from v3dg.levels import memory
 
     texts = {
         "/proc/meminfo": "MemAvailable: 4096 kB\n",

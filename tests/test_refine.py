@@ -12,8 +12,8 @@ import v3dg
 from devices import host, on
 from random_bundle import random_bundle
 from v3dg import BuildConfig, _core
-from v3dg.build.fit import fit_config
 from v3dg.donut import make_donut
+from v3dg.levels.fit import fit_config
 from v3dg.metrics import box_downsample, draw_truth
 from v3dg.refine import _without_least, refine_bundle
 from v3dg.residency import residency

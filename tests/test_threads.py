@@ -429,6 +429,6 @@ for work, subject in ((picture, asset()), (gradient, asset()), (frame, crowd()),
 def test_thread_that_ends_before_its_first_line_is_an_error(monkeypatch):
     """As it does where there is no memory to begin; threading.Thread would wait for it for ever."""
     starts_nothing = SimpleNamespace(start_new_thread=lambda work, arguments: 0)
-    monkeypatch.setattr(sys.modules["v3dg.build.fit"], "_thread", starts_nothing)
+    monkeypatch.setattr(sys.modules["v3dg.levels.fit"], "_thread", starts_nothing)
     with pytest.raises(MemoryError, match="ended at once"):
         bundle_of(asset(num=300))

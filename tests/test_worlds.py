@@ -6,7 +6,7 @@ import pytest
 import v3dg
 from benchmarks import worlds
 from benchmarks.__main__ import PROGRAM
-from v3dg.build import build_file
+from v3dg.levels import build_file
 from v3dg.rotations import rotation_from_quaternion
 
 

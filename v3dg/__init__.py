@@ -12,7 +12,6 @@ if _find_spec("v3dg._core") is None:
     )
 
 from v3dg._version import __version__
-from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.camera_file import read_cameras, write_cameras
 from v3dg.cameras import Camera, StereoCamera, turntable
@@ -20,6 +19,7 @@ from v3dg.export import write_site, write_streamed_sog, write_tiles, write_usd
 from v3dg.gaussians import Gaussians
 from v3dg.image import Image, RenderedImage, Stats
 from v3dg.io import read_asset, write_asset
+from v3dg.levels import BuildConfig, build_bundle
 from v3dg.opening import open as open  # not in __all__: with `*` it would hide the one of Python
 from v3dg.opening import read_usd_scene
 from v3dg.pick import Pick, pick

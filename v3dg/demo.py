@@ -12,10 +12,10 @@ from typing import Any, NamedTuple, TypeAlias
 from v3dg import _device
 from v3dg._device import Device
 from v3dg._progress import Progress, counted
-from v3dg.build import build_bundle
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.donut import make_donut, place_field
+from v3dg.levels import build_bundle
 from v3dg.metrics import draw_truth, errors_of
 from v3dg.pictures import Picture, check_picture_path, contact_sheet, to_8bit, write_picture
 from v3dg.render import render

@@ -6,11 +6,11 @@ from typing import Any, TypeAlias
 
 from v3dg._numbers import check
 from v3dg._urls import beside, is_url, reading, shown
-from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.formats import usd
 from v3dg.io import read_asset
+from v3dg.levels import BuildConfig, build_bundle
 from v3dg.scene import Scene, Subject
 from v3dg.scene.file import is_scene, read_scene
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg.build.memory import free_bytes
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.false_color import ColorBy
+from v3dg.levels.memory import free_bytes
 from v3dg.residency import ResidentScene, residency
 
 _RESERVE_BYTES = 1 << 30  # the most that stays free for frames, tables and everything else

@@ -13,11 +13,11 @@ from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg._numbers import check_type, real, whole
 from v3dg._progress import Bar, Progress
-from v3dg.build.config import BuildConfig
-from v3dg.build.fit import fit_config, run_fit
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
+from v3dg.levels.config import BuildConfig
+from v3dg.levels.fit import fit_config, run_fit
 from v3dg.opening import File
 from v3dg.residency import residency
 

@@ -6,7 +6,7 @@ from benchmarks.evaluation.evaluation import Evaluation
 from benchmarks.evaluation.markdown import Column
 from benchmarks.evaluation.measure import Row, tolerance_for
 from v3dg._judges import mean_of
-from v3dg.build import BuildConfig
+from v3dg.levels import BuildConfig
 
 
 def full_row(evaluation: Evaluation) -> Row:

@@ -19,13 +19,13 @@ from benchmarks.evaluation.measure import Judge, Row, Time, time_ms
 from benchmarks.evaluation.settings import Settings
 from benchmarks.worlds.procedural import make_asset
 from v3dg import _device
-from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cleaning import ball_of_most
 from v3dg.gaussians import Gaussians
 from v3dg.image import Stats
 from v3dg.io import read_asset
+from v3dg.levels import BuildConfig, build_bundle
 from v3dg.metrics import draw_truth
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import render

@@ -23,8 +23,8 @@ from benchmarks.evaluation import gpu, record
 from benchmarks.evaluation.assets import many_copies, read_layout
 from benchmarks.worlds.procedural import make_asset
 from v3dg import _core, metrics
-from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
+from v3dg.levels import BuildConfig, build_bundle
 
 # px², past which every instance is drawn from its last level.
 _MOST_TOLERANCE = 1e4

@@ -20,8 +20,8 @@ from benchmarks.evaluation import gpu, record
 from benchmarks.evaluation.assets import like_trained, read_layout
 from benchmarks.evaluation.measure import time_ms
 from benchmarks.worlds.procedural import make_asset
-from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
+from v3dg.levels import BuildConfig, build_bundle
 from v3dg.render import Renderer
 
 

@@ -25,8 +25,8 @@ from benchmarks.evaluation.assets import read_layout
 from benchmarks.evaluation.measure import Judge, Row, time_ms
 from benchmarks.worlds.procedural import make_asset
 from v3dg._judges import mean_of
-from v3dg.build import build_bundle
 from v3dg.cameras import Camera
+from v3dg.levels import build_bundle
 from v3dg.metrics import draw_truth
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import Renderer

@@ -15,13 +15,13 @@ import numpy as np
 import tyro
 
 from v3dg import BuildConfig, _core
-from v3dg.build.leaves_on_disk import _Sizes, _Tile, scratch_bytes
-from v3dg.build.memory import in_bytes, unit_bytes
-from v3dg.build.plan import LevelPlan, Plan
-from v3dg.build.whole import UNIT_LEAVES
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.file import BundlePlan
 from v3dg.gaussians import gaussian_bytes
+from v3dg.levels.leaves_on_disk import _Sizes, _Tile, scratch_bytes
+from v3dg.levels.memory import in_bytes, unit_bytes
+from v3dg.levels.plan import LevelPlan, Plan
+from v3dg.levels.whole import UNIT_LEAVES
 
 
 @dataclass

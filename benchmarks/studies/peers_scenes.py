@@ -16,8 +16,8 @@ from benchmarks.evaluation import gpu
 from benchmarks.evaluation.assets import like_trained, read_layout
 from benchmarks.worlds.procedural import make_asset
 from v3dg import _core
-from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
+from v3dg.levels import BuildConfig, build_bundle
 
 TRAINED_PX2 = 0.3
 """The filter of the original 3DGS code, with which assets are trained."""

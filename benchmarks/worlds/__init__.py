@@ -25,11 +25,11 @@ from benchmarks.worlds.procedural import TREE_KINDS, make_donut, make_person, ma
 from benchmarks.worlds.procedural.donut import RING, TUBE
 from benchmarks.worlds.rings import Pile
 from v3dg._device import Device
-from v3dg.build import BuildConfig, build_file
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
 from v3dg.gaussians import Gaussians
 from v3dg.io import read_asset, write_asset
+from v3dg.levels import BuildConfig, build_file
 from v3dg.scene import Scene
 from v3dg.scene.file import write_scene
 

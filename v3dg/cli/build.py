@@ -16,14 +16,14 @@ import tyro
 from v3dg import _extras
 from v3dg._numbers import check
 from v3dg._urls import beside, cleaned, shown
-from v3dg.build import BuildConfig, build_file, levels_path
-from v3dg.build.scheduler import SchedulerError
 from v3dg.cameras import Axis
 from v3dg.cleaning import AssetWarning, describe
 from v3dg.cli import _common
 from v3dg.cli._views import ask_up, is_at_terminal
 from v3dg.gaussians import Gaussians
 from v3dg.io import SUFFIXES, open_asset, run_files
+from v3dg.levels import BuildConfig, build_file, levels_path
+from v3dg.levels.scheduler import SchedulerError
 from v3dg.upright import ASSUMED, up_of
 
 _PATIENCE_S = 20  # time for a scheduler to answer

@@ -11,13 +11,13 @@ import numpy as np
 import tyro
 
 from v3dg._urls import shown
-from v3dg.build import BuildConfig
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cleaning import OUTLIER_DISTANCE, describe, examine, outliers
 from v3dg.cli import _common
 from v3dg.gaussians import Gaussians
 from v3dg.io import asset_bytes
+from v3dg.levels import BuildConfig
 from v3dg.opening import open_with_cameras
 from v3dg.scene import Scene
 

@@ -18,7 +18,6 @@ from pathlib import Path
 
 from v3dg._numbers import check
 from v3dg._urls import is_url
-from v3dg.build.scratch import lock
 from v3dg.export._below import Folder, folders_above
 from v3dg.export._record import (
     RECORD,
@@ -30,6 +29,7 @@ from v3dg.export._record import (
     stamp_of_content,
     stamp_of_status,
 )
+from v3dg.levels.scratch import lock
 from v3dg.scene import Scene
 
 _HIDDEN = re.compile(r"\.v3dg-export\.[0-9a-f]{16}\.tmp")

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Literal, cast, get_args, overload
 from v3dg import _device
 from v3dg._device import Device
 from v3dg._numbers import one_of
-from v3dg.build.memory import pool_bytes
 from v3dg.cameras import Camera, StereoCamera, check_camera, for_each
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
 from v3dg.image import RenderedImage
+from v3dg.levels.memory import pool_bytes
 from v3dg.opening import File, opened
 from v3dg.pool import PoolSlot
 from v3dg.render.frame import Frame, frame_of

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, overload
 from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg._numbers import real
-from v3dg.build.memory import in_mib, pool_bytes
 from v3dg.cameras import Camera, StereoCamera, check_camera
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
 from v3dg.image import RenderedImage
+from v3dg.levels.memory import in_mib, pool_bytes
 from v3dg.opening import File, opened
 from v3dg.pool import PoolSlot
 from v3dg.render.frame import AutoFrame, frame_of

@@ -12,12 +12,12 @@ from v3dg import _core, _device
 from v3dg._device import CPU, Device
 from v3dg._numbers import Floats
 from v3dg._urls import beside, cleaned, shown
-from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
 from v3dg.cleaning import ball_of_most
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
 from v3dg.image import RenderedImage, Stats
+from v3dg.levels import BuildConfig, build_bundle
 from v3dg.pick import Pick, pick
 from v3dg.pictures import to_8bit
 from v3dg.pool import PoolLook, chosen_bytes

@@ -20,9 +20,9 @@ from benchmarks.evaluation.markdown import Column, count_text, markdown
 from benchmarks.evaluation.measure import Row, time_ms
 from benchmarks.evaluation.summary import Summary
 from v3dg import _core, _device
-from v3dg.build import BuildConfig
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
+from v3dg.levels import BuildConfig
 from v3dg.metrics import psnr
 from v3dg.pictures import to_8bit
 from v3dg.render import Renderer, render

@@ -8,7 +8,7 @@ from benchmarks.evaluation.camera_sweep import COLUMNS, build_row, full_row
 from benchmarks.evaluation.evaluation import PAPER_TOLERANCE, Evaluation
 from benchmarks.evaluation.markdown import Column, markdown
 from benchmarks.evaluation.summary import Summary
-from v3dg.build import BuildConfig
+from v3dg.levels import BuildConfig
 from v3dg.select import DEFAULT_TOLERANCE
 
 TITLE = "What the fit gives"

@@ -14,9 +14,9 @@ from benchmarks.evaluation.markdown import Column, markdown
 from benchmarks.evaluation.measure import Row, tolerance_for
 from benchmarks.evaluation.summary import Summary
 from benchmarks.worlds.procedural import make_tree
-from v3dg.build import BuildConfig
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
+from v3dg.levels import BuildConfig
 from v3dg.metrics import draw_truth
 from v3dg.pictures import Picture, contact_sheet, to_8bit
 from v3dg.render import render

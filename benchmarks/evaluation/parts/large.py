@@ -11,8 +11,8 @@ from benchmarks.evaluation.markdown import count_text, markdown
 from benchmarks.evaluation.measure import crop
 from benchmarks.evaluation.parts import composed
 from benchmarks.evaluation.summary import Summary
-from v3dg.build import BuildConfig
 from v3dg.cameras import Camera
+from v3dg.levels import BuildConfig
 from v3dg.metrics import draw_truth
 from v3dg.pictures import contact_sheet
 from v3dg.select import DEFAULT_TOLERANCE

@@ -8,7 +8,7 @@ from benchmarks.evaluation.evaluation import Evaluation, close_view, every
 from benchmarks.evaluation.markdown import Column, count_text, markdown
 from benchmarks.evaluation.measure import Row
 from benchmarks.evaluation.summary import Summary
-from v3dg.build import BuildConfig
+from v3dg.levels import BuildConfig
 from v3dg.pictures import contact_sheet, to_8bit
 from v3dg.rasterize import rasterize
 

@@ -25,10 +25,10 @@ from benchmarks.evaluation.markdown import Column, markdown
 from benchmarks.evaluation.measure import Row, tolerance_for
 from benchmarks.evaluation.summary import Summary
 from v3dg._judges import mean_of
-from v3dg.build import BuildConfig
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.io import read_asset
+from v3dg.levels import BuildConfig
 from v3dg.metrics import draw_truth, psnr
 from v3dg.pictures import Picture, to_8bit
 from v3dg.rasterize import rasterize

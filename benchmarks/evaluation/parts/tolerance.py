@@ -10,7 +10,7 @@ from benchmarks.evaluation.evaluation import Evaluation, paper_tolerance
 from benchmarks.evaluation.markdown import markdown
 from benchmarks.evaluation.measure import Row
 from benchmarks.evaluation.summary import Summary
-from v3dg.build import BuildConfig
+from v3dg.levels import BuildConfig
 from v3dg.pictures import to_8bit
 from v3dg.select import select
 

@@ -16,7 +16,7 @@ LIMIT_S = kills.LIMIT_S
 
 PROGRAM = """
 import v3dg
-from v3dg.build import build_file, leaves_on_disk, whole
+from v3dg.levels import build_file, leaves_on_disk, whole
 whole.UNIT_LEAVES = 400
 sizes = leaves_on_disk._Sizes(in_memory=0, in_block=1 << 16, in_node=700, in_bucket=300)
 leaves_on_disk._Sizes.of = lambda *_: sizes

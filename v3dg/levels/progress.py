@@ -4,8 +4,8 @@ import threading
 
 from v3dg import _core, _progress
 from v3dg._progress import Progress
-from v3dg.build.plan import Plan
-from v3dg.build.simplify import Show
+from v3dg.levels.plan import Plan
+from v3dg.levels.simplify import Show
 
 
 class Stopped(Exception):

@@ -23,15 +23,15 @@ from v3dg import _device, _files
 from v3dg._device import Device
 from v3dg._numbers import check
 from v3dg._version import __version__
-from v3dg.build.plan import LevelPlan
-from v3dg.build.scratch import lock
-from v3dg.build.simplify import Level, LevelTables
 from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.file import BundlePlan, read_pages, write_pages
 from v3dg.bundle.format import HASH_BYTES, page_hash
 from v3dg.bundle.pages import PageRun
 from v3dg.gaussians import Gaussians, put
+from v3dg.levels.plan import LevelPlan
+from v3dg.levels.scratch import lock
+from v3dg.levels.simplify import Level, LevelTables
 
 _RECORD = struct.Struct("<II16s")  # precedes a level: its part, its number, the hash of the following arrays
 _MAGIC = bytes(8) + b"unfinished v3dg 1\n"

@@ -23,17 +23,17 @@ from v3dg._device import CPU, Device
 from v3dg._numbers import check
 from v3dg._progress import Bar, Progress
 from v3dg._urls import shown
-from v3dg.build import external_split
-from v3dg.build.config import BuildConfig
-from v3dg.build.digest import PIECE, digest_of_hashes, hash_of, new_pool, pieces_of
-from v3dg.build.leaves import Leaves, MemoryLeaves, Tally, Unusable
-from v3dg.build.memory import in_mib
-from v3dg.build.plan import halved
-from v3dg.build.scratch import RowFile, scratch_folder
 from v3dg.bundle.codec import Codec
 from v3dg.formats._reading import AssetFile
 from v3dg.gaussians import Gaussians, gaussian_bytes, put
 from v3dg.io import open_asset
+from v3dg.levels import external_split
+from v3dg.levels.config import BuildConfig
+from v3dg.levels.digest import PIECE, digest_of_hashes, hash_of, new_pool, pieces_of
+from v3dg.levels.leaves import Leaves, MemoryLeaves, Tally, Unusable
+from v3dg.levels.memory import in_mib
+from v3dg.levels.plan import halved
+from v3dg.levels.scratch import RowFile, scratch_folder
 
 MOST_GAUSSIANS = 1 << 32
 """An asset must have fewer gaussians than this."""

@@ -7,14 +7,14 @@ from typing import Literal
 from v3dg._device import Device
 from v3dg._numbers import check, check_type
 from v3dg._progress import Progress
-from v3dg.build.config import BuildConfig
-from v3dg.build.files import build_file, levels_path
-from v3dg.build.leaves import MemoryLeaves
-from v3dg.build.unfinished import discard_levels
-from v3dg.build.whole import build_into, devices_for
 from v3dg.bundle import Bundle
 from v3dg.gaussians import Gaussians
 from v3dg.io import loaded
+from v3dg.levels.config import BuildConfig
+from v3dg.levels.files import build_file, levels_path
+from v3dg.levels.leaves import MemoryLeaves
+from v3dg.levels.unfinished import discard_levels
+from v3dg.levels.whole import build_into, devices_for
 
 __all__ = ["BuildConfig", "build_bundle", "build_file", "discard_levels", "levels_path"]
 

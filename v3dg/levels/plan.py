@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core
-from v3dg.build.config import BuildConfig
 from v3dg.bundle.format import offset_of
 from v3dg.bundle.pages import PageLayout
+from v3dg.levels.config import BuildConfig
 
 Offsets = npt.NDArray[np.int64]
 

@@ -13,11 +13,11 @@ import numpy.typing as npt
 from v3dg import _core, _device, cleaning
 from v3dg._device import Device
 from v3dg._numbers import check, one_of, shown, whole_number
-from v3dg.build.config import BuildConfig
-from v3dg.build.digest import digest_of
 from v3dg.bundle.codec import Codec
 from v3dg.cameras import Axis
 from v3dg.gaussians import Gaussians, gaussian_bytes
+from v3dg.levels.config import BuildConfig
+from v3dg.levels.digest import digest_of
 
 Unusable = Literal["drop", "refuse"]
 

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg.build.config import BuildConfig
+from v3dg.levels.config import BuildConfig
 
 _T = TypeVar("_T")
 

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from v3dg.build.config import BuildConfig
-from v3dg.build.plan import Plan
-from v3dg.build.simplify import LevelTables
 from v3dg.bundle import Clusters, Groups
+from v3dg.levels.config import BuildConfig
+from v3dg.levels.plan import Plan
+from v3dg.levels.simplify import LevelTables
 
 
 def assemble(plan: Plan, tables: Sequence[LevelTables], config: BuildConfig) -> tuple[Clusters, Groups]:

@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core, _device
-from v3dg.build.config import BuildConfig
-from v3dg.build.fit import fit_config, run_fit
-from v3dg.build.plan import LevelPlan, Offsets, Plan
 from v3dg.bundle.codec import Codec
 from v3dg.gaussians import Array, Gaussians, empty, put
+from v3dg.levels.config import BuildConfig
+from v3dg.levels.fit import fit_config, run_fit
+from v3dg.levels.plan import LevelPlan, Offsets, Plan
 
 # Groups whose start is computed at once. Ctrl-C waits meanwhile, for about a second.
 _GROUPS_AT_ONCE = 256

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 
 from v3dg._numbers import refuse, shown
-from v3dg.build.leaves import Leaves
-from v3dg.build.whole import UNIT_LEAVES
 from v3dg.gaussians import gaussian_bytes
+from v3dg.levels.leaves import Leaves
+from v3dg.levels.whole import UNIT_LEAVES
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 # Memory that each leaf of a unit needs until the levels are written: a number of bytes that does not depend

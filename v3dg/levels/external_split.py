@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core
-from v3dg.build.scratch import RowFile
+from v3dg.levels.scratch import RowFile
 
 Points = npt.NDArray[np.uint32]
 """(N, 4): the bits of x, y and z, and the index."""

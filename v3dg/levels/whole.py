@@ -16,21 +16,21 @@ import numpy.typing as npt
 from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg._progress import Progress
-from v3dg.build.assemble import assemble
-from v3dg.build.config import BuildConfig
-from v3dg.build.leaves import Leaves, MemoryLeaves, made_with
-from v3dg.build.plan import Plan
-from v3dg.build.progress import Bar
-from v3dg.build.scheduler import Watch, completed, watch_over
-from v3dg.build.simplify import Level, LevelBuilder, LevelTables, Show
-from v3dg.build.smooth import measured_config
-from v3dg.build.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
 from v3dg.bundle import Bundle
 from v3dg.bundle.codec import codec_of
 from v3dg.bundle.file import BundlePlan
 from v3dg.bundle.pages import PageRun
 from v3dg.cameras import Axis
 from v3dg.gaussians import Gaussians
+from v3dg.levels.assemble import assemble
+from v3dg.levels.config import BuildConfig
+from v3dg.levels.leaves import Leaves, MemoryLeaves, made_with
+from v3dg.levels.plan import Plan
+from v3dg.levels.progress import Bar
+from v3dg.levels.scheduler import Watch, completed, watch_over
+from v3dg.levels.simplify import Level, LevelBuilder, LevelTables, Show
+from v3dg.levels.smooth import measured_config
+from v3dg.levels.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
 
 # Leaves of a unit: enough to keep a GPU busy, and little memory. The last bits of a bundle depend on it.
 UNIT_LEAVES = 1 << 20

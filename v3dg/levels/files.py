@@ -12,15 +12,15 @@ from v3dg._device import Device
 from v3dg._numbers import check_type
 from v3dg._progress import Progress
 from v3dg._urls import shown
-from v3dg.build.config import BuildConfig
-from v3dg.build.leaves import Leaves, MemoryLeaves, made_with
-from v3dg.build.leaves_on_disk import MOST_GAUSSIANS, leaves_on_disk
-from v3dg.build.memory import in_bytes, most_units, unit_bytes
-from v3dg.build.unfinished import discard_levels
-from v3dg.build.whole import build_into, devices_for
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis
 from v3dg.gaussians import Gaussians
+from v3dg.levels.config import BuildConfig
+from v3dg.levels.leaves import Leaves, MemoryLeaves, made_with
+from v3dg.levels.leaves_on_disk import MOST_GAUSSIANS, leaves_on_disk
+from v3dg.levels.memory import in_bytes, most_units, unit_bytes
+from v3dg.levels.unfinished import discard_levels
+from v3dg.levels.whole import build_into, devices_for
 
 AssetPath = str | os.PathLike[str]
 

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 from v3dg import _device
 from v3dg._device import Device
-from v3dg.build.config import BuildConfig
-from v3dg.build.leaves import Leaves
-from v3dg.build.plan import Plan
-from v3dg.build.simplify import LevelBuilder
 from v3dg.bundle.codec import Codec
 from v3dg.gaussians import Gaussians
+from v3dg.levels.config import BuildConfig
+from v3dg.levels.leaves import Leaves
+from v3dg.levels.plan import Plan
+from v3dg.levels.simplify import LevelBuilder
 
 # Groups of level 1 that are fitted with this filter and without one.
 _GROUPS = 32
