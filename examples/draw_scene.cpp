@@ -6,8 +6,8 @@
 #include <vector>
 
 #include "math/sh.h"
-#include "pipeline/model.h"
-#include "pipeline/scene_frame.h"
+#include "draw/model.h"
+#include "draw/scene_frame.h"
 
 using namespace v3dg;
 

@@ -30,18 +30,18 @@ MAY_INCLUDE = {
     "tile_bin": {"base", "math", "frame"},
     "rasterize": {"base", "math", "frame"},
     "fit_group": {"base", "math", "frame", "project", "tile_bin", "rasterize"},
-    "pipeline": {
+    "draw": {"base", "math", "frame", "quantize", "residency", "select", "project", "tile_bin", "rasterize"},
+    "levels": {
         "base",
         "math",
-        "io",
         "frame",
-        "quantize",
         "residency",
         "select",
         "project",
         "tile_bin",
         "rasterize",
         "fit_group",
+        "draw",
     },
     "bindings": {
         "base",
@@ -56,10 +56,11 @@ MAY_INCLUDE = {
         "select",
         "project",
         "fit_group",
-        "pipeline",
+        "draw",
+        "levels",
     },
 }
-NOT_OPERATIONS = {"base", "math", "io", "frame", "residency", "pipeline", "bindings"}
+NOT_OPERATIONS = {"base", "math", "io", "frame", "residency", "draw", "levels", "bindings"}
 TESTED_WITH = {"tile_bin": "rasterize"}
 
 OPERATIONS = sorted(p.name for p in CSRC.iterdir() if p.is_dir() and p.name not in NOT_OPERATIONS)

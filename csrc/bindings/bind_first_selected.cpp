@@ -3,8 +3,8 @@
 #include "bindings/operations.h"
 #include "bindings/tape.h"
 #include "cluster/cluster.h"
-#include "pipeline/first_selected.h"
-#include "pipeline/refine_cuts_math.h"
+#include "levels/first_selected.h"
+#include "levels/refine_cuts_math.h"
 
 namespace v3dg {
 

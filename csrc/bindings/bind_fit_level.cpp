@@ -4,13 +4,13 @@
 #include "bindings/operations.h"
 #include "bindings/tables.h"
 #include "bindings/types.h"
+#include "draw/model.h"
 #include "fit_group/dssim.h"
 #include "fit_group/ssim.h"
-#include "pipeline/fit_level.h"
-#include "pipeline/fit_level_cuda.h"
-#include "pipeline/model.h"
-#include "pipeline/refine_cuts.h"
-#include "pipeline/refine_cuts_cuda.h"
+#include "levels/fit_level.h"
+#include "levels/fit_level_cuda.h"
+#include "levels/refine_cuts.h"
+#include "levels/refine_cuts_cuda.h"
 
 namespace v3dg {
 

@@ -9,7 +9,7 @@
 #include "bindings/operations.h"
 #include "bindings/pool.h"
 #include "bindings/resident.h"
-#include "pipeline/scene_frame.h"
+#include "draw/scene_frame.h"
 
 namespace v3dg {
 

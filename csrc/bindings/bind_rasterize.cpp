@@ -3,12 +3,12 @@
 #include "bindings/operations.h"
 #include "bindings/picture.h"
 #include "bindings/tape.h"
-#include "pipeline/model.h"
-#include "pipeline/render.h"
+#include "draw/model.h"
+#include "draw/render.h"
 #include "project/ellipses.h"
 
 #if V3DG_WITH_CUDA
-#include "pipeline/render_backward_cuda.h"
+#include "draw/render_backward_cuda.h"
 #endif
 
 namespace v3dg {

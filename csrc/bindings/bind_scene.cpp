@@ -1,6 +1,6 @@
 #include "bindings/operations.h"
 #include "bindings/resident.h"
-#include "pipeline/false_color.h"
+#include "draw/false_color.h"
 
 namespace v3dg {
 

@@ -9,11 +9,11 @@
 #include <vector>
 
 #include "bindings/picture.h"
-#include "pipeline/scene_frame.h"
+#include "draw/scene_frame.h"
 
 #if V3DG_WITH_CUDA
-#include "pipeline/device_pages.h"
-#include "pipeline/scene_frame_cuda.h"
+#include "draw/device_pages.h"
+#include "draw/scene_frame_cuda.h"
 #endif
 
 namespace v3dg {

@@ -4,7 +4,7 @@
 #include "frame/image.h"
 
 #if V3DG_WITH_CUDA
-#include "pipeline/scene_frame_cuda.h"
+#include "draw/scene_frame_cuda.h"
 #endif
 
 namespace v3dg {

@@ -11,7 +11,7 @@
 #include "residency/host_pages.h"
 
 #if V3DG_WITH_CUDA
-#include "pipeline/device_pages.h"
+#include "draw/device_pages.h"
 #endif
 
 namespace v3dg {

@@ -7,13 +7,13 @@
 
 #include "bindings/codes.h"
 #include "bindings/tables.h"
-#include "pipeline/model.h"
-#include "pipeline/scene_frame.h"
+#include "draw/model.h"
+#include "draw/scene_frame.h"
 #include "select/budget_steps.h"
 #include "select/select.h"
 
 #if V3DG_WITH_CUDA
-#include "pipeline/scene_frame_cuda.h"
+#include "draw/scene_frame_cuda.h"
 #endif
 
 namespace v3dg {

@@ -1,4 +1,4 @@
-#include "pipeline/device_pages.h"
+#include "draw/device_pages.h"
 
 #include <algorithm>
 #include <stdexcept>

@@ -1,7 +1,7 @@
 #pragma once
 
-#include "pipeline/fit_level_cuda.h"
-#include "pipeline/refine_cuts.h"
+#include "levels/fit_level_cuda.h"
+#include "levels/refine_cuts.h"
 
 namespace v3dg {
 namespace cuda {

@@ -1,4 +1,4 @@
-#include "pipeline/false_color.h"
+#include "draw/false_color.h"
 
 #include <algorithm>
 #include <cmath>

@@ -6,9 +6,9 @@
 #include <vector>
 
 #include "base/span.h"
+#include "levels/cut_views.h"
 #include "math/bounds.h"
 #include "math/camera.h"
-#include "pipeline/cut_views.h"
 
 namespace v3dg {
 

@@ -1,4 +1,4 @@
-#include "pipeline/render_backward_cuda.h"
+#include "draw/render_backward_cuda.h"
 
 #include <map>
 #include <mutex>

@@ -1,4 +1,4 @@
-#include "pipeline/first_selected.h"
+#include "levels/first_selected.h"
 
 #include <algorithm>
 #include <cmath>

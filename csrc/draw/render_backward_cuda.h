@@ -2,7 +2,7 @@
 
 #include <memory>
 
-#include "pipeline/scene_frame_cuda.h"
+#include "draw/scene_frame_cuda.h"
 #include "project/project_backward.h"
 
 namespace v3dg {

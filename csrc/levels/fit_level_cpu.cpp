@@ -1,7 +1,7 @@
 // Hands the groups of a level to threads. What is done for one group is in fit_group/fit_group_cpu.cpp.
 
 #include "base/threads.h"
-#include "pipeline/fit_level.h"
+#include "levels/fit_level.h"
 
 #include <omp.h>
 

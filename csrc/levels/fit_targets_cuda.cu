@@ -1,6 +1,6 @@
 // Targets are pictures of a frame, thousands at once, drawn larger and box-averaged.
 
-#include "pipeline/fit_targets_cuda.h"
+#include "levels/fit_targets_cuda.h"
 
 #include <vector>
 

@@ -1,4 +1,4 @@
-#include "pipeline/refine_cuts.h"
+#include "levels/refine_cuts.h"
 
 #include <algorithm>
 #include <numeric>
@@ -6,9 +6,9 @@
 #include <vector>
 
 #include "base/parallel_for.h"
-#include "pipeline/model.h"
-#include "pipeline/refine_cuts_math.h"
-#include "pipeline/render.h"
+#include "draw/model.h"
+#include "draw/render.h"
+#include "levels/refine_cuts_math.h"
 
 namespace v3dg {
 

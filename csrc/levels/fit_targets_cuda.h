@@ -1,8 +1,8 @@
 #pragma once
 
+#include "draw/frame_cuda.h"
 #include "fit_group/fit_group_cuda.h"
-#include "pipeline/fit_level_cuda.h"
-#include "pipeline/frame_cuda.h"
+#include "levels/fit_level_cuda.h"
 
 namespace v3dg {
 namespace cuda {

@@ -1,10 +1,10 @@
-#include "pipeline/refine_cuts_cuda.h"
+#include "levels/refine_cuts_cuda.h"
 
 #include "base/ahead.h"
 #include "base/device_guard.h"
 #include "base/launch.cuh"
-#include "pipeline/refine_cuts_math.h"
-#include "pipeline/render_backward_cuda.h"
+#include "draw/render_backward_cuda.h"
+#include "levels/refine_cuts_math.h"
 
 namespace v3dg {
 namespace cuda {

@@ -1,7 +1,7 @@
 #pragma once
 
 #include "fit_group/fit_group.h"
-#include "pipeline/cut_views.h"
+#include "levels/cut_views.h"
 
 namespace v3dg {
 

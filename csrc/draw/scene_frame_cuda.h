@@ -1,7 +1,7 @@
 #pragma once
 
-#include "pipeline/device_pages.h"
-#include "pipeline/frame_cuda.h"
+#include "draw/device_pages.h"
+#include "draw/frame_cuda.h"
 #include "quantize/quantize.h"
 #include "select/select_cuda.h"
 

@@ -1,5 +1,5 @@
 #include "base/threads.h"
-#include "pipeline/render.h"
+#include "draw/render.h"
 
 #include <omp.h>
 

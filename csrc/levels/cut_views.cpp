@@ -1,4 +1,4 @@
-#include "pipeline/cut_views.h"
+#include "levels/cut_views.h"
 
 #include <algorithm>
 #include <cfloat>

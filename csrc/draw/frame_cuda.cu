@@ -1,4 +1,4 @@
-#include "pipeline/frame_cuda.h"
+#include "draw/frame_cuda.h"
 
 #include <algorithm>
 #include <optional>

@@ -3,7 +3,7 @@
 #include <atomic>
 #include <vector>
 
-#include "pipeline/render.h"
+#include "draw/render.h"
 #include "select/select.h"
 
 namespace v3dg {

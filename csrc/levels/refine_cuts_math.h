@@ -6,9 +6,9 @@
 #include <vector>
 
 #include "fit_group/fit_group_math.h"
+#include "levels/refine_cuts.h"
 #include "math/camera.h"
 #include "math/quat.h"
-#include "pipeline/refine_cuts.h"
 
 namespace v3dg {
 

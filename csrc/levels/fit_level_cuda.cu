@@ -1,4 +1,4 @@
-#include "pipeline/fit_level_cuda.h"
+#include "levels/fit_level_cuda.h"
 
 #include <algorithm>
 #include <chrono>
@@ -6,7 +6,7 @@
 #include <thread>
 #include <vector>
 
-#include "pipeline/fit_targets_cuda.h"
+#include "levels/fit_targets_cuda.h"
 
 namespace v3dg {
 namespace cuda {

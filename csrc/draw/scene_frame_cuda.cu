@@ -1,4 +1,4 @@
-#include "pipeline/scene_frame_cuda.h"
+#include "draw/scene_frame_cuda.h"
 
 #include <algorithm>
 #include <cstring>

@@ -1,4 +1,4 @@
-#include "pipeline/scene_frame.h"
+#include "draw/scene_frame.h"
 
 #include <algorithm>
 #include <chrono>
@@ -6,8 +6,8 @@
 #include <stdexcept>
 #include <string>
 
+#include "draw/false_color.h"
 #include "math/sh.h"
-#include "pipeline/false_color.h"
 
 namespace v3dg {
 
