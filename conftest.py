@@ -1,4 +1,5 @@
-"""Tests run on the installed package, unless a compiled module lies beside the sources (see CMakePresets)."""
+"""Tests run on the installed package, unless a compiled module lies beside the sources
+(see CMakePresets)."""
 
 import os
 import sys
@@ -11,7 +12,8 @@ ROOT = Path(__file__).resolve().parent
 IS_COMPILED_HERE = any((ROOT / "v3dg").glob("_core.*.so"))
 
 if not IS_COMPILED_HERE:
-    # `python -m pytest` puts the folder that it runs in first, where v3dg/ would hide the installed package.
+    # `python -m pytest` puts the folder that it runs in first, where v3dg/ would hide
+    # the installed package.
     sys.path[:] = [entry for entry in sys.path if Path(entry or ".").resolve() != ROOT]
 if str(ROOT) not in sys.path:
     sys.path.append(str(ROOT))  # for benchmarks/

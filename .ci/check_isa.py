@@ -1,9 +1,9 @@
 """Check that the compiled module runs on every x86-64 processor.
 
-Some sources are compiled once per instruction set, and every object holds copies of the inline functions
-that it uses. Had the linker kept such a copy from an AVX object, code that runs everywhere would call it.
-So: without entering the namespaces isa_avx2 and isa_avx512, no function can be reached that holds an
-instruction beyond plain x86-64.
+Some sources are compiled once per instruction set, and every object holds copies of the
+inline functions that it uses. Had the linker kept such a copy from an AVX object, code
+that runs everywhere would call it. So: without entering the namespaces isa_avx2 and
+isa_avx512, no function can be reached that holds an instruction beyond plain x86-64.
 
     python .ci/check_isa.py build/*/_core*.so      (not stripped)
 """
@@ -17,7 +17,8 @@ from dataclasses import dataclass, field
 
 FUNCTION = re.compile(r"^([0-9a-f]+) <(.*)>:$")
 TARGET = re.compile(r"\b([0-9a-f]+) <")
-# VEX and EVEX instructions begin with v, but so do two old ones; k* work on AVX-512 masks; the rest is BMI.
+# VEX and EVEX instructions begin with v, but so do two old ones; k* work on AVX-512
+# masks; the rest is BMI.
 WIDE = re.compile(
     r"^(v(?!er[rw]\b)|k(add|and|mov|not|or|shift|test|unpck|xnor|xor)"
     r"|(andn|bextr|blsi|blsr|blsmsk|bzhi|mulx|pdep|pext|rorx|sarx|shlx|shrx|movbe|lzcnt|popcnt)\b)"
@@ -40,7 +41,9 @@ def disassemble(path: str) -> dict[str, Function]:
     command = ["objdump", "-d", "-C", "-w", "--no-show-raw-insn", path]
     functions: dict[str, Function] = {}
     function = Function("")
-    for line in subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines():
+    for line in subprocess.run(
+        command, check=True, capture_output=True, text=True
+    ).stdout.splitlines():
         if match := FUNCTION.match(line):
             function = functions[match[1].lstrip("0")] = Function(match[2])
         elif "\t" in line:
@@ -54,12 +57,17 @@ def disassemble(path: str) -> dict[str, Function]:
 def main(path: str) -> int:
     functions = disassemble(path)
     if not any("v3dg::" in function.name for function in functions.values()):
-        print(f"{path}: expected a module with symbols, got a stripped one; take the one in the build folder")
+        print(
+            f"{path}: expected a module with symbols, got a stripped one; take the one in the "
+            "build folder"
+        )
         return 1
     dispatched = sum(function.is_dispatched for function in functions.values())
     # What no instruction refers to is called through tables or from outside.
     called = {t for address, f in functions.items() for t in f.targets if t != address}
-    todo = [address for address, f in functions.items() if address not in called and not f.is_dispatched]
+    todo = [
+        address for address, f in functions.items() if address not in called and not f.is_dispatched
+    ]
     caller = dict.fromkeys(todo, "")
     wrong = 0
     while todo:
@@ -67,7 +75,9 @@ def main(path: str) -> int:
         function = functions[address]
         if function.wide:
             wrong += 1
-            print(f"{function.name}\n    holds {function.wide[0]!r}\n    called by {caller[address]}")
+            print(
+                f"{function.name}\n    holds {function.wide[0]!r}\n    called by {caller[address]}"
+            )
             continue
         for target in function.targets:
             if target in functions and target not in caller and not functions[target].is_dispatched:

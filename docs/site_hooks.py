@@ -1,5 +1,5 @@
-"""What the site takes from elsewhere in the repository: pages from its root, recorded pictures, and the
-command line's options from its parser."""
+"""What the site takes from elsewhere in the repository: pages from its root, recorded
+pictures, and the command line's options from its parser."""
 
 from __future__ import annotations
 
@@ -15,7 +15,11 @@ from mkdocs.structure.files import File, Files
 from v3dg.cli import COMMANDS
 
 ROOT = Path(__file__).parent.parent
-PAGES = {"CONTRIBUTING.md": "contributing.md", "STYLE.md": "style.md", "CHANGELOG.md": "changelog.md"}
+PAGES = {
+    "CONTRIBUTING.md": "contributing.md",
+    "STYLE.md": "style.md",
+    "CHANGELOG.md": "changelog.md",
+}
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -50,9 +54,11 @@ def on_page_content(html: str, page: Any, **_: Any) -> str:
 
 
 def command_text(name: str) -> str:
-    """A section on one command: what it does, and tables of its arguments and options."""
+    """A section on one command: what it does, and tables of its arguments and
+    options."""
     with warnings.catch_warnings():
-        # tyro will drop it, and nothing else tells what a parser takes; the extra `docs` pins its version.
+        # tyro will drop it, and nothing else tells what a parser takes; the extra
+        # `docs` pins its version.
         warnings.simplefilter("ignore", DeprecationWarning)
         parser: argparse.ArgumentParser = tyro.extras.get_parser(
             COMMANDS[name][0], prog=f"v3dg {name}", config=(tyro.conf.FlagCreatePairsOff,)
@@ -76,7 +82,9 @@ def _spelling(action: argparse.Action) -> str:
     value = action.metavar if isinstance(action.metavar, str) else ""
     names = ", ".join(f"`{option}`" for option in sorted(action.option_strings, key=len))
     choices = re.fullmatch(r"\{(.*)\}", value)
-    value = ", ".join(f"`{choice}`" for choice in choices[1].split(",")) if choices else f"*{value}*"
+    value = (
+        ", ".join(f"`{choice}`" for choice in choices[1].split(",")) if choices else f"*{value}*"
+    )
     return f"{names} {value if value != '**' else ''}".strip()
 
 

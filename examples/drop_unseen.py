@@ -1,6 +1,8 @@
-"""Drop the gaussians of a captured scene that nobody sees from where people are, before its levels are built.
+"""Drop the gaussians of a captured scene that nobody sees from where people are, before
+its levels are built.
 
-pip install '.[torch]' && python examples/drop_unseen.py scene.ply transforms.json scene_seen.ply --keep 0.8
+pip install '.[torch]' && python examples/drop_unseen.py scene.ply transforms.json
+scene_seen.ply --keep 0.8
 """
 
 from __future__ import annotations
@@ -19,18 +21,21 @@ import v3dg
 
 @dataclass
 class Config:
-    """Rank gaussians by how much cameras see of them, and write those that are seen most."""
+    """Rank gaussians by how much cameras see of them, and write those that are seen
+    most."""
 
     asset: tyro.conf.Positional[Path]
     """File to read, of any format that v3dg reads."""
     cameras: tyro.conf.Positional[Path]
-    """Where people are: what v3dg.read_cameras reads, such as the cameras of the capture."""
+    """Where people are: what v3dg.read_cameras reads, such as the cameras of the
+    capture."""
     output: tyro.conf.Positional[Path]
     """File to write, of any format that v3dg writes."""
     keep: float = 1.0
     """Share that is kept of the gaussians that are seen at all."""
     turns: int = 1
-    """Directions that are looked into from each camera, spread evenly around its upright axis."""
+    """Directions that are looked into from each camera, spread evenly around its
+    upright axis."""
     width: int = 512
     """px of the pictures."""
     device: str = "cpu"
@@ -48,7 +53,10 @@ def main(config: Config) -> float:
     num_seen = int((weights > 0).sum())
     kept = asset.subset(np.sort(order[len(asset) - math.ceil(config.keep * num_seen) :]))
     v3dg.write_asset(config.output, kept)
-    print(f"{config.output}: {len(kept):,} of {len(asset):,} gaussians, of which {num_seen:,} are seen")
+    print(
+        f"{config.output}: {len(kept):,} of {len(asset):,} gaussians, of which {num_seen:,} are "
+        "seen"
+    )
     return len(kept) / len(asset)
 
 
@@ -68,15 +76,17 @@ def views(config: Config) -> Iterator[v3dg.Camera]:
 def weights_in(asset: v3dg.Gaussians, camera: v3dg.Camera, device: str) -> npt.NDArray[np.float64]:
     """(N,) blend weight of each gaussian, summed over the pixels.
 
-    It is the gradient of the picture's sum by the gaussian's colour, hence by its SH coefficient over the
-    constant that coefficients of degree 0 are multiplied with.
+    It is the gradient of the picture's sum by the gaussian's colour, hence by its SH
+    coefficient over the constant that coefficients of degree 0 are multiplied with.
     """
     import torch
 
     gaussians = asset.torch(device)
     sh = torch.zeros((len(asset), 1, 3), device=device, requires_grad=True)
     v3dg.rasterize(replace(gaussians, sh=sh), camera).color.sum().backward()
-    weights: npt.NDArray[np.float64] = sh.grad[:, 0, 0].double().cpu().numpy() * math.sqrt(4 * math.pi)
+    weights: npt.NDArray[np.float64] = sh.grad[:, 0, 0].double().cpu().numpy() * math.sqrt(
+        4 * math.pi
+    )
     return weights
 
 

@@ -1,4 +1,5 @@
-"""Let donuts fall into a pile, and film it: the scene moves and the cut is chosen anew in every frame.
+"""Let donuts fall into a pile, and film it: the scene moves and the cut is chosen anew
+in every frame.
 
 Needs the extra `video`: pip install '.[video]' && python examples/falling_donuts.py
 """
@@ -80,7 +81,8 @@ def main(config: Config) -> None:
 def make_scene(
     config: Config, positions: Any, quaternions: Any, scales: Any
 ) -> tuple[v3dg.Scene, np.ndarray[Any, Any]]:
-    """Donuts of several icings in turn, and which donut of the pile each instance of the scene is."""
+    """Donuts of several icings in turn, and which donut of the pile each instance of
+    the scene is."""
     build = v3dg.BuildConfig(steps=config.steps)
     scene, order = v3dg.Scene(), []
     for icing in range(config.icings):
@@ -93,7 +95,8 @@ def make_scene(
 
 
 def camera_at(time: float, config: Config) -> v3dg.Camera:
-    """A camera that circles the pile a little and sinks as it grows; ``time`` is in [0,1]."""
+    """A camera that circles the pile a little and sinks as it grows; ``time`` is in
+    [0,1]."""
     azimuth, elevation = 0.5 + 0.9 * time, 0.42 - 0.12 * time
     reach = 0.10 * math.sqrt(config.donuts / 12) + 0.25
     away = np.array(

@@ -1,7 +1,8 @@
-"""Train gaussians to pictures: gsplat's arguments, v3dg's pictures and gradients, on the CPU or on a GPU.
+"""Train gaussians to pictures: gsplat's arguments, v3dg's pictures and gradients, on
+the CPU or on a GPU.
 
-The pictures here are of a donut that is made for it; yours come from a camera. What is trained is written as
-an asset, to which `v3dg build` gives levels.
+The pictures here are of a donut that is made for it; yours come from a camera. What is
+trained is written as an asset, to which `v3dg build` gives levels.
 
 Needs torch: pip install '.[torch]' && python examples/train.py
 """
@@ -44,9 +45,15 @@ class Config:
 
 
 def main(config: Config) -> float:
-    """Write the asset, and return how near its picture is to one that it was not trained on, in dB."""
+    """Write the asset, and return how near its picture is to one that it was not
+    trained on, in dB."""
     cameras = v3dg.turntable(
-        (0, 0, 0), 3.5, config.pictures + 1, elevation=0.6, width=config.size[0], height=config.size[1]
+        (0, 0, 0),
+        3.5,
+        config.pictures + 1,
+        elevation=0.6,
+        width=config.size[0],
+        height=config.size[1],
     )
     donut = make_donut(20_000)
     targets = [v3dg.rasterize(donut, camera, filter_px2=0.3).color for camera in cameras]
@@ -54,7 +61,10 @@ def main(config: Config) -> float:
     v3dg.write_asset(config.output, asset)
     picture = v3dg.rasterize(asset, cameras[0], filter_px2=0.3).color
     likeness = psnr(np.clip(targets[0], 0, 1), np.clip(picture, 0, 1))
-    print(f"{config.output}: {len(asset):,} gaussians, {likeness:.1f} dB to a picture that they never saw")
+    print(
+        f"{config.output}: {len(asset):,} gaussians, {likeness:.1f} dB to a picture that they "
+        "never saw"
+    )
     return likeness
 
 
@@ -87,7 +97,8 @@ def train(cameras: list[v3dg.Camera], pictures: list[Any], config: Config) -> v3
 
 
 def start(num: int, generator: np.random.Generator, device: str) -> dict[str, torch.Tensor]:
-    """Grey gaussians all over the place, as training changes them: logs of scales, logits of opacities."""
+    """Grey gaussians all over the place, as training changes them: logs of scales,
+    logits of opacities."""
     values = {
         "means": generator.uniform(-1, 1, (num, 3)) * [1.1, 1.1, 0.5],
         "quats": generator.normal(size=(num, 4)),

@@ -1,12 +1,15 @@
-"""Train gaussians to photographs, with gsplat's DefaultStrategy and v3dg's pictures and gradients.
+"""Train gaussians to photographs, with gsplat's DefaultStrategy and v3dg's pictures and
+gradients.
 
-Takes a folder as COLMAP's `image_undistorter` writes it, with `images/` and a model in `sparse/` or
-`sparse/0`; or one with a `transforms.json` whose photographs have no distortion. Every eighth photograph is
-held out, and what is trained is measured on those. Rates and schedule are those of gsplat's
-`simple_trainer.py`, but for how long it grows. docs/photographs.md goes on from there.
+Takes a folder as COLMAP's `image_undistorter` writes it, with `images/` and a model in
+`sparse/` or `sparse/0`; or one with a `transforms.json` whose photographs have no
+distortion. Every eighth photograph is held out, and what is trained is measured on
+those. Rates and schedule are those of gsplat's `simple_trainer.py`, but for how long it
+grows. docs/photographs.md goes on from there.
 
-Needs torch and gsplat, pycolmap for models of COLMAP, and a GPU for more than a few hundred steps:
-pip install '.[torch,colmap]' gsplat==1.5.3 && python examples/train_photographs.py capture/
+Needs torch and gsplat, pycolmap for models of COLMAP, and a GPU for more than a few
+hundred steps: pip install '.[torch,colmap]' gsplat==1.5.3 && python
+examples/train_photographs.py capture/
 """
 
 from __future__ import annotations
@@ -40,7 +43,8 @@ class Config:
     capture: Annotated[Path, tyro.conf.Positional]
     """Folder with photographs and cameras."""
     output: Path = Path("trained.ply")
-    """Asset to write; beside it a .jpg of the photographs that were held out and what it shows there."""
+    """Asset to write; beside it a .jpg of the photographs that were held out and what
+    it shows there."""
     steps: int = 7000
     """Steps, of one photograph each."""
     longest: int = 1200
@@ -64,13 +68,16 @@ class Photograph:
 
 
 def main(config: Config) -> float:
-    """Write the asset, and return the mean PSNR of the photographs that were held out, in dB."""
+    """Write the asset, and return the mean PSNR of the photographs that were held out,
+    in dB."""
     torch.manual_seed(config.seed)
     photographs = read_photographs(config)
     held_out = photographs[::HELD_OUT]
     trained_on = [photograph for k, photograph in enumerate(photographs) if k % HELD_OUT]
     if not trained_on:
-        raise SystemExit(f"{config.capture}: expected two photographs or more, got {len(photographs)}")
+        raise SystemExit(
+            f"{config.capture}: expected two photographs or more, got {len(photographs)}"
+        )
     print(f"{len(trained_on)} photographs to train on, {len(held_out)} held out", flush=True)
     parameters = start(config, [photograph.camera for photograph in photographs])
     began = time.perf_counter()
@@ -91,12 +98,16 @@ def main(config: Config) -> float:
     write_picture(config.output.with_suffix(".jpg"), contact_sheet(rows[:4]))
     mean = float(np.mean(decibels))
     num = len(parameters["means"])
-    print(f"{config.output}: {num:,} gaussians, {seconds:.0f} s, {mean:.2f} dB on photographs held out")
+    print(
+        f"{config.output}: {num:,} gaussians, {seconds:.0f} s, {mean:.2f} dB on photographs held "
+        "out"
+    )
     return mean
 
 
 def read_photographs(config: Config) -> list[Photograph]:
-    """In the order of their names, no larger than is asked for, with cameras of that size."""
+    """In the order of their names, no larger than is asked for, with cameras of that
+    size."""
     listed = config.capture / "transforms.json"
     cameras = v3dg.read_cameras(listed if listed.is_file() else config.capture)
     folder = config.capture if listed.is_file() else config.capture / "images"
@@ -106,7 +117,9 @@ def read_photographs(config: Config) -> list[Photograph]:
             image = file.convert("RGB")
         if image.size != (camera.width, camera.height):
             wanted = f"{camera.width} x {camera.height} px, as its camera"
-            raise SystemExit(f"{folder / name}: expected {wanted}, got {image.width} x {image.height}")
+            raise SystemExit(
+                f"{folder / name}: expected {wanted}, got {image.width} x {image.height}"
+            )
         shrink = min(1.0, config.longest / max(image.size))
         size = (round(image.width * shrink), round(image.height * shrink))
         pixels = np.array(image.resize(size, Image.Resampling.LANCZOS) if shrink < 1 else image)
@@ -117,7 +130,8 @@ def read_photographs(config: Config) -> list[Photograph]:
 
 
 def start(config: Config, cameras: list[v3dg.Camera]) -> dict[str, torch.nn.Parameter]:
-    """A gaussian at each of COLMAP's points, or anywhere around what the cameras look at."""
+    """A gaussian at each of COLMAP's points, or anywhere around what the cameras look
+    at."""
     points, colors = points_of(config, cameras)
     num = len(points)
     rest = (config.sh_degree + 1) ** 2 - 1
@@ -129,35 +143,50 @@ def start(config: Config, cameras: list[v3dg.Camera]) -> dict[str, torch.nn.Para
         "sh0": ((colors - 0.5) / C0)[:, None],
         "shN": torch.zeros(num, rest, 3),
     }
-    return {name: torch.nn.Parameter(value.contiguous().to(config.device)) for name, value in values.items()}
+    return {
+        name: torch.nn.Parameter(value.contiguous().to(config.device))
+        for name, value in values.items()
+    }
 
 
 def points_of(config: Config, cameras: list[v3dg.Camera]) -> tuple[torch.Tensor, torch.Tensor]:
     """(N, 3) points, and their colours in [0,1]."""
-    models = [config.capture / part for part in ("sparse/0", "sparse") if (config.capture / part).is_dir()]
+    models = [
+        config.capture / part for part in ("sparse/0", "sparse") if (config.capture / part).is_dir()
+    ]
     if models:
         import pycolmap
 
         found = list(pycolmap.Reconstruction(str(models[0])).points3D.values())
-        points, colors = (np.array([getattr(point, what) for point in found]) for what in ("xyz", "color"))
+        points, colors = (
+            np.array([getattr(point, what) for point in found]) for what in ("xyz", "color")
+        )
     else:
         middle, size = looked_at(cameras)
         generator = np.random.default_rng(config.seed)
         points = middle + generator.uniform(-size, size, (config.start, 3))
         colors = np.full(points.shape, 127.5)
-    return torch.tensor(points, dtype=torch.float32), torch.tensor(colors / 255, dtype=torch.float32)
+    return torch.tensor(points, dtype=torch.float32), torch.tensor(
+        colors / 255, dtype=torch.float32
+    )
 
 
 def looked_at(cameras: list[v3dg.Camera]) -> tuple[np.ndarray, float]:
-    """The point that is nearest to all lines of sight, and how far the cameras are from it."""
+    """The point that is nearest to all lines of sight, and how far the cameras are from
+    it."""
     positions = np.array([camera.position for camera in cameras])
-    across = [np.eye(3) - np.outer(camera.viewmat[2, :3], camera.viewmat[2, :3]) for camera in cameras]
-    middle = np.linalg.lstsq(sum(across), sum(a @ p for a, p in zip(across, positions, strict=True)))[0]
+    across = [
+        np.eye(3) - np.outer(camera.viewmat[2, :3], camera.viewmat[2, :3]) for camera in cameras
+    ]
+    middle = np.linalg.lstsq(
+        sum(across), sum(a @ p for a, p in zip(across, positions, strict=True))
+    )[0]
     return middle, float(np.linalg.norm(positions - middle, axis=1).max())
 
 
 def nearest(points: torch.Tensor) -> torch.Tensor:
-    """How far a point is from others: the root mean square of the distances to the three nearest."""
+    """How far a point is from others: the root mean square of the distances to the
+    three nearest."""
     distances = [
         torch.cdist(part, points).topk(min(4, len(points)), largest=False).values
         for part in points.split(1024)
@@ -165,8 +194,11 @@ def nearest(points: torch.Tensor) -> torch.Tensor:
     return torch.cat(distances)[:, 1:].square().mean(1).sqrt().clamp(min=1e-7)
 
 
-def train(parameters: dict[str, torch.nn.Parameter], photographs: list[Photograph], config: Config) -> None:
-    """Change the parameters, and how many there are, until they look like the photographs."""
+def train(
+    parameters: dict[str, torch.nn.Parameter], photographs: list[Photograph], config: Config
+) -> None:
+    """Change the parameters, and how many there are, until they look like the
+    photographs."""
     from gsplat import DefaultStrategy
 
     positions = np.array([photograph.camera.position for photograph in photographs])
@@ -180,9 +212,12 @@ def train(parameters: dict[str, torch.nn.Parameter], photographs: list[Photograp
         "shN": 1.25e-4,
     }
     optimizers = {
-        name: torch.optim.Adam([values], lr=rates[name], eps=1e-15) for name, values in parameters.items()
+        name: torch.optim.Adam([values], lr=rates[name], eps=1e-15)
+        for name, values in parameters.items()
     }
-    decay = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], 0.01 ** (1 / max(1, config.steps)))
+    decay = torch.optim.lr_scheduler.ExponentialLR(
+        optimizers["means"], 0.01 ** (1 / max(1, config.steps))
+    )
     # Gaussians are made half of the way, and settle in the other half.
     strategy = DefaultStrategy(refine_stop_iter=config.steps // 2)
     strategy.check_sanity(parameters, optimizers)
@@ -190,10 +225,14 @@ def train(parameters: dict[str, torch.nn.Parameter], photographs: list[Photograp
     order = torch.Generator().manual_seed(config.seed)
     for step in range(config.steps):
         photograph = photographs[int(torch.randint(len(photographs), (1,), generator=order))]
-        drawn, _, info = draw(parameters, photograph.camera, min(config.sh_degree, step // DEGREE_EVERY))
+        drawn, _, info = draw(
+            parameters, photograph.camera, min(config.sh_degree, step // DEGREE_EVERY)
+        )
         strategy.step_pre_backward(parameters, optimizers, state, step, info)
         target = target_of(photograph, config.device)[None]
-        loss = (1 - STRUCTURE) * (drawn - target).abs().mean() + STRUCTURE * (1 - structure(drawn, target))
+        loss = (1 - STRUCTURE) * (drawn - target).abs().mean() + STRUCTURE * (
+            1 - structure(drawn, target)
+        )
         loss.backward()
         for optimizer in optimizers.values():
             optimizer.step()
@@ -202,7 +241,8 @@ def train(parameters: dict[str, torch.nn.Parameter], photographs: list[Photograp
         strategy.step_post_backward(parameters, optimizers, state, step, info, packed=False)
         if (step + 1) % 500 == 0 or step + 1 == config.steps:
             print(
-                f"step {step + 1}: loss {loss.item():.4f}, {len(parameters['means']):,} gaussians", flush=True
+                f"step {step + 1}: loss {loss.item():.4f}, {len(parameters['means']):,} gaussians",
+                flush=True,
             )
 
 
@@ -241,7 +281,11 @@ def structure(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     mx, my = mean(x), mean(y)
     variances = mean(x * x) - mx**2 + mean(y * y) - my**2
     covariance = mean(x * y) - mx * my
-    ratio = (2 * mx * my + 1e-4) * (2 * covariance + 9e-4) / ((mx**2 + my**2 + 1e-4) * (variances + 9e-4))
+    ratio = (
+        (2 * mx * my + 1e-4)
+        * (2 * covariance + 9e-4)
+        / ((mx**2 + my**2 + 1e-4) * (variances + 9e-4))
+    )
     return ratio.mean()
 
 

@@ -1,4 +1,5 @@
-"""Choose what one view needs with v3dg, and draw it with gsplat: a selection is gaussians for any rasterizer.
+"""Choose what one view needs with v3dg, and draw it with gsplat: a selection is
+gaussians for any rasterizer.
 
 Needs a GPU: pip install '.[torch]' gsplat==1.5.3 && python examples/with_gsplat.py
 """
@@ -55,8 +56,8 @@ def main(config: Config) -> float:
 def gsplat_arguments(selection: v3dg.Selection, camera: v3dg.Camera, device: str) -> dict[str, Any]:
     """What `gsplat.rasterization` takes to draw a selection.
 
-    Gaussians are taken relative to the camera, which is then at the origin: far from the world's origin
-    nothing is lost to float32.
+    Gaussians are taken relative to the camera, which is then at the origin: far from
+    the world's origin nothing is lost to float32.
     """
     import torch
 
@@ -81,7 +82,8 @@ def gsplat_arguments(selection: v3dg.Selection, camera: v3dg.Camera, device: str
 
 
 def filter_of(scene: v3dg.Scene) -> float:
-    """What level 1 of the first bundle is drawn with: gsplat has one filter for all gaussians."""
+    """What level 1 of the first bundle is drawn with: gsplat has one filter for all
+    gaussians."""
     clusters = scene.bundles[0].clusters
     return float(clusters.filter_px2[clusters.level == 1].max(initial=0.0))
 

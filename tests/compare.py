@@ -1,4 +1,5 @@
-"""How far apart two answers may be, each bound with its reason; and the comparisons that use them."""
+"""How far apart two answers may be, each bound with its reason; and the comparisons
+that use them."""
 
 from __future__ import annotations
 
@@ -18,10 +19,12 @@ class Bound:
 
 @dataclass(frozen=True)
 class PictureBound:
-    """Colour and alpha: `absolute` at every pixel, `mean` over all. Depth: `relative_depth` at every pixel.
+    """Colour and alpha: `absolute` at every pixel, `mean` over all. Depth:
+    `relative_depth` at every pixel.
 
-    A pixel where an alpha lies within the relative distance `band` of 1/255, or a transmittance of 1e-4, may
-    be decided either way. Such pixels are held to `flip`; at most `share` of all pixels may need that.
+    A pixel where an alpha lies within the relative distance `band` of 1/255, or a
+    transmittance of 1e-4, may be decided either way. Such pixels are held to `flip`; at
+    most `share` of all pixels may need that.
     """
 
     absolute: float
@@ -30,8 +33,9 @@ class PictureBound:
     band: float
     share: float
     reason: str
-    # A gaussian more or less at 1/255 changes a pixel by 1/255 of the colours' range (up to 4 here); one more
-    # or less where a pixel stops by the transmittance before it, at most 1e-4 / (1 - 0.999).
+    # A gaussian more or less at 1/255 changes a pixel by 1/255 of the colours' range
+    # (up to 4 here); one more or less where a pixel stops by the transmittance before
+    # it, at most 1e-4 / (1 - 0.999).
     flip: float = 0.4
 
 
@@ -65,8 +69,8 @@ PICTURE_FLOAT = PictureBound(
     band=1e-4,
     share=0.01,
     reason="float32 against float64: a mean is off by 1e-6 px to 1e-5 px, which moves the falloff of the "
-    "narrowest gaussians (0.1 px) by 3 sigma * 1e-5 / 0.1. Depth is divided by an alpha of 1/255, itself 1 "
-    "minus a number that is rounded to 6e-8. Measured: 2e-5, 3e-7, 3e-5.",
+    "narrowest gaussians (0.1 px) by 3 sigma * 1e-5 / 0.1. Depth is divided by an alpha of 1/255, "
+    "itself 1 minus a number that is rounded to 6e-8. Measured: 2e-5, 3e-7, 3e-5.",
 )
 NEEDLES_FLOAT = PictureBound(
     absolute=1e-3,
@@ -119,7 +123,8 @@ GRADIENT_GSPLAT = GradientBound(
     relative_l2=5e-3,
     cosine=0.9999,
     reason="float32 on both sides. gsplat takes the determinant as a difference, approximates the "
-    "exponential, and divides the transmittance back out from behind; single pixels flip at the cut-offs.",
+    "exponential, and divides the transmittance back out from behind; single pixels flip at the "
+    "cut-offs.",
 )
 BACKGROUND_GRADIENT = Bound(
     relative=1e-5,
@@ -147,12 +152,16 @@ DSSIM_FLOAT = Bound(
 
 
 def assert_close(got, expected, bound: Bound) -> None:
-    np.testing.assert_allclose(got, expected, rtol=bound.relative, atol=bound.absolute, err_msg=bound.reason)
+    np.testing.assert_allclose(
+        got, expected, rtol=bound.relative, atol=bound.absolute, err_msg=bound.reason
+    )
 
 
 def assert_pictures_agree(raster, picture, bound: PictureBound) -> None:
     """Compare a v3dg.Image (NumPy or torch) with a reference Picture."""
-    color, alpha, depth = (np.asarray(x, np.float64) for x in (raster.color, raster.alpha, raster.depth))
+    color, alpha, depth = (
+        np.asarray(x, np.float64) for x in (raster.color, raster.alpha, raster.depth)
+    )
     assert color.shape == picture.color.shape
     assert alpha.shape == depth.shape == picture.alpha.shape
     error = np.maximum(np.abs(color - picture.color).max(axis=2), np.abs(alpha - picture.alpha))
@@ -166,9 +175,9 @@ def assert_pictures_agree(raster, picture, bound: PictureBound) -> None:
         i, j = np.unravel_index(np.argmax(np.where(wrong, error, -1)), error.shape)
         raise AssertionError(
             f"{wrong.sum()} of {wrong.size} pixels are off; worst at row {i}, column {j}: "
-            f"colour {color[i, j]} for {picture.color[i, j]}, alpha {alpha[i, j]} for {picture.alpha[i, j]}, "
-            f"depth {depth[i, j]} for {picture.depth[i, j]}, largest depth error {depth_error[wrong].max()}; "
-            f"bound: {bound}"
+            f"colour {color[i, j]} for {picture.color[i, j]}, alpha {alpha[i, j]} for "
+            f"{picture.alpha[i, j]}, depth {depth[i, j]} for {picture.depth[i, j]}, largest depth "
+            f"error {depth_error[wrong].max()}; bound: {bound}"
         )
     assert error.max(initial=0) <= bound.flip
     assert is_off.sum() <= max(bound.share * is_off.size, 2 if bound.share else 0)

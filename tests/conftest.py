@@ -9,7 +9,8 @@ import scenes_lod
 from v3dg import _device
 from v3dg.viewer.frame import SceneView
 
-# A shared machine can stall for longer than any deadline that would still mean something.
+# A shared machine can stall for longer than any deadline that would still mean
+# something.
 settings.register_profile("v3dg", deadline=None, print_blob=True)
 settings.load_profile("v3dg")
 
@@ -46,7 +47,8 @@ def blob_view(blob_bundle):
 
 @pytest.fixture(scope="module")
 def collected_connections():
-    """No connection that a module's tests left to the collector is there in the tests after them."""
+    """No connection that a module's tests left to the collector is there in the tests
+    after them."""
     yield
     gc.collect()
 

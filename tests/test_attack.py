@@ -1,4 +1,5 @@
-"""A short part of each attack of fuzz/attack.py, which runs for as long as one likes."""
+"""A short part of each attack of fuzz/attack.py, which runs for as long as one
+likes."""
 
 import json
 
@@ -6,7 +7,8 @@ import pytest
 
 from fuzz.attacks.pool import attack
 
-# About a minute of two cores in all: tries of each kind, from seeds that the long runs do not begin with.
+# About a minute of two cores in all: tries of each kind, from seeds that the long runs
+# do not begin with.
 TRIES = {
     "files": 500,
     "commands": 24,

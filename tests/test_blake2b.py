@@ -1,4 +1,5 @@
-"""BLAKE2b in C++: the same bits as Python's, of one message and of several, on every instruction set."""
+"""BLAKE2b in C++: the same bits as Python's, of one message and of several, on every
+instruction set."""
 
 import hashlib
 import os
@@ -15,8 +16,12 @@ LENGTHS = [*range(301), 1023, 1024, 4095, 4096, 4097, 70_001]
 
 
 def messages_of(lengths):
-    data = np.random.default_rng(len(lengths)).integers(0, 256, max(lengths, default=0) + 64, np.uint8)
-    return [data[k % 64 : k % 64 + length] for k, length in enumerate(lengths)]  # hardly one is aligned
+    data = np.random.default_rng(len(lengths)).integers(
+        0, 256, max(lengths, default=0) + 64, np.uint8
+    )
+    return [
+        data[k % 64 : k % 64 + length] for k, length in enumerate(lengths)
+    ]  # hardly one is aligned
 
 
 def check(messages):
@@ -43,9 +48,17 @@ def test_digests_are_those_of_python():
 
 @pytest.mark.parametrize("isa", ISAS[: ISAS.index(_core.isa())])
 def test_narrower_instruction_sets_give_the_same_digests(isa):
-    code = f"import test_blake2b; assert test_blake2b._core.isa() == {isa!r}; test_blake2b.check_all()"
-    environment = {**os.environ, "V3DG_ISA": isa, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    code = (
+        f"import test_blake2b; assert test_blake2b._core.isa() == {isa!r}; test_blake2b.check_all()"
+    )
+    environment = {
+        **os.environ,
+        "V3DG_ISA": isa,
+        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
 
 

@@ -1,6 +1,8 @@
-"""Small files that claim or expand to much: what readers hold is bounded by what docs/robustness.md says.
+"""Small files that claim or expand to much: what readers hold is bounded by what
+docs/robustness.md says.
 
-Each is read by a process of its own, whose largest memory the system measures, and which has a minute.
+Each is read by a process of its own, whose largest memory the system measures, and
+which has a minute.
 """
 
 import gzip
@@ -52,7 +54,11 @@ WARM_UP = [FIXTURES / name for name in ("sh3.ply", "sh3.sog", "sh3_v3.spz", "sh3
 def read_apart(path):
     """Bytes that reading a file took, and what came of it."""
     done = subprocess.run(
-        [sys.executable, "-c", CHILD, path, *WARM_UP], capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", CHILD, path, *WARM_UP],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
     )
     peak, _, found = done.stdout.partition(" ")
     return int(peak), found.strip()
@@ -137,13 +143,18 @@ SOG = {
         sog_files(9) | dict.fromkeys(["quats.webp", "scales.webp"], HUGE + bytes(1_000_000))
     ),
     "pictures that Pillow warns of": lambda: zipped(
-        sog_files(9) | dict.fromkeys(["quats.webp", "scales.webp"], picture(10_000, 10_000, lossless=True))
+        sog_files(9)
+        | dict.fromkeys(["quats.webp", "scales.webp"], picture(10_000, 10_000, lossless=True))
     ),
-    "a canvas larger than its picture": lambda: zipped(sog_files(9) | {"scales.webp": canvas(16384, 16384)}),
+    "a canvas larger than its picture": lambda: zipped(
+        sog_files(9) | {"scales.webp": canvas(16384, 16384)}
+    ),
     "a palette larger than its count": lambda: zipped(
         sog_files(9, 3) | {"shN_centroids.webp": picture(960, 16383, lossless=True)}
     ),
-    "pictures of another format": lambda: zipped(sog_files(9) | {"quats.webp": picture(9999, 9999, "PNG")}),
+    "pictures of another format": lambda: zipped(
+        sog_files(9) | {"quats.webp": picture(9999, 9999, "PNG")}
+    ),
     "equal gaussians": lambda: zipped(
         dict.fromkeys(sog_files(1), picture(4000, 2600, lossless=True)) | meta_of_sog(count=MANY)
     ),
@@ -170,7 +181,9 @@ def spz_of_zstd(count, num_bytes, degree=0):
     """Streams of zeros, each of which may expand to more than it says."""
     sizes = [count * width for width in (9, 1, 3, 3, 4, 45)][: 6 if degree else 5]
     streams = [zstandard.ZstdCompressor().compress(bytes(num_bytes or size)) for size in sizes]
-    table = b"".join(struct.pack("<QQ", len(s), size) for s, size in zip(streams, sizes, strict=True))
+    table = b"".join(
+        struct.pack("<QQ", len(s), size) for s, size in zip(streams, sizes, strict=True)
+    )
     start = bytearray(spz_header(count, 4, degree) + struct.pack("<I", 32) + bytes(12))
     start[15] = len(sizes)
     return bytes(start) + table + b"".join(streams)
@@ -183,7 +196,9 @@ SPZ = {
     ),
     "a count alone": lambda: gzip.compress(spz_header(2**32 - 1)),
     "what follows": lambda: gzip.compress(spz_header(1) + bytes(20) + bytes(1 << 28)),
-    "many streams": lambda: gzip.compress(spz_header(1) + bytes(20)) + gzip.compress(bytes(1 << 28)),
+    "many streams": lambda: (
+        gzip.compress(spz_header(1) + bytes(20)) + gzip.compress(bytes(1 << 28))
+    ),
     "a name without end": lambda: b"\x1f\x8b\x08\x08" + bytes(6) + b"a" * (1 << 20),
     "zstd of equal gaussians": lambda: spz_of_zstd(MANY, None),
     "zstd of equal gaussians that are believed": lambda: spz_of_zstd(FREE_GAUSSIANS, None, 3),
@@ -193,7 +208,14 @@ SPZ = {
 
 def checkpoint(**changes):
     count = changes.pop("count", 9)
-    shapes = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
+    shapes = {
+        "means": (3,),
+        "scales": (3,),
+        "quats": (4,),
+        "opacities": (),
+        "sh0": (1, 3),
+        "shN": (15, 3),
+    }
     splats = {name: torch.zeros(count, *shape) for name, shape in shapes.items()} | changes
     stream = io.BytesIO()
     torch.save({"splats": splats}, stream)
@@ -209,7 +231,9 @@ def expanded(count):
 def repacked(content, compression=zipfile.ZIP_STORED, **members):
     source = zipfile.ZipFile(io.BytesIO(content))
     files = {name: source.read(name) for name in source.namelist()}
-    return zipped(files | {f"archive/{name}": value for name, value in members.items()}, compression)
+    return zipped(
+        files | {f"archive/{name}": value for name, value in members.items()}, compression
+    )
 
 
 def pickled(body):
@@ -217,7 +241,8 @@ def pickled(body):
 
 
 def tuple_bomb(end):
-    """A tuple of twice the last tuple, 60 times: 2^60 to whoever looks into all of it."""
+    """A tuple of twice the last tuple, 60 times: 2^60 to whoever looks into all of
+    it."""
     nested = b")q\x00" + b"".join(
         b"h" + bytes([i]) * 1 + b"h" + bytes([i]) + b"\x86q" + bytes([i + 1]) for i in range(60)
     )
@@ -234,8 +259,12 @@ SHARED_SHAPE = (
 CHECKPOINT = {
     "expanded tensors": lambda: checkpoint(**expanded(MANY)),
     "one expanded tensor": lambda: checkpoint(shN=torch.zeros(1, 15, 3).expand(9, 15, 3)),
-    "equal gaussians in deflated tensors": lambda: repacked(checkpoint(count=1 << 20), zipfile.ZIP_DEFLATED),
-    "equal gaussians that are believed": lambda: repacked(checkpoint(count=4000), zipfile.ZIP_DEFLATED),
+    "equal gaussians in deflated tensors": lambda: repacked(
+        checkpoint(count=1 << 20), zipfile.ZIP_DEFLATED
+    ),
+    "equal gaussians that are believed": lambda: repacked(
+        checkpoint(count=4000), zipfile.ZIP_DEFLATED
+    ),
     "a pickle that expands": lambda: repacked(
         checkpoint(), zipfile.ZIP_DEFLATED, **{"data.pkl": b"N0" * (1 << 26)}
     ),
@@ -273,7 +302,9 @@ PLY = {
         .replace(b"element vertex 300", b"element vertex 999999999999")
     ),
     "packed elements": lambda: ply_header(
-        "element vertex 1", "property uint packed_position", *(f"property uchar a{i}" for i in range(3000))
+        "element vertex 1",
+        "property uint packed_position",
+        *(f"property uchar a{i}" for i in range(3000)),
     ),
 }
 
@@ -326,7 +357,9 @@ READ = ["splat: zeros", "ksplat: a high degree without gaussians", "spz: many st
 
 def assert_bounded(path, num_bytes):
     peak, found = read_apart(path)
-    print(f"{num_bytes:,} bytes, {peak >> 20} MiB, {found}")  # what docs/robustness.md has figures of
+    print(
+        f"{num_bytes:,} bytes, {peak >> 20} MiB, {found}"
+    )  # what docs/robustness.md has figures of
     believed = FREE_GAUSSIANS + num_bytes
     count = int(found.split()[1]) if found.startswith("read") else 0
     assert count <= believed
@@ -377,12 +410,18 @@ def one_file(folder, make_name, times):
 STREAMED = {
     "a name 300 times": lambda folder: one_file(folder, lambda i: "a.sog", 300),
     "a name 20,000 times": lambda folder: one_file(folder, lambda i: "a.sog", 20_000),
-    "a name spelled 20,000 times": lambda folder: one_file(folder, lambda i: "./" * i + "a.sog", 2000),
+    "a name spelled 20,000 times": lambda folder: one_file(
+        folder, lambda i: "./" * i + "a.sog", 2000
+    ),
     "300 links": lambda folder: one_file(folder, lambda i: f"{i}.sog" if i else "a.sog", 300),
-    "300 hard links": lambda folder: one_file(folder, lambda i: f"hard{i}.sog" if i else "a.sog", 300),
+    "300 hard links": lambda folder: one_file(
+        folder, lambda i: f"hard{i}.sog" if i else "a.sog", 300
+    ),
     "a tree": deep_and_wide,
     "many objects": lambda folder: streamed(folder, [{"a": 0}] * 200_000),
-    "a long number of a level": lambda folder: streamed(folder, [], tree={"lods": {"1" * 5000: {}}}),
+    "a long number of a level": lambda folder: streamed(
+        folder, [], tree={"lods": {"1" * 5000: {}}}
+    ),
     "a run": lambda folder: streamed(folder, ["a.sog"], [(0, 0, 1 << 32)]),
     "runs": lambda folder: streamed(folder, ["a.sog"], [(0, 0, 60_000)] * 10_000),
 }
@@ -405,7 +444,8 @@ def test_a_name_that_is_there_many_times_is_read_once(tmp_path):
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("name", ["a.sog", "a.spz", "a.compressed.ply", "a.ply"])
 def test_equal_gaussians_read_back_however_many(tmp_path, name, degree):
-    """A constant picture has 74 bytes whatever its size; beyond a number the writer adds what is missing."""
+    """A constant picture has 74 bytes whatever its size; beyond a number the writer
+    adds what is missing."""
     write_asset(tmp_path / name, equal_gaussians(FREE_GAUSSIANS + 50_000, degree))
     assert assert_bounded(tmp_path / name, (tmp_path / name).stat().st_size) == "read 312144"
 
@@ -424,6 +464,8 @@ def test_one_constant_picture_is_read(tmp_path, part):
 
 def test_pictures_of_the_size_that_other_writers_round_to_are_read(tmp_path):
     """A square of a power of two has up to four times the pixels."""
-    files = {name: picture(1024, 1024, lossless=True) for name in sog_files(9) if name != "meta.json"}
+    files = {
+        name: picture(1024, 1024, lossless=True) for name in sog_files(9) if name != "meta.json"
+    }
     (tmp_path / "a.sog").write_bytes(zipped(files | meta_of_sog(count=FREE_GAUSSIANS - 9)))
     assert assert_bounded(tmp_path / "a.sog", 0).startswith("read")

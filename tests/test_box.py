@@ -36,7 +36,9 @@ def test_both_devices_give_the_same_bits():
     g = scenes_lod.blob(np.random.default_rng(1), 20_000)
     g = scenes.replaced(g, scales=g.scales**3, quats=g.quats * np.float32(1e-3))
     offset = np.unique(np.append(np.random.default_rng(2).integers(0, len(g), 300), [0, len(g)]))
-    np.testing.assert_array_equal(bound_by_boxes("cpu", g, offset), bound_by_boxes("cuda", g, offset))
+    np.testing.assert_array_equal(
+        bound_by_boxes("cpu", g, offset), bound_by_boxes("cuda", g, offset)
+    )
 
 
 def test_nothing_has_no_box(device):
@@ -57,5 +59,7 @@ def test_zero_quaternion_turns_nothing(device):
 @pytest.mark.parametrize("offset", [[0], [0, 2], [1, 3], [0, 2, 1, 3]])
 def test_wrong_offsets_are_named(device, offset):
     g = scenes.gaussians(np.zeros((3, 3)))
-    with pytest.raises(ValueError, match="offset: expected ascending boundaries from 0 to 3, got others"):
+    with pytest.raises(
+        ValueError, match="offset: expected ascending boundaries from 0 to 3, got others"
+    ):
         bound_by_boxes(device, g, np.array(offset))

@@ -18,7 +18,17 @@ import scenes
 import v3dg
 from benchmarks.worlds.procedural import make_asset
 from reference import project as reference_project
-from v3dg import BuildConfig, Camera, Gaussians, _core, build_bundle, metrics, rasterize, render, select
+from v3dg import (
+    BuildConfig,
+    Camera,
+    Gaussians,
+    _core,
+    build_bundle,
+    metrics,
+    rasterize,
+    render,
+    select,
+)
 from v3dg._device import CPU, place, resolve
 from v3dg.bundle.codec import codec_of
 from v3dg.levels.leaves import MemoryLeaves
@@ -46,7 +56,9 @@ def bundle(asset, device):
 
 def everything_in(bundle):
     """All arrays of a bundle by name."""
-    arrays = {f"{t}.{n}": getattr(getattr(bundle, t), n) for t in TABLES for n in vars(getattr(bundle, t))}
+    arrays = {
+        f"{t}.{n}": getattr(getattr(bundle, t), n) for t in TABLES for n in vars(getattr(bundle, t))
+    }
     return arrays | {name: getattr(bundle.gaussians, name) for name in scenes.NAMES}
 
 
@@ -67,7 +79,9 @@ def camera_at(center, radius, direction, footprint_px2):
     side = max(4, math.ceil(2.2 * math.sqrt(footprint_px2 / math.pi)))
     fov = 2 * math.atan(1.1 * math.tan(math.asin(1 / 4)))
     eye = center + 4 * radius * np.asarray(direction) / np.linalg.norm(direction)
-    return Camera.look_at(eye, center, [0.1, 0.2, 1.0], fov_x=fov, width=side, height=side, near=0.1 * radius)
+    return Camera.look_at(
+        eye, center, [0.1, 0.2, 1.0], fov_x=fov, width=side, height=side, near=0.1 * radius
+    )
 
 
 def held_out_psnr(asset, bundle, level):
@@ -106,7 +120,9 @@ def test_same_file_on_any_number_of_threads(asset, tmp_path):
     for threads in (1, 2, 4):
         files.append(tmp_path / f"{threads}.v3dg")
         environment = os.environ | {
-            "PYTHONPATH": os.pathsep.join(str(Path(file).parents[1]) for file in (v3dg.__file__, __file__)),
+            "PYTHONPATH": os.pathsep.join(
+                str(Path(file).parents[1]) for file in (v3dg.__file__, __file__)
+            ),
             "OMP_NUM_THREADS": str(threads),
         }
         command = [sys.executable, "-c", THREADS_SCRIPT, str(files[-1])]
@@ -151,7 +167,8 @@ def test_asset_may_be_on_the_device(asset):
 
 @pytest.mark.gpu
 def test_gpu_memory_that_is_taken_changes_no_byte():
-    """Groups whose pictures do not fit in memory together are fitted in turn, to the same."""
+    """Groups whose pictures do not fit in memory together are fitted in turn, to the
+    same."""
     import torch
 
     asset, config = make_asset(num_gaussians=60_000, seed=0), BuildConfig(cluster_size=32, steps=8)
@@ -195,7 +212,9 @@ def test_each_level_has_half_of_the_one_below(num_gaussians, group_size, device)
 
 @pytest.mark.parametrize(("filter_px2", "last"), [(0.0, 0.0), (0.05, 1 / 12), (0.2, 0.2)])
 def test_the_last_level_has_the_filter_of_a_pixel(filter_px2, last):
-    bundle = build(make_asset(num_gaussians=1000, seed=3), replace(SMALL, steps=0, filter_px2=filter_px2))
+    bundle = build(
+        make_asset(num_gaussians=1000, seed=3), replace(SMALL, steps=0, filter_px2=filter_px2)
+    )
     level = bundle.clusters.level
     expected = np.select([level == 0, level < bundle.num_levels - 1], [0.0, filter_px2], last)
     np.testing.assert_array_equal(bundle.clusters.filter_px2, expected.astype(np.float32))
@@ -204,7 +223,8 @@ def test_the_last_level_has_the_filter_of_a_pixel(filter_px2, last):
 
 
 def shell(width, height, seed=0):
-    """A ball of flat gaussians: their width and height, in distances to the next one."""
+    """A ball of flat gaussians: their width and height, in distances to the next
+    one."""
     rng, num = np.random.default_rng(seed), 1500
     quats = rng.normal(size=(num, 4))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
@@ -219,7 +239,8 @@ SMOOTH = BuildConfig(cluster_size=64, steps=40, num_views=16)
 
 
 def growth_of_level_1(smooth, plain):
-    """(G,) times that balls of level 1 of a smooth asset are larger; those above contain them."""
+    """(G,) times that balls of level 1 of a smooth asset are larger; those above
+    contain them."""
     is_first, ball, other = smooth.groups.level == 1, smooth.groups.ball, plain.groups.ball
     np.testing.assert_array_equal(ball[is_first, :3], other[is_first, :3])
     for lower, upper in enumerate(smooth.groups.parent):
@@ -236,7 +257,9 @@ def test_level_1_is_selected_later_where_it_is_worse_than_its_leaves(device):
 
     def growth(level):
         rows = [place(gaussians, resolve(device)).rows for gaussians in (leaves, level)]
-        return _core.first_selected(*rows, here.leaf_offset, here.leaf_offset, ball, 0.0, False, 0.0)
+        return _core.first_selected(
+            *rows, here.leaf_offset, here.leaf_offset, ball, 0.0, False, 0.0
+        )
 
     is_worse = np.add.reduceat(leaves.means[:, 2], here.leaf_offset[:-1]) > 0
     shift = np.where(np.repeat(is_worse, np.diff(here.leaf_offset)), 0.05, 0)[:, None, None]
@@ -257,14 +280,18 @@ def test_level_1_of_what_is_built_in_parts_is_selected_at_half_the_size(device, 
 @pytest.mark.parametrize(
     ("width", "height", "is_smooth"), [(1.1, 1.1, True), (0.4, 0.4, False), (1.1, 0.1, False)]
 )
-def test_smooth_assets_have_no_filter_and_a_level_1_for_later(width, height, is_smooth, device, tmp_path):
+def test_smooth_assets_have_no_filter_and_a_level_1_for_later(
+    width, height, is_smooth, device, tmp_path
+):
     asset = shell(width, height)
     found = build(asset, SMOOTH, device=device)
     first = found.level_range(1)
     assert (found.clusters.filter_px2[first] == (0 if is_smooth else np.float32(0.05))).all()
     assert found.clusters.filter_px2[-1] == np.float32(1 / 12)
     assert found.config["build"]["smooth"] == "measured"
-    assert same(found, build(asset, replace(SMOOTH, smooth="yes" if is_smooth else "no"), device=device))
+    assert same(
+        found, build(asset, replace(SMOOTH, smooth="yes" if is_smooth else "no"), device=device)
+    )
     assert same(found, build(asset, SMOOTH, device=device, resume_path=tmp_path / "parts.v3dg"))
     if is_smooth:
         plain = build(asset, replace(SMOOTH, smooth="no", filter_px2=0.0), device=device)
@@ -297,19 +324,24 @@ def test_smoothness_is_measured_where_levels_are_fitted_with_a_filter(changes, i
 @pytest.mark.parametrize("num_gaussians", [8192, 8193, 8200, 9000, 700])
 @pytest.mark.parametrize(("missed", "is_smooth"), [(1.47, True), (1.48, False)])
 def test_smoothness_is_measured_all_over_the_asset(num_gaussians, missed, is_smooth, monkeypatch):
-    """Also where groups have a gaussian more than a round number: a sample's clusters could be larger."""
+    """Also where groups have a gaussian more than a round number: a sample's clusters
+    could be larger."""
     asset = make_asset(num_gaussians=1000, seed=0).subset(np.arange(num_gaussians) % 1000)
     config = BuildConfig(cluster_size=64, group_size=4, steps=7, loss_l1=2.0, loss_alpha=0.25)
     leaves = MemoryLeaves(asset, config)
     plan = Plan.of(leaves.num_gaussians, config)
     num_groups, reads, builders = plan.levels[1].num_groups, [], []
     read = leaves.read
-    monkeypatch.setattr(leaves, "read", lambda first, last: reads.append((first, last)) or read(first, last))
+    monkeypatch.setattr(
+        leaves, "read", lambda first, last: reads.append((first, last)) or read(first, last)
+    )
 
     def levels(builder, asset):
         builders.append(builder)
         assert (
-            len(asset) == sum(last - first for first, last in reads) == builder.plan.levels[0].num_gaussians
+            len(asset)
+            == sum(last - first for first, last in reads)
+            == builder.plan.levels[0].num_gaussians
         )
         error = np.array([[0.2, 0.4], [0.6, 0.8]])  # a loss of 2 * 0.4 + 0.25 * 0.6
         error[:, 0] *= missed if builder.config.filter_px2 == 0 else 1
@@ -323,7 +355,8 @@ def test_smoothness_is_measured_all_over_the_asset(num_gaussians, missed, is_smo
     own = [np.searchsorted(offset, first, side="right") - 1 for first, _ in reads]
     assert np.diff(own).tolist() == [num_groups // count] * (count - 1)
     assert all(
-        offset[g] == first and last <= offset[g + 1] for g, (first, last) in zip(own, reads, strict=True)
+        offset[g] == first and last <= offset[g + 1]
+        for g, (first, last) in zip(own, reads, strict=True)
     )
     assert [builder.config.filter_px2 for builder in builders] == [0.05, 0.0]
     for builder in builders:
@@ -339,7 +372,8 @@ def test_level_zero_is_the_asset(asset, bundle):
 
 
 def test_the_filter_of_an_asset_is_its_own(asset, bundle, device):
-    """Level 0 is drawn with it; what is coarser is fitted to the asset without, or would be thicker."""
+    """Level 0 is drawn with it; what is coarser is fitted to the asset without, or
+    would be thicker."""
     filtered = build(asset, replace(SMALL, asset_filter_px2=0.3), device=device)
     is_fine = bundle.clusters.level == 0
     assert (filtered.clusters.filter_px2[is_fine] == np.float32(0.3)).all()
@@ -393,7 +427,8 @@ def test_colours_of_all_degrees_survive_to_the_coarsest_level(degree, device):
     bundle = build(asset, replace(SMALL, steps=0), device=device)
     last = bundle.level_gaussians(bundle.num_levels - 1)
     np.testing.assert_allclose(last.sh, asset.sh[: len(last)], rtol=1e-5, atol=1e-6)
-    # Fitting makes up for lost overlap with brightness, but has no reason to turn what the view changes.
+    # Fitting makes up for lost overlap with brightness, but has no reason to turn what
+    # the view changes.
     fitted = build(asset, device=device)
     assert fitted.sh_degree == degree
     fitted_last = fitted.level_gaussians(fitted.num_levels - 1)
@@ -453,7 +488,9 @@ DEGENERATE = degenerate_assets()
 @pytest.mark.parametrize("name", DEGENERATE)
 def test_any_asset_is_built_selected_and_drawn(name, init, device):
     asset = DEGENERATE[name]
-    config = BuildConfig(cluster_size=8, steps=3, views_per_step=1, num_views=8, min_gaussians=1, init=init)
+    config = BuildConfig(
+        cluster_size=8, steps=3, views_per_step=1, num_views=8, min_gaussians=1, init=init
+    )
     bundle = build(asset, config, device=device)
     for array_name, array in everything_in(bundle).items():
         assert np.isfinite(array).all(), array_name
@@ -464,7 +501,9 @@ def test_any_asset_is_built_selected_and_drawn(name, init, device):
         num = select(bundle, camera, tolerance=tolerance, device="cpu").num_gaussians
         assert 1 <= num <= len(asset)
         image = render(bundle, camera, tolerance=tolerance, depth=True, device="cpu")
-        assert all(np.isfinite(picture).all() for picture in (image.color, image.alpha, image.depth))
+        assert all(
+            np.isfinite(picture).all() for picture in (image.color, image.alpha, image.depth)
+        )
 
 
 def test_asset_without_gaussians_is_refused(device):
@@ -513,7 +552,9 @@ def test_gaussians_that_no_pixel_can_show_are_left_out_silently(asset, device):
 
 def test_asset_with_nothing_left_is_refused(asset, device):
     hidden = scenes.replaced(asset, opacities=np.full(1200, 0.001, np.float32))
-    with pytest.raises(ValueError, match=r"asset: expected a gaussian that can be drawn, got none: 1,200 of"):
+    with pytest.raises(
+        ValueError, match=r"asset: expected a gaussian that can be drawn, got none: 1,200 of"
+    ):
         build(hidden, device=device)
 
 
@@ -530,7 +571,10 @@ def test_unknown_choice_for_unusable_gaussians_is_refused(asset):
     [
         ({"cluster_size": 1}, "cluster_size: expected 2 to 1,073,741,824, got 1"),
         ({"cluster_size": 64.0}, "cluster_size: expected a whole number, got 64.0"),
-        ({"cluster_size": 2**62}, "cluster_size: expected 2 to 1,073,741,824, got 4611686018427387904"),
+        (
+            {"cluster_size": 2**62},
+            "cluster_size: expected 2 to 1,073,741,824, got 4611686018427387904",
+        ),
         ({"steps": -1}, "steps: expected 0 to 1,000,000, got -1"),
         ({"steps": True}, "steps: expected a whole number, got True"),
         ({"steps": 2**31 - 1}, "steps: expected 0 to 1,000,000, got 2147483647"),
@@ -540,7 +584,10 @@ def test_unknown_choice_for_unusable_gaussians_is_refused(asset):
         ({"supersample": 0}, "supersample: expected 1 to 64, got 0"),
         ({"supersample": 2**16}, "supersample: expected 1 to 64, got 65536"),
         ({"image_size": 2**31}, "image_size: expected 0 to 8,192, got 2147483648"),
-        ({"image_size": 8000}, "image_size: expected views of at most 8192 px a side with `supersample`"),
+        (
+            {"image_size": 8000},
+            "image_size: expected views of at most 8192 px a side with `supersample`",
+        ),
         ({"image_size": 2000, "num_views": 64}, "image_size: expected views of at most 8192 px"),
         ({"min_gaussians": 0}, "min_gaussians: expected 1 to 4,611,686,018,427,387,904, got 0"),
         ({"group_size": 1}, "group_size: expected 2 to 1,073,741,824, got 1"),
@@ -573,10 +620,15 @@ def is_number(field):
 
 
 def test_every_number_has_a_range_in_which_a_build_ends(asset):
-    """At either end of each, with the rest as it is: built, or refused before anything is allocated."""
+    """At either end of each, with the rest as it is: built, or refused before anything
+    is allocated."""
     small = BuildConfig(cluster_size=32, steps=1, num_views=2)
-    assert not {field.name for field in fields(BuildConfig) if field.type in (int, float)}  # without a range
-    ranges = {field.name: get_args(field.type)[1] for field in fields(BuildConfig) if is_number(field)}
+    assert not {
+        field.name for field in fields(BuildConfig) if field.type in (int, float)
+    }  # without a range
+    ranges = {
+        field.name: get_args(field.type)[1] for field in fields(BuildConfig) if is_number(field)
+    }
     assert len(ranges) == 26
     for name, ends in ranges.items():
         for value in {*ends} - {1_000_000 if name.endswith("steps") else None, 1 << 16}:
@@ -592,12 +644,16 @@ def test_every_number_has_a_range_in_which_a_build_ends(asset):
 
 
 def test_views_that_are_too_large_for_the_clusters_are_refused(asset):
-    with pytest.raises(ValueError, match="px2_per_gaussian: expected views of at most 8192 px a side"):
+    with pytest.raises(
+        ValueError, match="px2_per_gaussian: expected views of at most 8192 px a side"
+    ):
         build(asset, BuildConfig(cluster_size=1 << 20, px2_per_gaussian=1e4), device="cpu")
 
 
 def test_wrong_options_are_named(asset):
-    with pytest.raises(ValueError, match="device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got 'gpu'"):
+    with pytest.raises(
+        ValueError, match="device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got 'gpu'"
+    ):
         build(asset, device="gpu")
     with pytest.raises(TypeError, match="progress: expected True, False or a function, got 'yes'"):
         build_bundle(asset, progress="yes")
@@ -606,7 +662,9 @@ def test_wrong_options_are_named(asset):
 
 
 @pytest.mark.parametrize("group_size", [2, 4, 8, 32])
-@pytest.mark.parametrize("changes", [{}, {"prune_growth": 1.0}, {"init": "merge", "targets": "finest"}])
+@pytest.mark.parametrize(
+    "changes", [{}, {"prune_growth": 1.0}, {"init": "merge", "targets": "finest"}]
+)
 def test_paper_settings_build(asset, group_size, changes, device):
     config = BuildConfig.paper(cluster_size=1200 // 16, group_size=group_size, steps=2, **changes)
     bundle = build(asset, config, device=device)
@@ -626,7 +684,9 @@ def test_settings_for_leaves_only_make_one_level(asset, device):
 
 def test_paper_fit_reduces_the_error(asset, device):
     config = BuildConfig.paper(cluster_size=300)
-    start, fitted = (build(asset, replace(config, steps=steps), device=device) for steps in (0, 100))
+    start, fitted = (
+        build(asset, replace(config, steps=steps), device=device) for steps in (0, 100)
+    )
     assert held_out_psnr(asset, fitted, 1) > held_out_psnr(asset, start, 1)
 
 
@@ -636,8 +696,13 @@ def test_paper_fit_reduces_the_error(asset, device):
 def test_fit_is_never_worse_than_its_start(asset, device):
     config = replace(SMALL, num_views=16)
     start = build(asset, replace(config, steps=0), device=device).groups
-    # Steps so long that fits run away; those of the first level have the same start in all.
-    for change in ({}, {"step_position": 10.0, "step_logit": 50.0}, {"step_log_scale": 5.0, "step_sh0": 9.0}):
+    # Steps so long that fits run away; those of the first level have the same start in
+    # all.
+    for change in (
+        {},
+        {"step_position": 10.0, "step_logit": 50.0},
+        {"step_log_scale": 5.0, "step_sh0": 9.0},
+    ):
         fitted = build(asset, replace(config, **change), device=device).groups
         weights = [config.loss_l1, config.loss_alpha]
         first = start.level == 1
@@ -646,9 +711,12 @@ def test_fit_is_never_worse_than_its_start(asset, device):
 
 
 def test_runaway_fit_leaves_the_start(asset, device):
-    runaway = replace(SMALL, steps=3, step_position=1e6, step_logit=1e6, step_log_scale=1e6, step_sh0=1e6)
+    runaway = replace(
+        SMALL, steps=3, step_position=1e6, step_logit=1e6, step_log_scale=1e6, step_sh0=1e6
+    )
     fitted, start = (
-        build(asset, c, device=device).level_gaussians(1) for c in (runaway, replace(SMALL, steps=0))
+        build(asset, c, device=device).level_gaussians(1)
+        for c in (runaway, replace(SMALL, steps=0))
     )
     np.testing.assert_allclose(fitted.means, start.means, atol=1e-6)
     np.testing.assert_allclose(fitted.opacities, start.opacities, atol=1e-3)
@@ -656,7 +724,8 @@ def test_runaway_fit_leaves_the_start(asset, device):
 
 
 def test_fit_gains_over_merging_alone(asset, device):
-    """In dB, at the size of selection, on views that no fit saw. Measured: 1.5, 1.5, 0.7."""
+    """In dB, at the size of selection, on views that no fit saw. Measured: 1.5, 1.5,
+    0.7."""
     merged, fitted = (
         build(asset, BuildConfig(cluster_size=64, steps=steps), device=device) for steps in (0, 200)
     )
@@ -671,7 +740,9 @@ def test_progress_counts_all_levels_ahead(asset, device):
     """It ends complete: all coarser gaussians, all levels, the last group, its loss."""
     told = []
     config = replace(SMALL, group_size=4)
-    bundle = build_bundle(asset, config=config, progress=lambda *state: told.append(state), device=device)
+    bundle = build_bundle(
+        asset, config=config, progress=lambda *state: told.append(state), device=device
+    )
     done, total, text = told[-1]
     assert done == total == bundle.num_gaussians - len(asset)
     assert all(before[0] <= after[0] for before, after in itertools.pairwise(told))

@@ -169,7 +169,13 @@ def test_an_interrupt_cancels_what_waits(folder, tmp_path):
     executor = Interrupted()
     with small_units(), pytest.raises(KeyboardInterrupt):
         build_file(folder / "a.ply", tmp_path / "out.v3dg", executor=executor, **OPTIONS)
-    assert [future.cancelled() for future in executor.futures[:5]] == [False, False, True, True, True]
+    assert [future.cancelled() for future in executor.futures[:5]] == [
+        False,
+        False,
+        True,
+        True,
+        True,
+    ]
 
 
 # ---- dask
@@ -210,14 +216,38 @@ class Killer:
 def cluster(folder, num_workers):
     """The address of a scheduler, and of workers that are processes of their own."""
     environment = ENVIRONMENT | {"OMP_NUM_THREADS": "1", "DASK_DISTRIBUTED__ADMIN__LOG_LENGTH": "0"}
-    options = {"cwd": folder, "env": environment, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    options = {
+        "cwd": folder,
+        "env": environment,
+        "stdout": subprocess.DEVNULL,
+        "stderr": subprocess.DEVNULL,
+    }
     dask = [sys.executable, "-m", "dask"]
     file = folder / "scheduler.json"
     processes = []
     try:
         for command in (
-            ["scheduler", "--port", "0", "--no-dashboard", "--host", "127.0.0.1", "--scheduler-file", file],
-            *[["worker", "--scheduler-file", file, "--no-nanny", "--no-dashboard", "--nthreads", "1"]]
+            [
+                "scheduler",
+                "--port",
+                "0",
+                "--no-dashboard",
+                "--host",
+                "127.0.0.1",
+                "--scheduler-file",
+                file,
+            ],
+            *[
+                [
+                    "worker",
+                    "--scheduler-file",
+                    file,
+                    "--no-nanny",
+                    "--no-dashboard",
+                    "--nthreads",
+                    "1",
+                ]
+            ]
             * num_workers,
         ):
             processes.append(subprocess.Popen([*dask, *map(str, command)], **options))
@@ -250,7 +280,9 @@ def test_a_dask_cluster_builds_the_same_bytes_though_a_worker_is_killed(folder, 
             """A worker in the midst of a unit, when another unit is finished."""
             if not is_journal_longer(output, folder):
                 return None
-            return next((pids[worker] for worker, tasks in client.processing().items() if tasks), None)
+            return next(
+                (pids[worker] for worker, tasks in client.processing().items() if tasks), None
+            )
 
         with Killer(busy) as killer:
             build_on(client.get_executor(), folder, output)
@@ -259,7 +291,9 @@ def test_a_dask_cluster_builds_the_same_bytes_though_a_worker_is_killed(folder, 
         # And by the command, which gets whole units.
         address = client.scheduler.address
         for name, options in (("dask", ["--scheduler", address]), ("here", [])):
-            done = run("build", folder / "a.ply", "-o", tmp_path / f"{name}.v3dg", "--quiet", *options)
+            done = run(
+                "build", folder / "a.ply", "-o", tmp_path / f"{name}.v3dg", "--quiet", *options
+            )
             assert done.returncode == 0, done.stderr
         assert (tmp_path / "dask.v3dg").read_bytes() == (tmp_path / "here.v3dg").read_bytes()
 
@@ -280,7 +314,8 @@ class Meddler(threading.Thread):
 
 @pytest.fixture
 def meddled_build(folder, tmp_path):
-    """Builds on a cluster to whose scheduler something is done in the midst; also gives its address."""
+    """Builds on a cluster to whose scheduler something is done in the midst; also gives
+    its address."""
     distributed = pytest.importorskip("distributed")
     (tmp_path / "dask").mkdir()
     (tmp_path / "out").mkdir()
@@ -301,7 +336,8 @@ def meddled_build(folder, tmp_path):
 
 
 def goes_on_alone(folder, output):
-    """Whether finished units are there, from which a build goes on without the scheduler."""
+    """Whether finished units are there, from which a build goes on without the
+    scheduler."""
     assert levels_path(output).exists()
     with ThreadPoolExecutor(2) as executor:
         build_on(executor, folder, output, resume=True)
@@ -312,7 +348,9 @@ def test_a_scheduler_that_stops_in_the_midst_is_not_waited_for(meddled_build, fo
     build, output, address = meddled_build
     monkeypatch.setattr("v3dg.levels.scheduler._MOST_SILENCE_S", 4)
     monkeypatch.setattr("v3dg.levels.scheduler._TICK_S", 0.5)
-    with pytest.raises(RuntimeError, match=rf"^scheduler {address}: no answer for 4 s; .*units are kept"):
+    with pytest.raises(
+        RuntimeError, match=rf"^scheduler {address}: no answer for 4 s; .*units are kept"
+    ):
         build(lambda pid: os.kill(pid, signal.SIGSTOP))
     goes_on_alone(folder, output)
 
@@ -380,7 +418,9 @@ def test_only_silence_without_a_break_ends_a_wait():
                 while watch._question is not None and not watch._question.done():
                     time.sleep(0.001)
 
-        with pytest.raises(scheduler.SchedulerError, match=r"^scheduler tcp://127.0.0.1:1: no answer for"):
+        with pytest.raises(
+            scheduler.SchedulerError, match=r"^scheduler tcp://127.0.0.1:1: no answer for"
+        ):
             wait_for_long()
         assert 40 <= client.num_asked <= 40 + 2 + scheduler._MOST_SILENCE_S / scheduler._TICK_S
     finally:
@@ -423,19 +463,21 @@ def test_a_server_of_another_kind_is_no_scheduler(tmp_path, answer):
     pytest.importorskip("distributed")
     v3dg.write_asset(tmp_path / "a.ply", make_asset(num_gaussians=1000, seed=0))
     with serving(answer) as address:
-        expected = (
-            f"{address}: expected a dask scheduler, got a server that speaks another protocol; give the"
-        )
+        expected = f"{address}: expected a dask scheduler, got a server that speaks another protocol; give the"
         fails(1, expected, "build", "a.ply", "--scheduler", address, cwd=tmp_path)
 
 
-@pytest.mark.parametrize("address", ["", "nowhere", "http://127.0.0.1:80", "tcp://127.0.0.1", "tcp://["])
+@pytest.mark.parametrize(
+    "address", ["", "nowhere", "http://127.0.0.1:80", "tcp://127.0.0.1", "tcp://["]
+)
 def test_what_is_no_address_is_told_so(address):
     pytest.importorskip("distributed")
     from v3dg.cli import build
 
     with (
-        pytest.raises(RuntimeError, match=r"expected a dask scheduler, as tcp://host:8786, got no address"),
+        pytest.raises(
+            RuntimeError, match=r"expected a dask scheduler, as tcp://host:8786, got no address"
+        ),
         build._executor_at(address),
     ):
         pass
@@ -473,7 +515,15 @@ def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):
             build._executor_at(address),
         ):
             pass
-    fails(1, "nowhere: expected a dask scheduler", "build", "a.ply", "--scheduler", "nowhere", cwd=tmp_path)
+    fails(
+        1,
+        "nowhere: expected a dask scheduler",
+        "build",
+        "a.ply",
+        "--scheduler",
+        "nowhere",
+        cwd=tmp_path,
+    )
 
 
 def test_without_the_extra_it_is_named(tmp_path, monkeypatch):
@@ -483,7 +533,8 @@ def test_without_the_extra_it_is_named(tmp_path, monkeypatch):
 
     with (
         pytest.raises(
-            ImportError, match=r"builds on many machines: expected .*pip install 'distributed>=2024.1'"
+            ImportError,
+            match=r"builds on many machines: expected .*pip install 'distributed>=2024.1'",
         ),
         build._executor_at("tcp://127.0.0.1:8786"),
     ):

@@ -1,4 +1,5 @@
-"""Builds in parts: plans from counts, subtrees alone and in any order, files that take what is finished."""
+"""Builds in parts: plans from counts, subtrees alone and in any order, files that take
+what is finished."""
 
 from dataclasses import asdict, fields, replace
 from functools import partial
@@ -58,12 +59,15 @@ def part_of(level, plan, part):
     tables = level.tables
     return Level(
         level.gaussians.subset(slice(plan.offset[clusters.start], plan.offset[clusters.stop])),
-        LevelTables(tables.box[clusters], tables.ball[groups], tables.fit_ball[groups], tables.error[groups]),
+        LevelTables(
+            tables.box[clusters], tables.ball[groups], tables.fit_ball[groups], tables.error[groups]
+        ),
     )
 
 
 def build_subtree(leaves, plan, config, codec, level, first_group, last_group):
-    """The levels above the leaves under a run of groups, made from those leaves alone; and their plan."""
+    """The levels above the leaves under a run of groups, made from those leaves alone;
+    and their plan."""
     part = plan.subtree(level, first_group, last_group)
     bottom = part.levels[0].first_group
     rows = plan.levels[0].offset[[bottom, bottom + part.levels[0].num_groups]]
@@ -86,9 +90,15 @@ def joined(levels):
 @pytest.mark.parametrize("num_gaussians", [1, 2, 3, 7, 33, 1000, 1023, 1025])
 @pytest.mark.parametrize("group_size", [2, 8])
 def test_plan_has_the_shape_of_the_bundle(asset, num_gaussians, group_size):
-    config = BuildConfig(cluster_size=16, steps=0, num_views=1, group_size=group_size, min_gaussians=1)
+    config = BuildConfig(
+        cluster_size=16, steps=0, num_views=1, group_size=group_size, min_gaussians=1
+    )
     bundle = build_bundle(
-        asset.subset(slice(num_gaussians)), config=config, progress=False, device="cpu", unusable="refuse"
+        asset.subset(slice(num_gaussians)),
+        config=config,
+        progress=False,
+        device="cpu",
+        unusable="refuse",
     )
     plan = Plan.of(num_gaussians, config)
     assert len(plan.levels) == bundle.num_levels
@@ -97,7 +107,9 @@ def test_plan_has_the_shape_of_the_bundle(asset, num_gaussians, group_size):
         offset = bundle.clusters.offset[clusters.start : clusters.stop + 1]
         np.testing.assert_array_equal(level.offset, offset - offset[0])
         if number > 0:
-            np.testing.assert_array_equal(level.weight, bundle.groups.weight[bundle.groups.level == number])
+            np.testing.assert_array_equal(
+                level.weight, bundle.groups.weight[bundle.groups.level == number]
+            )
     pages = PageLayout.of(bundle.clusters)
     np.testing.assert_array_equal(plan.layout.first_cluster, pages.first_cluster)
     np.testing.assert_array_equal(plan.layout.first_gaussian, pages.first_gaussian)
@@ -120,7 +132,9 @@ def test_plan_of_a_subtree_is_a_part_of_the_plan():
 # ---- subtrees
 
 
-@pytest.mark.parametrize(("name", "codec"), [*((name, "float32") for name in CONFIGS), ("ours", "quantized")])
+@pytest.mark.parametrize(
+    ("name", "codec"), [*((name, "float32") for name in CONFIGS), ("ours", "quantized")]
+)
 def test_a_subtree_alone_is_that_of_the_whole(asset, name, codec):
     """Whatever is built beside it, below which level, and in which order."""
     config = CONFIGS[name]
@@ -132,7 +146,9 @@ def test_a_subtree_alone_is_that_of_the_whole(asset, name, codec):
         num_groups = plan.levels[level].num_groups
         for group in np.random.default_rng(level).permutation(num_groups)[:3]:
             levels, part = build_subtree(leaves, plan, config, codec, level, group, group + 1)
-            for built, of_whole, here, there in zip(levels, whole, part.levels, plan.levels, strict=False):
+            for built, of_whole, here, there in zip(
+                levels, whole, part.levels, plan.levels, strict=False
+            ):
                 expected = arrays_of(part_of(of_whole, there, here))
                 for key, array in arrays_of(built).items():
                     assert array.tobytes() == expected[key].tobytes(), (level, group, key)
@@ -143,7 +159,8 @@ def test_a_subtree_alone_is_that_of_the_whole(asset, name, codec):
 @pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize("name", ["ours", "groups_of_4"])
 def test_subtrees_in_any_order_make_the_same_file(asset, name, codec, tmp_path):
-    """Their pages go to the file as they are finished; what is above is built from what they became."""
+    """Their pages go to the file as they are finished; what is above is built from what
+    they became."""
     config = CONFIGS[name]
     options = {"config": config, "seed": SEED, "progress": False, "device": "cpu", "codec": codec}
     build_bundle(asset, **options).write(tmp_path / "whole.v3dg")
@@ -158,7 +175,9 @@ def test_subtrees_in_any_order_make_the_same_file(asset, name, codec, tmp_path):
     with open(tmp_path / "parts.v3dg", "wb") as output:
 
         def write(first, last, gaussians):
-            hashes[first:last] = write_pages(output.fileno(), file.run(first, last), codec, gaussians)
+            hashes[first:last] = write_pages(
+                output.fileno(), file.run(first, last), codec, gaussians
+            )
 
         for group in np.random.default_rng(0).permutation(num_groups):
             levels, part = build_subtree(leaves, plan, config, codec, level, group, group + 1)
@@ -183,7 +202,8 @@ def test_subtrees_in_any_order_make_the_same_file(asset, name, codec, tmp_path):
 @pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize("name", ["ours", "previous", "groups_of_4"])
 def test_units_are_the_same_on_any_number_of_threads(asset, name, codec, monkeypatch, tmp_path):
-    """And an interrupted build goes on to the same bytes, whichever units were finished."""
+    """And an interrupted build goes on to the same bytes, whichever units were
+    finished."""
     config = CONFIGS[name]
     monkeypatch.setattr("v3dg.levels.whole.UNIT_LEAVES", 160)
     whole = build_bundle(asset, config=config, seed=SEED, progress=False, device="cpu", codec=codec)
@@ -279,7 +299,8 @@ def test_a_built_file_has_the_permissions_of_a_written_one(asset, tmp_path, mode
 
 def test_an_interrupted_file_leaves_its_levels_alone(asset, tmp_path, monkeypatch):
     v3dg.write_asset(tmp_path / "asset.ply", asset)
-    # Whether an asset is smooth would be measured again, by fits that are not those of its levels.
+    # Whether an asset is smooth would be measured again, by fits that are not those of
+    # its levels.
     options = {"config": replace(SMALL, smooth="no"), "progress": False, "device": "cpu"}
 
     def interrupt(*_):
@@ -291,7 +312,9 @@ def test_an_interrupted_file_leaves_its_levels_alone(asset, tmp_path, monkeypatc
             build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", **options)
     assert {p.name for p in tmp_path.iterdir()} == {"asset.ply", levels_path("out.v3dg").name}
     monkeypatch.setattr("v3dg.levels.simplify.LevelBuilder._simplify", interrupt)
-    bundle, is_built = build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options)
+    bundle, is_built = build_file(
+        tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options
+    )
     assert is_built
     assert bundle.num_levels == len(Plan.of(len(asset), SMALL).levels)
 
@@ -301,7 +324,15 @@ def test_an_interrupted_file_leaves_its_levels_alone(asset, tmp_path, monkeypatc
 
 # Those of the build itself.
 OF_THE_BUILD = {
-    *("cluster_size", "group_size", "min_clusters", "min_gaussians", "init", "prune_growth", "targets"),
+    *(
+        "cluster_size",
+        "group_size",
+        "min_clusters",
+        "min_gaussians",
+        "init",
+        "prune_growth",
+        "targets",
+    ),
     *("asset_filter_px2", "asset_antialiased", "first_steps", "smooth"),
 }
 

@@ -1,4 +1,5 @@
-"""Builds that are interrupted, killed, gone on with; and the unfinished bundles that they leave."""
+"""Builds that are interrupted, killed, gone on with; and the unfinished bundles that
+they leave."""
 
 import errno
 import hashlib
@@ -95,7 +96,8 @@ def started_build(config, device, folder):
 
 
 def wait_for_growth(path, process, before=0):
-    """Until `path` has more than `before` bytes; how many, or None if the process ended first."""
+    """Until `path` has more than `before` bytes; how many, or None if the process ended
+    first."""
     while process.poll() is None:
         if path.exists() and (now := path.stat().st_size) > before:
             return now
@@ -137,7 +139,9 @@ def test_killed_builds_resume_to_the_same_bytes(asset, whole, tmp_path, device):
             process.kill()
             process.wait()
         assert names_in(tmp_path) == ["levels"]
-    bundle = build_bundle(asset, config=CONFIG, seed=7, progress=False, device=device, resume_path=levels)
+    bundle = build_bundle(
+        asset, config=CONFIG, seed=7, progress=False, device=device, resume_path=levels
+    )
     assert names_in(tmp_path) == ["levels"]
     assert bytes_of(bundle, tmp_path) == whole
 
@@ -162,7 +166,9 @@ def checkpoint(asset, tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def expected(asset, tmp_path_factory):
     """The bytes of a build that nothing interrupts."""
-    return bytes_of(build_bundle(asset, config=QUICK, progress=False), tmp_path_factory.mktemp("expected"))
+    return bytes_of(
+        build_bundle(asset, config=QUICK, progress=False), tmp_path_factory.mktemp("expected")
+    )
 
 
 def test_finished_levels_are_not_built_again(asset, checkpoint, monkeypatch):
@@ -245,7 +251,9 @@ def test_checkpoint_of_another_build_is_refused(asset, checkpoint, changed, monk
         monkeypatch.setattr("v3dg._device.describe", lambda _: "another")
     else:
         monkeypatch.setattr("v3dg.levels.unfinished.__version__", "0.0.0")
-    with pytest.raises(ValueError, match="another asset, config, seed, device or version; remove it"):
+    with pytest.raises(
+        ValueError, match="another asset, config, seed, device or version; remove it"
+    ):
         build_bundle(asset, config=config, seed=seed, progress=False, resume_path=checkpoint)
     assert checkpoint.read_bytes() == before
 
@@ -255,8 +263,14 @@ def test_damaged_checkpoint_is_named(asset, checkpoint, expected):
     rng = np.random.default_rng(0)
     damaged = {"text": b"not levels", "zeros": bytes(1000), "archive": b"PK\x03\x04" + bytes(1000)}
     pages, journal = rng.integers(0, len(expected), 30), rng.integers(len(expected), len(good), 30)
-    # The first bytes, pages, the journal; at its end are mostly numbers of clusters and digests.
-    for place in (*range(0, 42, 7), *pages, *journal, *rng.integers(len(good) - 500, len(good), 20)):
+    # The first bytes, pages, the journal; at its end are mostly numbers of clusters and
+    # digests.
+    for place in (
+        *range(0, 42, 7),
+        *pages,
+        *journal,
+        *rng.integers(len(good) - 500, len(good), 20),
+    ):
         flipped = bytearray(good)
         flipped[place] ^= 1 << rng.integers(8)
         damaged[f"bit flipped in byte {place} of {len(good)}"] = bytes(flipped)
@@ -270,7 +284,9 @@ def test_damaged_checkpoint_is_named(asset, checkpoint, expected):
         else:  # one that makes a level look cut off, or is where the header and tables will be
             assert checkpoint.read_bytes() == expected, damage
     assert len(refused) > len(damaged) / 2
-    assert [message for message in refused if not message.endswith("remove it to start again")] == []
+    assert [
+        message for message in refused if not message.endswith("remove it to start again")
+    ] == []
 
 
 def test_resume_path_needs_a_folder(asset, tmp_path):
@@ -289,10 +305,14 @@ def test_a_second_build_to_the_same_place_is_refused(asset, tmp_path):
     with started_build(ENDLESS, "cpu", tmp_path) as process:
         wait_for_growth(tmp_path / "levels", process)
         for use in (
-            lambda: build_bundle(asset, config=QUICK, progress=False, resume_path=tmp_path / "levels"),
+            lambda: build_bundle(
+                asset, config=QUICK, progress=False, resume_path=tmp_path / "levels"
+            ),
             lambda: v3dg.levels.discard_levels(tmp_path / "levels"),
         ):
-            with pytest.raises(RuntimeError, match="levels: another build is using it; wait for it"):
+            with pytest.raises(
+                RuntimeError, match="levels: another build is using it; wait for it"
+            ):
                 use()
         assert process.poll() is None
         assert names_in(tmp_path) == ["levels"]
@@ -325,7 +345,9 @@ def test_links_at_the_levels_are_refused(asset, checkpoint, tmp_path, target):
         lambda: build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint),
         lambda: v3dg.levels.discard_levels(checkpoint),
     ):
-        with pytest.raises(ValueError, match="levels: expected a file of levels, got a link; remove it"):
+        with pytest.raises(
+            ValueError, match="levels: expected a file of levels, got a link; remove it"
+        ):
             use()
     checkpoint.unlink()
     assert {name: (tmp_path / name).read_bytes() for name in names_in(tmp_path)} == before
@@ -336,7 +358,8 @@ def test_levels_are_for_their_owner_alone(checkpoint):
 
 
 def test_a_lock_on_a_file_that_was_removed_is_none(tmp_path, monkeypatch):
-    """A build that has opened the file of one that then ends and removes it would be alone with its lock."""
+    """A build that has opened the file of one that then ends and removes it would be
+    alone with its lock."""
     path = tmp_path / "levels"
 
     def lock(descriptor, name):
@@ -364,13 +387,20 @@ def test_levels_that_a_kill_left_beside_a_bundle_are_removed(asset, tmp_path):
 
 
 def test_what_is_no_levels_stays(asset, tmp_path):
-    """A file of somebody that has the name of an unfinished bundle is neither removed nor written to."""
+    """A file of somebody that has the name of an unfinished bundle is neither removed
+    nor written to."""
     v3dg.write_asset(tmp_path / "asset.ply", asset)
     (tmp_path / "out.v3dg.partial").write_text("a download that goes on")
     for resume in (False, True):
-        with pytest.raises(ValueError, match=r"out\.v3dg\.partial: .*(move it elsewhere|something else)"):
+        with pytest.raises(
+            ValueError, match=r"out\.v3dg\.partial: .*(move it elsewhere|something else)"
+        ):
             v3dg.levels.build_file(
-                tmp_path / "asset.ply", tmp_path / "out.v3dg", config=QUICK, progress=False, resume=resume
+                tmp_path / "asset.ply",
+                tmp_path / "out.v3dg",
+                config=QUICK,
+                progress=False,
+                resume=resume,
             )
     assert (tmp_path / "out.v3dg.partial").read_text() == "a download that goes on"
 
@@ -399,7 +429,10 @@ def test_a_full_disk_leaves_what_can_be_gone_on_with(asset, checkpoint, expected
     journal = np.linspace(len(expected), len(whole) - 1, 5).astype(int)
     for num_bytes in (0, 10, 1000, len(expected) // 2, *journal):
         checkpoint.unlink(missing_ok=True)
-        with files_of_at_most(num_bytes), pytest.raises(OSError, match=r"File too large: '.*levels'"):
+        with (
+            files_of_at_most(num_bytes),
+            pytest.raises(OSError, match=r"File too large: '.*levels'"),
+        ):
             build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint)
         left = checkpoint.read_bytes() if checkpoint.exists() else b""
         assert len(left) <= num_bytes
@@ -421,21 +454,25 @@ def tiles(tmp_path_factory):
 
 @pytest.fixture
 def bounded(tiles, monkeypatch):
-    """Builds the tiles on the disk and in several units, as if they were many and memory small."""
+    """Builds the tiles on the disk and in several units, as if they were many and
+    memory small."""
     monkeypatch.setattr("v3dg.levels.whole.UNIT_LEAVES", 400)
     sizes = leaves_on_disk._Sizes(in_memory=0, in_block=1 << 16, in_node=700, in_bucket=300)
     monkeypatch.setattr(leaves_on_disk._Sizes, "of", lambda *_: sizes)
     config = BuildConfig(cluster_size=32, steps=0, num_views=1)
 
     def build(output):
-        v3dg.levels.build_file(tiles, output, config=config, progress=False, device="cpu", resume=True)
+        v3dg.levels.build_file(
+            tiles, output, config=config, progress=False, device="cpu", resume=True
+        )
         return output.read_bytes()
 
     return build
 
 
 def test_a_disk_that_is_full_at_any_write_of_a_bounded_build(bounded, tmp_path, monkeypatch):
-    """The first, the last and some between of each kind, of which half gets to the disk."""
+    """The first, the last and some between of each kind, of which half gets to the
+    disk."""
     write, kinds = _files.write_at, []
     expected = bounded(tmp_path / "whole.v3dg")
 

@@ -113,13 +113,16 @@ def split_file(data):
         if name != "__metadata__":
             first, end = (8 + header_bytes + offset for offset in tensor["data_offsets"])
             tensors[name] = (
-                np.frombuffer(data[first:end], DTYPES[tensor["dtype"]]).reshape(tensor["shape"]).copy()
+                np.frombuffer(data[first:end], DTYPES[tensor["dtype"]])
+                .reshape(tensor["shape"])
+                .copy()
             )
     return header, tensors
 
 
 def join_file(header, tensors):
-    """The file of a header, as it is given, and tensors in the header's order, with a hash that fits."""
+    """The file of a header, as it is given, and tensors in the header's order, with a
+    hash that fits."""
     text = header if isinstance(header, bytes) else json.dumps(header).encode()
     version = re.search(rb'"version": "([0-9]{1,9})"', text)
     text += b" " * (-(8 + len(text)) % (16 if b'"codec": "quantized"' in text else 4096))
@@ -166,7 +169,9 @@ def test_official_reader_sees_the_same(tmp_path_factory, bundle):
         assert file.metadata()["format"] == "v3dg"
         for table in ("clusters", "groups"):
             for name, array in vars(getattr(bundle, table)).items():
-                np.testing.assert_array_equal(file.get_tensor(f"{table}.{name}"), array, strict=True)
+                np.testing.assert_array_equal(
+                    file.get_tensor(f"{table}.{name}"), array, strict=True
+                )
         pages = file.get_slice("pages")
         places = [*file.get_tensor("pages.offset").tolist(), pages.get_shape()[0]]
         for page, (first, end) in enumerate(itertools.pairwise(places)):
@@ -196,16 +201,22 @@ def test_format_page_lists_the_tables_in_file_order(saved):
     header, _ = split_file(saved[1].read_bytes())
     del header["__metadata__"]
     in_file = sorted(header.items(), key=lambda item: item[1]["data_offsets"])
-    only_of_floats = re.findall(r"^\| `([a-z0-9_.]+)` \| .*; only with float32 \|$", text, re.MULTILINE)
+    only_of_floats = re.findall(
+        r"^\| `([a-z0-9_.]+)` \| .*; only with float32 \|$", text, re.MULTILINE
+    )
     assert len(only_of_floats) == 2
     has_floats = saved[0].codec == "float32"
-    expected = [(name, dtype) for name, dtype in documented if has_floats or name not in only_of_floats]
+    expected = [
+        (name, dtype) for name, dtype in documented if has_floats or name not in only_of_floats
+    ]
     assert expected == [(name, tensor["dtype"]) for name, tensor in in_file]
 
 
 def test_same_bundle_gives_same_bytes(saved, tmp_path):
     _, path = saved
-    again, from_file, loaded = (tmp_path / name for name in ("again.v3dg", "from_file.v3dg", "loaded.v3dg"))
+    again, from_file, loaded = (
+        tmp_path / name for name in ("again.v3dg", "from_file.v3dg", "loaded.v3dg")
+    )
     random_bundle(3, config={"seed": 3}, codec=saved[0].codec).write(again)
     Bundle.open(path).write(from_file)
     opened = Bundle.open(path)
@@ -239,7 +250,9 @@ def test_torch_gaussians_are_kept_as_numpy(saved):
     torch = pytest.importorskip("torch")
     bundle, _ = saved
     tensors = Gaussians(*(torch.from_numpy(getattr(bundle.gaussians, name)) for name in ATTRIBUTES))
-    assert_same_gaussians(Bundle(bundle.clusters, bundle.groups, tensors).gaussians, bundle.gaussians)
+    assert_same_gaussians(
+        Bundle(bundle.clusters, bundle.groups, tensors).gaussians, bundle.gaussians
+    )
 
 
 def tables_of(bundle):
@@ -248,14 +261,18 @@ def tables_of(bundle):
 
 def test_opened_gaussians_can_be_written(saved):
     opened = Bundle.open(saved[1])
-    assert all(array.flags.aligned for array in (*tables_of(opened), *vars(opened.gaussians).values()))
+    assert all(
+        array.flags.aligned for array in (*tables_of(opened), *vars(opened.gaussians).values())
+    )
     assert all(array.flags.writeable for array in vars(opened.gaussians).values())
 
 
 def test_tables_cannot_be_changed_after_they_were_checked(saved):
     """Drawing trusts them: an offset that is wrong would read anywhere."""
     bundle, path = saved
-    built = v3dg.build_bundle(bundle.level_gaussians(0), config=v3dg.BuildConfig(steps=0), progress=False)
+    built = v3dg.build_bundle(
+        bundle.level_gaussians(0), config=v3dg.BuildConfig(steps=0), progress=False
+    )
     opened = Bundle.open(path)
     copies = [copy.copy(bundle), copy.deepcopy(bundle), copy.copy(opened), copy.deepcopy(opened)]
     copies += [pickle.loads(pickle.dumps(some)) for some in (bundle, opened)]
@@ -272,7 +289,9 @@ def test_tables_cannot_be_changed_after_they_were_checked(saved):
 def test_arrays_that_tables_were_made_of_stay_their_owner_s(saved):
     bundle, _ = saved
     offset = bundle.clusters.offset.copy()
-    made = Bundle(dataclasses.replace(bundle.clusters, offset=offset), bundle.groups, bundle.gaussians)
+    made = Bundle(
+        dataclasses.replace(bundle.clusters, offset=offset), bundle.groups, bundle.gaussians
+    )
     offset[:] = 2**40
     np.testing.assert_array_equal(made.clusters.offset, bundle.clusters.offset)
 
@@ -287,7 +306,9 @@ def test_threads_read_large_bundles(tmp_path):
 def test_reads_go_on_where_the_system_stops(saved, monkeypatch):
     bundle, path = saved
     preadv = os.preadv
-    monkeypatch.setattr(os, "preadv", lambda fd, buffers, offset: preadv(fd, [buffers[0][:100]], offset))
+    monkeypatch.setattr(
+        os, "preadv", lambda fd, buffers, offset: preadv(fd, [buffers[0][:100]], offset)
+    )
     assert_same_gaussians(Bundle.open(path).gaussians, bundle.gaussians)
 
 
@@ -333,7 +354,8 @@ def test_a_level_reads_its_pages_only(saved, reads):
 
 
 def test_a_sparse_file_of_ten_gigabytes_opens(tmp_path, reads):
-    """One cluster a page as a build makes them, 40 MB a page, so that the tables stay small."""
+    """One cluster a page as a build makes them, 40 MB a page, so that the tables stay
+    small."""
     num_levels, per_cluster = 256, 200_000
     level = np.arange(num_levels, dtype=np.int32)
     ball = np.zeros((num_levels - 1, 4), np.float32)
@@ -375,7 +397,11 @@ def test_a_sparse_file_of_ten_gigabytes_opens(tmp_path, reads):
     for name in (*TABLE_NAMES, "hash"):
         array = tensors[name]
         offsets = [end, end + array.nbytes]
-        header[name] = {"dtype": names[array.dtype], "shape": list(array.shape), "data_offsets": offsets}
+        header[name] = {
+            "dtype": names[array.dtype],
+            "shape": list(array.shape),
+            "data_offsets": offsets,
+        }
         end += array.nbytes
     parts = join_file(header, tensors | {"pages": np.empty(0, np.uint8)})
     data_start = 8 + int.from_bytes(parts[:8], "little")
@@ -390,7 +416,9 @@ def test_a_sparse_file_of_ten_gigabytes_opens(tmp_path, reads):
     bundle = Bundle.open(path)
     assert bundle.info()["bytes"] == path.stat().st_size
     assert reads.num_bytes < 100_000
-    with pytest.raises(ValueError, match=r"large.v3dg: page 7 \(gaussians \d+ to \d+\): the hash does not"):
+    with pytest.raises(
+        ValueError, match=r"large.v3dg: page 7 \(gaussians \d+ to \d+\): the hash does not"
+    ):
         bundle.cluster_gaussians(7)
     assert reads.num_bytes < 100_000 + page_file_bytes
 
@@ -412,7 +440,11 @@ def test_a_changed_byte_anywhere_is_noticed(saved):
     data_start = 8 + int.from_bytes(data[:8], "little")
     pages_end = data_start + split_file(data)[1]["pages"].nbytes
     rng = np.random.default_rng(0)
-    places = {*range(0, 1500), *range(pages_end, len(data)), *rng.integers(0, len(data), 1000).tolist()}
+    places = {
+        *range(0, 1500),
+        *range(pages_end, len(data)),
+        *rng.integers(0, len(data), 1000).tolist(),
+    }
     with open(path, "r+b", buffering=0) as file:
         for place in sorted(places):
             os.pwrite(file.fileno(), bytes([data[place] ^ (1 << rng.integers(8))]), place)
@@ -457,7 +489,9 @@ def test_damage_of_a_file_with_an_odd_name_is_told(tmp_path):
     content = bytearray(path.read_bytes())
     content[8 + int.from_bytes(content[:8], "little")] ^= 1
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"\.v3dg: page 0 \(gaussians 0 to \d+\): the hash does not match"):
+    with pytest.raises(
+        ValueError, match=r"\.v3dg: page 0 \(gaussians 0 to \d+\): the hash does not match"
+    ):
         Bundle.open(path).read_page(0)
 
 
@@ -467,7 +501,9 @@ def test_a_page_that_the_system_cannot_read_is_named(saved, tmp_path):
     folder = os.open(tmp_path, os.O_RDONLY)
     os.dup2(folder, opened._file._fd)
     os.close(folder)
-    with pytest.raises(IsADirectoryError, match=r"page 0 \(gaussians 0 to \d+\): Is a directory: '.*small"):
+    with pytest.raises(
+        IsADirectoryError, match=r"page 0 \(gaussians 0 to \d+\): Is a directory: '.*small"
+    ):
         opened.read_page(0)
 
 
@@ -500,7 +536,9 @@ def test_what_is_not_a_bundle_is_refused(tmp_path, content, message):
 
 def test_other_safetensors_files_are_refused(tmp_path):
     save_file({"weights": np.zeros(3)}, tmp_path / "x.safetensors")
-    with pytest.raises(ValueError, match=r"x\.safetensors: format: expected 'v3dg', got null; not a bundle"):
+    with pytest.raises(
+        ValueError, match=r"x\.safetensors: format: expected 'v3dg', got null; not a bundle"
+    ):
         Bundle.open(tmp_path / "x.safetensors")
 
 
@@ -522,7 +560,9 @@ def test_newer_version_asks_for_an_update(saved, monkeypatch):
 
     monkeypatch.chdir(path.parent)
     path.rename("x.v3dg")
-    with pytest.raises(ValueError, match=r"^x\.v3dg: version 4, this build reads up to 3; update v3dg$"):
+    with pytest.raises(
+        ValueError, match=r"^x\.v3dg: version 4, this build reads up to 3; update v3dg$"
+    ):
         open_changed(Path("x.v3dg"), newer)
 
 
@@ -556,16 +596,28 @@ def with_metadata(**values):
         (with_metadata(config="{"), "config: expected JSON"),
         (with_metadata(config='{"a":Infinity}'), "config: expected JSON"),
         (with_metadata(config=None), "config: expected a string"),
-        (lambda header, _: header.pop("groups.ball") and None, "groups.ball: expected .*, got null"),
-        (lambda header, _: header.pop("clusters.level") and None, "clusters.level: expected a tensor"),
-        (lambda header, _: header.update(extra=header["hash"]), '"extra": expected only the tensors'),
+        (
+            lambda header, _: header.pop("groups.ball") and None,
+            "groups.ball: expected .*, got null",
+        ),
+        (
+            lambda header, _: header.pop("clusters.level") and None,
+            "clusters.level: expected a tensor",
+        ),
+        (
+            lambda header, _: header.update(extra=header["hash"]),
+            '"extra": expected only the tensors',
+        ),
         (lambda header, _: header.update(pages=7), "pages: expected a tensor"),
         (with_entry("pages", shape=[-4096]), "pages: expected a tensor"),
         (with_entry("pages", shape=[True]), "pages: expected a tensor"),
         (with_entry("pages", shape=[4096.0]), "pages: expected a tensor"),
         (with_entry("pages", shape=[2**70]), "size: expected more than"),
         (with_entry("clusters.level", shape=[2**62]), "size: expected more than"),
-        (with_entry("groups.parent", shape=[0]), "clusters.level|groups.ball|pages|clusters.offset"),
+        (
+            with_entry("groups.parent", shape=[0]),
+            "clusters.level|groups.ball|pages|clusters.offset",
+        ),
         (with_entry("pages", data_offsets=[0, 0]), "pages: expected"),
         (with_entry("groups.ball", dtype="F64"), "groups.ball: expected"),
         (with_entry("groups.ball", shape=[1, 4]), "groups.ball: expected"),
@@ -610,7 +662,12 @@ BIG = 2**31 - 1
     ("name", "row", "value", "message"),
     [
         ("clusters.offset", 0, 1, r"clusters.offset\[0\]: expected 0, got 1"),
-        ("clusters.offset", 1, 2**62, r"clusters.offset\[2\]: expected offsets that never decrease"),
+        (
+            "clusters.offset",
+            1,
+            2**62,
+            r"clusters.offset\[2\]: expected offsets that never decrease",
+        ),
         ("clusters.offset", -1, 2**62, r"clusters.offset\[-1\]: expected at most"),
         ("clusters.offset", slice(1, None), -5, r"clusters.offset\[1\]: expected offsets"),
         ("clusters.level", 0, 1, r"clusters.level\[0\]: expected 0, got 1"),
@@ -619,10 +676,25 @@ BIG = 2**31 - 1
         ("clusters.own_group", 0, 0, r"clusters.own_group\[0\]: expected -1, got 0"),
         ("clusters.own_group", -1, BIG, r"clusters.own_group\[\d+\]: expected a group of level 2"),
         ("clusters.own_group", -1, -1, r"clusters.own_group\[\d+\]: expected a group of level 2"),
-        ("clusters.parent_group", 0, -1, r"clusters.parent_group\[0\]: expected a group of level 1, got -1"),
-        ("clusters.parent_group", 0, BIG, r"clusters.parent_group\[0\]: expected a group of level 1"),
+        (
+            "clusters.parent_group",
+            0,
+            -1,
+            r"clusters.parent_group\[0\]: expected a group of level 1, got -1",
+        ),
+        (
+            "clusters.parent_group",
+            0,
+            BIG,
+            r"clusters.parent_group\[0\]: expected a group of level 1",
+        ),
         ("clusters.parent_group", -1, 0, r"clusters.parent_group\[\d+\]: expected -1, got 0"),
-        ("clusters.parent_group", 0, 1, r"clusters.parent_group\[1\]: expected parents in ascending order"),
+        (
+            "clusters.parent_group",
+            0,
+            1,
+            r"clusters.parent_group\[1\]: expected parents in ascending order",
+        ),
         ("clusters.box", 0, np.nan, r"clusters.box\[0\]: expected finite"),
         ("clusters.filter_px2", 1, -0.5, r"clusters.filter_px2\[1\]: expected 0 or more, got -0.5"),
         ("clusters.filter_px2", 1, np.inf, r"clusters.filter_px2\[1\]: expected 0 or more"),
@@ -631,7 +703,12 @@ BIG = 2**31 - 1
         ("groups.ball", (0, 3), -1, r"groups.ball\[0\]: expected a radius"),
         ("groups.ball", (0, 3), 1e30, r"groups.ball\[0\]: expected a ball inside"),
         ("groups.weight", 0, 0, r"groups.weight\[0\]: expected a positive"),
-        ("groups.weight", 0, 1e30, r"groups.weight\[0\]: expected at most the weight of the group above"),
+        (
+            "groups.weight",
+            0,
+            1e30,
+            r"groups.weight\[0\]: expected at most the weight of the group above",
+        ),
         ("groups.parent", 0, 0, r"groups.parent\[0\]: expected a group of level 2, got 0"),
         ("groups.parent", 0, -2, r"groups.parent\[0\]: expected a group of level 2"),
         ("groups.parent", -1, BIG, r"groups.parent\[\d+\]: expected -1"),
@@ -683,7 +760,9 @@ def test_random_tables_open_or_are_refused(tmp_path_factory, data):
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
+    ),
     max_leaves=8,
 )
 
@@ -712,7 +791,8 @@ def test_random_headers_open_or_are_refused(tmp_path_factory, data):
     ("version", "codec"), [(1, "float32"), (2, "quantized"), (3, "float32"), (3, "quantized")]
 )
 def test_golden_files_of_all_versions_are_read(version, codec, tmp_path):
-    """What was written once stays readable, to the same bits; what is written is of the newest version."""
+    """What was written once stays readable, to the same bits; what is written is of the
+    newest version."""
     path, bundle = golden_bundles.path_of(version, codec), golden_bundles.bundle_of(codec)
     opened = Bundle.open(path)
     info = opened.info()
@@ -761,7 +841,10 @@ def test_values_that_have_no_code_are_refused():
 def test_unknown_codecs_ask_for_an_update(tmp_path):
     random_bundle(3, codec="quantized").write(tmp_path / "a.v3dg")
     (tmp_path / "2.v3dg").write_bytes(golden_bundles.path_of(2, "quantized").read_bytes())
-    for name, codecs in (("a", ("later", None, 3, ["quantized"])), ("2", ("later", "float32", None))):
+    for name, codecs in (
+        ("a", ("later", None, 3, ["quantized"])),
+        ("2", ("later", "float32", None)),
+    ):
         for codec in codecs:
             message = rf"{name}\.v3dg: codec: expected one that this .*, got .*; update"
             with pytest.raises(ValueError, match=message):
@@ -845,7 +928,8 @@ def test_a_full_disk_is_named_and_leaves_nothing(saved, monkeypatch):
 
 
 def test_a_half_written_file_is_refused_and_replaced(saved):
-    """What a lost power supply leaves is another file, that nobody takes for a bundle."""
+    """What a lost power supply leaves is another file, that nobody takes for a
+    bundle."""
     bundle, path = saved
     leftover = path.with_name(".small.v3dg.0123456789abcdef.tmp")
     leftover.write_bytes(path.read_bytes()[:-100])
@@ -926,7 +1010,9 @@ def test_tables_that_do_not_fit_are_refused(saved):
         Bundle(bundle.clusters, bundle.groups, gaussians)
     weight = bundle.groups.weight.copy()
     weight[0] = np.float32(np.nan)
-    with pytest.raises(ValueError, match=r"groups.weight\[0\]: expected a positive number, got nan"):
+    with pytest.raises(
+        ValueError, match=r"groups.weight\[0\]: expected a positive number, got nan"
+    ):
         Bundle(bundle.clusters, dataclasses.replace(bundle.groups, weight=weight), bundle.gaussians)
 
 
@@ -934,7 +1020,9 @@ def test_a_ball_that_barely_sticks_out_is_refused():
     bundle = random_bundle(11, num_levels=3)
     ball = bundle.groups.ball.copy()
     above = bundle.groups.parent[0]
-    needed = (np.linalg.norm(ball[above, :3].astype(np.float64) - ball[0, :3]) + ball[0, 3]) * (1 + 4e-6)
+    needed = (np.linalg.norm(ball[above, :3].astype(np.float64) - ball[0, :3]) + ball[0, 3]) * (
+        1 + 4e-6
+    )
     ball[above, 3] = np.float32(needed * (1 - 1e-6))
     with pytest.raises(ValueError, match=r"groups.ball\[0\]: expected a ball inside that of group"):
         Bundle(bundle.clusters, dataclasses.replace(bundle.groups, ball=ball), bundle.gaussians)
@@ -943,7 +1031,9 @@ def test_a_ball_that_barely_sticks_out_is_refused():
 def test_config_that_no_reader_would_accept_is_refused(saved):
     bundle, path = saved
     # The config alone is within the limit, the header is not.
-    large = Bundle(bundle.clusters, bundle.groups, bundle.gaussians, {"note": "x" * ((1 << 20) - 100)})
+    large = Bundle(
+        bundle.clusters, bundle.groups, bundle.gaussians, {"note": "x" * ((1 << 20) - 100)}
+    )
     message = r"config: expected at most 1048576 bytes of JSON in the header that contains it, got (\d+); "
     with pytest.raises(ValueError, match=message) as error:
         large.write(path)
@@ -960,7 +1050,12 @@ def test_config_that_is_not_json_is_refused(saved, config):
 
 def test_ids_out_of_range_are_refused(saved):
     bundle, _ = saved
-    for read in (bundle.cluster_gaussians, bundle.level_gaussians, bundle.read_page, bundle.level_range):
+    for read in (
+        bundle.cluster_gaussians,
+        bundle.level_gaussians,
+        bundle.read_page,
+        bundle.level_range,
+    ):
         for index in (-1, 1000):
             with pytest.raises(ValueError, match=r"(cluster|level|page): expected 0 to \d+, got"):
                 read(index)
@@ -985,4 +1080,6 @@ def test_info_describes_every_level(saved):
 def test_unknown_errors_are_none_in_info(saved):
     bundle, _ = saved
     groups = dataclasses.replace(bundle.groups, error=np.full_like(bundle.groups.error, np.nan))
-    assert Bundle(bundle.clusters, groups, bundle.gaussians).info()["levels"][1]["error_color"] is None
+    assert (
+        Bundle(bundle.clusters, groups, bundle.gaussians).info()["levels"][1]["error_color"] is None
+    )

@@ -55,7 +55,8 @@ def test_a_capture_is_read(tmp_path):
     np.testing.assert_allclose(first.viewmat, VIEWMAT, atol=1e-15)
     np.testing.assert_array_equal(first.K, [[500, 0, 321.5], [0, 510, 238.5], [0, 0, 1]])
     assert (first.width, first.height, first.near) == (640, 480, 0.01)
-    # A frame's own focal length stands for both axes: the file's fl_y belongs to the other lens.
+    # A frame's own focal length stands for both axes: the file's fl_y belongs to the
+    # other lens.
     assert (second.fx, second.fy, second.width, second.height) == (600, 600, 320, 480)
 
 
@@ -67,12 +68,16 @@ def test_a_synthetic_scene_is_read(tmp_path):
         np.testing.assert_allclose(camera.viewmat, VIEWMAT, atol=1e-15)
         assert camera.fx == camera.fy == pytest.approx(400 / math.tan(0.345))
         assert (camera.cx, camera.cy, camera.width, camera.height) == (400, 300, 800, 600)
-    with pytest.raises(ValueError, match=r"frames\[0\]: expected w and h, .* got neither; give the size"):
+    with pytest.raises(
+        ValueError, match=r"frames\[0\]: expected w and h, .* got neither; give the size"
+    ):
         read_cameras(path)
 
 
 def test_vertical_field_of_view_is_used(tmp_path):
-    camera, _ = read_cameras(put(tmp_path, {**SYNTHETIC, "camera_angle_y": 0.5}), size=(80, 60)).values()
+    camera, _ = read_cameras(
+        put(tmp_path, {**SYNTHETIC, "camera_angle_y": 0.5}), size=(80, 60)
+    ).values()
     assert camera.fy == pytest.approx(30 / math.tan(0.25))
 
 
@@ -94,7 +99,9 @@ def test_distortion_is_refused_or_ignored(tmp_path, name):
     ):
         read_cameras(path)
     ignored = next(iter(read_cameras(path, distortion="ignore").values()))
-    np.testing.assert_array_equal(ignored.K, read_cameras(put(tmp_path, CAPTURE))["images/frame_1.png"].K)
+    np.testing.assert_array_equal(
+        ignored.K, read_cameras(put(tmp_path, CAPTURE))["images/frame_1.png"].K
+    )
 
 
 @pytest.mark.parametrize("frame", [{"file_path": "images/frame_2.png"}, {}])
@@ -158,17 +165,31 @@ BAD = {
         "frames[1].transform_matrix: expected a rotation in the upper left 3x3",
     ),
     "position beyond doubles": (
-        with_frame(transform_matrix=[[0.6, 0.8, 0, 1.7e308], [-0.8, 0.6, 0, 1.7e308], [0, 0, 1, 0]]),
+        with_frame(
+            transform_matrix=[[0.6, 0.8, 0, 1.7e308], [-0.8, 0.6, 0, 1.7e308], [0, 0, 1, 0]]
+        ),
         "frames[1].viewmat: expected finite numbers, got",
     ),
     "no focal length": (
         without("fl_x", "fl_y"),
         "frames[0]: expected fl_x or camera_angle_x, in the frame or at the top, got neither",
     ),
-    "no size": (without("h"), "frames[0]: expected w and h, in the frame or at the top, got focal lengths"),
-    "size of half a pixel": (with_frame(w=320.5), "frames[1].w: expected a positive whole number, got 320.5"),
-    "endless size": ({**CAPTURE, "w": 1 << 40}, "w: expected at most 1048576 px, got 1099511627776"),
-    "negative focal length": (with_frame(fl_x=-1), "frames[1].fl_x: expected a positive number, got -1"),
+    "no size": (
+        without("h"),
+        "frames[0]: expected w and h, in the frame or at the top, got focal lengths",
+    ),
+    "size of half a pixel": (
+        with_frame(w=320.5),
+        "frames[1].w: expected a positive whole number, got 320.5",
+    ),
+    "endless size": (
+        {**CAPTURE, "w": 1 << 40},
+        "w: expected at most 1048576 px, got 1099511627776",
+    ),
+    "negative focal length": (
+        with_frame(fl_x=-1),
+        "frames[1].fl_x: expected a positive number, got -1",
+    ),
     "angle beyond a half turn": (
         {**without("fl_x"), "camera_angle_x": 3.5},
         "camera_angle_x: expected radians between 0 and pi, got 3.5",
@@ -180,12 +201,19 @@ BAD = {
     "principal point of another kind": ({**CAPTURE, "cx": True}, "cx: expected a number, got true"),
     "fisheye": (
         {**CAPTURE, "camera_model": "OPENCV_FISHEYE"},
-        "camera_model: expected a pinhole camera (PINHOLE, SIMPLE_PINHOLE, OPENCV, SIMPLE_RADIAL, RADIAL), "
+        "camera_model: expected a pinhole camera (PINHOLE, SIMPLE_PINHOLE, OPENCV, SIMPLE_RADIAL, "
+        "RADIAL), "
         'got "OPENCV_FISHEYE"; undistort the pictures first',
     ),
-    "fisheye of instant-ngp": ({**CAPTURE, "is_fisheye": True}, "is_fisheye: expected a pinhole camera"),
+    "fisheye of instant-ngp": (
+        {**CAPTURE, "is_fisheye": True},
+        "is_fisheye: expected a pinhole camera",
+    ),
     "distortion of one frame": (with_frame(k2=-0.1), "frames[1].k2: expected no lens distortion"),
-    "name of another kind": (with_frame(file_path=7), "frames[1].file_path: expected a string, got 7"),
+    "name of another kind": (
+        with_frame(file_path=7),
+        "frames[1].file_path: expected a string, got 7",
+    ),
     "not an object": ([], "top level: expected an object, got []"),
 }
 
@@ -203,9 +231,13 @@ def test_distortion_is_refused_with_what_leaves_it_out(tmp_path):
 
 
 def test_an_applied_transform_that_scales_is_not_undone(tmp_path):
-    path = put(tmp_path, {**CAPTURE, "applied_transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]})
+    path = put(
+        tmp_path, {**CAPTURE, "applied_transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}
+    )
     read_cameras(path)
-    with pytest.raises(ValueError, match=r"^transforms.json: applied_transform: expected a rotation and"):
+    with pytest.raises(
+        ValueError, match=r"^transforms.json: applied_transform: expected a rotation and"
+    ):
         read_cameras(path, applied_transform="undo")
 
 

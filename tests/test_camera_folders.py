@@ -1,4 +1,5 @@
-"""Cameras of COLMAP's models, written by COLMAP's own library, and of nerfstudio's runs."""
+"""Cameras of COLMAP's models, written by COLMAP's own library, and of nerfstudio's
+runs."""
 
 import json
 import os
@@ -56,7 +57,9 @@ def test_models_of_colmap_are_read(tmp_path, cameras, text, place):
 
 def test_distortion_is_refused_or_left_out(tmp_path, cameras):
     write_model(tmp_path / "a", cameras, model="OPENCV", extra=(0.1, 0, 0, 0))
-    with pytest.raises(ValueError, match="a pinhole without lens distortion, got OPENCV; undistort the pict"):
+    with pytest.raises(
+        ValueError, match="a pinhole without lens distortion, got OPENCV; undistort the pict"
+    ):
         read_cameras(tmp_path / "a")
     assert_same(read_cameras(tmp_path / "a", distortion="ignore"), cameras)
     write_model(tmp_path / "fish", cameras, model="OPENCV_FISHEYE", extra=(0, 0, 0, 0))
@@ -79,11 +82,14 @@ def test_folders_without_cameras_are_refused(tmp_path, cameras):
 def test_without_pycolmap_the_error_says_how_to_get_it(tmp_path, cameras, monkeypatch):
     write_model(tmp_path / "a", cameras)
     monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
-    with pytest.raises(ImportError, match=r"cameras of COLMAP: expected .*pip install 'pycolmap>=4.0'"):
+    with pytest.raises(
+        ImportError, match=r"cameras of COLMAP: expected .*pip install 'pycolmap>=4.0'"
+    ):
         read_cameras(tmp_path / "a")
 
 
-# As nerfstudio 1.1 writes it: a run's settings as YAML with Python's objects, of which many more follow.
+# As nerfstudio 1.1 writes it: a run's settings as YAML with Python's objects, of which
+# many more follow.
 CONFIG = """\
 !!python/object:nerfstudio.engine.trainer.TrainerConfig
 _target: !!python/name:nerfstudio.engine.trainer.Trainer ''
@@ -101,7 +107,8 @@ pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConf
 
 @pytest.fixture
 def trained(tmp_path, cameras, monkeypatch):
-    """A run of nerfstudio, and its cameras in the frame of the gaussians: turned, moved and scaled."""
+    """A run of nerfstudio, and its cameras in the frame of the gaussians: turned, moved
+    and scaled."""
     monkeypatch.chdir(tmp_path)
     cameras = {name.replace("é", ""): camera for name, camera in cameras.items()}
     (tmp_path / "data" / "poster").mkdir(parents=True)
@@ -146,7 +153,9 @@ def test_what_was_applied_to_the_data_is_not_applied_twice(trained, tmp_path):
 def test_a_run_without_its_data_is_refused(trained, tmp_path):
     run, _ = trained
     (tmp_path / "data" / "poster" / "transforms.json").unlink()
-    with pytest.raises(ValueError, match=r"config\.yml: expected the run's data at data/poster/tran"):
+    with pytest.raises(
+        ValueError, match=r"config\.yml: expected the run's data at data/poster/tran"
+    ):
         read_cameras(run)
     (run / "config.yml").write_text("data: null\n")
     with pytest.raises(ValueError, match="a path under data:, which it has not, got none"):
@@ -158,7 +167,8 @@ def test_the_command_takes_a_folder(tmp_path, cameras):
 
     v3dg.write_asset(tmp_path / "donut.ply", make_donut(1000))
     write_model(
-        tmp_path / "sparse" / "0", {"a.jpg": v3dg.Camera.look_at((0, -2, 1), (0, 0, 0), width=40, height=30)}
+        tmp_path / "sparse" / "0",
+        {"a.jpg": v3dg.Camera.look_at((0, -2, 1), (0, 0, 0), width=40, height=30)},
     )
     done = run_command("render", "donut.ply", "--cameras", ".", "-o", "a.png", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -180,7 +190,9 @@ def test_the_viewer_offers_the_cameras_of_a_folder(tmp_path, monkeypatch, camera
     v3dg.write_asset(tmp_path / "donut.ply", make_donut(1000))
     write_model(tmp_path / "capture", cameras)
     assert (
-        cli.main(["view", f"{tmp_path}/donut.ply", "--cameras", f"{tmp_path}/capture", "--device", "cpu"])
+        cli.main(
+            ["view", f"{tmp_path}/donut.ply", "--cameras", f"{tmp_path}/capture", "--device", "cpu"]
+        )
         == 130
     )
     assert_same(offered, cameras)

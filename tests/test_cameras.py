@@ -36,7 +36,8 @@ def test_look_at_centres_the_target(eye, direction, up):
 
 
 def test_transposed_matrices_are_taken():
-    """Whoever passes `matrix.T` has its columns in memory first; the core reads rows."""
+    """Whoever passes `matrix.T` has its columns in memory first; the core reads
+    rows."""
     turned = Camera.look_at((1, 2, 3), (4, 5, 7), width=64, height=48)
     camera = Camera(np.asfortranarray(turned.viewmat), np.asfortranarray(turned.K), 64, 48)
     assert camera.viewmat.flags.c_contiguous
@@ -44,10 +45,14 @@ def test_transposed_matrices_are_taken():
     np.testing.assert_array_equal(camera.viewmat, turned.viewmat)
 
 
-@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda c: pickle.loads(pickle.dumps(c))])
+@pytest.mark.parametrize(
+    "again", [copy.copy, copy.deepcopy, lambda c: pickle.loads(pickle.dumps(c))]
+)
 def test_camera_is_copied_and_pickled_as_it_is(again):
     """Also one that has been drawn with, which keeps what the core made of it."""
-    camera, drawn = (Camera.look_at((3, -4, 2), (0, 0, 0), width=64, height=48, near=0.5) for _ in range(2))
+    camera, drawn = (
+        Camera.look_at((3, -4, 2), (0, 0, 0), width=64, height=48, near=0.5) for _ in range(2)
+    )
     assert drawn.core is not None
     for source in (camera, drawn):
         other = again(source)
@@ -66,7 +71,8 @@ def test_camera_of_the_core_is_made_once():
 
 
 def test_position_of_a_rounded_matrix_is_what_it_brings_to_zero():
-    """Rows that are orthonormal only as far as float32 text goes, far from the origin."""
+    """Rows that are orthonormal only as far as float32 text goes, far from the
+    origin."""
     exact = Camera.look_at((3e4, -2e4, 5e3), (1, 2, 3), width=64, height=48).viewmat
     viewmat = np.round(exact, 4)
     camera = Camera(viewmat, np.diag([50.0, 50.0, 1.0]), 64, 48)
@@ -76,7 +82,9 @@ def test_position_of_a_rounded_matrix_is_what_it_brings_to_zero():
 
 def test_look_at_has_up_upwards_and_right_to_the_right():
     camera = Camera.look_at((0, -5, 0), (0, 0, 0), (0, 0, 1), math.pi / 2, width=200, height=100)
-    np.testing.assert_allclose(pixel(camera, (0, 0, 1))[0], [100, 30])  # y is down: above is a smaller row
+    np.testing.assert_allclose(
+        pixel(camera, (0, 0, 1))[0], [100, 30]
+    )  # y is down: above is a smaller row
     np.testing.assert_allclose(pixel(camera, (1, 0, 0))[0], [120, 50])
     np.testing.assert_allclose(pixel(camera, (5, 0, 0))[0], [200, 50])  # half the field of view
 
@@ -109,7 +117,9 @@ def test_scaled_camera_sees_the_same():
     camera = Camera.look_at((1, 2, 3), (0, 0, 0), width=30, height=20)
     double = camera.scaled(2)
     assert (double.width, double.height) == (60, 40)
-    np.testing.assert_allclose(pixel(double, (0.1, 0.2, 0.3))[0], 2 * pixel(camera, (0.1, 0.2, 0.3))[0])
+    np.testing.assert_allclose(
+        pixel(double, (0.1, 0.2, 0.3))[0], 2 * pixel(camera, (0.1, 0.2, 0.3))[0]
+    )
     np.testing.assert_array_equal(double.viewmat, camera.viewmat)
 
 
@@ -147,11 +157,20 @@ GOOD = {"viewmat": np.eye(4), "K": np.eye(3), "width": 8, "height": 8}
     [
         ({"viewmat": np.eye(3)}, r"viewmat: expected shape \(4, 4\), got \(3, 3\)"),
         ({"viewmat": "wide"}, r"viewmat: expected numbers of shape \(4, 4\), got str"),
-        ({"viewmat": with_entry(np.eye(4), (0, 3), np.nan)}, "viewmat: expected finite numbers, got nan"),
+        (
+            {"viewmat": with_entry(np.eye(4), (0, 3), np.nan)},
+            "viewmat: expected finite numbers, got nan",
+        ),
         ({"viewmat": 2 * np.eye(4)}, "viewmat: expected a rotation"),
         ({"viewmat": np.diag([1.0, 1.0, -1.0, 1.0])}, "viewmat: expected a rotation"),
-        ({"viewmat": with_entry(np.eye(4), (3, 0), 1)}, "viewmat: expected the last row 0 0 0 1, got"),
-        ({"K": with_entry(np.eye(3), (0, 0), -1)}, "K: expected positive focal lengths, got -1 and 1"),
+        (
+            {"viewmat": with_entry(np.eye(4), (3, 0), 1)},
+            "viewmat: expected the last row 0 0 0 1, got",
+        ),
+        (
+            {"K": with_entry(np.eye(3), (0, 0), -1)},
+            "K: expected positive focal lengths, got -1 and 1",
+        ),
         ({"K": with_entry(np.eye(3), (0, 1), 1)}, "K: expected .* got a matrix with skew"),
         ({"width": 0}, "width: expected a positive whole number, got 0"),
         ({"width": 8.5}, "width: expected a positive whole number, got 8.5"),

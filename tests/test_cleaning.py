@@ -49,7 +49,9 @@ def test_every_kind_is_counted_and_a_gaussian_may_be_of_several(device):
         "transparent": 2,
     }
     assert (findings.num_wrong, findings.num_dropped) == (7, 9)
-    assert findings.text.startswith("9 of 50 gaussians cannot be drawn: 1 with a position that is not finite")
+    assert findings.text.startswith(
+        "9 of 50 gaussians cannot be drawn: 1 with a position that is not finite"
+    )
 
 
 @pytest.mark.parametrize("name", scenes.poison())
@@ -59,7 +61,9 @@ def test_what_has_no_meaning_is_wrong(name):
 
 def test_counts_are_described_in_words():
     text = describe({"negative_scale": 1234, "transparent": 1})
-    assert text == "1,234 with a negative scale, 1 with an opacity below 1/255, which no pixel shows"
+    assert (
+        text == "1,234 with a negative scale, 1 with an opacity below 1/255, which no pixel shows"
+    )
 
 
 @pytest.mark.parametrize("filter_px2", [0.0, 0.3])

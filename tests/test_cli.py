@@ -21,7 +21,8 @@ from v3dg import cli
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with an asset, a bundle and a scene of three instances and two cameras."""
+    """A folder with an asset, a bundle and a scene of three instances and two
+    cameras."""
     folder = tmp_path_factory.mktemp("cli")
     v3dg.write_asset(folder / "tuft.ply", make_asset(1000))
     done = run("build", "tuft.ply", "--quiet", "--json", cwd=folder)
@@ -34,7 +35,13 @@ def folder(tmp_path_factory):
         "instances": [{"bundle": "tuft", "position": [2 * i, 0, 0]} for i in range(3)],
         "cameras": [
             {"name": "near", "width": 48, "height": 32, "eye": [0, -4, 2], "target": [1, 0, 0.4]},
-            {"name": "far away", "width": 32, "height": 32, "eye": [0, -40, 9], "target": [2, 0, 0]},
+            {
+                "name": "far away",
+                "width": 32,
+                "height": 32,
+                "eye": [0, -40, 9],
+                "target": [2, 0, 0],
+            },
         ],
     }
     (folder / "scene.json").write_text(json.dumps(scene))
@@ -43,7 +50,9 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.skipif(v3dg._core.num_cuda_devices() > 0, reason="there is a CUDA device")
-@pytest.mark.parametrize("command", [("build", "tuft.ply", "-o", "other.v3dg"), ("render", "tuft.v3dg")])
+@pytest.mark.parametrize(
+    "command", [("build", "tuft.ply", "-o", "other.v3dg"), ("render", "tuft.v3dg")]
+)
 def test_missing_cuda_is_an_error(folder, command):
     fails(1, "or use 'cpu'", *command, "--device", "cuda", cwd=folder)
 
@@ -56,7 +65,18 @@ def test_version():
 
 @pytest.mark.parametrize(
     "command",
-    ["build", "refine", "info", "render", "compare", "convert", "export", "demo", "doctor", "completion"],
+    [
+        "build",
+        "refine",
+        "info",
+        "render",
+        "compare",
+        "convert",
+        "export",
+        "demo",
+        "doctor",
+        "completion",
+    ],
 )
 def test_help(command):
     done = run(command, "--help")
@@ -75,7 +95,11 @@ def test_completion_is_a_script_that_knows_commands_and_options(shell):
     assert "compare" in done.stdout
     assert "tolerance" in done.stdout
     # Where nothing else fits, files are completed.
-    files = {"bash": "complete -o default -F", "zsh": '-z "$completions"', "fish": "complete --command"}
+    files = {
+        "bash": "complete -o default -F",
+        "zsh": '-z "$completions"',
+        "fish": "complete --command",
+    }
     assert files[shell] in done.stdout
     told = json.loads(run("completion", shell, "--json", "--quiet").stdout)
     assert told["shell"] == shell
@@ -83,7 +107,12 @@ def test_completion_is_a_script_that_knows_commands_and_options(shell):
 
 
 def test_what_is_missing_is_named(tmp_path):
-    fails(2, "PATH: expected file to describe, got nothing; run v3dg info --help", "info", cwd=tmp_path)
+    fails(
+        2,
+        "PATH: expected file to describe, got nothing; run v3dg info --help",
+        "info",
+        cwd=tmp_path,
+    )
 
 
 def test_a_name_that_is_nearly_there_is_proposed(tmp_path):
@@ -110,16 +139,16 @@ def test_bash_completes_what_the_script_says():
     assert done.stderr == ""
     *completed, registered = done.stdout.splitlines()
     assert completed == ["render", "--tolerance"]
-    assert registered == "complete -o default -F _tyro_v3dg v3dg"  # else no file would be completed any more
+    assert (
+        registered == "complete -o default -F _tyro_v3dg v3dg"
+    )  # else no file would be completed any more
 
 
 @pytest.mark.witness
 @pytest.mark.skipif(shutil.which("fish") is None, reason="there is no fish")
 def test_fish_completes_what_the_script_says(tmp_path):
     (tmp_path / "rendered.ply").touch()
-    typed = (
-        f"{shlex.join(COMMAND)} completion fish | source; complete -C 'v3dg ren'; complete -C 'v3dg build r'"
-    )
+    typed = f"{shlex.join(COMMAND)} completion fish | source; complete -C 'v3dg ren'; complete -C 'v3dg build r'"
     done = subprocess.run(
         ["fish", "-c", typed], capture_output=True, text=True, cwd=tmp_path, env=ENVIRONMENT
     )
@@ -138,7 +167,8 @@ def test_module_runs_too():
 def test_help_loads_nothing_heavy():
     code = (
         "import sys, v3dg.cli; "
-        "print([m for m in ('torch', 'PIL', 'flip_evaluator', 'matplotlib', 'scipy') if m in sys.modules])"
+        "print([m for m in ('torch', 'PIL', 'flip_evaluator', 'matplotlib', 'scipy') if m in "
+        "sys.modules])"
     )
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=ENVIRONMENT)
@@ -191,7 +221,10 @@ def dirty(folder):
 
 def test_info_says_what_is_wrong_with_an_asset(dirty):
     text = run("info", dirty).stdout
-    assert "2 cannot be drawn: 1 with a colour that is not finite, 1 with an opacity below 1/255" in text
+    assert (
+        "2 cannot be drawn: 1 with a colour that is not finite, 1 with an opacity below 1/255"
+        in text
+    )
     assert "1 outliers" in text
     result = json.loads(run("info", dirty, "--json").stdout)
     assert result["not_drawable"] == {"sh_not_finite": 1, "transparent": 1}
@@ -204,7 +237,9 @@ def test_build_leaves_out_what_cannot_be_drawn_and_says_so(dirty, tmp_path):
     done = run("build", dirty, "-o", "out.v3dg", "--quiet", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
-    assert "left out: 1 with a colour that is not finite, 1 with an opacity below 1/255" in done.stdout
+    assert (
+        "left out: 1 with a colour that is not finite, 1 with an opacity below 1/255" in done.stdout
+    )
     assert v3dg.Bundle.open(tmp_path / "out.v3dg").config["asset_gaussians"] == 1000
     message = f"{dirty}: asset: expected gaussians that can be drawn, got others: 2 of 1,000"
     (tmp_path / "out.v3dg").unlink()
@@ -227,7 +262,9 @@ def test_a_full_disk_is_named_with_what_resumes(folder, tmp_path):
         text=True,
         cwd=tmp_path,
         env=ENVIRONMENT,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY)),
+        preexec_fn=lambda: resource.setrlimit(
+            resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY)
+        ),
     )
     assert done.returncode == 1
     message = "out.v3dg.partial: File too large; `--resume` continues from out.v3dg.partial"
@@ -306,7 +343,9 @@ def test_render_from_a_pool(folder, tmp_path):
     pictures = []
     for options in ((), ("--memory", "64MB")):
         path = tmp_path / f"{len(options)}.png"
-        done = run("render", folder / "tuft.v3dg", "-o", path, "--size", 64, 48, "--views", 1, *options)
+        done = run(
+            "render", folder / "tuft.v3dg", "-o", path, "--size", 64, 48, "--views", 1, *options
+        )
         assert done.returncode == 0, done.stderr
         pictures.append(path.read_bytes())
     assert pictures[0] == pictures[1]
@@ -321,7 +360,9 @@ def test_render_of_a_film_takes_a_budget_in_steps(folder, tmp_path):
         done = run("render", folder / "scene.json", "-o", tmp_path / "out.png", *options)
         assert done.returncode == 0, done.stderr
         (picture,) = json.loads(done.stdout)["pictures"]
-        assert picture["tolerance"] == v3dg.select(scene, camera, budget=budget, fade=fade).tolerance
+        assert (
+            picture["tolerance"] == v3dg.select(scene, camera, budget=budget, fade=fade).tolerance
+        )
 
 
 def test_render_within_a_budget(folder, tmp_path):
@@ -338,7 +379,16 @@ def test_render_within_a_budget(folder, tmp_path):
     fails(
         1,
         "budget: expected at least",
-        *("render", folder / "scene.json", "--camera", "near", "--budget", 1, "-o", tmp_path / "no.png"),
+        *(
+            "render",
+            folder / "scene.json",
+            "--camera",
+            "near",
+            "--budget",
+            1,
+            "-o",
+            tmp_path / "no.png",
+        ),
         cwd=tmp_path,
     )
 
@@ -360,7 +410,9 @@ def test_render_from_a_camera_file(folder, tmp_path):
         os.unlink(tmp_path / "out_train_r_0.png")
         os.unlink(tmp_path / "out_train_r_1.png")
     fails(1, "transforms.json: k1: expected no lens distortion", *command, cwd=tmp_path)
-    done = run(*command, "--distortion", "ignore", "--camera", "train/r_1", "-o", tmp_path / "one.png")
+    done = run(
+        *command, "--distortion", "ignore", "--camera", "train/r_1", "-o", tmp_path / "one.png"
+    )
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "one.png").exists()
 
@@ -372,15 +424,49 @@ def test_wrong_usage(folder):
     fails(2, "--seed", "build", "tuft.ply", "--seed", "many", cwd=folder)
     fails(2, "--cluster-sise", "build", "tuft.ply", "--cluster-sise", "3", cwd=folder)
     for number in (0, 2**32):
-        fails(2, "--threads: expected 1 to 1,024", "build", "tuft.ply", "--threads", number, cwd=folder)
+        fails(
+            2,
+            "--threads: expected 1 to 1,024",
+            "build",
+            "tuft.ply",
+            "--threads",
+            number,
+            cwd=folder,
+        )
     fails(2, "--camera", "render", "tuft.ply", "--camera", "near", cwd=folder)
     fails(2, "COMMAND: expected build, refine, info,", "tuft.ply", cwd=folder)
-    fails(2, "--up: expected one of x, y, z, -x, -y, -z, got", "build", "tuft.ply", "--up", "q", cwd=folder)
-    fails(2, "--size: expected 2 values, got fewer;", "render", "tuft.v3dg", "--size", 100, cwd=folder)
+    fails(
+        2,
+        "--up: expected one of x, y, z, -x, -y, -z, got",
+        "build",
+        "tuft.ply",
+        "--up",
+        "q",
+        cwd=folder,
+    )
+    fails(
+        2, "--size: expected 2 values, got fewer;", "render", "tuft.v3dg", "--size", 100, cwd=folder
+    )
     fails(2, "--output: expected 1 value, got fewer;", "render", "tuft.v3dg", "-o", cwd=folder)
-    fails(2, "--budget: expected whole numbers, got '1e6'", "render", "tuft.v3dg", "--budget=1e6", cwd=folder)
-    fails(2, "--elevation: expected numbers, got 'x'", "render", "tuft.v3dg", "--elevation=x", cwd=folder)
-    fails(2, "--views: expected 1 to 10,000, got 0", "render", "tuft.v3dg", "--views", 0, cwd=folder)
+    fails(
+        2,
+        "--budget: expected whole numbers, got '1e6'",
+        "render",
+        "tuft.v3dg",
+        "--budget=1e6",
+        cwd=folder,
+    )
+    fails(
+        2,
+        "--elevation: expected numbers, got 'x'",
+        "render",
+        "tuft.v3dg",
+        "--elevation=x",
+        cwd=folder,
+    )
+    fails(
+        2, "--views: expected 1 to 10,000, got 0", "render", "tuft.v3dg", "--views", 0, cwd=folder
+    )
     fails(2, "-89.99 to 89.99, got 90", "render", "tuft.v3dg", "--elevation", 90, cwd=folder)
     fails(2, "leave it out", "export", "tuft.v3dg", "--to", "tiles", "-o", "a.usda", cwd=folder)
     fails(2, "--seed: expected 0 to", "demo", "--seed", "-1", cwd=folder)
@@ -389,7 +475,8 @@ def test_wrong_usage(folder):
 @pytest.mark.parametrize("option", [("--views", 1), ("--elevation", 20), ("--up", "z")])
 @pytest.mark.parametrize("command", ["render scene.json", "compare tuft.ply scene.json"])
 def test_options_of_a_turntable_are_refused_beside_cameras(folder, option, command):
-    """Whatever their values: those that are the defaults say nothing of what was given."""
+    """Whatever their values: those that are the defaults say nothing of what was
+    given."""
     message = f"{option[0]}: expected a turntable to set with it, got the cameras of scene.json; leave it out"
     fails(2, message, *command.split(), *option, cwd=folder)
 
@@ -419,9 +506,18 @@ def test_a_file_that_is_read_is_not_written_over(folder, tmp_path):
 
 
 def test_an_empty_argument_is_not_the_working_folder(folder):
-    """A shell gives one for a variable that is not set, and `build` would take all assets that are there."""
+    """A shell gives one for a variable that is not set, and `build` would take all
+    assets that are there."""
     before = sorted(os.listdir(folder))
-    fails(2, "argument 2 is empty; is a shell variable unset", "build", "", "-o", "all.v3dg", cwd=folder)
+    fails(
+        2,
+        "argument 2 is empty; is a shell variable unset",
+        "build",
+        "",
+        "-o",
+        "all.v3dg",
+        cwd=folder,
+    )
     assert sorted(os.listdir(folder)) == before
 
 
@@ -439,11 +535,25 @@ def test_failures(folder):
     fails(1, "nothing.ply", "build", "nothing.ply", cwd=folder)
     fails(1, "broken.ply", "build", "broken.ply", cwd=folder)
     fails(1, "broken.ply", "info", "broken.ply", cwd=folder)
-    fails(1, "expected a file name ending in .v3dg", "build", "tuft.ply", "-o", "tuft.zip", cwd=folder)
-    fails(1, "error: no/tuft.v3dg: expected an", "build", "tuft.ply", "-o", "no/tuft.v3dg", cwd=folder)
+    fails(
+        1, "expected a file name ending in .v3dg", "build", "tuft.ply", "-o", "tuft.zip", cwd=folder
+    )
+    fails(
+        1, "error: no/tuft.v3dg: expected an", "build", "tuft.ply", "-o", "no/tuft.v3dg", cwd=folder
+    )
     fails(1, "got a folder; tuft.v3dg is one", "build", "tuft.ply", "-o", "./", cwd=folder)
     fails(1, "got a folder", "info", ".", cwd=folder)
-    fails(1, "MiB, got 0.0 MiB", "build", "tuft.ply", "--memory", "1KB", "-o", "small.v3dg", cwd=folder)
+    fails(
+        1,
+        "MiB, got 0.0 MiB",
+        "build",
+        "tuft.ply",
+        "--memory",
+        "1KB",
+        "-o",
+        "small.v3dg",
+        cwd=folder,
+    )
     fails(1, "create it first", "render", "tuft.ply", "-o", "no/tuft.png", cwd=folder)
     fails(1, ".png", "render", "tuft.ply", "-o", "tuft.gif", cwd=folder)
     fails(1, "tolerance", "render", "tuft.v3dg", "--tolerance", "-1", cwd=folder)
@@ -460,7 +570,8 @@ def test_interrupt_leaves_no_bundle_and_says_so(tmp_path):
         stderr=subprocess.PIPE,
         text=True,
         env=ENVIRONMENT,
-        # Whoever starts the tests in the background has them ignore interrupts, and children inherit that.
+        # Whoever starts the tests in the background has them ignore interrupts, and
+        # children inherit that.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     time.sleep(2.5)
@@ -473,7 +584,9 @@ def test_interrupt_leaves_no_bundle_and_says_so(tmp_path):
 
 def test_closed_pipe_is_quiet(folder):
     command = f"{sys.executable} -m v3dg info tuft.v3dg --json | head -c 1"
-    done = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=folder, env=ENVIRONMENT)
+    done = subprocess.run(
+        command, shell=True, capture_output=True, text=True, cwd=folder, env=ENVIRONMENT
+    )
     assert done.stderr == ""
 
 
@@ -481,14 +594,20 @@ def test_closed_pipe_is_quiet(folder):
 @pytest.mark.parametrize(
     "command", ["--help", "info tuft.v3dg", "info nowhere.ply", "convert tuft.ply {}/a.ply"]
 )
-def test_closed_and_full_streams_end_with_one_line_and_take_no_file(folder, tmp_path, closed, command):
+def test_closed_and_full_streams_end_with_one_line_and_take_no_file(
+    folder, tmp_path, closed, command
+):
     command = f"{sys.executable} -m v3dg {command.format(tmp_path)} {closed}"
-    done = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=folder, env=ENVIRONMENT)
+    done = subprocess.run(
+        command, shell=True, capture_output=True, text=True, cwd=folder, env=ENVIRONMENT
+    )
     assert done.returncode in (0, 1)
     assert done.stderr.count("\n") <= 1
     assert done.stderr.startswith("v3dg: error: " if done.stderr else "")
     for path in tmp_path.iterdir():  # all that is printed goes elsewhere
-        np.testing.assert_array_equal(v3dg.read_asset(path).means, v3dg.read_asset(folder / "tuft.ply").means)
+        np.testing.assert_array_equal(
+            v3dg.read_asset(path).means, v3dg.read_asset(folder / "tuft.ply").means
+        )
 
 
 def test_text_of_files_reaches_no_terminal_as_it_is(folder, tmp_path):
@@ -498,7 +617,9 @@ def test_text_of_files_reaches_no_terminal_as_it_is(folder, tmp_path):
         shutil.copy(folder / name.format("tuft"), tmp_path / name.format(evil))
     bundle = v3dg.Bundle.open(folder / "tuft.v3dg")
     config = {**bundle.config, evil: evil, "nested": {evil: [evil]}}
-    v3dg.Bundle(bundle.clusters, bundle.groups, bundle.gaussians, config).write(tmp_path / "told.v3dg")
+    v3dg.Bundle(bundle.clusters, bundle.groups, bundle.gaussians, config).write(
+        tmp_path / "told.v3dg"
+    )
     for command in (
         ("info", f"{evil}.ply"),
         ("info", f"{evil}.v3dg"),

@@ -43,7 +43,14 @@ def test_one_that_fails_does_not_stop_the_others(folder):
     ]
     assert "b.ply" in result["assets"][1]["error"]
     assert (result["built"], result["kept"], result["failed"]) == (2, 0, 1)
-    assert sorted(os.listdir(folder)) == ["a.ply", "a.v3dg", "b.ply", "c.ply", "c.v3dg", "notes.txt"]
+    assert sorted(os.listdir(folder)) == [
+        "a.ply",
+        "a.v3dg",
+        "b.ply",
+        "c.ply",
+        "c.v3dg",
+        "notes.txt",
+    ]
 
 
 def test_bundles_go_to_the_output_folder_and_are_those_of_single_builds(folder):
@@ -67,8 +74,8 @@ def test_resume_keeps_what_is_done_with_these_settings(folder):
     assert statuses() == ["built", "built"]
     assert statuses() == ["kept", "kept"]
     assert statuses("--seed", 1) == ["built", "built"]
-    # Dates say nothing: these are other gaussians in files that are older than their bundles, and the same
-    # in files that are newer.
+    # Dates say nothing: these are other gaussians in files that are older than their
+    # bundles, and the same in files that are newer.
     (folder / "a.ply").rename(folder / "b.ply")
     (folder / "c.ply").rename(folder / "a.ply")
     (folder / "b.ply").rename(folder / "c.ply")
@@ -101,7 +108,9 @@ def lies(config):
         config | {"asset_digest": 0},
         config | {"build": []},
         config | {"seed": {}},
-        {name: value for name, value in config.items() if name != "asset_digest"},  # as of earlier builds
+        {
+            name: value for name, value in config.items() if name != "asset_digest"
+        },  # as of earlier builds
     ]
 
 
@@ -115,9 +124,9 @@ def test_resume_builds_over_a_bundle_whose_config_lies(folder):
         assert v3dg.Bundle.open(output).config == config
         assert build_file(folder / "a.ply", output, resume=True, **options)[1], config
         assert output.read_bytes() == whole
-    v3dg.Bundle(bundle.clusters, bundle.groups, bundle.gaussians, bundle.config | {"dropped": 5}).write(
-        output
-    )
+    v3dg.Bundle(
+        bundle.clusters, bundle.groups, bundle.gaussians, bundle.config | {"dropped": 5}
+    ).write(output)
     done = run("build", "a.ply", *FAST, "--resume", "--json", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["status"] == "built"
@@ -129,7 +138,14 @@ def test_strict_refuses_also_what_resume_would_keep(folder):
     v3dg.write_asset(folder / "bad.ply", asset)
     assert run("build", "bad.ply", *FAST, cwd=folder).returncode == 0
     fails(
-        1, "bad.ply: asset: expected gaussians", "build", "bad.ply", *FAST, "--resume", "--strict", cwd=folder
+        1,
+        "bad.ply: asset: expected gaussians",
+        "build",
+        "bad.ply",
+        *FAST,
+        "--resume",
+        "--strict",
+        cwd=folder,
     )
 
 
@@ -172,17 +188,34 @@ def test_several_files_make_one_asset(tmp_path):
     (tmp_path / "tiles").mkdir()
     for name, part in zip("ab", parts, strict=True):
         v3dg.write_asset(tmp_path / "tiles" / f"{name}.ply", part)
-    done = run("build", "tiles/a.ply", "tiles/b.ply", "-o", "city.v3dg", *FAST, "--json", cwd=tmp_path)
+    done = run(
+        "build", "tiles/a.ply", "tiles/b.ply", "-o", "city.v3dg", *FAST, "--json", cwd=tmp_path
+    )
     result = json.loads(done.stdout)
     assert result["asset"] == ["tiles/a.ply", "tiles/b.ply"]
     assert result["asset_gaussians"] == sum(map(len, parts))
-    assert run("build", "tiles", "-o", "again.v3dg", *FAST, "--memory", "1GiB", cwd=tmp_path).returncode == 0
+    assert (
+        run(
+            "build", "tiles", "-o", "again.v3dg", *FAST, "--memory", "1GiB", cwd=tmp_path
+        ).returncode
+        == 0
+    )
     assert (tmp_path / "city.v3dg").read_bytes() == (tmp_path / "again.v3dg").read_bytes()
     for amount, message in (
         ("much", "expected bytes, or text like '8GiB', got 'much'"),
         ("1", "expected at least 7"),
     ):
-        fails(1, f"memory: {message}", "build", "tiles", "-o", "x.v3dg", "--memory", amount, cwd=tmp_path)
+        fails(
+            1,
+            f"memory: {message}",
+            "build",
+            "tiles",
+            "-o",
+            "x.v3dg",
+            "--memory",
+            amount,
+            cwd=tmp_path,
+        )
 
 
 def test_an_asset_larger_than_memory_makes_the_same_bundle(tmp_path, monkeypatch):
@@ -220,14 +253,21 @@ def test_a_run_of_gsplat_is_one_asset_of_its_last_step(tmp_path):
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     assert result["asset"] == [f"garden/ckpts/ckpt_29999_rank{rank}.pt" for rank in (0, 1)]
-    assert result["asset_gaussians"] == v3dg.open(tmp_path / "garden.v3dg").config["asset_gaussians"] == 600
+    assert (
+        result["asset_gaussians"]
+        == v3dg.open(tmp_path / "garden.v3dg").config["asset_gaussians"]
+        == 600
+    )
 
 
 @pytest.mark.parametrize(
     ("last", "before"),
     [
         ("nerfstudio_models/step-000029999.ckpt", "nerfstudio_models/step-000002000.ckpt"),
-        ("point_cloud/iteration_30000/point_cloud.ply", "point_cloud/iteration_7000/point_cloud.ply"),
+        (
+            "point_cloud/iteration_30000/point_cloud.ply",
+            "point_cloud/iteration_7000/point_cloud.ply",
+        ),
     ],
 )
 def test_the_last_step_of_a_run_counts(tmp_path, last, before):

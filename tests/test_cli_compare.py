@@ -23,7 +23,9 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("compare")
     asset = make_asset(1000)
     v3dg.write_asset(folder / "tuft.ply", asset)
-    bundle = v3dg.build_bundle(asset, config=v3dg.BuildConfig(steps=20), progress=False, device="cpu")
+    bundle = v3dg.build_bundle(
+        asset, config=v3dg.BuildConfig(steps=20), progress=False, device="cpu"
+    )
     bundle.write(folder / "tuft.v3dg")
     scene = v3dg.Scene()
     scene.add(bundle, positions=[[0, 0, 0]])
@@ -50,7 +52,8 @@ def test_an_asset_and_itself_are_equal(folder, tmp_path):
 
 
 def test_many_views_are_measured_by_several_processes_alike(folder, tmp_path):
-    """View 0 of a turntable is the same, however many there are; the others come in order."""
+    """View 0 of a turntable is the same, however many there are; the others come in
+    order."""
     options = ("--size", 64, 48, "-o", tmp_path / "c.png", "--tolerance", 100, "--views")
     one, many = (compare(folder, "tuft.ply", "tuft.v3dg", *options, n)["views"] for n in (1, 9))
     assert [view["camera"] for view in many] == list("012345678")
@@ -61,7 +64,17 @@ def test_many_views_are_measured_by_several_processes_alike(folder, tmp_path):
 
 def test_error_grows_with_the_tolerance_and_shrinks_the_cut(folder, tmp_path):
     def mean(tolerance):
-        options = ("--views", 2, "--size", 64, 48, "-o", tmp_path / "c.png", "--tolerance", tolerance)
+        options = (
+            "--views",
+            2,
+            "--size",
+            64,
+            48,
+            "-o",
+            tmp_path / "c.png",
+            "--tolerance",
+            tolerance,
+        )
         return compare(folder, "tuft.ply", "tuft.v3dg", *options)["mean"]
 
     fine, coarse = mean(10), mean(300)
@@ -73,7 +86,15 @@ def test_error_grows_with_the_tolerance_and_shrinks_the_cut(folder, tmp_path):
 
 def test_a_scene_is_compared_from_its_own_cameras(folder, tmp_path):
     result = compare(
-        folder, "scene.json", "scene.json", "--budget", 300, "--pictures", "all", "-o", tmp_path / "c.png"
+        folder,
+        "scene.json",
+        "scene.json",
+        "--budget",
+        300,
+        "--pictures",
+        "all",
+        "-o",
+        tmp_path / "c.png",
     )
     assert [view["camera"] for view in result["views"]] == ["near", "far"]
     assert all(0 < view["gaussians_selected"] <= 300 for view in result["views"])
@@ -83,7 +104,15 @@ def test_a_scene_is_compared_from_its_own_cameras(folder, tmp_path):
 
 def test_the_scene_gives_the_cameras_whichever_it_is(folder, tmp_path):
     result = compare(
-        folder, "tuft.ply", "scene.json", "--camera", "near", "--tolerance", 0, "-o", tmp_path / "c.png"
+        folder,
+        "tuft.ply",
+        "scene.json",
+        "--camera",
+        "near",
+        "--tolerance",
+        0,
+        "-o",
+        tmp_path / "c.png",
     )
     assert [view["camera"] for view in result["views"]] == ["near"]
     assert result["mean"]["flip"] < 1e-3
@@ -91,7 +120,9 @@ def test_the_scene_gives_the_cameras_whichever_it_is(folder, tmp_path):
 
 def test_supersampling_the_reference_shows_aliasing(folder, tmp_path):
     options = ("--camera", "far", "--tolerance", 0, "-o", tmp_path / "c.png", "--supersample")
-    once, thrice = (compare(folder, "scene.json", "scene.json", *options, n)["mean"] for n in (1, 3))
+    once, thrice = (
+        compare(folder, "scene.json", "scene.json", *options, n)["mean"] for n in (1, 3)
+    )
     assert once["flip"] == 0
     assert thrice["flip"] > 0
 
@@ -158,7 +189,14 @@ def test_errors(folder, tmp_path):
     fails(1, "c.gif", "compare", "tuft.ply", "tuft.v3dg", "-o", "c.gif", cwd=folder)
     fails(2, "--supersample", "compare", "tuft.ply", "tuft.ply", "--supersample", 0, cwd=folder)
     (tmp_path / "compare.png").symlink_to("a.png")
-    fails(2, "compare.png: expected another file than a.png", "compare", "a.png", "b.png", cwd=tmp_path)
+    fails(
+        2,
+        "compare.png: expected another file than a.png",
+        "compare",
+        "a.png",
+        "b.png",
+        cwd=tmp_path,
+    )
 
 
 def chunk(kind, data):
@@ -169,7 +207,9 @@ def grey_png(side, *chunks, depth=8, rows=1):
     """A grey PNG of any side with so few rows of data."""
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, depth, 0, 0, 0, 0))
     data = zlib.compress(bytes((1 + side * depth // 8) * rows))
-    return b"\x89PNG\r\n\x1a\n" + b"".join([header, *chunks, chunk(b"IDAT", data), chunk(b"IEND", b"")])
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        [header, *chunks, chunk(b"IDAT", data), chunk(b"IEND", b"")]
+    )
 
 
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n"
@@ -182,7 +222,10 @@ POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\ns
         (b"", "expected a PNG or a JPEG, got another file"),
         (POSTSCRIPT, "expected a PNG or a JPEG, got another file"),
         (grey_png(8)[:50], "expected a PNG or a JPEG that is not damaged, got"),
-        (grey_png(12_000), "expected a picture of at most 65,500 px a side and 33,554,432 px in all"),
+        (
+            grey_png(12_000),
+            "expected a picture of at most 65,500 px a side and 33,554,432 px in all",
+        ),
         (grey_png(20_000), "expected a PNG or a JPEG that is not damaged, got Image size"),
         (grey_png(2**31 - 1), "expected a PNG or a JPEG that is not damaged, got Image size"),
         (grey_png(8, depth=16, rows=8), "expected 8 bits a channel, got 16"),
@@ -226,12 +269,18 @@ def test_pictures_of_all_views_have_names_of_their_own(folder, tmp_path):
     first, second = scene["cameras"]
     first["name"], second["name"] = "a/b", "a:b"
     (tmp_path / "scene.json").write_text(json.dumps(scene))
-    for command in (["compare", "scene.json", "scene.json", "--pictures", "all"], ["render", "scene.json"]):
+    for command in (
+        ["compare", "scene.json", "scene.json", "--pictures", "all"],
+        ["render", "scene.json"],
+    ):
         done = run(*command, "-o", "c.png", "--json", cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         result = json.loads(done.stdout)
         rows = result.get("views") or result["pictures"]
-        assert [(row["camera"], row["picture"]) for row in rows] == [("a/b", "c_0.png"), ("a:b", "c_1.png")]
+        assert [(row["camera"], row["picture"]) for row in rows] == [
+            ("a/b", "c_0.png"),
+            ("a:b", "c_1.png"),
+        ]
 
 
 def test_without_flip_views_are_compared_by_psnr(folder, tmp_path, monkeypatch, capsys):

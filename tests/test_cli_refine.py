@@ -15,7 +15,9 @@ def folder(tmp_path_factory):
     asset = make_donut(2000)
     v3dg.write_asset(folder / "donut.ply", asset)
     config = v3dg.BuildConfig(steps=0, cluster_size=128)
-    v3dg.build_bundle(asset, config=config, device="cpu", progress=False).write(folder / "donut.v3dg")
+    v3dg.build_bundle(asset, config=config, device="cpu", progress=False).write(
+        folder / "donut.v3dg"
+    )
     v3dg.write_cameras(folder / "eyes.json", {"front": v3dg.turntable((0, 0, 0), 3, 1)[0]})
     return folder
 
@@ -36,7 +38,9 @@ def test_info_tells_how_levels_were_built_from_how_they_were_refined(folder):
     bundle = v3dg.Bundle.open(folder / "donut.v3dg")
     about = {"refined": {"steps": v3dg.BuildConfig().steps, "drop": 0.1, "seed": 3}}
     config = bundle.config | about
-    v3dg.Bundle(bundle.clusters, bundle.groups, bundle.gaussians, config).write(folder / "told.v3dg")
+    v3dg.Bundle(bundle.clusters, bundle.groups, bundle.gaussians, config).write(
+        folder / "told.v3dg"
+    )
     text = " ".join(run("info", "told.v3dg", cwd=folder).stdout.split())
     assert f"refined drop=0.1, refined seed=3, refined steps={about['refined']['steps']}" in text
     assert " steps=0," in text
@@ -56,7 +60,17 @@ def test_lens_distortion_is_left_out_if_told(folder):
     """As most models of COLMAP have it."""
     document = json.loads((folder / "eyes.json").read_text())
     (folder / "bent.json").write_text(json.dumps(document | {"camera_model": "OPENCV", "k1": 0.1}))
-    command = ("refine", "donut.v3dg", "bent.v3dg", "--steps", 1, "--cameras", "bent.json", "--device", "cpu")
+    command = (
+        "refine",
+        "donut.v3dg",
+        "bent.v3dg",
+        "--steps",
+        1,
+        "--cameras",
+        "bent.json",
+        "--device",
+        "cpu",
+    )
     fails(1, "expected no lens distortion", *command, cwd=folder)
     done = run(*command, "--distortion", "ignore", cwd=folder)
     assert done.returncode == 0, done.stderr
@@ -67,10 +81,28 @@ def test_what_cannot_be_meant_is_told(folder):
     (folder / "no_eyes.json").write_text('{"frames": []}')
     before = sorted(folder.iterdir())
     fails(2, "another file than donut.v3dg", "refine", "donut.v3dg", "donut.v3dg", cwd=folder)
-    fails(2, "x.ply: expected a file name ending in .v3dg", "refine", "donut.v3dg", "x.ply", cwd=folder)
-    fails(1, "a file ending in .v3dg, got another name", "refine", "donut.ply", "x.v3dg", cwd=folder)
+    fails(
+        2,
+        "x.ply: expected a file name ending in .v3dg",
+        "refine",
+        "donut.v3dg",
+        "x.ply",
+        cwd=folder,
+    )
+    fails(
+        1, "a file ending in .v3dg, got another name", "refine", "donut.ply", "x.v3dg", cwd=folder
+    )
     fails(1, "create it first", "refine", "donut.v3dg", "no/x.v3dg", cwd=folder)
-    fails(1, "steps: expected 1 step or more", "refine", "donut.v3dg", "x.v3dg", "--steps", 0, cwd=folder)
+    fails(
+        1,
+        "steps: expected 1 step or more",
+        "refine",
+        "donut.v3dg",
+        "x.v3dg",
+        "--steps",
+        0,
+        cwd=folder,
+    )
     fails(1, "none.json", "refine", "donut.v3dg", "x.v3dg", "--cameras", "none.json", cwd=folder)
     found = "cameras, got a file without any"
     fails(1, found, "refine", "donut.v3dg", "x.v3dg", "--cameras", "no_eyes.json", cwd=folder)

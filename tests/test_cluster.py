@@ -41,7 +41,11 @@ def test_split_agrees_with_reference(device, means, cluster_size):
     np.testing.assert_array_equal(order, [i for leaf in leaves for i in leaf])
 
 
-@given(num_points=st.integers(0, 3000), cluster_size=st.integers(1, 500), seed=st.integers(0, 2**32 - 1))
+@given(
+    num_points=st.integers(0, 3000),
+    cluster_size=st.integers(1, 500),
+    seed=st.integers(0, 2**32 - 1),
+)
 def test_leaves_partition_the_points_evenly(device, num_points, cluster_size, seed):
     means = np.random.default_rng(seed).normal(size=(num_points, 3)).astype(np.float32)
     order, leaf_offset = median_split(device, means, cluster_size)
@@ -50,7 +54,9 @@ def test_leaves_partition_the_points_evenly(device, num_points, cluster_size, se
     assert num_leaves & (num_leaves - 1) == 0
     assert sizes.max() <= cluster_size
     assert sizes.max() - sizes.min() <= 1
-    assert num_leaves == 1 or -(-num_points // (num_leaves // 2)) > cluster_size  # no deeper than needed
+    assert (
+        num_leaves == 1 or -(-num_points // (num_leaves // 2)) > cluster_size
+    )  # no deeper than needed
     np.testing.assert_array_equal(np.sort(order), np.arange(num_points))
     for first, last in itertools.pairwise(leaf_offset):
         assert (np.diff(order[first:last]) > 0).all()
@@ -71,7 +77,9 @@ def test_large_split_agrees_with_itself_moved(device):
 
 
 @given(
-    lengths=st.lists(st.integers(0, 40), max_size=6), depth=st.integers(0, 5), seed=st.integers(0, 2**32 - 1)
+    lengths=st.lists(st.integers(0, 40), max_size=6),
+    depth=st.integers(0, 5),
+    seed=st.integers(0, 2**32 - 1),
 )
 def test_segments_split_as_if_alone(device, lengths, depth, seed):
     offset = np.cumsum([0, *lengths])
@@ -79,7 +87,9 @@ def test_segments_split_as_if_alone(device, lengths, depth, seed):
     order, leaf_offset = split_segments(device, means, offset, depth)
     assert len(leaf_offset) == len(lengths) * 2**depth + 1
     for s, (first, last) in enumerate(itertools.pairwise(offset)):
-        alone, alone_offset = split_segments("cpu", means[first:last], np.array([0, last - first]), depth)
+        alone, alone_offset = split_segments(
+            "cpu", means[first:last], np.array([0, last - first]), depth
+        )
         np.testing.assert_array_equal(order[first:last], first + alone)
         np.testing.assert_array_equal(
             leaf_offset[s * 2**depth : (s + 1) * 2**depth + 1], first + alone_offset
@@ -89,8 +99,13 @@ def test_segments_split_as_if_alone(device, lengths, depth, seed):
 @pytest.mark.gpu
 @pytest.mark.parametrize("decimals", [1, 6])
 def test_large_splits_are_the_same_on_both_devices(decimals):
-    means = np.round(np.random.default_rng(2).normal(size=(150_000, 3)), decimals).astype(np.float32)
-    for split, argument in ((median_split, (100,)), (split_segments, (np.arange(0, 150_001, 300), 3))):
+    means = np.round(np.random.default_rng(2).normal(size=(150_000, 3)), decimals).astype(
+        np.float32
+    )
+    for split, argument in (
+        (median_split, (100,)),
+        (split_segments, (np.arange(0, 150_001, 300), 3)),
+    ):
         for got, expected in zip(
             split("cuda", means, *argument), split("cpu", means, *argument), strict=True
         ):
@@ -128,7 +143,8 @@ def bound(device, spheres, offset):
 
 
 def reaches(ball, spheres):
-    """Distance from the ball's centre to the far side of each sphere, in double precision."""
+    """Distance from the ball's centre to the far side of each sphere, in double
+    precision."""
     ball, spheres = ball.astype(np.float64), spheres.astype(np.float64)
     return np.linalg.norm(spheres[:, :3] - ball[:3], axis=1) + spheres[:, 3]
 

@@ -15,11 +15,15 @@ seeds = st.integers(0, 2**32 - 1)
 TOGETHER = 8
 
 
-def may_draw(scene, camera, *, tolerance, min_level=0, footprint="solid_angle", cull=True, and_coarser=False):
+def may_draw(
+    scene, camera, *, tolerance, min_level=0, footprint="solid_angle", cull=True, and_coarser=False
+):
     """For each instance, whether its clusters may be drawn, cluster by cluster."""
     rule = rule_of(tolerance, None, min_level, footprint, cull)
     tables = [residency.table(bundle) for bundle in scene.bundles]
-    flags, first = _core.bounds_may_draw(tables, instances_of(scene), camera.core, rule, and_coarser)
+    flags, first = _core.bounds_may_draw(
+        tables, instances_of(scene), camera.core, rule, and_coarser
+    )
     counts = [len(scene.bundles[b].clusters.level) for b in scene.instance_bundle]
     return [
         np.repeat(flags[first[i] : first[i + 1]].astype(bool), TOGETHER)[:count]

@@ -1,4 +1,5 @@
-"""Few values for many: the tables and palettes of SOG, and the order in which gaussians are written."""
+"""Few values for many: the tables and palettes of SOG, and the order in which gaussians
+are written."""
 
 import numpy as np
 import pytest

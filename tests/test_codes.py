@@ -76,14 +76,18 @@ def test_pictures_have_the_same_bits(device, sh_degree):
 @pytest.mark.parametrize("sh_degree", DEGREES)
 def test_scenes_of_either_kind_and_of_both_have_the_same_bits(device, sh_degree):
     rng = np.random.default_rng(sh_degree)
-    bundles = [lod_bundle(k, degree, 200 + 90 * k, 16) for k, degree in enumerate((sh_degree, 0, 3, 1))]
+    bundles = [
+        lod_bundle(k, degree, 200 + 90 * k, 16) for k, degree in enumerate((sh_degree, 0, 3, 1))
+    ]
     all_scenes = scenes_of(bundles, sh_degree)
     for color_by in ("appearance", "level"):
         renderers = [Renderer(scene, color_by=color_by, device=device) for scene in all_scenes]
         for distance in (2.0, 8.0, 300.0):
             camera = scenes_lod.random_camera(rng, distance=distance, width=90, height=70)
             for fade in (None, 1.5):
-                first, *others = (renderer.render(camera, tolerance=4.0, fade=fade) for renderer in renderers)
+                first, *others = (
+                    renderer.render(camera, tolerance=4.0, fade=fade) for renderer in renderers
+                )
                 for other in others:
                     same_bits(first, other)
 
@@ -96,7 +100,9 @@ def test_empty_and_tiny_clusters_have_the_same_bits(device, seed):
     camera = scenes_lod.random_camera(rng, distance=4.0)
     for options in ({}, {"tolerance": 100.0}, {"fade": 4.0}):
         cut = select(scene_of_codes, camera, device=device, **options)
-        pictures = [render(s, camera, device=device, **options) for s in (scene_of_codes, scene_of_rows)]
+        pictures = [
+            render(s, camera, device=device, **options) for s in (scene_of_codes, scene_of_rows)
+        ]
         same_bits(*pictures)
         drawn = dataclasses.replace(cut, scene=scene_of_rows, revision=scene_of_rows.revision)
         same_bits(
@@ -148,7 +154,11 @@ def test_every_instruction_set_draws_the_same_bits(isa, sh_degree, tmp_path):
         "assert images[0].stats.gaussians_in_frustum > 100\n"
         "assert images[0].color.tobytes() == images[1].color.tobytes()\n"
     )
-    environment = {**os.environ, "V3DG_ISA": isa, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    environment = {
+        **os.environ,
+        "V3DG_ISA": isa,
+        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+    }
     command = [sys.executable, "-c", program, *map(str, paths)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if "this processor has no" in done.stderr:
@@ -186,7 +196,9 @@ def test_small_bundles_are_decoded_once_while_they_fit(monkeypatch, num_decoded)
     pairs = [both(lod_bundle(seed, 1)) for seed in (3, 3, 3)]
     row_bytes = residency.model(pairs[0][1], where).bytes
     taken = sum(entries.get(("decoded", where), 0) for entries in residency._entries.values())
-    monkeypatch.setattr("v3dg.residency.MOST_DECODED_BYTES", taken + int((num_decoded + 0.5) * row_bytes))
+    monkeypatch.setattr(
+        "v3dg.residency.MOST_DECODED_BYTES", taken + int((num_decoded + 0.5) * row_bytes)
+    )
     camera = scenes_lod.random_camera(np.random.default_rng(0))
     for k, (codes, rows) in enumerate(pairs):
         same_bits(*(render(b, camera, device="cuda") for b in (codes, rows)))

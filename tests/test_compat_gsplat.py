@@ -1,4 +1,5 @@
-"""gsplat's rasterization, as v3dg draws it: against autograd in float64, and with gsplat's own strategies."""
+"""gsplat's rasterization, as v3dg draws it: against autograd in float64, and with
+gsplat's own strategies."""
 
 import gc
 import weakref
@@ -8,7 +9,13 @@ import numpy as np
 import pytest
 
 import scenes
-from compare import GRADIENT_DOUBLE, GRADIENT_FLOAT, PICTURE_DOUBLE, assert_close, assert_gradients_agree
+from compare import (
+    GRADIENT_DOUBLE,
+    GRADIENT_FLOAT,
+    PICTURE_DOUBLE,
+    assert_close,
+    assert_gradients_agree,
+)
 from v3dg import Camera, Gaussians
 from v3dg import rasterize as v3dg_rasterize
 from v3dg.compat.gsplat import rasterization, rasterization_2dgs
@@ -21,7 +28,10 @@ EPS2D = 0.3  # gsplat's default
 NAMES = (*scenes.NAMES, "backgrounds")
 FIRST = scenes.camera(23, 19, fx=20.0, cx=6.5, cy=14.0, pose=scenes.pose(2))
 CAMERAS = [FIRST]
-for _seed, _shift in ((1, 0.1), (2, -0.2)):  # near the first one, so that they see the same gaussians
+for _seed, _shift in (
+    (1, 0.1),
+    (2, -0.2),
+):  # near the first one, so that they see the same gaussians
     _viewmat = FIRST.viewmat.copy()
     _viewmat[:3, 3] += _shift
     CAMERAS.append(Camera(_viewmat, FIRST.K * [[1 + _shift], [1], [1]], 23, 19))
@@ -30,14 +40,18 @@ for _seed, _shift in ((1, 0.1), (2, -0.2)):  # near the first one, so that they 
 def of_cameras(cameras, *, dtype=torch.float64, device="cpu"):
     """The arguments that say what cameras there are."""
     return {
-        "viewmats": torch.tensor(np.stack([c.viewmat for c in cameras]), dtype=dtype, device=device),
+        "viewmats": torch.tensor(
+            np.stack([c.viewmat for c in cameras]), dtype=dtype, device=device
+        ),
         "Ks": torch.tensor(np.stack([c.K for c in cameras]), dtype=dtype, device=device),
         "width": cameras[0].width,
         "height": cameras[0].height,
     }
 
 
-def leaves(cameras, num=25, *, sh_degree=3, plain=False, dtype=torch.float64, device="cpu", seed=30):
+def leaves(
+    cameras, num=25, *, sh_degree=3, plain=False, dtype=torch.float64, device="cpu", seed=30
+):
     """Means, quats, scales, opacities, colours and backgrounds that want gradients."""
     gaussians = scenes.random_gaussians(
         seed, cameras[0], num, size_px=(0.5, 6), aspect=8, sh_degree=sh_degree, opacity=(0.05, 1.1)
@@ -75,7 +89,8 @@ def weighted_sum(pictures, alphas, seed=0):
     """A number that every pixel has a part in."""
     rng = np.random.default_rng(seed)
     return sum(
-        (p * torch.from_numpy(rng.normal(size=tuple(p.shape))).to(p)).sum() for p in (pictures, alphas)
+        (p * torch.from_numpy(rng.normal(size=tuple(p.shape))).to(p)).sum()
+        for p in (pictures, alphas)
     )
 
 
@@ -101,10 +116,15 @@ def test_pictures_and_gradients_are_those_of_autograd(render_mode, sh_degree, pa
         assert g.shape == w.shape
         assert (g - w).abs().max() <= PICTURE_DOUBLE.absolute
     pairs = zip(
-        NAMES, gradients(weighted_sum(*got), inputs), gradients(weighted_sum(*wanted), inputs), strict=True
+        NAMES,
+        gradients(weighted_sum(*got), inputs),
+        gradients(weighted_sum(*wanted), inputs),
+        strict=True,
     )
     for name, g, w in pairs:
-        assert w.abs().max() > 0 or (render_mode in ("D", "ED") and name in ("sh", "backgrounds")), name
+        assert w.abs().max() > 0 or (
+            render_mode in ("D", "ED") and name in ("sh", "backgrounds")
+        ), name
         assert_close(g.numpy(), w.numpy(), GRADIENT_DOUBLE)
 
 
@@ -122,7 +142,9 @@ def test_each_camera_may_see_colors_of_its_own(sh_degree):
         for g, w in zip(got, wanted, strict=True):
             assert (g[c] - w[0]).abs().max() <= PICTURE_DOUBLE.absolute
         total = total + weighted_sum(*wanted, seed=c)
-    mine = sum(weighted_sum(*(part[c : c + 1] for part in got), seed=c) for c in range(len(CAMERAS)))
+    mine = sum(
+        weighted_sum(*(part[c : c + 1] for part in got), seed=c) for c in range(len(CAMERAS))
+    )
     for g, w in zip(gradients(mine, of_all), gradients(total, of_all), strict=True):
         assert_close(g.numpy(), w.numpy(), GRADIENT_DOUBLE)
 
@@ -158,7 +180,8 @@ def test_a_camera_alone_is_drawn_as_v3dg_draws_it(device):
 
 @pytest.fixture
 def located(monkeypatch):
-    """The tensors of centres that the reference makes, one a picture; they keep their gradients."""
+    """The tensors of centres that the reference makes, one a picture; they keep their
+    gradients."""
     found, project = [], rasterize_torch.project
 
     def remember(*arguments):
@@ -202,7 +225,9 @@ def test_dict_says_where_gaussians_are(device, located, rasterize_mode):
     inputs = leaves(CAMERAS, 60, dtype=torch.float32, device=device)
     options = {"sh_degree": 3, "packed": False, "rasterize_mode": rasterize_mode}
     info = draw(inputs, CAMERAS, **options)[2]
-    info = {name: v.detach().cpu().double() if torch.is_tensor(v) else v for name, v in info.items()}
+    info = {
+        name: v.detach().cpu().double() if torch.is_tensor(v) else v for name, v in info.items()
+    }
     doubles = leaves(CAMERAS, 60)
     expected(doubles, CAMERAS, sh_degree=3)
     for c, (camera, (centers, covariance, depth, compensation, _)) in enumerate(
@@ -251,7 +276,9 @@ def test_packed_dict_holds_the_pairs_in_sight(device):
     for name, found in zip(("camera_ids", "gaussian_ids"), ids, strict=True):
         np.testing.assert_array_equal(of_pairs[name].cpu(), found.cpu())
     for name in ("means2d", "depths", "conics", "opacities", "radii", "grad", "absgrad"):
-        np.testing.assert_array_equal(of_pairs[name].detach().cpu(), of_all[name][ids].detach().cpu())
+        np.testing.assert_array_equal(
+            of_pairs[name].detach().cpu(), of_all[name][ids].detach().cpu()
+        )
     for g, w in zip(got, wanted, strict=True):
         np.testing.assert_array_equal(g.cpu(), w.cpu())
     hidden = of_all["grad"][~is_seen]
@@ -286,7 +313,9 @@ def test_what_is_clipped_is_not_there(device, clip, is_kept):
 
 
 def test_nothing_is_drawn_of_no_gaussians(device):
-    inputs = [t[:0].detach().requires_grad_() for t in leaves(CAMERAS, dtype=torch.float32, device=device)]
+    inputs = [
+        t[:0].detach().requires_grad_() for t in leaves(CAMERAS, dtype=torch.float32, device=device)
+    ]
     inputs[5] = torch.full((3, 3), 0.25, device=device)
     pictures, alphas, info = draw(inputs, CAMERAS, sh_degree=3)
     assert (pictures == 0.25).all()
@@ -322,7 +351,11 @@ def test_no_call_outlives_its_results():
     try:
         pictures, alphas, info = draw(inputs, CAMERAS, sh_degree=3, absgrad=True)
         pictures.sum().backward()
-        watched = [weakref.ref(pictures), weakref.ref(info["means2d"]), weakref.ref(info["means2d"].grad_fn)]
+        watched = [
+            weakref.ref(pictures),
+            weakref.ref(info["means2d"]),
+            weakref.ref(info["means2d"].grad_fn),
+        ]
         del pictures, alphas, info
         assert [ref() for ref in watched] == [None] * 3
     finally:
@@ -386,7 +419,9 @@ def test_cameras_are_not_trained():
 def test_wrong_kinds_are_refused():
     *shape, colors, _ = leaves([FIRST])
     with pytest.raises(TypeError, match="quats: expected a torch tensor, got ndarray"):
-        rasterization(shape[0], shape[1].detach().numpy(), *shape[2:], colors, **of_cameras([FIRST]))
+        rasterization(
+            shape[0], shape[1].detach().numpy(), *shape[2:], colors, **of_cameras([FIRST])
+        )
     with pytest.raises(TypeError, match="glossy: expected an argument of gsplat"):
         rasterization(*shape, colors, **of_cameras([FIRST]), sh_degree=3, glossy=True)
     places = of_cameras(CAMERAS[:2])
@@ -423,12 +458,19 @@ class Trainer:
     """A few gaussians that are trained to pictures of others."""
 
     def __init__(self, device, *, packed, absgrad=False):
-        self.cameras = [scenes.camera(48, 40), *(scenes.camera(48, 40, pose=_near(seed)) for seed in (1, 2))]
+        self.cameras = [
+            scenes.camera(48, 40),
+            *(scenes.camera(48, 40, pose=_near(seed)) for seed in (1, 2)),
+        ]
         self.options = {"packed": packed, "absgrad": absgrad, "sh_degree": 1}
-        *target, _ = leaves(self.cameras, 40, sh_degree=1, dtype=torch.float32, device=device, seed=5)
+        *target, _ = leaves(
+            self.cameras, 40, sh_degree=1, dtype=torch.float32, device=device, seed=5
+        )
         with torch.no_grad():
             self.target = self.draw(*target)[0]
-        *first, _ = leaves(self.cameras, 60, sh_degree=1, dtype=torch.float32, device=device, seed=6)
+        *first, _ = leaves(
+            self.cameras, 60, sh_degree=1, dtype=torch.float32, device=device, seed=6
+        )
         first[2] = first[2].log()
         first[3] = torch.logit(first[3].clamp(0.1, 0.9))
         first[3][:10] = -8  # too faint to be kept
@@ -476,7 +518,9 @@ def test_default_strategy_grows_and_prunes(gsplat, device, packed, absgrad):
         "grow_grad2d": 1e-3,
         "refine_scale2d_stop_iter": 100,
     }
-    strategy = gsplat.DefaultStrategy(absgrad=absgrad, prune_scale2d=10, grow_scale3d=0.05, **options)
+    strategy = gsplat.DefaultStrategy(
+        absgrad=absgrad, prune_scale2d=10, grow_scale3d=0.05, **options
+    )
     strategy.check_sanity(trainer.params, trainer.optimizers)
     state = strategy.initialize_state()
     sizes = []
@@ -487,7 +531,9 @@ def test_default_strategy_grows_and_prunes(gsplat, device, packed, absgrad):
 
         info = trainer.step(before)
         faint = trainer.params["opacities"].sigmoid().min()
-        strategy.step_post_backward(trainer.params, trainer.optimizers, state, step, info, packed=packed)
+        strategy.step_post_backward(
+            trainer.params, trainer.optimizers, state, step, info, packed=packed
+        )
         sizes.append(len(trainer.params["means"]))
         if step == 10:
             assert faint < strategy.prune_opa <= trainer.params["opacities"].sigmoid().min()
@@ -503,7 +549,9 @@ def test_default_strategy_sees_the_same_packed_or_not(gsplat, device):
         trainer, strategy = Trainer(device, packed=packed), gsplat.DefaultStrategy()
         state = strategy.initialize_state()
         info = trainer.step(lambda info: info["means2d"].retain_grad())
-        strategy.step_post_backward(trainer.params, trainer.optimizers, state, 1, info, packed=packed)
+        strategy.step_post_backward(
+            trainer.params, trainer.optimizers, state, 1, info, packed=packed
+        )
         states.append(state)
     for name in ("grad2d", "count"):
         assert states[0][name].max() > 0

@@ -1,4 +1,5 @@
-"""Composed scenes: instances that come, go and move, budgets, cuts that are kept, false colours."""
+"""Composed scenes: instances that come, go and move, budgets, cuts that are kept, false
+colours."""
 
 from dataclasses import replace
 
@@ -14,7 +15,8 @@ from scenes_lod import blob, lod_bundle, random_camera, random_scene
 from v3dg import Scene, select
 from v3dg.false_color import palette_of
 
-# Of the tolerances that a budget chooses from, neighbours differ by this in their float32 bits.
+# Of the tolerances that a budget chooses from, neighbours differ by this in their
+# float32 bits.
 STEP_BITS = 1 << 12
 
 
@@ -29,7 +31,9 @@ def same_picture(a, b):
 
 def step_from(tolerance, steps):
     """The tolerance so many steps coarser."""
-    return float((np.float32(tolerance).view(np.int32) + np.int32(steps * STEP_BITS)).view(np.float32))
+    return float(
+        (np.float32(tolerance).view(np.int32) + np.int32(steps * STEP_BITS)).view(np.float32)
+    )
 
 
 def composed(rng, count=40, **change):
@@ -57,7 +61,9 @@ def test_budget_is_met_by_the_finest_cut(device, seed):
             finer = select(scene, camera, tolerance=step_from(cut.tolerance, -1), device=device)
             assert finer.num_gaussians > budget
             for steps in (1, 2, 3, 10, 100, 1000):
-                coarser = select(scene, camera, tolerance=step_from(cut.tolerance, steps), device=device)
+                coarser = select(
+                    scene, camera, tolerance=step_from(cut.tolerance, steps), device=device
+                )
                 assert coarser.num_gaussians <= budget
 
 
@@ -86,7 +92,9 @@ def test_budget_below_the_coarsest_cut_is_refused(device):
     assert image.stats.gaussians_selected == least
     with pytest.raises(ValueError, match=message):
         render(scene, camera, budget=least - 1, device=device).stats  # noqa: B018  waits for the picture
-    with pytest.raises(ValueError, match="budget: expected a whole number of gaussians, 0 or more, got -1"):
+    with pytest.raises(
+        ValueError, match="budget: expected a whole number of gaussians, 0 or more, got -1"
+    ):
         select(scene, camera, budget=-1, device="cpu")
 
 
@@ -115,7 +123,9 @@ def test_importance_divides_the_tolerance(device):
     assert pairs(mixed) == pairs(plain)
     scene.set_importance(1.0)
     coarse = select(scene, camera, tolerance=1.0, device=device)
-    expected = [p for p in pairs(finer) if p[0] in (1, 2)] + [p for p in pairs(coarse) if p[0] not in (1, 2)]
+    expected = [p for p in pairs(finer) if p[0] in (1, 2)] + [
+        p for p in pairs(coarse) if p[0] not in (1, 2)
+    ]
     assert pairs(mixed) == sorted(expected)
 
 
@@ -164,7 +174,12 @@ def test_scene_that_changes_is_the_scene_built_anew(device):
         if step == 3:
             scene.remove([0, 7, len(scene) - 1])
         if step == 4:
-            scene.add(lod_bundle(rng, blob(rng, 50), 8), rng.normal(size=(4, 3)), scales=2.0, importance=3.0)
+            scene.add(
+                lod_bundle(rng, blob(rng, 50), 8),
+                rng.normal(size=(4, 3)),
+                scales=2.0,
+                importance=3.0,
+            )
         if step == 5:
             scene.remove(range(len(scene)))
         fresh = rebuilt(scene)
@@ -195,7 +210,10 @@ def test_what_cannot_be_a_pose_is_refused_and_changes_nothing():
     before = [rows.copy() for rows in (scene.positions, scene.quaternions, scene.scales)]
     for change, message in [
         ({"positions": np.zeros((3, 3))}, r"positions: expected shape \(2, 3\), got \(3, 3\)"),
-        ({"positions": np.zeros((2, 3)), "scales": [1.0, 0.0]}, "scales: expected positive numbers, got 0"),
+        (
+            {"positions": np.zeros((2, 3)), "scales": [1.0, 0.0]},
+            "scales: expected positive numbers, got 0",
+        ),
         ({"quaternions": np.zeros((2, 4))}, "quaternions: expected a rotation"),
         ({"positions": [[0, 0, np.nan]] * 2}, "positions: expected finite numbers, got nan"),
     ]:
@@ -215,7 +233,9 @@ def test_poses_may_be_tensors(device):
     expected, camera = composed(rng, 12), random_camera(rng, distance=10)
     scene = Scene()
     for i, b in enumerate(expected.instance_bundle):
-        scene.add(expected.bundles[b], torch.zeros(1, 3, device=device), importance=expected.importance[i])
+        scene.add(
+            expected.bundles[b], torch.zeros(1, 3, device=device), importance=expected.importance[i]
+        )
 
     def tensor(rows):
         return torch.from_numpy(np.array(rows)).to(device)
@@ -262,9 +282,13 @@ def test_several_cameras_are_each_as_if_alone(device):
     rng = np.random.default_rng(11)
     scene = composed(rng)
     cameras = [random_camera(rng, distance=6, width=w, height=40) for w in (64, 30, 64)]
-    for cut, camera in zip(select(scene, cameras, budget=3000, device=device), cameras, strict=True):
+    for cut, camera in zip(
+        select(scene, cameras, budget=3000, device=device), cameras, strict=True
+    ):
         assert pairs(cut) == pairs(select(scene, camera, budget=3000, device=device))
-    for image, camera in zip(render(scene, cameras, budget=3000, device=device), cameras, strict=True):
+    for image, camera in zip(
+        render(scene, cameras, budget=3000, device=device), cameras, strict=True
+    ):
         alone = render(scene, camera, budget=3000, device=device)
         same_picture(image, alone)
         assert image.stats.gaussians_selected == alone.stats.gaussians_selected
@@ -274,10 +298,15 @@ def test_several_cameras_are_each_as_if_alone(device):
 
 def test_cut_can_be_kept_while_the_camera_moves(device):
     rng = np.random.default_rng(12)
-    scene, camera, other = composed(rng), random_camera(rng, distance=8), random_camera(rng, distance=8)
+    scene, camera, other = (
+        composed(rng),
+        random_camera(rng, distance=8),
+        random_camera(rng, distance=8),
+    )
     cut = select(scene, camera, tolerance=0.5, device=device)
     same_picture(
-        render(scene, camera, cut=cut, device=device), render(scene, camera, tolerance=0.5, device=device)
+        render(scene, camera, cut=cut, device=device),
+        render(scene, camera, tolerance=0.5, device=device),
     )
     everything = select(scene, camera, tolerance=0.5, cull=False, device=device)
     kept = render(scene, other, cut=everything, device=device)
@@ -287,7 +316,10 @@ def test_cut_can_be_kept_while_the_camera_moves(device):
     own = render(scene, other, tolerance=0.5, device=device)
     assert not np.array_equal(host(kept.color), host(own.color))
     nothing = select(
-        scene, v3dg.Camera.look_at((1e6, 0, 0), (2e6, 0, 0), width=8, height=8), tolerance=1.0, device="cpu"
+        scene,
+        v3dg.Camera.look_at((1e6, 0, 0), (2e6, 0, 0), width=8, height=8),
+        tolerance=1.0,
+        device="cpu",
     )
     assert not host(render(scene, camera, cut=nothing, device=device).alpha).any()
 
@@ -308,7 +340,8 @@ def test_cut_of_another_scene_is_refused(device):
 
 @pytest.mark.parametrize("by", ["level", "cluster"])
 def test_palette_draws_what_a_recoloured_copy_does(device, by):
-    """Bit for bit, also where neighbouring clusters of several instances are drawn together."""
+    """Bit for bit, also where neighbouring clusters of several instances are drawn
+    together."""
     rng = np.random.default_rng(21)
     bundle = lod_bundle(rng, blob(rng, 300, sh_degree=2), 16)
     clusters = bundle.clusters
@@ -354,16 +387,21 @@ def test_depth_is_drawn_where_it_is_asked_for(device):
     bundle = lod_bundle(rng, blob(rng, 500), 32)
     for subject in (bundle, blob(rng, 500)):
         camera = random_camera(rng)
-        with_depth, without = (render(subject, camera, depth=asked, device=device) for asked in (True, False))
+        with_depth, without = (
+            render(subject, camera, depth=asked, device=device) for asked in (True, False)
+        )
         assert host(with_depth.depth).shape == host(with_depth.alpha).shape
         for one, other in ((without.color, with_depth.color), (without.alpha, with_depth.alpha)):
             np.testing.assert_array_equal(host(one), host(other))
-        with pytest.raises(AttributeError, match="depth: expected a picture that was drawn with depth=True"):
+        with pytest.raises(
+            AttributeError, match="depth: expected a picture that was drawn with depth=True"
+        ):
             without.depth  # noqa: B018
 
 
 def test_asset_and_bundle_are_seen_from_the_same_place(device):
-    """Also with a rotation that is off by what float32 text loses, far from the origin."""
+    """Also with a rotation that is off by what float32 text loses, far from the
+    origin."""
     rng = np.random.default_rng(20)
     center = np.array([300.0, -200.0, 50.0])
     asset = blob(rng, 200, origin=center, sh_degree=3)
@@ -373,7 +411,8 @@ def test_asset_and_bundle_are_seen_from_the_same_place(device):
     viewmat[:3, :3] += rng.uniform(-3e-5, 3e-5, (3, 3))
     viewmat[:3, 3] = -viewmat[:3, :3] @ exact.position
     camera = v3dg.Camera(viewmat, exact.K, 64, 48)
-    # Where the rotation is taken for one, the eye is elsewhere, and colours change with the direction.
+    # Where the rotation is taken for one, the eye is elsewhere, and colours change with
+    # the direction.
     np.testing.assert_allclose(camera.position, exact.position, atol=1e-9)
     assert np.linalg.norm(-viewmat[:3, :3].T @ viewmat[:3, 3] - camera.position) > 5e-3
     as_bundle = render(bundle, camera, tolerance=0.0, depth=True, device=device)
@@ -384,7 +423,8 @@ def test_asset_and_bundle_are_seen_from_the_same_place(device):
         for name in ("color", "alpha", "depth"):
             error = np.abs(host(getattr(picture, name)) - host(getattr(as_bundle, name)))
             assert error.max() < 2e-4, name
-            # Depths are of 6, where float32 has steps of 5e-7; what is packed is rounded once more.
+            # Depths are of 6, where float32 has steps of 5e-7; what is packed is
+            # rounded once more.
             assert error.mean() < 3e-6, name
 
 
@@ -396,14 +436,17 @@ def test_both_devices_choose_the_same():
         options = {"min_level": int(rng.integers(3)), "cull": bool(trial % 2)}
         least = select(scene, camera, tolerance=np.inf, device="cpu", **options).num_gaussians
         for choice in ({"tolerance": float(10 ** rng.uniform(-3, 3))}, {"budget": 2 * least + 5}):
-            cpu, cuda = (select(scene, camera, device=d, **choice, **options) for d in ("cpu", "cuda"))
+            cpu, cuda = (
+                select(scene, camera, device=d, **choice, **options) for d in ("cpu", "cuda")
+            )
             assert pairs(cpu) == pairs(cuda)
             assert (cpu.num_gaussians, cpu.tolerance) == (cuda.num_gaussians, cuda.tolerance)
 
 
 @pytest.mark.gpu
 def test_budgets_before_do_not_matter():
-    # Few clusters, many of them at the edge of the picture: a coarser cut can have more gaussians.
+    # Few clusters, many of them at the edge of the picture: a coarser cut can have more
+    # gaussians.
     rng = np.random.default_rng(19)
     for _ in range(20):
         scene = random_scene(rng, lod_bundle(rng, blob(rng, 120), 8), 3, spread=1)
@@ -411,7 +454,9 @@ def test_budgets_before_do_not_matter():
         least = select(scene, camera, tolerance=np.inf, device="cpu").num_gaussians
         full = select(scene, camera, tolerance=0.0, device="cpu").num_gaussians
         for budget in rng.integers(least, full + 2, 12):
-            cpu, cuda = (select(scene, camera, budget=int(budget), device=d) for d in ("cpu", "cuda"))
+            cpu, cuda = (
+                select(scene, camera, budget=int(budget), device=d) for d in ("cpu", "cuda")
+            )
             assert cpu.tolerance == cuda.tolerance
             assert pairs(cpu) == pairs(cuda)
 
@@ -444,13 +489,18 @@ def test_pick_finds_what_a_pixel_shows():
         seen += 1
         assert (found.instance, found.cluster) in pairs(full)
         assert 0 < found.weight <= image.alpha[y, x] + 1e-6
-        # Without its cluster the pixel loses at least as much as the picked gaussian gave, behind or not.
+        # Without its cluster the pixel loses at least as much as the picked gaussian
+        # gave, behind or not.
         keep = (full.instance_ids != found.instance) | (full.cluster_ids != found.cluster)
-        rest = replace(full, instance_ids=full.instance_ids[keep], cluster_ids=full.cluster_ids[keep])
+        rest = replace(
+            full, instance_ids=full.instance_ids[keep], cluster_ids=full.cluster_ids[keep]
+        )
         assert image.alpha[y, x] != render(scene, camera, cut=rest, device="cpu").alpha[y, x]
         ray = camera.viewmat[:3, :3] @ (found.position - camera.position)
         np.testing.assert_allclose(
-            ray[:2] / ray[2] * [camera.fx, camera.fy] + [camera.cx, camera.cy], [x + 0.5, y + 0.5], atol=1e-6
+            ray[:2] / ray[2] * [camera.fx, camera.fy] + [camera.cx, camera.cy],
+            [x + 0.5, y + 0.5],
+            atol=1e-6,
         )
         assert ray[2] == pytest.approx(found.depth)
     assert seen > 10

@@ -17,9 +17,9 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("convert")
     asset = make_asset(2000)
     v3dg.write_asset(folder / "tuft.ply", asset)
-    v3dg.build_bundle(asset, config=v3dg.BuildConfig(cluster_size=64, steps=0), progress=False).write(
-        folder / "tuft.v3dg"
-    )
+    v3dg.build_bundle(
+        asset, config=v3dg.BuildConfig(cluster_size=64, steps=0), progress=False
+    ).write(folder / "tuft.v3dg")
     scene = {
         "format": "v3dg-scene",
         "version": 1,
@@ -53,7 +53,9 @@ def test_an_asset_becomes_any_format_and_that_a_ply(folder, suffix):
 
 
 def test_versions_of_spz(folder):
-    sizes = {v: converted(folder, "tuft.ply", "a.spz", "--spz-version", v)[0]["bytes"] for v in (2, 3, 4)}
+    sizes = {
+        v: converted(folder, "tuft.ply", "a.spz", "--spz-version", v)[0]["bytes"] for v in (2, 3, 4)
+    }
     assert sizes[2] < sizes[3]
     fails(
         2,
@@ -110,7 +112,15 @@ def test_the_cut_of_a_scene_for_one_of_its_cameras(folder):
     scene, cameras = v3dg.read_scene(folder / "scene.json")
     for outside, cull in (("drop", True), ("keep", False)):
         result, gaussians = converted(
-            folder, "scene.json", "cut.ply", "--camera", "near", "--tolerance", "2", "--outside", outside
+            folder,
+            "scene.json",
+            "cut.ply",
+            "--camera",
+            "near",
+            "--tolerance",
+            "2",
+            "--outside",
+            outside,
         )
         wanted = v3dg.select(scene, cameras["near"], tolerance=2, cull=cull, device="cpu")
         assert result["clusters"] == len(wanted)
@@ -126,7 +136,9 @@ def test_cameras_of_a_file(folder):
 
 
 def test_a_camera_that_sees_nothing_gives_an_empty_file(folder):
-    camera = v3dg.Camera.look_at((0, -30, 2), (0, -60, 2), (0, 0, 1), fov_x=0.8, width=64, height=48)
+    camera = v3dg.Camera.look_at(
+        (0, -30, 2), (0, -60, 2), (0, 0, 1), fov_x=0.8, width=64, height=48
+    )
     v3dg.write_cameras(folder / "away.json", {"a": camera})
     _, gaussians = converted(folder, "tuft.v3dg", "nothing.spz", "--cameras", "away.json")
     assert len(gaussians) == 0
@@ -157,7 +169,12 @@ def test_what_cannot_be_meant_is_refused(folder):
         cwd=folder,
     )
     fails(
-        2, "--camera: expected one camera to look from, got 2", "convert", "scene.json", "x.ply", cwd=folder
+        2,
+        "--camera: expected one camera to look from, got 2",
+        "convert",
+        "scene.json",
+        "x.ply",
+        cwd=folder,
     )
     fails(
         1,
@@ -167,11 +184,38 @@ def test_what_cannot_be_meant_is_refused(folder):
         "x.obj",
         cwd=folder,
     )
-    fails(2, "--up: expected a bundle or a scene", "convert", "tuft.ply", "x.ply", "--up", "z", cwd=folder)
-    fails(2, "--views: expected one camera", "convert", "tuft.v3dg", "x.ply", "--views", "3", cwd=folder)
+    fails(
+        2,
+        "--up: expected a bundle or a scene",
+        "convert",
+        "tuft.ply",
+        "x.ply",
+        "--up",
+        "z",
+        cwd=folder,
+    )
+    fails(
+        2,
+        "--views: expected one camera",
+        "convert",
+        "tuft.v3dg",
+        "x.ply",
+        "--views",
+        "3",
+        cwd=folder,
+    )
     fails(2, "expected a bundle to write anew", "convert", "tuft.ply", "x.v3dg", cwd=folder)
     fails(2, "and no level or cut", "convert", "tuft.v3dg", "x.v3dg", "--level", "1", cwd=folder)
-    fails(2, "--codec: expected an output", "convert", "tuft.ply", "x.ply", "--codec", "float32", cwd=folder)
+    fails(
+        2,
+        "--codec: expected an output",
+        "convert",
+        "tuft.ply",
+        "x.ply",
+        "--codec",
+        "float32",
+        cwd=folder,
+    )
     fails(1, "create it first", "convert", "tuft.ply", "no/x.ply", cwd=folder)
     options = ("--camera", "far", "--budget", "1")
     fails(1, "budget: expected at least", "convert", "scene.json", "x.ply", *options, cwd=folder)

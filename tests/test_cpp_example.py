@@ -1,4 +1,5 @@
-"""The core without Python: the C++ example draws a scene, and the library is configured alone."""
+"""The core without Python: the C++ example draws a scene, and the library is configured
+alone."""
 
 import shutil
 import subprocess
@@ -15,9 +16,13 @@ BUILDS = [path for name in ("ci/cpp", "dev", "cpu") if (path := ROOT / "build" /
 def test_core_draws_a_scene_without_python(tmp_path):
     if not BUILDS:
         pytest.skip("needs a build by a preset: cmake --preset cpu")
-    subprocess.run(["cmake", "--build", BUILDS[0], "--target", "draw_scene"], check=True, capture_output=True)
+    subprocess.run(
+        ["cmake", "--build", BUILDS[0], "--target", "draw_scene"], check=True, capture_output=True
+    )
     picture = tmp_path / "scene.ppm"
-    done = subprocess.run([BUILDS[0] / "draw_scene", picture], check=True, capture_output=True, text=True)
+    done = subprocess.run(
+        [BUILDS[0] / "draw_scene", picture], check=True, capture_output=True, text=True
+    )
     assert done.stdout == "4000 gaussians selected, 4000 in the frustum\n"
     pixels = np.frombuffer(picture.read_bytes()[-320 * 240 * 3 :], np.uint8).reshape(240, 320, 3)
     background = np.array([26, 26, 38])
@@ -28,7 +33,8 @@ def test_core_draws_a_scene_without_python(tmp_path):
 
 
 def test_the_library_is_configured_without_what_it_is_measured_with(tmp_path):
-    """As a package of the system may have it: neither benchmarks/ nor examples/ are there."""
+    """As a package of the system may have it: neither benchmarks/ nor examples/ are
+    there."""
     pybind11 = pytest.importorskip("pybind11")
     if shutil.which("cmake") is None or shutil.which("ninja") is None:
         pytest.skip("needs cmake and ninja")

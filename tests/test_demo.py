@@ -16,7 +16,9 @@ VIEWS = ((3.3, 0.36), (40.0, 0.4))
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     picture = tmp_path_factory.mktemp("demo") / "demo.png"
-    return run_demo(picture, num_gaussians=3000, instances=60, size=(96, 112), views=VIEWS, progress=False)
+    return run_demo(
+        picture, num_gaussians=3000, instances=60, size=(96, 112), views=VIEWS, progress=False
+    )
 
 
 def test_demo_measures_every_distance(demo):

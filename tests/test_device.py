@@ -1,4 +1,5 @@
-"""Devices: the tests' helpers bring arrays there, and asking for CUDA where it is missing is an error."""
+"""Devices: the tests' helpers bring arrays there, and asking for CUDA where it is
+missing is an error."""
 
 import os
 import re
@@ -30,7 +31,9 @@ def test_arrays_go_to_a_device_and_back(device):
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:-1", "cuda:x", "cpu:0", "auto:1", ""])
 def test_unknown_device_is_named(name):
-    with pytest.raises(ValueError, match=f"device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got '{name}'"):
+    with pytest.raises(
+        ValueError, match=f"device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got '{name}'"
+    ):
         _device.resolve(name)
 
 
@@ -109,7 +112,8 @@ def test_missing_torch_is_named(tmp_path):
 
 
 class OnDevice:
-    """What the core sees of an array on a device, without a device: enough to be refused."""
+    """What the core sees of an array on a device, without a device: enough to be
+    refused."""
 
     def __init__(self, shape, typestr="<f4", strides=None):
         self.shape = shape
@@ -149,7 +153,9 @@ def zeros(shape):
     ],
 )
 def test_wrong_arrays_on_a_device_are_named(means, error, message):
-    pattern = re.escape(message).replace(r"\?", "[4N]")  # of rows, that there have to be four is known
+    pattern = re.escape(message).replace(
+        r"\?", "[4N]"
+    )  # of rows, that there have to be four is known
     with pytest.raises(error, match=pattern):
         rows(OnDevice, means=means)
     with pytest.raises(error, match=pattern):
@@ -159,9 +165,13 @@ def test_wrong_arrays_on_a_device_are_named(means, error, message):
 @pytest.mark.skipif(not _core.has_cuda, reason="built without CUDA")
 @pytest.mark.parametrize("name", ["quats", "scales", "opacities", "sh"])
 def test_rows_of_mixed_devices_are_refused(name):
-    with pytest.raises(TypeError, match=f"{name}: expected a NumPy array, got <class '.*OnDevice'>"):
+    with pytest.raises(
+        TypeError, match=f"{name}: expected a NumPy array, got <class '.*OnDevice'>"
+    ):
         rows(zeros, **{name: OnDevice(SHAPES[name])})
-    with pytest.raises(TypeError, match=f"{name}: expected an array on a CUDA device, got <class 'num"):
+    with pytest.raises(
+        TypeError, match=f"{name}: expected an array on a CUDA device, got <class 'num"
+    ):
         rows(OnDevice, **{name: zeros(SHAPES[name])})
 
 
@@ -188,7 +198,9 @@ def test_rows_that_begin_between_words_are_copied():
     """Part of a tensor, of which the core could not read four floats at once."""
     many = scenes.gaussians([[0, 0, 1], [1, 2, 3], [4, 5, 6]])
     there, last = many.torch("cuda"), slice(1, None)
-    with pytest.raises(ValueError, match="quats, sh: expected memory that begins at a multiple of 16 bytes"):
+    with pytest.raises(
+        ValueError, match="quats, sh: expected memory that begins at a multiple of 16 bytes"
+    ):
         _core.Rows(*(getattr(there, name)[last] for name in scenes.NAMES))
     box = _core.bound_by_boxes(there.subset(last).rows, np.array([0, 2]))
     np.testing.assert_array_equal(
@@ -202,7 +214,9 @@ def test_devices_cannot_be_mixed():
     there = g.torch("cuda")
     with pytest.raises(ValueError, match="sh: expected device cuda:0 like the others, got cpu"):
         scenes.replaced(there, sh=g.torch().sh)
-    with pytest.raises(TypeError, match="sh: expected a torch tensor like the others, got a NumPy array"):
+    with pytest.raises(
+        TypeError, match="sh: expected a torch tensor like the others, got a NumPy array"
+    ):
         scenes.replaced(there, sh=g.sh)
 
 
@@ -210,7 +224,9 @@ def test_devices_cannot_be_mixed():
 def test_build_of_doubles_is_refused():
     g = scenes.gaussians([[0, 0, 1], [1, 2, 3]]).torch("cuda")
     doubles = v3dg.Gaussians(*(getattr(g, name).double() for name in scenes.NAMES))
-    with pytest.raises(ValueError, match="asset: expected float32 arrays, got float64; convert them first"):
+    with pytest.raises(
+        ValueError, match="asset: expected float32 arrays, got float64; convert them first"
+    ):
         v3dg.build_bundle(doubles, progress=False)
 
 
@@ -219,7 +235,10 @@ def test_build_of_doubles_is_refused():
     ("mib_left", "message"),
     [
         (64, "out of memory"),  # torch's, which has the result to hold
-        (1024, r"cuda: out of memory: asked for .* MiB, free are .* MiB of .* MiB"),  # ours, for scratch
+        (
+            1024,
+            r"cuda: out of memory: asked for .* MiB, free are .* MiB of .* MiB",
+        ),  # ours, for scratch
     ],
 )
 def test_full_device_is_a_memory_error(mib_left, message):

@@ -1,7 +1,8 @@
-"""Every block of code in the README and in docs/ runs, with small files in place of large ones.
+"""Every block of code in the README and in docs/ runs, with small files in place of
+large ones.
 
-A comment before a block says what else it takes: <!-- test: gpu -->, <!-- test: needs MODULE -->, or
-<!-- test: skip, REASON -->.
+A comment before a block says what else it takes: <!-- test: gpu -->, <!-- test: needs
+MODULE -->, or <!-- test: skip, REASON -->.
 """
 
 import json
@@ -22,8 +23,13 @@ import v3dg
 from v3dg.donut import make_donut
 
 ROOT = Path(__file__).parent.parent
-PAGES = ["README.md", *sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").rglob("*.md"))]
-BLOCK = re.compile(r"^(?:<!-- test: (?P<how>.*?) -->\n)?```(?P<kind>\w+)\n(?P<code>.*?)^```$", re.M | re.S)
+PAGES = [
+    "README.md",
+    *sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").rglob("*.md")),
+]
+BLOCK = re.compile(
+    r"^(?:<!-- test: (?P<how>.*?) -->\n)?```(?P<kind>\w+)\n(?P<code>.*?)^```$", re.M | re.S
+)
 
 
 @dataclass
@@ -53,7 +59,8 @@ def is_gpu(page):
 
 @pytest.fixture(scope="session")
 def files(tmp_path_factory):
-    """What the docs take as given: assets, bundles and folders of them, a scene, cameras."""
+    """What the docs take as given: assets, bundles and folders of them, a scene,
+    cameras."""
     folder = tmp_path_factory.mktemp("docs")
     asset = make_donut(1000, seed=0)
     for name in ("donut.ply", "donut.spz"):
@@ -87,7 +94,10 @@ def files(tmp_path_factory):
     if_ours = '[ "$1 $2" = "-m benchmarks" ]'
     for name, line in (
         ("v3dg", f'exec {small} v3dg "$@"'),
-        ("python", f'if {if_ours}; then shift 2; exec {small} benchmarks "$@"; fi\nexec {python} "$@"'),
+        (
+            "python",
+            f'if {if_ours}; then shift 2; exec {small} benchmarks "$@"; fi\nexec {python} "$@"',
+        ),
     ):
         (commands / name).write_text(f"#!/bin/sh\n{line}\n")
         (commands / name).chmod(0o755)
@@ -101,7 +111,9 @@ def write_capture(folder, asset):
         from test_camera_folders import write_model
 
         around = v3dg.turntable((0, 0, 0), 3, 6, width=64, height=48)
-        write_model(folder / "fox" / "sparse", {f"{i}.jpg": camera for i, camera in enumerate(around)})
+        write_model(
+            folder / "fox" / "sparse", {f"{i}.jpg": camera for i, camera in enumerate(around)}
+        )
 
 
 def published_layout():
@@ -183,7 +195,8 @@ def test_code_of_page_runs_on_a_gpu(page, folder, monkeypatch):
 
 @pytest.mark.parametrize("page", PAGES)
 def test_blocks_are_all_found(page):
-    """A fence that is indented, or has a comment of another form before it, would not be run."""
+    """A fence that is indented, or has a comment of another form before it, would not
+    be run."""
     text = (ROOT / page).read_text(encoding="utf-8")
     assert len(re.findall(r"^\s*```\w", text, re.M)) == len(list(blocks_of(page)))
     assert text.count("<!-- test:") == sum(bool(block.how) for block in blocks_of(page))

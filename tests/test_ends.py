@@ -1,4 +1,5 @@
-"""Programs that end while their threads work, and those that start in odd interpreters and settings."""
+"""Programs that end while their threads work, and those that start in odd interpreters
+and settings."""
 
 import os
 import subprocess
@@ -35,7 +36,9 @@ def files(tmp_path_factory):
     return shared
 
 
-@pytest.mark.parametrize("work", ["render", "select", "rasterize", "open", "pool of a URL", "viewer"])
+@pytest.mark.parametrize(
+    "work", ["render", "select", "rasterize", "open", "pool of a URL", "viewer"]
+)
 def test_program_ends_while_daemon_threads_work(files, tmp_path, work):
     if work == "viewer":
         pytest.importorskip("websockets")

@@ -1,4 +1,5 @@
-"""The evaluation: its baselines, its measures, a small run of it, and the page that is made of that."""
+"""The evaluation: its baselines, its measures, a small run of it, and the page that is
+made of that."""
 
 from __future__ import annotations
 
@@ -109,7 +110,8 @@ def test_hierarchy_keeps_moments_and_shares_axes(asset):
     assert ((mean >= low - 1e-6) & (mean <= high + 1e-6)).all()
     np.testing.assert_array_less(hierarchy.box[parent, 0], hierarchy.box[:, 0] + 1e-6)
     np.testing.assert_array_less(hierarchy.box[:, 1], hierarchy.box[parent, 1] + 1e-6)
-    # Axes are named alike: no turn of more than 63 degrees, the farthest from all 24 that map axes to axes.
+    # Axes are named alike: no turn of more than 63 degrees, the farthest from all 24
+    # that map axes to axes.
     turn = np.abs((nodes.quats * nodes.quats[parent]).sum(axis=1)) / np.linalg.norm(
         nodes.quats[parent], axis=1
     )
@@ -177,7 +179,8 @@ def test_popping_is_what_a_frame_changes_beyond_the_truth():
 
 
 def frames_of(*changes):
-    """Grey pictures of 40 x 36 px, in which a tile at the right is lighter by so many 255ths."""
+    """Grey pictures of 40 x 36 px, in which a tile at the right is lighter by so many
+    255ths."""
     pictures = []
     for change in changes:
         picture = np.full((36, 40, 3), 0.5, np.float32)
@@ -246,14 +249,18 @@ def test_paths_keep_a_part_of_a_picture_in_sight():
 
 
 def test_pops_are_what_cuts_differ_by_from_one_place(scene):
-    path = next(p for p in steadiness.paths_from(eye_camera(6), np.zeros(3), 12) if p.name == "zoom")
+    path = next(
+        p for p in steadiness.paths_from(eye_camera(6), np.zeros(3), 12) if p.name == "zoom"
+    )
     cuts = {
         "all": {"tolerance": 0.0},
         "hard": {"tolerance": 3.0},
         "fade": {"tolerance": 3.0, "fade": 1.5},
         "stays": Stays(path.cameras[0], 3.0),
     }
-    found = {row["cut"]: row for row in steadiness.compare(scene, path, cuts, "cpu", along_motion=False)}
+    found = {
+        row["cut"]: row for row in steadiness.compare(scene, path, cuts, "cpu", along_motion=False)
+    }
     assert found["all"]["pop_worst"] == found["stays"]["pop_worst"] == 0
     assert found["hard"]["most_changed_items"] > 0
     assert 0 < found["fade"]["pop_worst"] < 0.5 * found["hard"]["pop_worst"]
@@ -286,7 +293,8 @@ class Seen:
 
 
 def test_errors_are_followed_to_where_they_are_seen_next():
-    """A wall at depth 8, seen by cameras that are three pixels of it apart, or by one as the wall moves."""
+    """A wall at depth 8, seen by cameras that are three pixels of it apart, or by one
+    as the wall moves."""
     first = Camera(np.eye(4), np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), 48, 32)
     aside = np.eye(4)
     aside[0, 3] = 3 * 8 / 40
@@ -301,7 +309,11 @@ def test_errors_are_followed_to_where_they_are_seen_next():
         found.add(error, np.zeros_like(error))
         found.add(np.roll(error, 3, axis=1), np.zeros_like(error), warp)
         assert found.row()["warped_worst"] < 0.01 < 50 < found.row()["tile_worst"]
-    for before, after in ((Seen(8.0), Seen(7.0)), (Seen(8.0, 0.5), Seen(8.0)), (Seen(8.0), Seen(8.0, 0.5))):
+    for before, after in (
+        (Seen(8.0), Seen(7.0)),
+        (Seen(8.0, 0.5), Seen(8.0)),
+        (Seen(8.0), Seen(8.0, 0.5)),
+    ):
         assert not steadiness.Warp(first, first, (before, after)).is_valid.any()
 
 
@@ -313,7 +325,9 @@ def test_changed_items_are_those_of_another_weight_and_those_of_one_cut(scene):
         cluster_ids=cut.cluster_ids[2:],
         given_weights=cut.weights[2:],
     )
-    other = replace(cut, given_weights=np.where(np.arange(len(cut)) < 3, 0.125, cut.weights).astype("f4"))
+    other = replace(
+        cut, given_weights=np.where(np.arange(len(cut)) < 3, 0.125, cut.weights).astype("f4")
+    )
     assert steadiness.changed_items(cut, cut) == 0
     assert steadiness.changed_items(cut, fewer) == steadiness.changed_items(fewer, cut) == 2
     assert steadiness.changed_items(cut, other) == 3
@@ -420,7 +434,8 @@ def test_plots_are_drawn(results):
 
 def test_page_names_all_commits_that_were_measured():
     parts = [
-        {"gpu": "a GPU", "commit": commit, "python": "3.12", "torch": "2.11"} for commit in ("aa", "bb", "aa")
+        {"gpu": "a GPU", "commit": commit, "python": "3.12", "torch": "2.11"}
+        for commit in ("aa", "bb", "aa")
     ]
     assert report.machine(parts) == "a GPU, commits aa, bb, Python 3.12, torch 2.11"
     assert report.machine(parts[:1]) == "a GPU, commit aa, Python 3.12, torch 2.11"
@@ -441,8 +456,12 @@ def test_views_of_rounded_cameras_are_from_one_direction(degrees):
 @pytest.mark.slow
 def test_parts_run_on_cuda(tmp_path):
     made = evaluation.Evaluation(TINY, "cuda", tmp_path)
-    measured = evaluation.run(made, "tiny", ("tolerance", "clipping", "hierarchy", "motion"), quiet=True)
+    measured = evaluation.run(
+        made, "tiny", ("tolerance", "clipping", "hierarchy", "motion"), quiet=True
+    )
     for row in measured["clipping"]["rows"]:
         assert 0.9 * row["ours_in_frustum"] < row["clipped_in_frustum"] <= row["ours_in_frustum"]
     for row in measured["hierarchy"]["rows"]:
-        assert row["ours_selected"] <= row["theirs_selected"] or row["tolerance"] == measure.COARSEST
+        assert (
+            row["ours_selected"] <= row["theirs_selected"] or row["tolerance"] == measure.COARSEST
+        )

@@ -106,7 +106,9 @@ def test_photographs_of_another_size_than_their_cameras_are_refused(capture):
     pytest.importorskip("gsplat")
     example = load_example("train_photographs")
     write_picture(capture / "images" / "3.png", np.zeros((48, 32, 3), np.uint8))
-    with pytest.raises(SystemExit, match=r"3\.png: expected 64 x 48 px, as its camera, got 32 x 48"):
+    with pytest.raises(
+        SystemExit, match=r"3\.png: expected 64 x 48 px, as its camera, got 32 x 48"
+    ):
         example.main(example.Config(capture, capture / "trained.ply", device="cpu"))
 
 
@@ -125,10 +127,13 @@ def sheet(z, size):
 
 @pytest.mark.parametrize("turns", [1, 2])
 def test_what_no_camera_sees_is_dropped(tmp_path, turns):
-    """A wall ahead hides what is behind it; another wall is behind the camera, and seen when it turns."""
+    """A wall ahead hides what is behind it; another wall is behind the camera, and seen
+    when it turns."""
     wall, hidden, behind = sheet(3, 6), sheet(9, 1), sheet(-3, 6)
     v3dg.write_asset(tmp_path / "scene.ply", v3dg.Gaussians.concatenate([hidden, wall, behind]))
-    camera = v3dg.Camera.look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0), fov_x=1.2, width=64, height=48)
+    camera = v3dg.Camera.look_at(
+        (0, 0, 0), (0, 0, 1), up=(0, -1, 0), fov_x=1.2, width=64, height=48
+    )
     write_cameras(tmp_path / "cameras.json", {"eye": camera})
     example = load_example("drop_unseen")
     files = tmp_path / "scene.ply", tmp_path / "cameras.json", tmp_path / "seen.ply"
@@ -138,7 +143,9 @@ def test_what_no_camera_sees_is_dropped(tmp_path, turns):
     places = set(np.round(seen.means[:, 2]))
     assert places == ({3, -3} if turns == 2 else {3})
     whole = v3dg.read_asset(tmp_path / "scene.ply")
-    np.testing.assert_array_equal(v3dg.rasterize(seen, camera).color, v3dg.rasterize(whole, camera).color)
+    np.testing.assert_array_equal(
+        v3dg.rasterize(seen, camera).color, v3dg.rasterize(whole, camera).color
+    )
     half = example.main(example.Config(*files, keep=0.5, turns=turns, width=128))
     assert half == pytest.approx(share / 2, abs=0.01)
 
@@ -146,7 +153,9 @@ def test_what_no_camera_sees_is_dropped(tmp_path, turns):
 def test_weights_are_those_of_the_picture(tmp_path):
     """All weights together are the picture's alpha."""
     example = load_example("drop_unseen")
-    camera = v3dg.Camera.look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0), fov_x=1.2, width=64, height=48)
+    camera = v3dg.Camera.look_at(
+        (0, 0, 0), (0, 0, 1), up=(0, -1, 0), fov_x=1.2, width=64, height=48
+    )
     asset = sheet(3, 1)
     weights = example.weights_in(asset, camera, "cpu")
     assert weights.sum() == pytest.approx(v3dg.rasterize(asset, camera).alpha.sum(), rel=1e-5)
@@ -157,14 +166,17 @@ def gsplat_example(tmp_path):
     """The example, and its settings for a field of small donuts."""
     example = load_example("with_gsplat")
     config = v3dg.BuildConfig(cluster_size=64, steps=0)
-    v3dg.build_bundle(make_donut(2000), config=config, progress=False).write(tmp_path / "donut.v3dg")
+    v3dg.build_bundle(make_donut(2000), config=config, progress=False).write(
+        tmp_path / "donut.v3dg"
+    )
     return example, example.Config(
         tmp_path / "donut.v3dg", tmp_path / "picture.png", rows=4, size=(160, 120), tolerance=30
     )
 
 
 def test_arguments_for_gsplat_describe_the_picture(gsplat_example):
-    """What it hands over is all that a rasterizer needs: ours, which has gsplat's meaning, draws it."""
+    """What it hands over is all that a rasterizer needs: ours, which has gsplat's
+    meaning, draws it."""
     example, config = gsplat_example
     scene, camera = example.make_scene(config)
     camera = v3dg.Camera(camera.viewmat, camera.K, camera.width, camera.height, near=0.02)
@@ -194,8 +206,8 @@ def test_arguments_for_gsplat_describe_the_picture(gsplat_example):
     options = {"tolerance": config.tolerance, "min_transmittance": 0, "device": "cpu"}
     wanted = v3dg.render(scene, camera, **options)
     assert wanted.alpha.max() > 0.9
-    # Coarser levels have the filter of the arguments; what is left is rounding of the translation. Where
-    # gsplat's pixels stop, ours go on here.
+    # Coarser levels have the filter of the arguments; what is left is rounding of the
+    # translation. Where gsplat's pixels stop, ours go on here.
     go_on = wanted.alpha < 0.9999
     assert 0.5 < go_on.mean() < 1
     assert psnr(wanted.color[go_on][None], drawn.color.numpy()[go_on][None]) > 100

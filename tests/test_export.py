@@ -1,4 +1,5 @@
-"""`v3dg export`: bundles as streamed SOG, read back; docs/formats.md has them open in a viewer."""
+"""`v3dg export`: bundles as streamed SOG, read back; docs/formats.md has them open in a
+viewer."""
 
 import json
 import os
@@ -31,7 +32,8 @@ def leaves_of(node):
 
 
 def assert_holds(folder, bundle, chunk):
-    """Every leaf has all levels; together the leaves have each gaussian once, and the files nothing else."""
+    """Every leaf has all levels; together the leaves have each gaussian once, and the
+    files nothing else."""
     index = json.loads((folder / "lod-meta.json").read_text())
     leaves = leaves_of(index["tree"])
     files = [v3dg.read_asset(folder / name) for name in index["filenames"]]
@@ -48,7 +50,9 @@ def assert_holds(folder, bundle, chunk):
             assert len(part) == lod["count"] <= chunk
             if level == 0:
                 assert len(part) > 0
-            if level == 0 or np.sum(bundle.groups.level == level) >= len(leaves):  # else it is a share
+            if level == 0 or np.sum(bundle.groups.level == level) >= len(
+                leaves
+            ):  # else it is a share
                 assert (part.means >= np.array(leaf["bound"]["min"]) - 1e-3).all()
                 assert (part.means <= np.array(leaf["bound"]["max"]) + 1e-3).all()
             parts.append(part)
@@ -88,7 +92,8 @@ def test_every_leaf_says_how_far_its_levels_are_from_the_finest(tmp_path, bundle
 
 
 def test_errors_of_a_chunk_are_those_of_its_pictures(bundle):
-    """Whatever its size; a level that is the finest has none, and one that is missing that of the last."""
+    """Whatever its size; a level that is the finest has none, and one that is missing
+    that of the last."""
     finest, nothing = bundle.level_gaussians(0), bundle.level_gaussians(0).subset(slice(0, 0))
     half = finest.subset(slice(0, None, 2))
     errors = ChunkErrors()
@@ -98,7 +103,9 @@ def test_errors_of_a_chunk_are_those_of_its_pictures(bundle):
     first, second = errors.of_chunk[0], errors.of_chunk[1]
     assert first[0] == 0
     assert first[1] < 1e-6  # pictures are kept rounded
-    assert 0 < 2 * first[2] < first[3] == first[4]  # every other gaussian is worse than a level of as many
+    assert (
+        0 < 2 * first[2] < first[3] == first[4]
+    )  # every other gaussian is worse than a level of as many
     np.testing.assert_allclose(first, second, rtol=1e-3)
 
 
@@ -106,7 +113,11 @@ def test_errors_of_a_chunk_are_those_of_its_pictures(bundle):
 def test_every_gaussian_is_in_one_chunk_of_its_level(tmp_path, bundle, chunk):
     done = write_streamed_sog(bundle, tmp_path / "web", chunk=chunk)
     index, leaves = assert_holds(tmp_path / "web", bundle, chunk)
-    assert (done.counts, done.chunks, done.files) == (index["counts"], len(leaves), len(index["filenames"]))
+    assert (done.counts, done.chunks, done.files) == (
+        index["counts"],
+        len(leaves),
+        len(index["filenames"]),
+    )
     written = [file for file in (tmp_path / "web").rglob("*.*") if file.name != RECORD]
     assert done.bytes == sum(file.stat().st_size for file in written)
     assert index["lodLevels"] == bundle.num_levels  # so that a viewer can come down to the coarsest
@@ -119,23 +130,30 @@ def test_every_gaussian_is_in_one_chunk_of_its_level(tmp_path, bundle, chunk):
 def test_the_finest_level_of_an_export_loads(tmp_path, bundle):
     write_streamed_sog(bundle, tmp_path / "web", chunk=250)
     loaded, wanted = v3dg.read_asset(tmp_path / "web" / "lod-meta.json"), bundle.level_gaussians(0)
-    np.testing.assert_allclose(np.sort(loaded.means, axis=0), np.sort(wanted.means, axis=0), atol=5e-4)
+    np.testing.assert_allclose(
+        np.sort(loaded.means, axis=0), np.sort(wanted.means, axis=0), atol=5e-4
+    )
 
 
 def edited(tmp_path, bundle, **changes):
-    """The index of an export with other values at the top, or in its first leaf's finest level."""
+    """The index of an export with other values at the top, or in its first leaf's
+    finest level."""
     write_streamed_sog(bundle, tmp_path / "web", chunk=10**9)
     path = tmp_path / "web" / "lod-meta.json"
     index = json.loads(path.read_text())
     for name, value in changes.items():
-        (index if name in index or name == "environment" else index["tree"]["lods"]["0"])[name] = value
+        (index if name in index or name == "environment" else index["tree"]["lods"]["0"])[name] = (
+            value
+        )
     path.write_text(json.dumps(index))
     return path
 
 
 def test_an_environment_is_loaded_with_the_rest(tmp_path, bundle):
     path = edited(tmp_path, bundle, environment="3_0/meta.json")
-    assert len(v3dg.read_asset(path)) == len(bundle.level_gaussians(0)) + len(bundle.level_gaussians(3))
+    assert len(v3dg.read_asset(path)) == len(bundle.level_gaussians(0)) + len(
+        bundle.level_gaussians(3)
+    )
 
 
 def test_an_environment_that_is_null_is_none(tmp_path, bundle):
@@ -155,10 +173,19 @@ def test_a_leaf_without_its_finest_level_has_the_next(tmp_path, bundle):
     ("changes", "message"),
     [
         ({"version": 2}, "version: expected streamed SOG version 1, got 2"),
-        ({"filenames": ["/etc/passwd"] * 9}, "filenames[0]: expected a path below that of lod-meta.json"),
-        ({"filenames": ["../a/meta.json"] * 9}, "filenames[0]: expected a path below that of lod-meta.json"),
+        (
+            {"filenames": ["/etc/passwd"] * 9},
+            "filenames[0]: expected a path below that of lod-meta.json",
+        ),
+        (
+            {"filenames": ["../a/meta.json"] * 9},
+            "filenames[0]: expected a path below that of lod-meta.json",
+        ),
         ({"filenames": []}, "tree.lods.0.file: expected 0 to -1, got 0"),
-        ({"environment": "../meta.json"}, "environment: expected a path below that of lod-meta.json"),
+        (
+            {"environment": "../meta.json"},
+            "environment: expected a path below that of lod-meta.json",
+        ),
         ({"offset": 1}, "gaussians of '0_0/meta.json', got more"),
         ({"offset": -1}, "tree.lods.0.offset: expected a whole number, 0 or more, got -1"),
         ({"offset": 10**30}, "tree.lods.0.offset: expected a whole number"),
@@ -175,7 +202,9 @@ def test_hostile_indices_are_refused(tmp_path, bundle, changes, message):
 
 
 @pytest.mark.parametrize(
-    "changes", [{"environment": "../meta.json"}, {"environment": 5}, {"tree": {}}, {"file": 99}], ids=str
+    "changes",
+    [{"environment": "../meta.json"}, {"environment": 5}, {"tree": {}}, {"file": 99}],
+    ids=str,
 )
 def test_a_wrong_index_is_refused_before_a_chunk_is_decoded(tmp_path, bundle, changes, monkeypatch):
     path = edited(tmp_path, bundle, **changes)
@@ -188,7 +217,8 @@ def test_a_wrong_index_is_refused_before_a_chunk_is_decoded(tmp_path, bundle, ch
 
 @pytest.mark.parametrize("seed", range(6))
 def test_bundles_of_any_shape_are_exported(tmp_path, seed):
-    """Groups of several clusters, clusters without gaussians, one level or four, SH of every degree."""
+    """Groups of several clusters, clusters without gaussians, one level or four, SH of
+    every degree."""
     bundle = random_bundle(seed, num_levels=1 + seed % 4, sh_degree=seed % 4, max_cluster=9)
     write_streamed_sog(bundle, tmp_path / "web", chunk=100)
     index = json.loads((tmp_path / "web" / "lod-meta.json").read_text())
@@ -244,12 +274,17 @@ def test_a_viewer_starts_where_it_sees_the_asset(tmp_path, bundle):
 
 
 def rotation_between(points, turned):
-    """Which of the 24 rotations of a cube takes points, in any order, to where they are turned."""
+    """Which of the 24 rotations of a cube takes points, in any order, to where they are
+    turned."""
     signed = [
-        np.diag(signs)[:, order] for signs in product((1, -1), repeat=3) for order in permutations(range(3))
+        np.diag(signs)[:, order]
+        for signs in product((1, -1), repeat=3)
+        for order in permutations(range(3))
     ]
     rotations = [matrix for matrix in signed if np.linalg.det(matrix) > 0]
-    errors = [np.abs(np.sort(points @ r.T, axis=0) - np.sort(turned, axis=0)).max() for r in rotations]
+    errors = [
+        np.abs(np.sort(points @ r.T, axis=0) - np.sort(turned, axis=0)).max() for r in rotations
+    ]
     assert sorted(errors)[0] < 1e-4 < sorted(errors)[1]
     return rotations[int(np.argmin(errors))]
 
@@ -272,7 +307,9 @@ def test_what_is_up_becomes_what_viewers_take_to_be_up(tmp_path, up):
     np.testing.assert_array_equal(rotation @ axis, (0, -1, 0))
     pictures = []
     for gaussians, matrix in ((asset, np.eye(3)), (turned, rotation)):
-        camera = v3dg.Camera.look_at(matrix @ eye, (0, 0, 0), matrix @ axis, fov_x=0.7, width=64, height=64)
+        camera = v3dg.Camera.look_at(
+            matrix @ eye, (0, 0, 0), matrix @ axis, fov_x=0.7, width=64, height=64
+        )
         pictures.append(v3dg.rasterize(gaussians, camera).color)
     assert pictures[0].max() > 0.3
     assert psnr(*pictures) > 38
@@ -283,10 +320,13 @@ def test_other_folders_and_impossible_chunks_are_refused(tmp_path, bundle):
     (tmp_path / "mine" / "thesis.tex").touch()
     (tmp_path / "file").touch()
     for name in ("mine", "file"):
-        with pytest.raises(ValueError, match=f"{name}: expected a new folder, or one with an earlier export"):
+        with pytest.raises(
+            ValueError, match=f"{name}: expected a new folder, or one with an earlier export"
+        ):
             write_streamed_sog(bundle, tmp_path / name)
     with pytest.raises(
-        ValueError, match=r"chunk: expected at least \d+ gaussians, the size of a group of the asset, got 9"
+        ValueError,
+        match=r"chunk: expected at least \d+ gaussians, the size of a group of the asset, got 9",
     ):
         write_streamed_sog(bundle, tmp_path / "web", chunk=9)
     with pytest.raises(ValueError, match="bundle: expected gaussians to export, got none"):
@@ -299,7 +339,8 @@ def test_other_folders_and_impossible_chunks_are_refused(tmp_path, bundle):
 
 
 def test_info_of_an_export_has_the_size_of_all_its_files(tmp_path, bundle):
-    """Of every level and of the environment, once each; the page's settings are not part of the asset."""
+    """Of every level and of the environment, once each; the page's settings are not
+    part of the asset."""
     path = edited(tmp_path, bundle, environment="3_0/meta.json")
     num_bytes = sum(file.stat().st_size for file in (tmp_path / "web").rglob("*.*"))
     num_bytes -= sum((tmp_path / "web" / name).stat().st_size for name in ("settings.json", RECORD))
@@ -308,7 +349,9 @@ def test_info_of_an_export_has_the_size_of_all_its_files(tmp_path, bundle):
     shutil.rmtree(tmp_path / "web" / "2_0")  # a level that is not read may be missing
     assert asset_bytes(path) < num_bytes
     folder = tmp_path / "web" / "1_0"
-    assert asset_bytes(folder / "meta.json") == sum(file.stat().st_size for file in folder.iterdir())
+    assert asset_bytes(folder / "meta.json") == sum(
+        file.stat().st_size for file in folder.iterdir()
+    )
 
 
 @pytest.mark.witness

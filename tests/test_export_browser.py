@@ -1,9 +1,10 @@
 """Exports in SuperSplat's own viewer, and in their own page, in Chromium.
 
-They need playwright, Chromium where PATH finds it, and what environment variables name: SUPERSPLAT_VIEWER the
-folder `public` of `npm install @playcanvas/supersplat-viewer@1.36.2`, PLAYCANVAS the file
-`build/playcanvas.min.mjs` of `npm install playcanvas@2.23.3`, CESIUM the folder `Build/Cesium` of
-`npm install cesium@1.145.0`.
+They need playwright, Chromium where PATH finds it, and what environment variables name:
+SUPERSPLAT_VIEWER the folder `public` of `npm install
+@playcanvas/supersplat-viewer@1.36.2`, PLAYCANVAS the file `build/playcanvas.min.mjs` of
+`npm install playcanvas@2.23.3`, CESIUM the folder `Build/Cesium` of `npm install
+cesium@1.145.0`.
 """
 
 import functools
@@ -29,7 +30,9 @@ pytest.importorskip("playwright.sync_api")
 VIEWER, ENGINE = os.environ.get("SUPERSPLAT_VIEWER"), os.environ.get("PLAYCANVAS")
 pytestmark = [
     pytest.mark.witness,
-    pytest.mark.skipif(chromium.PROGRAM is None, reason="neither chromium nor google-chrome is installed"),
+    pytest.mark.skipif(
+        chromium.PROGRAM is None, reason="neither chromium nor google-chrome is installed"
+    ),
 ]
 
 SIDE = 300
@@ -62,19 +65,26 @@ def server(tmp_path_factory, bundle):
 
 
 CESIUM = os.environ.get("CESIUM")
-needs_viewer = pytest.mark.skipif(VIEWER is None, reason="SUPERSPLAT_VIEWER does not name its folder")
-needs_engine = pytest.mark.skipif(ENGINE is None, reason="PLAYCANVAS does not name the engine's file")
+needs_viewer = pytest.mark.skipif(
+    VIEWER is None, reason="SUPERSPLAT_VIEWER does not name its folder"
+)
+needs_engine = pytest.mark.skipif(
+    ENGINE is None, reason="PLAYCANVAS does not name the engine's file"
+)
 
 
 def seen(browser, server, options=""):
-    """The picture that the viewer settles at, (H, W, 3), and the levels whose files it asked for."""
+    """The picture that the viewer settles at, (H, W, 3), and the levels whose files it
+    asked for."""
     errors = []
     server.asked.clear()
     page = browser.new_page(viewport={"width": SIDE, "height": SIDE})
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on(
         "console",
-        lambda m: m.type == "error" and "favicon" not in m.location["url"] and errors.append(m.text),
+        lambda m: (
+            m.type == "error" and "favicon" not in m.location["url"] and errors.append(m.text)
+        ),
     )
     address = f"http://127.0.0.1:{server.server_address[1]}/index.html"
     page.goto(
@@ -83,19 +93,27 @@ def seen(browser, server, options=""):
     picture = before = None
     for _ in range(60):
         page.wait_for_timeout(1000)
-        before, picture = picture, np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")) / 255
+        before, picture = (
+            picture,
+            np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")) / 255,
+        )
         if picture.max() > 0.2 and np.array_equal(before, picture):
             break
     page.close()
     assert errors == []
-    levels = {path.split("/")[2][0] for path in server.asked if path.startswith("/donut/") and "_" in path}
+    levels = {
+        path.split("/")[2][0] for path in server.asked if path.startswith("/donut/") and "_" in path
+    }
     return picture, levels
 
 
 def wanted(bundle, server):
     """Our picture from where the viewer looks, with the filter that it has."""
-    pose = json.loads((server.folder / "donut" / "settings.json").read_text())["cameras"][0]["initial"]
-    # The viewer has y up, and shows -y of an asset as up; the asset was turned so that z is.
+    pose = json.loads((server.folder / "donut" / "settings.json").read_text())["cameras"][0][
+        "initial"
+    ]
+    # The viewer has y up, and shows -y of an asset as up; the asset was turned so that
+    # z is.
     back = np.array([[-1, 0, 0], [0, 0, 1], [0, 1, 0]])
     eye, target = (back @ np.array(pose[name]) for name in ("position", "target"))
     fov = np.radians(pose["fov"])
@@ -128,7 +146,8 @@ def town(bundle):
 
 
 def page_of(browser, server, town, query):
-    """The picture at which the page of a town settles, and how many gaussians it draws."""
+    """The picture at which the page of a town settles, and how many gaussians it
+    draws."""
     scene, camera = town
     folder = server.folder / "town"
     if not folder.exists():

@@ -1,4 +1,5 @@
-"""What exports do to the folders that they write to: nothing that is not their own is removed or replaced."""
+"""What exports do to the folders that they write to: nothing that is not their own is
+removed or replaced."""
 
 import json
 import os
@@ -34,7 +35,8 @@ def bundle(tmp_path):
 
 
 def contents(folder):
-    """All that is below a folder by its name: bytes of files, targets of links, permissions of folders."""
+    """All that is below a folder by its name: bytes of files, targets of links,
+    permissions of folders."""
     found = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -46,7 +48,8 @@ def contents(folder):
 
 
 def project(folder):
-    """A folder with files of somebody, some of them with names that exports use, too."""
+    """A folder with files of somebody, some of them with names that exports use,
+    too."""
     (folder / ".git").mkdir(parents=True)
     (folder / ".git" / "config").write_text("mine")
     (folder / "0_0").mkdir()
@@ -87,7 +90,9 @@ def test_files_that_are_read_are_not_written_around(tmp_path, bundle, write):
     before = contents(folder)
     for output in (folder, tmp_path, tmp_path / "link", Path("/")):
         for overwrite in (False, True):
-            with pytest.raises(ValueError, match=r"a\.v3dg, which is read, is in it; choose another folder"):
+            with pytest.raises(
+                ValueError, match=r"a\.v3dg, which is read, is in it; choose another folder"
+            ):
                 write(bundle, output, overwrite=overwrite)
     assert contents(folder) == before
 
@@ -102,7 +107,17 @@ def test_the_command_refuses_a_folder_with_what_it_reads(tmp_path, bundle):
     for cwd, name in ((tmp_path / "data", "a.v3dg"), (tmp_path / "town", "town.json")):
         before = contents(tmp_path)
         for more in ((), ("--overwrite",), ("--to", "tiles")):
-            fails(1, f"{name}, which is read, is in it", "export", name, "-o", ".", "--quiet", *more, cwd=cwd)
+            fails(
+                1,
+                f"{name}, which is read, is in it",
+                "export",
+                name,
+                "-o",
+                ".",
+                "--quiet",
+                *more,
+                cwd=cwd,
+            )
         assert contents(tmp_path) == before
     with pytest.raises(ValueError, match=r"town\.json, which is read, is in it"):
         write_site(tmp_path / "town" / "town.json", tmp_path / "town", overwrite=True)
@@ -183,14 +198,18 @@ def test_a_file_that_is_in_the_way_of_a_new_one_stays(tmp_path, bundle):
     (folder / "0_0").mkdir()
     (folder / "0_0" / "meta.json").write_text("mine")
     before = contents(folder)
-    with pytest.raises(ValueError, match=r"web/0_0/meta\.json: expected a file of an earlier export, got"):
+    with pytest.raises(
+        ValueError, match=r"web/0_0/meta\.json: expected a file of an earlier export, got"
+    ):
         write_streamed_sog(bundle, folder)
     assert contents(folder) == before
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
 @pytest.mark.parametrize("name", ["index.html", "0_0", "0_0/meta.json", "settings.json", RECORD])
-@pytest.mark.parametrize("kind", ["link to a file", "link to a folder", "link to nothing", "folder", "pipe"])
+@pytest.mark.parametrize(
+    "kind", ["link to a file", "link to a folder", "link to nothing", "folder", "pipe"]
+)
 def test_nothing_is_written_through_links(tmp_path, bundle, name, kind, overwrite):
     folder, outside = tmp_path / "web", tmp_path / "outside"
     (folder / name).parent.mkdir(parents=True)
@@ -248,13 +267,18 @@ def test_a_record_that_names_what_no_export_writes_is_refused(tmp_path, bundle, 
     (tmp_path / "victim.json").write_text("victim")
     record = json.loads((folder / RECORD).read_text())
     if field == "files":
-        record["files"][name] = [6, v3dg.export._record._content_of_path(tmp_path / "victim.json").digest]
+        record["files"][name] = [
+            6,
+            v3dg.export._record._content_of_path(tmp_path / "victim.json").digest,
+        ]
     else:
         record["folders"].append(name)
     (folder / RECORD).write_text(json.dumps(record))
     before = contents(tmp_path)
     for overwrite in (False, True):
-        with pytest.raises(ValueError, match=rf"{RECORD}: {field}.*: expected a name that an export writes"):
+        with pytest.raises(
+            ValueError, match=rf"{RECORD}: {field}.*: expected a name that an export writes"
+        ):
             write_tiles(bundle, folder, overwrite=overwrite)
     assert contents(tmp_path) == before
 
@@ -274,7 +298,9 @@ def test_a_damaged_record_is_refused(tmp_path, bundle, text):
     assert contents(folder) == before
 
 
-@pytest.mark.parametrize("content", [[-1, "0" * 32], [True, "0" * 32], [1], [1, "xyz"], [1, 2], 5, {}])
+@pytest.mark.parametrize(
+    "content", [[-1, "0" * 32], [True, "0" * 32], [1], [1, "xyz"], [1, 2], 5, {}]
+)
 def test_a_record_with_other_values_is_refused(tmp_path, bundle, content):
     folder = tmp_path / "web"
     write_tiles(bundle, folder)
@@ -326,7 +352,9 @@ def write_files(bundle, folder, files):
 
 
 def write_first(bundle, folder):
-    write_files(bundle, folder, ("index.html", "0_0/meta.json", "0_0/means_l.webp", "1_0/meta.json"))
+    write_files(
+        bundle, folder, ("index.html", "0_0/meta.json", "0_0/means_l.webp", "1_0/meta.json")
+    )
 
 
 def write_second(bundle, folder):
@@ -334,7 +362,8 @@ def write_second(bundle, folder):
 
 
 def two_exports(tmp_path, bundle):
-    """What a folder has after an export of one kind, and after that of another, with a file of somebody."""
+    """What a folder has after an export of one kind, and after that of another, with a
+    file of somebody."""
     states = []
     for number, write in enumerate((write_first, write_second)):
         folder = tmp_path / str(number)
@@ -345,7 +374,9 @@ def two_exports(tmp_path, bundle):
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
-def test_an_export_that_fails_as_it_takes_its_place_is_whole_or_gone(tmp_path, bundle, monkeypatch, error):
+def test_an_export_that_fails_as_it_takes_its_place_is_whole_or_gone(
+    tmp_path, bundle, monkeypatch, error
+):
     earlier, later = two_exports(tmp_path, bundle)
     moment, has_ended = 0, False
     while not has_ended:
@@ -366,7 +397,8 @@ def test_an_export_that_fails_as_it_takes_its_place_is_whole_or_gone(tmp_path, b
 
 
 def test_an_export_goes_back_where_one_before_was_killed(tmp_path, bundle, monkeypatch):
-    """At every move; what is there after the next one that fails is one of the two, whole."""
+    """At every move; what is there after the next one that fails is one of the two,
+    whole."""
     earlier, later = two_exports(tmp_path, bundle)
     moment, was_killed = 0, True
     while was_killed:
@@ -437,7 +469,9 @@ def test_a_file_that_appears_meanwhile_stays(tmp_path, bundle):
 
 def test_bundles_whose_names_clash_have_folders_of_their_own(tmp_path):
     scene, counts = v3dg.Scene(), []
-    for number, name in enumerate(("a_2", "a", "A", "x/a", "x/a b", "a_b", "x/A_2", "cesium", "CESIUM")):
+    for number, name in enumerate(
+        ("a_2", "a", "A", "x/a", "x/a b", "a_b", "x/A_2", "cesium", "CESIUM")
+    ):
         path = tmp_path / "data" / f"{name}.v3dg"
         path.parent.mkdir(parents=True, exist_ok=True)
         bundle = random_bundle(number, num_levels=2, max_cluster=20)
@@ -455,7 +489,12 @@ def test_bundles_whose_names_clash_have_folders_of_their_own(tmp_path):
 
 
 def test_names_become_distinct():
-    assert _common.distinct(["_a", "_a", "_A_1", "_a"], reserved=["B"]) == ["_a", "_a_1", "_A_1_2", "_a_3"]
+    assert _common.distinct(["_a", "_a", "_A_1", "_a"], reserved=["B"]) == [
+        "_a",
+        "_a_1",
+        "_A_1_2",
+        "_a_3",
+    ]
     assert _common.distinct(["b"], reserved=["B"]) == ["b_0"]
 
 
@@ -505,7 +544,8 @@ def test_a_folder_that_may_not_be_written_to_is_named(tmp_path, bundle, write):
 
 
 def test_an_export_is_recorded_whole(tmp_path, bundle):
-    """Every file that was written is in the record, with its size, and so is every folder."""
+    """Every file that was written is in the record, with its size, and so is every
+    folder."""
     write_site(bundle, tmp_path / "web")
     record = json.loads((tmp_path / "web" / RECORD).read_text())
     found = without(contents(tmp_path / "web"), RECORD)

@@ -1,4 +1,5 @@
-"""`v3dg export`: scenes and bundles as web pages; tests/test_export_browser.py opens them in a browser."""
+"""`v3dg export`: scenes and bundles as web pages; tests/test_export_browser.py opens
+them in a browser."""
 
 import json
 import os
@@ -15,7 +16,8 @@ from v3dg.rotations import rotation_from_quaternion
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    """An empty folder, with two bundles, and a scene of three instances with a camera."""
+    """An empty folder, with two bundles, and a scene of three instances with a
+    camera."""
     monkeypatch.chdir(tmp_path)
     for seed in (1, 2):
         random_bundle(seed, num_levels=2 + seed, sh_degree=seed).write(f"a b{seed}.v3dg")
@@ -56,7 +58,9 @@ def test_a_scene_has_its_instances_and_cameras(place):
     for name in ("positions", "quaternions", "scales", "importance"):
         np.testing.assert_allclose(found[name], getattr(scene, name).ravel(), rtol=1e-8)
     for name in ("rotation", "camera_rotation"):
-        np.testing.assert_allclose(np.array(site[name]).T @ [0, 0, 1], [0, 1, 0], atol=1e-12)  # z becomes y
+        np.testing.assert_allclose(
+            np.array(site[name]).T @ [0, 0, 1], [0, 1, 0], atol=1e-12
+        )  # z becomes y
     view, camera = site["cameras"][0], cameras["gate"]
     assert view["name"] == "gate"
     np.testing.assert_allclose(view["position"], [3, -20, 5])
@@ -70,17 +74,21 @@ def test_a_scene_has_its_instances_and_cameras(place):
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
 def test_what_is_up_is_up_in_the_page(place, up):
-    """For a bundle alone, whose files are turned so that y is down, and the page turns them on."""
+    """For a bundle alone, whose files are turned so that y is down, and the page turns
+    them on."""
     bundle = v3dg.Bundle.open("a b1.v3dg")
     write_site(bundle, "site", up=up)
-    written = v3dg.read_asset("site/lod-meta.json").means @ np.array(site_of(place / "site")["rotation"])
+    written = v3dg.read_asset("site/lod-meta.json").means @ np.array(
+        site_of(place / "site")["rotation"]
+    )
     axis, sign = "xyz".index(up[-1]), -1 if up[0] == "-" else 1
     heights = sign * bundle.level_gaussians(0).means[:, axis]
     np.testing.assert_allclose(np.sort(written[:, 1]), np.sort(heights), atol=1e-3)
 
 
 def test_levels_reach_as_far_as_selection_has_them():
-    """Beyond `reach` times the focal length over √tolerance, half of the groups of level 1 are enough."""
+    """Beyond `reach` times the focal length over √tolerance, half of the groups of
+    level 1 are enough."""
     bundle = random_bundle(3, num_levels=5)
     detail = v3dg.export._common.detail_of(bundle)
     first = bundle.groups.level == 1
@@ -117,10 +125,14 @@ def test_bad_input_is_named_and_nothing_is_left(place):
     (place / "town.txt").touch()
     v3dg.write_asset("asset.ply", random_gaussians(np.random.default_rng(0), 5))
     before = sorted(os.listdir(place))
-    fails(2, "--chunk: expected at least 1, got 0", "export", "a b1.v3dg", "--chunk", "0", cwd=place)
+    fails(
+        2, "--chunk: expected at least 1, got 0", "export", "a b1.v3dg", "--chunk", "0", cwd=place
+    )
     fails(1, "expected a file ending in", "export", "town.txt", cwd=place)
     fails(1, "got an asset; make one of it: v3dg build asset.ply", "export", "asset.ply", cwd=place)
-    fails(1, "chunk: expected at least", "export", "a b1.v3dg", "-o", "x/y", "--chunk", "1", cwd=place)
+    fails(
+        1, "chunk: expected at least", "export", "a b1.v3dg", "-o", "x/y", "--chunk", "1", cwd=place
+    )
     with pytest.raises(ValueError, match="scene: expected instances to export, got none"):
         write_site(v3dg.Scene(), "site")
     scene, cameras = v3dg.read_scene("town.json")

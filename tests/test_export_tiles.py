@@ -1,4 +1,5 @@
-"""3D Tiles of bundles and scenes, and `.glb` files; tests/test_export_browser.py opens them in CesiumJS."""
+"""3D Tiles of bundles and scenes, and `.glb` files; tests/test_export_browser.py opens
+them in CesiumJS."""
 
 import json
 import math
@@ -49,16 +50,21 @@ def bundle_tree(folder):
 
 
 def test_any_depth_of_tiles_is_a_level_of_the_bundle(tmp_path, bundle):
-    """Replacing all tiles of a height by their children gives the level below, with nothing lost."""
+    """Replacing all tiles of a height by their children gives the level below, with
+    nothing lost."""
     write_tiles(bundle, tmp_path / "tiles")
     front = [bundle_tree(tmp_path / "tiles")["root"]]
     if "content" not in front[0]:
         front = front[0]["children"]
     for level in reversed(range(bundle.num_levels)):
         files = [tile["content"]["uri"] for tile in front if "content" in tile]
-        found = np.concatenate([upright(v3dg.read_asset(tmp_path / "tiles/bundle" / f)) for f in files])
+        found = np.concatenate(
+            [upright(v3dg.read_asset(tmp_path / "tiles/bundle" / f)) for f in files]
+        )
         wanted = bundle.level_gaussians(level).means
-        np.testing.assert_allclose(*(m[np.lexsort(m.round(3).T)] for m in (found, wanted)), atol=2e-3)
+        np.testing.assert_allclose(
+            *(m[np.lexsort(m.round(3).T)] for m in (found, wanted)), atol=2e-3
+        )
         front = [child for tile in front for child in tile.get("children", [])]
     assert front == []
 
@@ -69,7 +75,9 @@ def test_tiles_hold_what_is_below_them(tmp_path, bundle):
     assert root["refine"] == "REPLACE"
     for tile in tiles_of(root):
         if "content" in tile:
-            assert_inside(upright(v3dg.read_asset(tmp_path / "tiles/bundle" / tile["content"]["uri"])), tile)
+            assert_inside(
+                upright(v3dg.read_asset(tmp_path / "tiles/bundle" / tile["content"]["uri"])), tile
+            )
         for child in tile.get("children", []):
             assert_inside(corners(child), tile)
             assert child["geometricError"] <= tile["geometricError"]
@@ -99,7 +107,9 @@ def test_a_scene_is_a_tile_an_instance(tmp_path):
     assert (done.bundles, done.instances) == (2, 3)
     assert done.tiles == sum(1 for _ in (tmp_path / "a/b").rglob("*.glb"))
     root = json.loads((tmp_path / "a/b/tileset.json").read_text())["root"]
-    np.testing.assert_allclose(np.reshape(root["transform"], (4, 4)), np.eye(4), atol=1e-12)  # z is up
+    np.testing.assert_allclose(
+        np.reshape(root["transform"], (4, 4)), np.eye(4), atol=1e-12
+    )  # z is up
     assert len(root["children"]) == 3
     for i, tile in enumerate(root["children"]):
         matrix = np.reshape(tile["transform"], (4, 4)).T
@@ -123,7 +133,9 @@ def test_the_command_says_how_to_look_at_tiles(tmp_path):
     done = run("export", "a.v3dg", "--to", "tiles", "--quiet", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "cp -r node_modules/cesium/Build/Cesium a_web/cesium" in done.stdout
-    assert {"index.html", "tileset.json", "v3dg-export.json", "a"} == set(os.listdir(tmp_path / "a_web"))
+    assert {"index.html", "tileset.json", "v3dg-export.json", "a"} == set(
+        os.listdir(tmp_path / "a_web")
+    )
     (tmp_path / "a_web" / "cesium").mkdir()
     (tmp_path / "a_web" / "cesium" / "Cesium.js").touch()
     again = run("export", "a.v3dg", "--to", "tiles", "--quiet", cwd=tmp_path)
@@ -131,7 +143,17 @@ def test_the_command_says_how_to_look_at_tiles(tmp_path):
     assert (tmp_path / "a_web" / "cesium" / "Cesium.js").is_file()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").touch()
-    fails(1, "mine: expected a new folder", "export", "a.v3dg", "--to", "tiles", "-o", "mine", cwd=tmp_path)
+    fails(
+        1,
+        "mine: expected a new folder",
+        "export",
+        "a.v3dg",
+        "--to",
+        "tiles",
+        "-o",
+        "mine",
+        cwd=tmp_path,
+    )
     with pytest.raises(ValueError, match="bundle: expected gaussians to export, got none"):
         write_tiles(random_bundle(num_levels=0), tmp_path / "none")
     assert sorted(os.listdir(tmp_path)) == ["a.v3dg", "a_web", "mine"]

@@ -1,4 +1,5 @@
-"""Fades between levels: weights that add up to one, what they do to opacities, and that nothing jumps."""
+"""Fades between levels: weights that add up to one, what they do to opacities, and that
+nothing jumps."""
 
 from dataclasses import replace
 
@@ -22,7 +23,18 @@ from frames import (
 from random_bundle import random_bundle
 from reference import select as reference
 from scenes_lod import blob, group_metrics, lod_bundle, random_camera, random_scene, turned
-from v3dg import DEFAULT_FADE, Bundle, Camera, Gaussians, Scene, Selection, _core, _device, rasterize, select
+from v3dg import (
+    DEFAULT_FADE,
+    Bundle,
+    Camera,
+    Gaussians,
+    Scene,
+    Selection,
+    _core,
+    _device,
+    rasterize,
+    select,
+)
 from v3dg.select import rule_of, select_by
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
@@ -56,7 +68,9 @@ def test_weights_add_up_to_one_on_every_path(seed, fade, tolerance):
     rng = np.random.default_rng(seed)
     bundle = random_bundle(seed, num_levels=4)
     scene = random_scene(rng, bundle, 3)
-    selection = select(scene, random_camera(rng), tolerance=tolerance, fade=fade, cull=False, device="cpu")
+    selection = select(
+        scene, random_camera(rng), tolerance=tolerance, fade=fade, cull=False, device="cpu"
+    )
     assert selection.weights.min(initial=1) > 0
     for i in range(len(scene)):
         weights = weights_of(selection, i, bundle)
@@ -90,7 +104,8 @@ def test_no_fade_is_the_cut_of_one_cluster_a_path(device, fade):
     same(cut, select(scene, CAMERA, tolerance=2.0, fade=fade, device=device))
     assert (cut.weights == 1).all()
     assert (
-        len(replace(cut, instance_ids=cut.instance_ids[1:], cluster_ids=cut.cluster_ids[1:])) == len(cut) - 1
+        len(replace(cut, instance_ids=cut.instance_ids[1:], cluster_ids=cut.cluster_ids[1:]))
+        == len(cut) - 1
     )
     image = render(scene, CAMERA, tolerance=2.0, fade=fade, device=device)
     assert_same_bytes(image, render(scene, CAMERA, cut=cut, device=device))
@@ -99,7 +114,12 @@ def test_no_fade_is_the_cut_of_one_cluster_a_path(device, fade):
 @pytest.mark.parametrize("tolerance", [0.0, np.inf])
 def test_the_finest_and_the_coarsest_cut_have_no_fade(tolerance):
     scene = composed_scene(np.random.default_rng(2))
-    same(*(select(scene, CAMERA, tolerance=tolerance, fade=fade, device="cpu") for fade in (None, 1.05)))
+    same(
+        *(
+            select(scene, CAMERA, tolerance=tolerance, fade=fade, device="cpu")
+            for fade in (None, 1.05)
+        )
+    )
 
 
 def test_weights_follow_the_camera_without_a_jump():
@@ -114,9 +134,13 @@ def test_weights_follow_the_camera_without_a_jump():
         cut = select(bundle, camera, tolerance=tolerance, fade=fade, cull=False, device="cpu")
         weights = weights_of(cut, 0, bundle)
         if last is not None:
-            most, changed = max(most, np.abs(weights - last).max()), changed + (weights != last).any()
+            most, changed = (
+                max(most, np.abs(weights - last).max()),
+                changed + (weights != last).any(),
+            )
         last = weights
-    # The metric grows by two steps, and by more near a ball, of a band that is 2 (fade - 1) wide.
+    # The metric grows by two steps, and by more near a ball, of a band that is 2 (fade
+    # - 1) wide.
     assert changed > 100
     assert most < 3 * step / (fade - 1)
 
@@ -127,7 +151,8 @@ def test_budget_is_kept(seed, fade, share, cull):
     scene = random_scene(rng, lod_bundle(rng, blob(rng, 200), 8), 5)
     camera = random_camera(rng)
     least, most = (
-        select(scene, camera, tolerance=t, cull=cull, device="cpu").num_gaussians for t in (np.inf, 0.0)
+        select(scene, camera, tolerance=t, cull=cull, device="cpu").num_gaussians
+        for t in (np.inf, 0.0)
     )
     budget = round(least + share * (most - least))
     cut = select(scene, camera, budget=budget, fade=fade, cull=cull, device="cpu")
@@ -144,7 +169,9 @@ def test_budget_is_kept_in_steps(seed, fade, share):
     for step in (1e-3, 1e-3, 0.3, 3e-3, 0):
         eye = eye + step * np.linalg.norm(eye) * rng.normal(size=3)
         camera = Camera.look_at(eye, eye + ahead, camera.viewmat[1, :3], width=16, height=12)
-        least, most = (select(scene, camera, tolerance=t, device="cpu").num_gaussians for t in (np.inf, 0.0))
+        least, most = (
+            select(scene, camera, tolerance=t, device="cpu").num_gaussians for t in (np.inf, 0.0)
+        )
         options = {"budget": round(least + share * (most - least)), "fade": fade}
         cut = select(scene, camera, **options, device="cpu")
         stats = renderer.render(camera, **options).stats
@@ -160,7 +187,8 @@ def slow_orbit(num_frames):
 
 
 def settled_at(renderer, camera, options):
-    """The tolerance at which ten pictures of a camera at rest are the same, bit by bit."""
+    """The tolerance at which ten pictures of a camera at rest are the same, bit by
+    bit."""
     first, *others = (renderer.render(camera, **options) for _ in range(10))
     for image in others:
         assert_same_bytes(image, first)
@@ -171,11 +199,14 @@ def settled_at(renderer, camera, options):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("memory", [None, "64MB"])
 def test_a_budget_draws_the_same_bits_from_the_tenth_frame_at_rest_on(device, memory):
-    """From the first one on where it looks first; where slow motion ended, it goes to the same in steps."""
+    """From the first one on where it looks first; where slow motion ended, it goes to
+    the same in steps."""
     scene = composed_scene(np.random.default_rng(5))
     options, cameras = {"budget": 9000, "fade": DEFAULT_FADE}, slow_orbit(150)[:88]
     last = cameras[-1]
-    roomy = select(scene, last, budget=9000 - 9000 // 32, fade=DEFAULT_FADE, device=device).tolerance
+    roomy = select(
+        scene, last, budget=9000 - 9000 // 32, fade=DEFAULT_FADE, device=device
+    ).tolerance
     renderer = Renderer(scene, device=device, memory=memory)
     renderer.settle(last, **options)
     assert settled_at(renderer, last, options) == roomy
@@ -187,7 +218,9 @@ def test_a_budget_draws_the_same_bits_from_the_tenth_frame_at_rest_on(device, me
         ways.append(np.log2(roomy / renderer.render(last, **options).stats.tolerance))
     steps = -np.diff(ways)
     assert ways[0] > 0.04
-    assert 0 <= steps.min() <= steps.max() < 2.1 * ways[0] / 8  # values of an octave are evenly apart
+    assert (
+        0 <= steps.min() <= steps.max() < 2.1 * ways[0] / 8
+    )  # values of an octave are evenly apart
     assert settled_at(renderer, last, options) == roomy
 
 
@@ -232,7 +265,8 @@ def test_in_slow_motion_the_tolerance_of_a_budget_goes_in_steps(device):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_leaps_of_a_budget_are_made_at_once(device):
-    """After another view, another budget or another tolerance, and where the budget binds no more."""
+    """After another view, another budget or another tolerance, and where the budget
+    binds no more."""
     scene = composed_scene(np.random.default_rng(5))
     renderer = Renderer(scene, device=device)
     not_binding = {"budget": 9000, "tolerance": 5000.7}
@@ -263,7 +297,9 @@ def test_cuts_that_follow_each_other_are_those_of_a_renderer(device):
     viewers = [(Renderer(scene, device=device), _core.BudgetSteps()) for _ in range(2)]
     for pair in zip([*cameras, *10 * cameras[-1:]], cameras[::-1] + 10 * cameras[:1], strict=True):
         for camera, (renderer, steps) in zip(pair, viewers, strict=True):
-            cut = select_by(rule_of(None, **options, min_level=0), scene, camera, 9000, where, steps)
+            cut = select_by(
+                rule_of(None, **options, min_level=0), scene, camera, 9000, where, steps
+            )
             stats = renderer.render(camera, **options).stats
             assert (cut.tolerance, cut.num_gaussians) == (stats.tolerance, stats.gaussians_selected)
         last = cut
@@ -276,7 +312,9 @@ def test_both_devices_go_the_same_steps():
     renderers = [Renderer(scene, device=device) for device in ("cpu", "cuda")]
     for budget in (9000, 9100, 15000):
         for camera in [*slow_orbit(60), *slow_orbit(150)[:88], *10 * slow_orbit(150)[87:88]]:
-            cpu, cuda = (r.render(camera, budget=budget, fade=DEFAULT_FADE).stats for r in renderers)
+            cpu, cuda = (
+                r.render(camera, budget=budget, fade=DEFAULT_FADE).stats for r in renderers
+            )
             assert cuda.tolerance == cpu.tolerance
             assert cuda.gaussians_selected == cpu.gaussians_selected
 
@@ -289,7 +327,10 @@ def test_turning_in_place_changes_no_weight(device):
         camera = random_camera(rng, distance=30)
         other = Camera(turned(camera, rng).viewmat, camera.K, 64, 48)
         same(
-            *(select(scene, c, tolerance=0.5, fade=1.05, cull=False, device=device) for c in (camera, other))
+            *(
+                select(scene, c, tolerance=0.5, fade=1.05, cull=False, device=device)
+                for c in (camera, other)
+            )
         )
 
 
@@ -309,7 +350,8 @@ def faded(bundle, opacities, weights, device):
 
 
 def singles(opacities):
-    """A bundle of as many clusters of a gaussian each, side by side, all of them leaves."""
+    """A bundle of as many clusters of a gaussian each, side by side, all of them
+    leaves."""
     count = len(opacities)
     means = np.stack([np.arange(count), np.zeros(count), np.zeros(count)], 1).astype(np.float32)
     asset = Gaussians(
@@ -356,26 +398,35 @@ def test_picture_is_that_of_the_gaussians_with_faded_opacities(device):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("filter_px2", "is_antialiased"), [(0.0, 0), (0.3, 0), (0.02, 1)])
 def test_a_fade_gives_level_0_a_filter_that_has_none(filter_px2, is_antialiased, device):
-    """Also where nothing is on its way, so that a picture does not change as a whole once something is."""
+    """Also where nothing is on its way, so that a picture does not change as a whole
+    once something is."""
     rng = np.random.default_rng(3)
     asset = blob(rng, 900)
-    px = CAMERA.fx / np.linalg.norm(CAMERA.position)  # of a unit, about; none so narrow that it gets less
+    px = CAMERA.fx / np.linalg.norm(
+        CAMERA.position
+    )  # of a unit, about; none so narrow that it gets less
     asset = replace(asset, scales=np.clip(asset.scales, 0.2 / px, 0.5 / px).astype(np.float32))
     bundle = lod_bundle(rng, asset, 32)
     is_fine = bundle.clusters.level == 0
     filters = np.where(is_fine, np.float32(filter_px2), bundle.clusters.filter_px2)
     antialiased = np.where(is_fine, np.uint8(is_antialiased), bundle.clusters.antialiased)
     bundle = Bundle(
-        replace(bundle.clusters, filter_px2=filters, antialiased=antialiased), bundle.groups, bundle.gaussians
+        replace(bundle.clusters, filter_px2=filters, antialiased=antialiased),
+        bundle.groups,
+        bundle.gaussians,
     )
-    soft, hard = (select(bundle, CAMERA, tolerance=0.0, fade=fade, device=device) for fade in (1.05, None))
+    soft, hard = (
+        select(bundle, CAMERA, tolerance=0.0, fade=fade, device=device) for fade in (1.05, None)
+    )
     assert (hard.filters_px2 == np.float32(filter_px2)).all()
     assert (hard.antialiased == bool(is_antialiased)).all()
     assert (soft.weights == 1).all()
     expected, compensates = (filter_px2, bool(is_antialiased)) if filter_px2 else (0.05, True)
     assert (soft.filters_px2 == np.float32(expected)).all()
     assert (soft.antialiased == compensates).all()
-    shown = rasterize(soft.gaussians(device=device), CAMERA, filter_px2=expected, antialiased=compensates)
+    shown = rasterize(
+        soft.gaussians(device=device), CAMERA, filter_px2=expected, antialiased=compensates
+    )
     drawn = render(bundle, CAMERA, cut=soft, min_transmittance=1e-4, device=device)
     assert_close(arrays(drawn)[:2], arrays(shown)[:2])
     image = render(bundle, CAMERA, tolerance=0.0, fade=1.05, device=device)
@@ -389,7 +440,8 @@ def test_a_fade_gives_level_0_a_filter_that_has_none(filter_px2, is_antialiased,
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("distance", [3, 10, 30, 60])
 def test_a_surface_of_tiny_gaussians_does_not_become_transparent(distance, device):
-    """Far smaller than the low-pass, so that each alone would be less than the least alpha that is drawn."""
+    """Far smaller than the low-pass, so that each alone would be less than the least
+    alpha that is drawn."""
     rng = np.random.default_rng(1)
     means = rng.normal(size=(50_000, 3))
     means /= np.linalg.norm(means, axis=1, keepdims=True)
@@ -405,12 +457,15 @@ def test_a_surface_of_tiny_gaussians_does_not_become_transparent(distance, devic
     camera = Camera.look_at((0, -distance, 0), (0, 0, 0), width=160, height=160)
     options = {"tolerance": 0.0, "device": device}
     truth = host(render(bundle, camera.scaled(8), **options).alpha).sum() / 64
-    assert host(render(bundle, camera, fade=1.05, **options).alpha).sum() == pytest.approx(truth, rel=0.1)
+    assert host(render(bundle, camera, fade=1.05, **options).alpha).sum() == pytest.approx(
+        truth, rel=0.1
+    )
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_levels_that_are_drawn_alike_without_a_fade_are_not_with_one(device):
-    """The last clusters of level 0 and the first of level 1 follow each other, each with its own filter."""
+    """The last clusters of level 0 and the first of level 1 follow each other, each
+    with its own filter."""
     rng = np.random.default_rng(5)
     bundle = lod_bundle(rng, blob(rng, 240, size=0.02), 60, filter_px2=0.0)
     clusters = replace(bundle.clusters, antialiased=np.ones_like(bundle.clusters.antialiased))
@@ -430,7 +485,11 @@ def test_levels_that_are_drawn_alike_without_a_fade_are_not_with_one(device):
 def test_weights_of_a_cut_may_be_any_numbers():
     bundle = lod_bundle(np.random.default_rng(8), blob(np.random.default_rng(8), 300), 32)
     cut = select(bundle, CAMERA, tolerance=2.0, device="cpu")
-    for ones in (np.ones(len(cut)), np.ones(len(cut), np.int64), np.ones(2 * len(cut), np.float32)[::2]):
+    for ones in (
+        np.ones(len(cut)),
+        np.ones(len(cut), np.int64),
+        np.ones(2 * len(cut), np.float32)[::2],
+    ):
         faded_cut = replace(cut, given_weights=ones)
         assert faded_cut.weights.dtype == np.float32
         assert (faded_cut.filters_px2 > 0).all()
@@ -490,18 +549,24 @@ def test_both_devices_choose_the_same_with_the_same_weights():
     below = 0
     for _ in range(60):
         scene = random_scene(rng, lod_bundle(rng, blob(rng, 300), 8, past_root=2), 200, spread=10)
-        scene.add(random_bundle(int(rng.integers(1 << 30)), num_levels=4), positions=rng.normal(size=(5, 3)))
+        scene.add(
+            random_bundle(int(rng.integers(1 << 30)), num_levels=4),
+            positions=rng.normal(size=(5, 3)),
+        )
         scene.set_importance(np.exp(rng.normal(size=len(scene))))
         camera = random_camera(rng)
         metric = np.concatenate(group_metrics(scene, camera))
         options = {
-            "tolerance": float(rng.choice(metric[np.isfinite(metric)])) * np.exp(0.02 * rng.normal()),
+            "tolerance": float(rng.choice(metric[np.isfinite(metric)]))
+            * np.exp(0.02 * rng.normal()),
             "fade": float(rng.choice([1.01, 1.05, 1.3, 4.0])),
             "min_level": int(rng.choice([0, 0, 2])),
             "cull": bool(rng.random() < 0.5),
         }
         if rng.random() < 0.5:
-            least = select(scene, camera, **options | {"tolerance": np.inf}, device="cpu").num_gaussians
+            least = select(
+                scene, camera, **options | {"tolerance": np.inf}, device="cpu"
+            ).num_gaussians
             options["budget"] = int(least * rng.uniform(1, 4))
         cpu, cuda = (select(scene, camera, **options, device=device) for device in ("cpu", "cuda"))
         same(cpu, cuda)
@@ -515,7 +580,9 @@ def test_both_devices_choose_the_same_with_the_same_weights():
 def test_faded_scene_looks_as_on_the_cpu(sh_degree, fade):
     scene = composed_scene(np.random.default_rng(sh_degree), sh_degree)
     for options in ({"tolerance": 2.0}, {"budget": 9000}, {"tolerance": np.inf}):
-        images = [render(scene, CAMERA, **options, fade=fade, device=device) for device in ("cuda", "cpu")]
+        images = [
+            render(scene, CAMERA, **options, fade=fade, device=device) for device in ("cuda", "cpu")
+        ]
         assert_like_cpu(*images)
     metric = np.concatenate(group_metrics(scene, CAMERA))
     between = {"tolerance": float(np.median(metric[np.isfinite(metric)])), "fade": fade}

@@ -1,4 +1,5 @@
-"""What all writers do to files and links that are there already; failures are in test_malformed."""
+"""What all writers do to files and links that are there already; failures are in
+test_malformed."""
 
 import os
 import stat

@@ -29,10 +29,13 @@ CENTER, RADIUS = np.float32([3.0, -2.0, 1.0]), 0.5
 def fit_groups(
     device, start, target, config, target_range, own_range, *, seed=0, streams=None, progress=None
 ):
-    """Fit groups that are all in the ball (CENTER, RADIUS); the result and residuals."""
+    """Fit groups that are all in the ball (CENTER, RADIUS); the result and
+    residuals."""
     num_groups = len(own_range)
     fitted = on(device, copied(start))
-    target_range, own_range = (np.array(r, np.int64).reshape(-1, 2) for r in (target_range, own_range))
+    target_range, own_range = (
+        np.array(r, np.int64).reshape(-1, 2) for r in (target_range, own_range)
+    )
     error = _core.fit_level(
         fit_config(config, seed, 0),
         _core.FitTarget(on(device, target).rows, 0.0, False),
@@ -64,7 +67,10 @@ def in_ball(seed, num, **changes):
     rng = np.random.default_rng(seed)
     means = rng.normal(size=(num, 3))
     means *= (
-        RADIUS * 0.8 * rng.uniform(0, 1, (num, 1)) ** (1 / 3) / np.linalg.norm(means, axis=1, keepdims=True)
+        RADIUS
+        * 0.8
+        * rng.uniform(0, 1, (num, 1)) ** (1 / 3)
+        / np.linalg.norm(means, axis=1, keepdims=True)
     )
     g = scenes.gaussians(
         CENTER + means,
@@ -77,7 +83,8 @@ def in_ball(seed, num, **changes):
 
 
 def ball(opacity, color, scale=0.3, sh=None):
-    """One round gaussian at the centre: it looks the same from everywhere, except for `sh` above degree 0."""
+    """One round gaussian at the centre: it looks the same from everywhere, except for
+    `sh` above degree 0."""
     return scenes.gaussians(CENTER, scales=scale * RADIUS, opacities=opacity, color=color, sh=sh)
 
 
@@ -115,7 +122,8 @@ def test_residual_is_the_mean_difference_in_colour_and_alpha(device):
 
 
 def test_targets_are_supersampled(device):
-    """A gaussian between the pixel centres of a picture is seen at four times the size."""
+    """A gaussian between the pixel centres of a picture is seen at four times the
+    size."""
     speck = ball(0.9, (1, 1, 1), scale=0.004)
     nothing = ball(0.0, (0, 0, 0))
     camera = view_of_ball(PLAIN).scaled(4)
@@ -125,7 +133,8 @@ def test_targets_are_supersampled(device):
 
 
 def mean_colour_over_views(device, coefficient, config, **options):
-    """Of one SH coefficient over the views of a residual, in standard deviations over the sphere."""
+    """Of one SH coefficient over the views of a residual, in standard deviations over
+    the sphere."""
     sh = np.zeros((1, 16, 3), np.float32)
     sh[0, 0] = 0.5 / scenes.SH_C0  # a colour of 1, which keeps all of them above 0
     sh[0, coefficient] = 0.2
@@ -136,9 +145,14 @@ def mean_colour_over_views(device, coefficient, config, **options):
 
 @pytest.mark.parametrize("num_views", [1, 16])
 def test_views_held_out_lie_evenly_on_the_sphere(device, num_views):
-    """Up to degree 2, functions on the sphere average out as they do not over 8 random views."""
+    """Up to degree 2, functions on the sphere average out as they do not over 8 random
+    views."""
     config = replace(PLAIN, num_views=num_views)
-    means = [mean_colour_over_views(device, k, config, seed=seed) for k in range(1, 9) for seed in range(3)]
+    means = [
+        mean_colour_over_views(device, k, config, seed=seed)
+        for k in range(1, 9)
+        for seed in range(3)
+    ]
     assert np.abs(means).max() < 0.2
     assert np.sqrt(np.mean(np.square(means))) < 0.08  # 0.35 if they were random
 
@@ -146,7 +160,9 @@ def test_views_held_out_lie_evenly_on_the_sphere(device, num_views):
 def test_fresh_views_are_random_and_uniform(device):
     config = replace(PLAIN, num_views=0)
     for k in (*range(1, 9), 12, 15):
-        means = np.array([mean_colour_over_views(device, k, config, stream=stream) for stream in range(100)])
+        means = np.array(
+            [mean_colour_over_views(device, k, config, stream=stream) for stream in range(100)]
+        )
         assert abs(means.mean()) < 4 * 0.35 / 10  # 4 sigma of 100 means over 8
         assert 0.7 < means.std() / 0.35 < 1.3
 
@@ -154,7 +170,9 @@ def test_fresh_views_are_random_and_uniform(device):
 def test_seed_and_stream_change_the_views(device):
     _, first = fit(device, ball(0, (0, 0, 0)), in_ball(1, 20), replace(PLAIN, steps=0))
     for options in ({"seed": 1}, {"stream": 1}):
-        _, other = fit(device, ball(0, (0, 0, 0)), in_ball(1, 20), replace(PLAIN, steps=0), **options)
+        _, other = fit(
+            device, ball(0, (0, 0, 0)), in_ball(1, 20), replace(PLAIN, steps=0), **options
+        )
         assert not np.array_equal(first, other)
 
 
@@ -232,7 +250,8 @@ def test_wrong_pictures_are_refused(picture, target):
 @pytest.mark.parametrize("weights", [(1.0, 0.0, 0.5), (0.8, 0.2, 0.1), (0.0, 1.0, 0.0)])
 @pytest.mark.parametrize("views_per_step", [1, 3])
 def test_steps_are_those_of_adam(device, weights, views_per_step):
-    """A ball that looks the same from everywhere, fitted by torch.optim.Adam on differentiable pictures."""
+    """A ball that looks the same from everywhere, fitted by torch.optim.Adam on
+    differentiable pictures."""
     steps = 25
     config = replace(
         PLAIN,
@@ -255,7 +274,9 @@ def test_steps_are_those_of_adam(device, weights, views_per_step):
         betas=(0.9, config.beta2),
         eps=1e-15,
     )
-    decay = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda s: config.final_step ** (s / (steps - 1)))
+    decay = torch.optim.lr_scheduler.LambdaLR(
+        optimizer, lambda s: config.final_step ** (s / (steps - 1))
+    )
     for _ in range(steps):
         g.opacities, g.sh = torch.sigmoid(logit), sh
         drawn = rasterize(g, camera)
@@ -306,7 +327,8 @@ def test_longer_fits_come_closer(device, changes):
     start, target = in_ball(4, 20), in_ball(5, 60)
     config = replace(PLAIN, supersample=2, filter_px2=0.1, **changes)
     loss = [
-        fit(device, start, target, replace(config, steps=steps))[1] @ [config.loss_l1, config.loss_alpha]
+        fit(device, start, target, replace(config, steps=steps))[1]
+        @ [config.loss_l1, config.loss_alpha]
         for steps in (0, 20, 200)
     ]
     assert loss[1] < 0.9 * loss[0]
@@ -315,7 +337,9 @@ def test_longer_fits_come_closer(device, changes):
 
 def test_result_no_better_than_its_start_is_thrown_away(device):
     target = in_ball(6, 20)
-    start = scenes.replaced(target, sh=target.sh + np.float32(0.05))  # far better than nothing at all
+    start = scenes.replaced(
+        target, sh=target.sh + np.float32(0.05)
+    )  # far better than nothing at all
     _, before = fit(device, start, target, replace(PLAIN, steps=0))
     for step in ("step_position", "step_log_scale", "step_logit", "step_sh0"):
         out, error = fit(device, start, target, replace(PLAIN, **FROZEN | {step: 1e8}, steps=5))
@@ -324,7 +348,8 @@ def test_result_no_better_than_its_start_is_thrown_away(device):
 
 
 def test_result_that_pleases_only_the_views_it_was_fitted_to_is_thrown_away(device):
-    """The target is red from one side; the start has its mean colour, which fits all around best."""
+    """The target is red from one side; the start has its mean colour, which fits all
+    around best."""
     sh = np.zeros((1, 4, 3), np.float32)
     sh[0, 0], sh[0, 1:, 0] = 1.0, [0.4, -0.4, 0.4]
     target = ball(0.9, (0, 0, 0), sh=sh)
@@ -348,7 +373,8 @@ def test_result_that_pleases_only_the_views_it_was_fitted_to_is_thrown_away(devi
     ],
 )
 def test_nothing_runs_away(device, step, target):
-    """A target outside the ball, larger than it, or opaque, that is fitted in steps as large."""
+    """A target outside the ball, larger than it, or opaque, that is fitted in steps as
+    large."""
     start = ball(0.3, (1, 1, 1))
     out, error = fit(device, start, target, replace(PLAIN, **FROZEN | {step: 30.0}, steps=3))
     _, before = fit(device, start, target, replace(PLAIN, steps=0))
@@ -363,7 +389,8 @@ def test_groups_do_not_touch_each_other(device):
     starts, targets = [in_ball(8, 12), in_ball(9, 7)], [in_ball(10, 30), in_ball(11, 20)]
     config = replace(PLAIN, steps=10)
     alone = [
-        fit(device, s, t, config, stream=i) for i, (s, t) in enumerate(zip(starts, targets, strict=True))
+        fit(device, s, t, config, stream=i)
+        for i, (s, t) in enumerate(zip(starts, targets, strict=True))
     ]
     progress = _core.FitProgress()
     both, error = fit_groups(
@@ -405,7 +432,10 @@ def test_no_groups_are_legal(device):
         ),
         ({"target_range": [[0, 5], [5, 10]]}, "target_range: expected shape"),
         ({"stream": [0, 1]}, "stream: expected shape"),
-        ({"ball": np.zeros((1, 4), np.float32)}, "ball: expected a positive radius, group 0 has none"),
+        (
+            {"ball": np.zeros((1, 4), np.float32)},
+            "ball: expected a positive radius, group 0 has none",
+        ),
     ],
 )
 def test_wrong_groups_are_named(change, message):
@@ -473,8 +503,12 @@ def test_what_is_fitted_has_to_be_where_its_target_is():
 )
 @pytest.mark.parametrize("steps", [0, 1, 5])
 def test_devices_agree(num, num_target, degree, changes, steps):
-    """Rounding moves nearly nothing; Adam makes whole steps out of gradients that are all rounding."""
-    start, target = with_bases(in_ball(16, num), degree), with_bases(in_ball(17, num_target), degree)
+    """Rounding moves nearly nothing; Adam makes whole steps out of gradients that are
+    all rounding."""
+    start, target = (
+        with_bases(in_ball(16, num), degree),
+        with_bases(in_ball(17, num_target), degree),
+    )
     config = replace(PLAIN, steps=steps, **changes)
     (a, a_error), (b, b_error) = (fit(device, start, target, config) for device in ("cpu", "cuda"))
     np.testing.assert_allclose(b_error, a_error, rtol=1e-4, atol=1e-7)
@@ -502,6 +536,8 @@ def test_every_run_gives_the_same_bytes(num_groups, num):
     start, target = in_ball(20, num_groups * num), in_ball(21, num_groups * num)
     ranges = np.arange(num_groups)[:, None] * num + [0, num]
     config = replace(PLAIN, steps=20, views_per_step=2, num_views=4, image_size=0)
-    (a, a_error), (b, b_error) = (fit_groups("cuda", start, target, config, ranges, ranges) for _ in range(2))
+    (a, a_error), (b, b_error) = (
+        fit_groups("cuda", start, target, config, ranges, ranges) for _ in range(2)
+    )
     assert all(np.array_equal(getattr(a, name), getattr(b, name)) for name in scenes.NAMES)
     np.testing.assert_array_equal(a_error, b_error)

@@ -1,4 +1,5 @@
-"""Files of other programs: what other people's tools wrote and read, and what a hostile file can do to us.
+"""Files of other programs: what other people's tools wrote and read, and what a hostile
+file can do to us.
 
 Who wrote the fixtures, and how, is in fixtures/README.md.
 What all readers share is in test_malformed.py.
@@ -28,8 +29,9 @@ from v3dg.formats import _reading
 FIXTURES = Path(__file__).parent / "fixtures"
 SH_C0 = 0.28209479177387814
 
-# The most that a component of a unit quaternion changes by when three are stored with an error e: those by e,
-# the fourth, which is at least a half, by at most 3 * e * sqrt(1/2) / (1/2).
+# The most that a component of a unit quaternion changes by when three are stored with
+# an error e: those by e, the fourth, which is at least a half, by at most 3 * e *
+# sqrt(1/2) / (1/2).
 QUAT = 3 * np.sqrt(2)
 
 
@@ -40,7 +42,8 @@ def spz_bounds(sh_bits_1=8, sh_bits_rest=8):
         "quats": QUAT * 0.5 * np.sqrt(0.5) / 511 * 1.01,  # 9 bits and a sign for up to sqrt(1/2)
         "opacities": 0.5 / 255,
         "color": 0.5 / 255 / 0.15,  # a byte for 1 / 0.15
-        # A byte for -1 to 1 whose lower bits may be dropped, to the nearest or, at its end, the last below.
+        # A byte for -1 to 1 whose lower bits may be dropped, to the nearest or, at its
+        # end, the last below.
         "band 1": (0.5 * 2.0 ** (8 - sh_bits_1) + 1) / 128,
         "higher": (0.5 * 2.0 ** (8 - sh_bits_rest) + 1) / 128,
     }
@@ -62,11 +65,12 @@ def compressed_ply_bounds(reference):
 
 def sog_bounds(reference):
     logs = np.log1p(np.abs(reference.means))
-    # Of 256 values that are nearer to each other where there is more: none is further from its value than two
-    # steps of equal length.
+    # Of 256 values that are nearer to each other where there is more: none is further
+    # from its value than two steps of equal length.
     step = 2 / 256
     return {
-        # 16 bits, cut off, of sign(x) ln(1 + |x|), whose derivative is at least 1 / (1 + |x|).
+        # 16 bits, cut off, of sign(x) ln(1 + |x|), whose derivative is at least 1 / (1
+        # + |x|).
         "means": np.ptp(np.sign(reference.means) * logs, axis=0).max()
         / 65535
         * (1 + np.abs(reference.means).max()),
@@ -107,7 +111,8 @@ WRITTEN = {
     ".glb": lambda _: {},
 }
 
-# File, the asset that it was made of, its bounds; who wrote it is in fixtures/README.md.
+# File, the asset that it was made of, its bounds; who wrote it is in
+# fixtures/README.md.
 FOREIGN = {
     "sh0.compressed.ply": compressed_ply_bounds,
     "sh3.compressed.ply": compressed_ply_bounds,
@@ -123,7 +128,9 @@ FOREIGN = {
     "sh0_gaussforge.splat": lambda _: SPLAT_BOUNDS,
     "sh3_mkkellogg_0.ksplat": lambda _: SPLAT_BOUNDS,
     "sh3_mkkellogg_1.ksplat": lambda _: KSPLAT_HALF,
-    "sh3_mkkellogg_2.ksplat": lambda _: KSPLAT_HALF | {"band 1": 1.001 * 3 / 255, "higher": 1.001 * 3 / 255},
+    "sh3_mkkellogg_2.ksplat": lambda _: (
+        KSPLAT_HALF | {"band 1": 1.001 * 3 / 255, "higher": 1.001 * 3 / 255}
+    ),
     "sh0_mkkellogg_1.ksplat": lambda _: KSPLAT_HALF,
 }
 
@@ -150,7 +157,9 @@ def largest_errors(gaussians, reference):
     parts = {"color": slice(0, 1), "band 1": slice(1, 4), "higher": slice(4, 16)}
     return {
         "means": np.abs(found.means - wanted.means.astype(float)).max(initial=0),
-        "log_scales": np.abs(np.log(found.scales) - np.log(wanted.scales.astype(float))).max(initial=0),
+        "log_scales": np.abs(np.log(found.scales) - np.log(wanted.scales.astype(float))).max(
+            initial=0
+        ),
         "quats": np.minimum(*turned).max(initial=0),
         "opacities": np.abs(found.opacities - wanted.opacities.astype(float)).max(initial=0),
         **{
@@ -174,7 +183,9 @@ def test_what_other_tools_write_is_read(name):
     if name.endswith("splat"):
         sh = np.ascontiguousarray(reference.sh[:, : gaussians.sh.shape[1]])
         sh[:, 0] = np.clip(sh[:, 0], -0.5 / SH_C0, 0.5 / SH_C0)  # between black and white
-        reference = Gaussians(reference.means, reference.quats, reference.scales, reference.opacities, sh)
+        reference = Gaussians(
+            reference.means, reference.quats, reference.scales, reference.opacities, sh
+        )
     assert_within(gaussians, reference, FOREIGN[name](reference))
 
 
@@ -183,7 +194,9 @@ def test_what_other_tools_write_is_read(name):
 def test_what_is_written_reads_back(tmp_path, suffix, degree):
     reference = read_asset(FIXTURES / "sh3.ply")
     sh = np.ascontiguousarray(reference.sh[:, : (degree + 1) ** 2])
-    reference = Gaussians(reference.means, reference.quats, reference.scales, reference.opacities, sh)
+    reference = Gaussians(
+        reference.means, reference.quats, reference.scales, reference.opacities, sh
+    )
     path = tmp_path / f"a{suffix}"
     write_asset(path, reference)
     assert_within(in_order_of(reference, read_asset(path)), reference, WRITTEN[suffix](reference))
@@ -222,7 +235,11 @@ def test_gsply_reads_what_we_write(tmp_path, suffix, degree):
     write_asset(path, reference)
     theirs = gsply.read_spz(str(path)) if suffix == ".spz" else gsply.plyread(str(path))
     num = len(reference)
-    sh = theirs.sh0[:, None] if not degree else np.concatenate([theirs.sh0[:, None], theirs.shN], axis=1)
+    sh = (
+        theirs.sh0[:, None]
+        if not degree
+        else np.concatenate([theirs.sh0[:, None], theirs.shN], axis=1)
+    )
     values = {
         "means": theirs.means,
         "quats": theirs.quats,
@@ -230,7 +247,9 @@ def test_gsply_reads_what_we_write(tmp_path, suffix, degree):
         "opacities": 1 / (1 + np.exp(-theirs.opacities.reshape(num).astype(float))),
         "sh": sh,
     }
-    found = Gaussians(**{name: np.ascontiguousarray(array, np.float32) for name, array in values.items()})
+    found = Gaussians(
+        **{name: np.ascontiguousarray(array, np.float32) for name, array in values.items()}
+    )
     bounds = WRITTEN[suffix](reference)
     # It moves opacities of 0 and 1 by 1e-6.
     assert_within(
@@ -259,15 +278,20 @@ def test_small_and_large_assets_keep_their_shape_in_spz(tmp_path):
         asset = random_gaussians(100, 0)
         means = (asset.means / np.abs(asset.means).max() * size).astype(np.float32)
         write_asset(
-            tmp_path / "a.spz", Gaussians(means, asset.quats, asset.scales, asset.opacities, asset.sh)
+            tmp_path / "a.spz",
+            Gaussians(means, asset.quats, asset.scales, asset.opacities, asset.sh),
         )
-        assert np.abs(read_asset(tmp_path / "a.spz").means - means).max() <= max(size * 2**-17, 2**-22)
+        assert np.abs(read_asset(tmp_path / "a.spz").means - means).max() <= max(
+            size * 2**-17, 2**-22
+        )
     with pytest.raises(
         ValueError, match=r"means: expected coordinates within ±8388607 for \.spz, got 1e\+07"
     ):
         write_asset(
             tmp_path / "b.spz",
-            Gaussians(means * np.float32(2.5), asset.quats, asset.scales, asset.opacities, asset.sh),
+            Gaussians(
+                means * np.float32(2.5), asset.quats, asset.scales, asset.opacities, asset.sh
+            ),
         )
     assert not (tmp_path / "b.spz").exists()
 
@@ -335,12 +359,17 @@ def test_chunks_without_colours_mean_black_to_white(tmp_path):
 
 
 def spz_of_version(version, asset, fraction_bits=12):
-    """Bytes of a file of a version that no tool writes any more, from Niantic's description."""
+    """Bytes of a file of a version that no tool writes any more, from Niantic's
+    description."""
     num = len(asset)
     positions = (
         asset.means.astype("<f2").tobytes()
         if version == 1
-        else np.rint(asset.means * 2**fraction_bits).astype("<i4").view("u1").reshape(-1, 4)[:, :3].tobytes()
+        else np.rint(asset.means * 2**fraction_bits)
+        .astype("<i4")
+        .view("u1")
+        .reshape(-1, 4)[:, :3]
+        .tobytes()
     )
     quats = unit(asset.quats) * np.where(asset.quats[:, :1] < 0, -1, 1)
     sections = (
@@ -350,7 +379,9 @@ def spz_of_version(version, asset, fraction_bits=12):
         (quats[:, 1:] + 1) * 127.5,
         asset.sh[:, 1:] * 128 + 128,
     )
-    packed = b"".join(np.clip(np.rint(section), 0, 255).astype("u1").tobytes() for section in sections)
+    packed = b"".join(
+        np.clip(np.rint(section), 0, 255).astype("u1").tobytes() for section in sections
+    )
     header = struct.pack("<IIIBBBB", 0x5053474E, version, num, asset.sh_degree, fraction_bits, 0, 0)
     return header + positions + packed
 
@@ -359,7 +390,9 @@ def spz_of_version(version, asset, fraction_bits=12):
 def test_old_versions_of_spz_are_read(tmp_path, version):
     reference = read_asset(FIXTURES / "sh3.ply")
     (tmp_path / "a.spz").write_bytes(gzip.compress(spz_of_version(version, reference)))
-    bounds = spz_bounds() | {"quats": 0.1}  # where w is nearly 0, it has the square root of x y z's errors
+    bounds = spz_bounds() | {
+        "quats": 0.1
+    }  # where w is nearly 0, it has the square root of x y z's errors
     if version == 1:
         bounds["means"] = np.abs(reference.means).max() * 2**-11  # half precision
     assert_within(read_asset(tmp_path / "a.spz"), reference, bounds)
@@ -385,14 +418,23 @@ HOSTILE_SPZ = {
     "version 4 in gzip": (spz(version=4), "expected version 1 to 3 in gzip, got 4"),
     "degree": (spz(degree=4), "expected SH degree 0 to 3, got 4"),
     "fraction bits": (spz(bits=25), "expected at most 24 fraction bits, got 25"),
-    "too short": (spz()[:-1], "expected a gzip stream that ends after 40 bytes of gaussians, got another"),
-    "header only": (spz()[:16], "expected a gzip stream that ends after 40 bytes of gaussians, got another"),
+    "too short": (
+        spz()[:-1],
+        "expected a gzip stream that ends after 40 bytes of gaussians, got another",
+    ),
+    "header only": (
+        spz()[:16],
+        "expected a gzip stream that ends after 40 bytes of gaussians, got another",
+    ),
     "no header": (spz()[:15], "expected a header of 16 bytes, got 15"),
     "huge count": (
         spz(count=2**32 - 1),
         "expected a byte a gaussian beyond 262144, got 4294967295 gaussians in",
     ),
-    "a long trailer": (spz() + bytes(2 << 20), "that ends after 40 bytes of gaussians, got another"),
+    "a long trailer": (
+        spz() + bytes(2 << 20),
+        "that ends after 40 bytes of gaussians, got another",
+    ),
 }
 
 
@@ -430,7 +472,11 @@ def test_extensions_after_the_gaussians_of_spz_are_passed_over(tmp_path):
         (16, 31, "expected a table of 6 streams after the header, got 6 at 31"),
         (19, 255, "expected a table of 6 streams after the header, got 6 at 42"),
         (8, 65, "expected 585 bytes in stream 0, got 576"),
-        (11, 255, "expected a byte a gaussian beyond 262144, got 4278190144 gaussians in 2635 bytes"),
+        (
+            11,
+            255,
+            "expected a byte a gaussian beyond 262144, got 4278190144 gaussians in 2635 bytes",
+        ),
         (32 + 7, 255, "expected 576 bytes in stream 0, got 576 of"),
         (4, 3, "expected version 3 in a gzip stream, got it outside of one"),
         (128, 0, "expected a zstd stream that is not damaged, got zstd decompress error"),
@@ -444,9 +490,13 @@ def test_hostile_spz_of_version_4_is_refused(tmp_path, place, value, message):
 
 
 def sog_with(tmp_path, edit=None, files=None, compression=zipfile.ZIP_STORED):
-    """The fixture with `edit` of the text of its meta.json, and other contents of some files."""
+    """The fixture with `edit` of the text of its meta.json, and other contents of some
+    files."""
     path = tmp_path / "a.sog"
-    with zipfile.ZipFile(FIXTURES / "sh0.sog") as source, zipfile.ZipFile(path, "w", compression) as target:
+    with (
+        zipfile.ZipFile(FIXTURES / "sh0.sog") as source,
+        zipfile.ZipFile(path, "w", compression) as target,
+    ):
         for name in source.namelist():
             content = source.read(name)
             if name == "meta.json" and edit:
@@ -471,7 +521,10 @@ HOSTILE_SOG = {
         replaced('"version":2,', ""),
         "expected SOG version 2, got an older file; convert it with",
     ),
-    "count": (replaced('"count":300', '"count":-1'), "count: expected a number of gaussians, got -1"),
+    "count": (
+        replaced('"count":300', '"count":-1'),
+        "count: expected a number of gaussians, got -1",
+    ),
     "more than the pictures hold": (
         replaced('"count":300', '"count":400'),
         "expected 400 pixels in 'means_l.webp'",
@@ -480,7 +533,10 @@ HOSTILE_SOG = {
         replaced('"count":300', '"count":99999999999'),
         "count: expected a number of gaussians, got 99999999999",
     ),
-    "path": (replaced('"means_l.webp"', '"../means_l.webp"'), "expected the name of a file beside meta.json"),
+    "path": (
+        replaced('"means_l.webp"', '"../means_l.webp"'),
+        "expected the name of a file beside meta.json",
+    ),
     "parent": (replaced('"means_l.webp"', '".."'), "expected the name of a file beside meta.json"),
     "absolute path": (
         replaced('"means_l.webp"', '"/etc/passwd"'),
@@ -518,7 +574,8 @@ def picture(width, height, kind="WEBP", lossless=True):
 
 def test_other_pictures_are_refused(tmp_path):
     assert_refused_cheaply(
-        sog_with(tmp_path, files={"quats.webp": b"no picture"}), "expected a WebP picture in 'quats.webp'"
+        sog_with(tmp_path, files={"quats.webp": b"no picture"}),
+        "expected a WebP picture in 'quats.webp'",
     )
     for kind in ("PNG", "TIFF"):
         path = sog_with(tmp_path, files={"quats.webp": picture(20, 20, kind)})
@@ -541,7 +598,9 @@ def test_a_first_value_that_is_null_continues_its_codebook(tmp_path):
     import json
     import re
 
-    codebook = json.loads(zipfile.ZipFile(FIXTURES / "sh0.sog").read("meta.json"))["scales"]["codebook"]
+    codebook = json.loads(zipfile.ZipFile(FIXTURES / "sh0.sog").read("meta.json"))["scales"][
+        "codebook"
+    ]
     path = sog_with(
         tmp_path, lambda text: re.sub(r'("scales":\{"codebook":\[)[^,]+', r"\1null", text, count=1)
     )
@@ -580,13 +639,21 @@ def test_hostile_ksplat_is_refused(tmp_path, place, value, message):
 
 
 HOSTILE_COMPRESSED_PLY = {
-    "too few chunks": (b"element chunk 2", b"element chunk 1", "expected 2 chunks for 300 gaussians, got 1"),
+    "too few chunks": (
+        b"element chunk 2",
+        b"element chunk 1",
+        "expected 2 chunks for 300 gaussians, got 1",
+    ),
     "too many rows": (
         b"element vertex 300",
         b"element vertex 301",
         "expected 301 rows of element 'vertex' with 16",
     ),
-    "too few rows": (b"element vertex 300", b"element vertex 299", "expected the end of the file after"),
+    "too few rows": (
+        b"element vertex 300",
+        b"element vertex 299",
+        "expected the end of the file after",
+    ),
     "huge count": (
         b"element vertex 300",
         b"element vertex 999999999999",
@@ -597,7 +664,11 @@ HOSTILE_COMPRESSED_PLY = {
         b"float packed_rotation",
         "expected 'property uint packed_rotation'",
     ),
-    "no such property": (b"packed_rotation", b"packed_rotatiom", "expected 'property uint packed_rotation'"),
+    "no such property": (
+        b"packed_rotation",
+        b"packed_rotatiom",
+        "expected 'property uint packed_rotation'",
+    ),
     "a property twice": (
         b"packed_rotation",
         b"packed_scale",
@@ -680,7 +751,10 @@ HOSTILE_GLB = {
         lambda d: d["meshes"][0]["primitives"][0]["attributes"].update({"POSITION": 99}),
         "POSITION: expected 0 to 20, got 99",
     ),
-    "another type": (lambda d: attribute(d, "POSITION").update(type="VEC4"), "type: expected VEC3, got"),
+    "another type": (
+        lambda d: attribute(d, "POSITION").update(type="VEC4"),
+        "type: expected VEC3, got",
+    ),
     "another number": (
         lambda d: attribute(d, "KHR_gaussian_splatting:SCALE").update(count=65),
         "count: expected 64, as POSITION has, got 65",
@@ -721,11 +795,14 @@ def test_a_glb_that_is_cut_off_is_refused(tmp_path):
     content = (FIXTURES / "sh3.glb").read_bytes()
     for size in (0, 3, 19, 400, len(content) - 1):
         (tmp_path / "a.glb").write_bytes(content[:size])
-        assert_refused_cheaply(tmp_path / "a.glb", "expected a .glb file, glTF 2.0 that is whole, got")
+        assert_refused_cheaply(
+            tmp_path / "a.glb", "expected a .glb file, glTF 2.0 that is whole, got"
+        )
 
 
 def hier_of(asset, half, inner=7):
-    """Bytes of a `.hier`, as its program's writer has them: some inner gaussians, then leaves, two a node."""
+    """Bytes of a `.hier`, as its program's writer has them: some inner gaussians, then
+    leaves, two a node."""
     kind, count = ("<f2" if half else "<f4"), inner + len(asset)
 
     def column(values, of=kind):
@@ -739,7 +816,9 @@ def hier_of(asset, half, inner=7):
         column(asset.opacities),
         column(asset.sh.reshape(len(asset), 48)),
     ]
-    nodes = [(i, 0, 1) for i in range(inner)]  # where gaussians begin, how many are leaves, how many merged
+    nodes = [
+        (i, 0, 1) for i in range(inner)
+    ]  # where gaussians begin, how many are leaves, how many merged
     nodes += [(inner + i, min(2, len(asset) - i), 0) for i in range(0, len(asset), 2)]
     if half:
         records = b"".join(struct.pack("<iiihhhh", -1, s, 0, 0, 0, n, m) for s, n, m in nodes)
@@ -787,7 +866,9 @@ def test_hostile_hier_is_refused(tmp_path, case):
 
 
 @settings(max_examples=300)
-@example(name="sh3.sog", edits=[(230, 128)], in_header=True)  # a file name in a zip that is no UTF-8
+@example(
+    name="sh3.sog", edits=[(230, 128)], in_header=True
+)  # a file name in a zip that is no UTF-8
 @given(
     name=st.sampled_from(
         [
@@ -866,7 +947,9 @@ def test_checkpoints_of_nerfstudio_are_read(tmp_path, degree):
         "optimizers": {"means": optimizer.state_dict()},
         "scalers": {},
     }
-    asset = Gaussians(tensors["means"].numpy(), asset.quats, asset.scales, asset.opacities, asset.sh)
+    asset = Gaussians(
+        tensors["means"].numpy(), asset.quats, asset.scales, asset.opacities, asset.sh
+    )
     torch.save(content, tmp_path / "step-000029999.ckpt")
     assert_same(read_asset(tmp_path / "step-000029999.ckpt"), asset)
 
@@ -880,7 +963,8 @@ def test_a_checkpoint_executes_nothing(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     torch.save({"splats": gsplat_tensors(random_gaussians(2, 0)), "extra": Harmful()}, "a.pt")
     assert_refused_cheaply(
-        Path("a.pt"), "expected a checkpoint of tensors and plain values, got one whose pickle refers to"
+        Path("a.pt"),
+        "expected a checkpoint of tensors and plain values, got one whose pickle refers to",
     )
     assert not Path("harm").exists()
 
@@ -899,11 +983,14 @@ def test_checkpoints_that_do_not_fit_are_refused(tmp_path, change, message):
     torch.save({"splats": gsplat_tensors(random_gaussians(2, 1)) | change}, tmp_path / "a.pt")
     assert_refused_cheaply(tmp_path / "a.pt", message)
     torch.save({"model": 3}, tmp_path / "a.pt")
-    assert_refused_cheaply(tmp_path / "a.pt", "expected 'splats' (gsplat) or 'pipeline' (nerfstudio)")
+    assert_refused_cheaply(
+        tmp_path / "a.pt", "expected 'splats' (gsplat) or 'pipeline' (nerfstudio)"
+    )
 
 
 def test_changed_bytes_of_a_checkpoint_never_do_worse_than_an_error(tmp_path):
-    """Where the zip says what it holds: what torch makes of that has no list of errors."""
+    """Where the zip says what it holds: what torch makes of that has no list of
+    errors."""
     torch.save({"splats": gsplat_tensors(random_gaussians(2, 0))}, tmp_path / "whole.pt")
     content = (tmp_path / "whole.pt").read_bytes()
     path = tmp_path / "a.pt"
@@ -948,7 +1035,9 @@ def test_a_checkpoint_that_was_packed_again_is_the_same(saved):
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
 def test_checkpoints_of_other_floats_are_read(tmp_path, dtype):
-    tensors = {name: tensor.to(dtype) for name, tensor in gsplat_tensors(random_gaussians(20, 1)).items()}
+    tensors = {
+        name: tensor.to(dtype) for name, tensor in gsplat_tensors(random_gaussians(20, 1)).items()
+    }
     torch.save({"splats": tensors}, tmp_path / "a.pt")
     found = read_asset(tmp_path / "a.pt")
     np.testing.assert_array_equal(found.means, tensors["means"].float().numpy())
@@ -1007,7 +1096,8 @@ def test_a_checkpoint_whose_numbers_are_others_is_refused(saved, change):
 
 @pytest.mark.parametrize("suffix", [".pt", ".sog"])
 def test_a_file_that_shrinks_while_it_is_read_is_refused(tmp_path, monkeypatch, suffix):
-    """Of these the parts are read one by one; nothing is mapped, which would end the process."""
+    """Of these the parts are read one by one; nothing is mapped, which would end the
+    process."""
     path, asset = tmp_path / f"a{suffix}", random_gaussians(5000, 0)
     if suffix == ".sog":
         write_asset(path, asset)
@@ -1029,7 +1119,9 @@ def test_a_file_that_shrinks_while_it_is_read_is_refused(tmp_path, monkeypatch, 
 def test_bands_of_another_kind_are_refused(tmp_path, bands):
     path = sog_with(
         tmp_path,
-        replaced('"version":2', f'"shN":{{"bands":{bands},"count":1,"files":["a","b"]}},"version":2'),
+        replaced(
+            '"version":2', f'"shN":{{"bands":{bands},"count":1,"files":["a","b"]}},"version":2'
+        ),
         files={},
     )
     with zipfile.ZipFile(path, "a") as target:
@@ -1042,7 +1134,9 @@ def test_bands_of_another_kind_are_refused(tmp_path, bands):
 def test_half_of_the_ranges_of_colour_is_refused(tmp_path, gone):
     content = (FIXTURES / "sh0.compressed.ply").read_bytes()
     for name in gone.split():
-        content = content.replace(f"property float {name}\n".encode(), f"property float x{name}\n".encode())
+        content = content.replace(
+            f"property float {name}\n".encode(), f"property float x{name}\n".encode()
+        )
     (tmp_path / "a.ply").write_bytes(content)
     assert_refused_cheaply(
         tmp_path / "a.ply", f"expected 'property float {gone.split()[0]}' in element chunk"

@@ -1,9 +1,10 @@
 """Files that we write, in the engines of others, in Chromium: each draws what we draw.
 
-They need playwright, Chromium where PATH finds it, and the environment variable NODE_MODULES, which names the
-folder that `npm install playcanvas@2.23.3 three@0.187.0 @sparkjsdev/spark@2.2.0 babylonjs@9.28.0
-babylonjs-loaders@9.28.0 @adobe/spz@0.2.2 fflate@0.8.3` makes.
-With SCREENSHOTS, the name of a folder, the pictures are left there, ours beside them.
+They need playwright, Chromium where PATH finds it, and the environment variable
+NODE_MODULES, which names the folder that `npm install playcanvas@2.23.3 three@0.187.0
+@sparkjsdev/spark@2.2.0 babylonjs@9.28.0 babylonjs-loaders@9.28.0 @adobe/spz@0.2.2
+fflate@0.8.3` makes. With SCREENSHOTS, the name of a folder, the pictures are left
+there, ours beside them.
 """
 
 import dataclasses
@@ -29,14 +30,17 @@ pytest.importorskip("playwright.sync_api")
 MODULES, SCREENSHOTS = os.environ.get("NODE_MODULES"), os.environ.get("SCREENSHOTS")
 pytestmark = [
     pytest.mark.witness,
-    pytest.mark.skipif(chromium.PROGRAM is None, reason="neither chromium nor google-chrome is installed"),
+    pytest.mark.skipif(
+        chromium.PROGRAM is None, reason="neither chromium nor google-chrome is installed"
+    ),
     pytest.mark.skipif(MODULES is None, reason="NODE_MODULES does not name its folder"),
 ]
 
 SIDE, FOV = 300, 40
 EYE = (0.18, -0.38, 0.30)  # of the donut, whose z is up
 
-# Each page looks from EYE at the origin, with z up, and counts the pictures since its asset was there.
+# Each page looks from EYE at the origin, with z up, and counts the pictures since its
+# asset was there.
 HEAD = """<!doctype html>
 <style>body { margin: 0; overflow: hidden } canvas { width: 100vw; height: 100vh; display: block }</style>
 <canvas id="canvas"></canvas>
@@ -162,9 +166,14 @@ def shown(browser, site, engine, file):
     picture = before = None
     for _ in range(60):
         page.wait_for_timeout(1000)
-        before, picture = picture, np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")) / 255
+        before, picture = (
+            picture,
+            np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")) / 255,
+        )
         if errors or (
-            page.evaluate("frames_shown") > 3 and picture.max() > 0.2 and np.array_equal(before, picture)
+            page.evaluate("frames_shown") > 3
+            and picture.max() > 0.2
+            and np.array_equal(before, picture)
         ):
             break
     page.close()
@@ -177,13 +186,18 @@ def shown(browser, site, engine, file):
     [
         *(("playcanvas", f"donut.{suffix}") for suffix in ("ply", "compressed.ply", "sog", "glb")),
         *(("spark", f"donut.{suffix}") for suffix in ("ply", "compressed.ply", "spz", "sog")),
-        *(("babylon", f"donut.{suffix}") for suffix in ("ply", "compressed.ply", "spz", "sog", "glb")),
+        *(
+            ("babylon", f"donut.{suffix}")
+            for suffix in ("ply", "compressed.ply", "spz", "sog", "glb")
+        ),
         ("babylon", "streamed/lod-meta.json"),
     ],
 )
 def test_an_engine_draws_what_we_do(browser, site, asset, engine, file):
     picture = shown(browser, site, engine, file)
-    camera = v3dg.Camera.look_at(EYE, (0, 0, 0), (0, 0, 1), fov_x=np.radians(FOV), width=SIDE, height=SIDE)
+    camera = v3dg.Camera.look_at(
+        EYE, (0, 0, 0), (0, 0, 1), fov_x=np.radians(FOV), width=SIDE, height=SIDE
+    )
     if file.endswith(".json"):  # Babylon streams without what depends on the direction.
         asset = dataclasses.replace(asset, sh=np.ascontiguousarray(asset.sh[:, :1]))
     ours = np.clip(v3dg.rasterize(asset, camera, filter_px2=0.3).color, 0, 1)

@@ -1,4 +1,5 @@
-"""Frames drawn by CUDA: the CPU's pictures, whatever the stream, the buffers and what was drawn before."""
+"""Frames drawn by CUDA: the CPU's pictures, whatever the stream, the buffers and what
+was drawn before."""
 
 from dataclasses import replace
 
@@ -28,7 +29,8 @@ def test_scene_looks_as_on_the_cpu(sh_degree, tolerance):
 @pytest.mark.parametrize("sh_degree", [0, 3])
 @pytest.mark.parametrize("tops", [5, 20, 150])
 def test_neighbours_that_share_a_cluster_look_as_on_the_cpu(sh_degree, tops):
-    """Instances so far that their top clusters are drawn: alone, several at once, of two bundles in turn."""
+    """Instances so far that their top clusters are drawn: alone, several at once, of
+    two bundles in turn."""
     rng = np.random.default_rng(tops)
     bundles = [
         scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, n, sh_degree=sh_degree), tops, past_root=0)
@@ -47,7 +49,9 @@ def test_neighbours_that_share_a_cluster_look_as_on_the_cpu(sh_degree, tops):
     image = render(scene, CAMERA, tolerance=np.inf, background=BACKGROUND, device="cuda")
     assert_like_cpu(image, expected)
     one_by_one = select(scene, CAMERA, tolerance=np.inf, device="cuda")
-    assert_same_bytes(image, render(scene, CAMERA, cut=one_by_one, background=BACKGROUND, device="cuda"))
+    assert_same_bytes(
+        image, render(scene, CAMERA, cut=one_by_one, background=BACKGROUND, device="cuda")
+    )
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
@@ -74,16 +78,21 @@ def test_gaussians_over_thousands_of_tiles(size):
     camera = Camera.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), 0.9, width=width, height=height)
     blob = scenes_lod.blob(rng, 400)
     scales = np.exp(rng.uniform(-6, 1, (400, 3))).astype(np.float32)
-    asset = Gaussians(blob.means + np.float32([0, 0, 4]), blob.quats, scales, 0.2 * blob.opacities, blob.sh)
+    asset = Gaussians(
+        blob.means + np.float32([0, 0, 4]), blob.quats, scales, 0.2 * blob.opacities, blob.sh
+    )
     expected = render(asset, camera, device="cpu")
     assert_like_cpu(render(asset, camera, device="cuda"), expected)
     assert (host(expected.alpha) > 0.1).mean() > 0.5
 
 
-@pytest.mark.parametrize("depths", ["spread", "one before all", "equal", "in one step", "on sheets"])
+@pytest.mark.parametrize(
+    "depths", ["spread", "one before all", "equal", "in one step", "on sheets"]
+)
 @pytest.mark.parametrize("count", [3000, 60_000])
 def test_tiles_blended_in_parts_have_the_same_bytes(depths, count):
-    """Where few tiles have most of the entries; a frame that keeps a tape blends tiles whole."""
+    """Where few tiles have most of the entries; a frame that keeps a tape blends tiles
+    whole."""
     rng = np.random.default_rng(count)
     camera = Camera.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), 0.9, width=640, height=400)
     ranges = {"spread": (2, 3), "one before all": (4, 4.1), "on sheets": (2, 2.0001)}
@@ -110,7 +119,8 @@ def test_tiles_blended_in_parts_have_the_same_bytes(depths, count):
 
 @pytest.mark.parametrize("millions", [70, 140])
 def test_frames_with_room_for_many_records_have_the_same_bytes(millions):
-    """Depth has fewer bits in the lists of such frames; many here are alike, or one float apart."""
+    """Depth has fewer bits in the lists of such frames; many here are alike, or one
+    float apart."""
     rng = np.random.default_rng(millions)
     blob = scenes_lod.blob(rng, 20_000, size=0.5)
     faint = replace(blob, opacities=np.full(len(blob), 0.003, np.float32))  # too faint for a record
@@ -147,7 +157,8 @@ def test_nothing_gives_the_background(subject):
 
 
 def test_buffers_that_were_too_small_leave_no_trace():
-    """The first frame of a renderer finds next to no room; later ones what it needed."""
+    """The first frame of a renderer finds next to no room; later ones what it
+    needed."""
     subject = composed_scene(np.random.default_rng(3))
     renderer = Renderer(subject)
     first, second = (renderer.render(CAMERA, tolerance=0.0) for _ in range(2))
@@ -173,7 +184,9 @@ def test_every_renderer_draws_the_same_bytes():
 
 def test_pictures_drawn_ahead_stay_apart():
     subject = composed_scene(np.random.default_rng(5))
-    cameras = [scenes_lod.turned(CAMERA, np.random.default_rng(seed)) for seed in range(12)] + [CAMERA]
+    cameras = [scenes_lod.turned(CAMERA, np.random.default_rng(seed)) for seed in range(12)] + [
+        CAMERA
+    ]
     renderer = Renderer(subject)
     ahead = [renderer.render(camera, tolerance=0.0) for camera in cameras]
     for camera, image in zip(cameras, ahead, strict=True):

@@ -18,7 +18,8 @@ def pairs(selection):
 
 
 def color_of(gaussians, n, direction):
-    """Colour of gaussian n towards a unit direction, from the definition of the real harmonics."""
+    """Colour of gaussian n towards a unit direction, from the definition of the real
+    harmonics."""
     x, y, z = direction
     basis = [0.28209479177387814]
     basis += [0.4886025119029199 * v for v in (-y, z, -x)]
@@ -42,13 +43,17 @@ def color_of(gaussians, n, direction):
     return np.array(basis[: len(coefficients)]) @ coefficients
 
 
-@given(seed=st.integers(0, 2**32 - 1), sh_degree=st.integers(0, 3), origin=st.sampled_from([0.0, 1e6]))
+@given(
+    seed=st.integers(0, 2**32 - 1), sh_degree=st.integers(0, 3), origin=st.sampled_from([0.0, 1e6])
+)
 def test_gaussians_are_those_of_the_instances_in_the_world(device, seed, sh_degree, origin):
     rng = np.random.default_rng(seed)
     bundle = lod_bundle(rng, blob(rng, 40, sh_degree=sh_degree), 8)
     scene = random_scene(rng, bundle, 3, origin=origin)
     camera = random_camera(rng, origin=origin)
-    selection = select(scene, camera, tolerance=float(rng.choice([0.0, 1.0, 1e3])), cull=False, device="cpu")
+    selection = select(
+        scene, camera, tolerance=float(rng.choice([0.0, 1.0, 1e3])), cull=False, device="cpu"
+    )
     world = host(selection.gaussians(origin=camera.position, device=device))
     assert len(world) == selection.num_gaussians
     first = 0
@@ -57,7 +62,11 @@ def test_gaussians_are_those_of_the_instances_in_the_world(device, seed, sh_degr
         rows = slice(first, first + len(asset))
         first += len(asset)
         rotation, scale = scene.rotations[i], scene.scales[i]
-        means = scale * asset.means.astype(np.float64) @ rotation.T + scene.positions[i] - camera.position
+        means = (
+            scale * asset.means.astype(np.float64) @ rotation.T
+            + scene.positions[i]
+            - camera.position
+        )
         np.testing.assert_allclose(world.means[rows], means, rtol=1e-5, atol=1e-5)
         placed = world.subset(rows)
         expected = scale**2 * rotation @ covariances(asset) @ rotation.T
@@ -68,7 +77,9 @@ def test_gaussians_are_those_of_the_instances_in_the_world(device, seed, sh_degr
         direction /= np.linalg.norm(direction)
         for n in range(len(asset)):
             towards = color_of(asset, n, rotation.T @ direction)
-            np.testing.assert_allclose(color_of(placed, n, direction), towards, rtol=1e-4, atol=1e-5)
+            np.testing.assert_allclose(
+                color_of(placed, n, direction), towards, rtol=1e-4, atol=1e-5
+            )
         filters = selection.filters_px2[rows]
         np.testing.assert_array_equal(filters, np.full(len(asset), bundle.clusters.filter_px2[c]))
         assert (selection.antialiased[rows] == bool(bundle.clusters.antialiased[c])).all()
@@ -76,9 +87,11 @@ def test_gaussians_are_those_of_the_instances_in_the_world(device, seed, sh_degr
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_harmonics_turn_as_the_bases_do(device, degree):
-    """To 1e-12, though results are float32: coefficients are such that all but one of a band nearly vanish.
+    """To 1e-12, though results are float32: coefficients are such that all but one of a
+    band nearly vanish.
 
-    What a row of the true rotation stands for in the asset is, but for its rounding, one basis in the world.
+    What a row of the true rotation stands for in the asset is, but for its rounding,
+    one basis in the world.
     """
     rng = np.random.default_rng(degree)
     count, size, first = 50, 2 * degree + 1, degree * degree
@@ -158,7 +171,10 @@ def test_both_devices_give_the_same_bits():
         mixed_selection(),
         select(turned, random_camera(rng, distance=30), tolerance=0.1, device="cpu"),
     ):
-        on_cpu, on_device = selection.gaussians(device="cpu"), host(selection.gaussians(device="cuda"))
+        on_cpu, on_device = (
+            selection.gaussians(device="cpu"),
+            host(selection.gaussians(device="cuda")),
+        )
         assert len(on_cpu) > 0
         for name in scenes.NAMES:
             np.testing.assert_array_equal(getattr(on_cpu, name), getattr(on_device, name))
@@ -182,9 +198,14 @@ def test_gaussians_of_an_unplaced_bundle_are_its_own(device):
 
 def test_wrong_arguments_are_named():
     selection = select(
-        random_bundle(1), Camera.look_at((0, -5, 0), (0, 0, 0), width=8, height=8), tolerance=1, device="cpu"
+        random_bundle(1),
+        Camera.look_at((0, -5, 0), (0, 0, 0), width=8, height=8),
+        tolerance=1,
+        device="cpu",
     )
     with pytest.raises(ValueError, match=r"origin: expected shape \(3,\)"):
         selection.gaussians(origin=1.0, device="cpu")
-    with pytest.raises(ValueError, match="device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got 'gpu'"):
+    with pytest.raises(
+        ValueError, match="device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got 'gpu'"
+    ):
         selection.gaussians(device="gpu")

@@ -49,10 +49,18 @@ def test_survives_pickling():
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"means": [[0, 0, 0]]}, TypeError, "means: expected a NumPy array or a torch tensor, got list"),
+        (
+            {"means": [[0, 0, 0]]},
+            TypeError,
+            "means: expected a NumPy array or a torch tensor, got list",
+        ),
         ({"sh": None}, TypeError, "sh: expected a NumPy array or a torch tensor, got NoneType"),
         ({"means": np.zeros(5, np.float32)}, ValueError, "means: expected shape (N, 3), got (5,)"),
-        ({"means": np.zeros((5, 4), np.float32)}, ValueError, "means: expected shape (N, 3), got (5, 4)"),
+        (
+            {"means": np.zeros((5, 4), np.float32)},
+            ValueError,
+            "means: expected shape (N, 3), got (5, 4)",
+        ),
         (
             {"quats": np.zeros((4, 4), np.float32)},
             ValueError,
@@ -73,8 +81,16 @@ def test_survives_pickling():
             ValueError,
             "sh: expected shape (5, K, 3) with K 1, 4, 9 or 16, got (5, 3)",
         ),
-        ({"scales": np.zeros((5, 3))}, ValueError, "scales: expected dtype float32, got float64; convert it"),
-        ({"scales": np.zeros((5, 3), ">f4")}, ValueError, "scales: expected dtype float32, got >f4"),
+        (
+            {"scales": np.zeros((5, 3))},
+            ValueError,
+            "scales: expected dtype float32, got float64; convert it",
+        ),
+        (
+            {"scales": np.zeros((5, 3), ">f4")},
+            ValueError,
+            "scales: expected dtype float32, got >f4",
+        ),
         (
             {"means": np.zeros((3, 5), np.float32).T},
             ValueError,
@@ -137,7 +153,11 @@ def test_subset_by_a_plain_slice_shares_memory():
     ("index", "error", "message"),
     [
         (3, TypeError, "index: expected a slice, integers or booleans, got int"),
-        ([0.5], TypeError, "index: expected a slice, integers or booleans, got list of dtype float64"),
+        (
+            [0.5],
+            TypeError,
+            "index: expected a slice, integers or booleans, got list of dtype float64",
+        ),
         ([[0, 1]], ValueError, "index: expected one dimension, got shape (1, 2)"),
         ([5], IndexError, "5"),
         ([True] * 4, IndexError, "4"),
@@ -206,7 +226,9 @@ def test_tensors_keep_their_gradients():
 
 
 @pytest.mark.parametrize(
-    "index", [slice(1, 3), slice(None, None, -2), [2, 0], np.array([True, False, True, False])], ids=str
+    "index",
+    [slice(1, 3), slice(None, None, -2), [2, 0], np.array([True, False, True, False])],
+    ids=str,
 )
 def test_subset_of_tensors_is_that_of_arrays(index):
     torch = pytest.importorskip("torch")
@@ -222,17 +244,27 @@ def test_subset_of_tensors_is_that_of_arrays(index):
 def test_refuses_a_mixture_of_kinds():
     torch = pytest.importorskip("torch")
     arrays = random_arrays(4)
-    with pytest.raises(TypeError, match="sh: expected a NumPy array like the others, got a torch tensor"):
+    with pytest.raises(
+        TypeError, match="sh: expected a NumPy array like the others, got a torch tensor"
+    ):
         Gaussians(**{**arrays, "sh": torch.from_numpy(arrays["sh"])})
-    with pytest.raises(TypeError, match=r"parts\[1\]\.means: expected a NumPy array like the others"):
+    with pytest.raises(
+        TypeError, match=r"parts\[1\]\.means: expected a NumPy array like the others"
+    ):
         Gaussians.concatenate([Gaussians(**arrays), Gaussians(**arrays).torch()])
 
 
 @pytest.mark.parametrize(
     ("sh", "message"),
     [
-        (lambda torch: torch.zeros(4, 4, 3, dtype=torch.float64), "sh: expected dtype float32, got float64"),
-        (lambda torch: torch.zeros(3, 4, 4).T, "sh: expected a contiguous tensor, got a strided one"),
+        (
+            lambda torch: torch.zeros(4, 4, 3, dtype=torch.float64),
+            "sh: expected dtype float32, got float64",
+        ),
+        (
+            lambda torch: torch.zeros(3, 4, 4).T,
+            "sh: expected a contiguous tensor, got a strided one",
+        ),
         (
             lambda torch: torch.zeros(4, 4, 3, device="meta"),
             "sh: expected device cpu like the others, got meta",

@@ -35,7 +35,9 @@ def test_bundles_show_their_levels_in_notebooks(bundle):
     shown = bundle._repr_html_()
     assert shown.count("<tr>") == 1 + bundle.num_levels
     for level in bundle.info()["levels"]:
-        assert f"<td>{level['level']}<td>{level['clusters']:,}<td>{level['gaussians']:,}<td>" in shown
+        assert (
+            f"<td>{level['level']}<td>{level['clusters']:,}<td>{level['gaussians']:,}<td>" in shown
+        )
 
 
 def test_open_gives_what_the_name_says(bundle, camera, tmp_path):
@@ -55,7 +57,9 @@ def test_scenes_are_saved_and_loaded(bundle, camera, tmp_path):
     (tmp_path / "bundles").mkdir()
     bundle.write(tmp_path / "bundles" / "a.v3dg")
     scene = v3dg.Scene()
-    scene.add(v3dg.open(tmp_path / "bundles" / "a.v3dg"), positions=[[0, 1, 2], [3, 4, 5]], scales=2)
+    scene.add(
+        v3dg.open(tmp_path / "bundles" / "a.v3dg"), positions=[[0, 1, 2], [3, 4, 5]], scales=2
+    )
     scene.save(tmp_path / "a.json", {"front": camera})
     again = v3dg.Scene.load(tmp_path / "a.json")
     np.testing.assert_array_equal(again.positions, scene.positions)
@@ -64,7 +68,9 @@ def test_scenes_are_saved_and_loaded(bundle, camera, tmp_path):
 
 
 def test_a_scene_of_bundles_in_memory_says_what_to_do_first(bundle, tmp_path):
-    with pytest.raises(ValueError, match=r"scene.bundles\[0\]: .* got one in memory or at a URL; write it"):
+    with pytest.raises(
+        ValueError, match=r"scene.bundles\[0\]: .* got one in memory or at a URL; write it"
+    ):
         v3dg.Scene.of(bundle).save(tmp_path / "a.json")
     assert list(tmp_path.iterdir()) == []
 
@@ -77,7 +83,9 @@ def test_transform_moves_turns_and_scales(kind):
     moved = given.transform(turn, (1, 2, 3), 3.0)
     assert type(moved.means) is type(given.means)
     rotation = rotation_from_quaternion(turn / np.linalg.norm(turn))
-    np.testing.assert_allclose(moved.numpy().means, 3 * asset.means @ rotation.T + (1, 2, 3), atol=1e-5)
+    np.testing.assert_allclose(
+        moved.numpy().means, 3 * asset.means @ rotation.T + (1, 2, 3), atol=1e-5
+    )
     np.testing.assert_allclose(moved.numpy().scales, 3 * asset.scales, rtol=1e-6)
     np.testing.assert_array_equal(moved.numpy().opacities, asset.opacities)
 
@@ -116,7 +124,9 @@ def test_files_stand_for_what_is_in_them(bundle, camera, tmp_path):
             np.testing.assert_equal(chosen(path), chosen(v3dg.open(path)))
         v3dg.write_tiles(path, tmp_path / "tiles")
         v3dg.write_site(path, tmp_path / "site")
-    assert json.loads((tmp_path / "site" / "site.json").read_text())["cameras"][0]["name"] == "front"
+    assert (
+        json.loads((tmp_path / "site" / "site.json").read_text())["cameras"][0]["name"] == "front"
+    )
     v3dg.write_streamed_sog(file, tmp_path / "sog")
     drawn = v3dg.rasterize(asset, camera)
     np.testing.assert_array_equal(drawn.color, v3dg.rasterize(v3dg.open(asset), camera).color)
@@ -162,7 +172,9 @@ def test_nothing_is_written_that_cannot_be_opened(bundle, tmp_path):
         with pytest.raises(ValueError, match=r"x\.ply: expected a file name ending in \.v3dg"):
             write()
     for name in ("noname", "scene.txt", "meta.json"):
-        with pytest.raises(ValueError, match=rf"{name}: expected a file name ending in \.json, not meta"):
+        with pytest.raises(
+            ValueError, match=rf"{name}: expected a file name ending in \.json, not meta"
+        ):
             scene.save(tmp_path / name)
     assert sorted(tmp_path.iterdir()) == before
 
@@ -205,7 +217,9 @@ def test_cameras_without_names_are_told_so(bundle, camera, tmp_path):
     bundle.write(tmp_path / "a.v3dg")
     scene = v3dg.Scene.of(v3dg.open(tmp_path / "a.v3dg"))
     for write in (v3dg.write_cameras, lambda path, cameras: scene.save(path, cameras)):
-        with pytest.raises(TypeError, match=r"^cameras: expected cameras by their names, .* got list"):
+        with pytest.raises(
+            TypeError, match=r"^cameras: expected cameras by their names, .* got list"
+        ):
             write(tmp_path / "t.json", [camera])
         with pytest.raises(TypeError, match=r"cameras\['a'\]: expected a Camera, got NoneType"):
             write(tmp_path / "t.json", {"a": None})
@@ -231,7 +245,9 @@ def test_no_camera_and_no_bundle_are_named(bundle, tmp_path):
         v3dg.write_usd(bundle, tmp_path / "nowhere" / "a.usda")
 
 
-@pytest.mark.parametrize(("name", "got"), [("a.sog", "begins with b''"), ("a.glb", "whole, got 0 bytes")])
+@pytest.mark.parametrize(
+    ("name", "got"), [("a.sog", "begins with b''"), ("a.glb", "whole, got 0 bytes")]
+)
 def test_empty_files_are_told_in_our_words(tmp_path, name, got):
     (tmp_path / name).touch()
     with pytest.raises(ValueError, match=f"{name}: expected a .*{got}"):
@@ -259,7 +275,9 @@ def test_nothing_is_guessed_where_nothing_is_alike():
     with pytest.raises(UsageError) as error:
         cli.parse(["xyzzy"])
     assert "perhaps" not in str(error.value)
-    with pytest.raises(UsageError, match="--steps: expected an option of v3dg build, got none; run"):
+    with pytest.raises(
+        UsageError, match="--steps: expected an option of v3dg build, got none; run"
+    ):
         cli.parse(["build", "a.ply", "--steps", "3"])
 
 
@@ -290,6 +308,10 @@ def test_doctor_prints_json(capsys):
     assert cli.main(["doctor", "--json"]) == 0
     parts = json.loads(capsys.readouterr().out)["parts"]
     assert all(
-        (part["found"] is None) == (part["missing"] is not None) for part in parts if part["part"] != "CUDA"
+        (part["found"] is None) == (part["missing"] is not None)
+        for part in parts
+        if part["part"] != "CUDA"
     )
-    assert {"v3dg", "Python", "compiler", "CUDA", "torch", "web browser"} <= {part["part"] for part in parts}
+    assert {"v3dg", "Python", "compiler", "CUDA", "torch", "web browser"} <= {
+        part["part"] for part in parts
+    }

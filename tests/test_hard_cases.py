@@ -81,7 +81,8 @@ def test_gradients_are_those_in_double(torch, device, name):
 
 @pytest.mark.parametrize("name", SMOOTH)
 def test_gradients_in_double_are_autograds(torch, name):
-    """Of the gaussians that are drawn, by a chain of torch operations that knows none of our formulas."""
+    """Of the gaussians that are drawn, by a chain of torch operations that knows none
+    of our formulas."""
     from reference import rasterize_torch
 
     case = hard_cases()[name]
@@ -99,7 +100,8 @@ def test_gradients_in_double_are_autograds(torch, name):
 
 
 def test_maps_keep_their_detail(device):
-    """Details of 10⁻³ at coordinates of 10⁷: an asset of its own frame, placed by an instance."""
+    """Details of 10⁻³ at coordinates of 10⁷: an asset of its own frame, placed by an
+    instance."""
     rng = np.random.default_rng(0)
     asset = scenes_lod.blob(rng, 400, size=0.02, sh_degree=1)
     bundle = scenes_lod.lod_bundle(rng, asset, 64)
@@ -111,14 +113,17 @@ def test_maps_keep_their_detail(device):
     scene.add(bundle, positions=place[None])
     got = v3dg.render(scene, far, tolerance=0.0, depth=True, device=device)
     raster = v3dg.Image(*host((got.color, got.alpha, got.depth)))
-    expected = reference_rasterize.rasterize(asset, near, min_transmittance=DEFAULT_MIN_TRANSMITTANCE)
+    expected = reference_rasterize.rasterize(
+        asset, near, min_transmittance=DEFAULT_MIN_TRANSMITTANCE
+    )
     assert (expected.alpha > 0.5).mean() > 0.3
     assert_pictures_agree(raster, expected, PICTURE_FLOAT)
 
 
 @pytest.mark.parametrize("distance", [1e3, 1e4, 1e5])
 def test_assets_far_from_their_zero_keep_their_detail(device, distance):
-    """Own coordinates of up to 10⁵, and an eye among them, behind an instance that turns and scales."""
+    """Own coordinates of up to 10⁵, and an eye among them, behind an instance that
+    turns and scales."""
     rng = np.random.default_rng(0)
     near = scenes_lod.blob(rng, 400, size=0.5, sh_degree=2)
     center = distance * np.array([0.6, -0.64, 0.48])
@@ -135,7 +140,9 @@ def test_assets_far_from_their_zero_keep_their_detail(device, distance):
     own = v3dg.Camera(viewmat, camera.K, 70, 50, camera.near / scale)
     got = v3dg.render(scene, camera, tolerance=0.0, depth=True, device=device)
     raster = v3dg.Image(*host((got.color, got.alpha, got.depth / scale)))
-    expected = reference_rasterize.rasterize(asset, own, min_transmittance=DEFAULT_MIN_TRANSMITTANCE)
+    expected = reference_rasterize.rasterize(
+        asset, own, min_transmittance=DEFAULT_MIN_TRANSMITTANCE
+    )
     assert (expected.alpha > 0.5).mean() > 0.1
     assert_pictures_agree(raster, expected, PICTURE_FLOAT)
 
@@ -177,7 +184,8 @@ def test_scene_out_of_sight_is_the_background(device, count):
 
 
 def test_more_pairs_than_31_bits_count(torch, device):
-    """Every pixel has stopped long before the 5,000th gaussian, so the others change nothing."""
+    """Every pixel has stopped long before the 5,000th gaussian, so the others change
+    nothing."""
     # 1920 x 1080 in tiles of 32 x 16, or of 32 x 32
     num, tiles = (550_000, 60 * 68) if device == "cuda" else (1_060_000, 60 * 34)
     assert num * tiles > 1 << 31
@@ -197,5 +205,9 @@ def test_more_pairs_than_31_bits_count(torch, device):
     few = v3dg.rasterize(on(device, everywhere.subset(slice(5000))), camera)
     assert few.alpha.min() > 0.999
     many = v3dg.rasterize(on(device, everywhere), camera)
-    for got, expected in ((many.color, few.color), (many.alpha, few.alpha), (many.depth, few.depth)):
+    for got, expected in (
+        (many.color, few.color),
+        (many.alpha, few.alpha),
+        (many.depth, few.depth),
+    ):
         np.testing.assert_array_equal(host(got), host(expected))

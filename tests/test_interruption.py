@@ -1,4 +1,5 @@
-"""Ctrl-C at the moments that are hard, and two builds to one place; fuzz/attack.py tries all others."""
+"""Ctrl-C at the moments that are hard, and two builds to one place; fuzz/attack.py
+tries all others."""
 
 import os
 import signal
@@ -30,7 +31,9 @@ def test_two_builds_to_one_path_do_not_disturb_each_other(tmp_path):
         v3dg.write_asset(folder / "asset.ply", make_asset(num_gaussians=2000, seed=0))
     processes = [started(folder) for folder in (alone, shared, shared)]
     errors = [process.communicate()[1] for process in processes]
-    refused = [error for process, error in zip(processes, errors, strict=True) if process.returncode != 0]
+    refused = [
+        error for process, error in zip(processes, errors, strict=True) if process.returncode != 0
+    ]
     assert len(refused) < 2
     assert all("out.v3dg.partial: another build is using it" in error for error in refused)
     assert (shared / "out.v3dg").read_bytes() == (alone / "out.v3dg").read_bytes()
@@ -38,7 +41,8 @@ def test_two_builds_to_one_path_do_not_disturb_each_other(tmp_path):
 
 
 def run_as_command(code, tmp_path, begin="_start.raise_interrupts()"):
-    """A Python that hears Ctrl-C as commands do, runs the code, and interrupts itself in it."""
+    """A Python that hears Ctrl-C as commands do, runs the code, and interrupts itself
+    in it."""
     (tmp_path / "slow.py").write_text(
         "import os, signal; os.kill(os.getpid(), signal.SIGINT); done = sum(range(10**6))"
     )
@@ -133,4 +137,8 @@ try:
 except KeyboardInterrupt:
     print("heard another")
 """
-    assert run_as_command(code, tmp_path).stdout.split("\n")[:3] == ["cleaned up", "heard", "heard another"]
+    assert run_as_command(code, tmp_path).stdout.split("\n")[:3] == [
+        "cleaned up",
+        "heard",
+        "heard another",
+    ]

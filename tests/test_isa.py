@@ -14,8 +14,14 @@ ISAS = ["baseline", "avx2", "avx512"]
 def run_with_isa(isa: str) -> subprocess.CompletedProcess[str]:
     code = "from v3dg import _core; print(_core.isa())"
     # The parent's search path, so that both use the same v3dg.
-    environment = {**os.environ, "V3DG_ISA": isa, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    environment = {
+        **os.environ,
+        "V3DG_ISA": isa,
+        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+    }
+    return subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
+    )
 
 
 def test_default_is_a_known_isa():

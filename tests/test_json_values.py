@@ -1,6 +1,8 @@
-"""Every value in the JSON of every file that is read, replaced by values of other kinds.
+"""Every value in the JSON of every file that is read, replaced by values of other
+kinds.
 
-Each file is then read, or refused with the ValueError of its reader, in one line that begins with the file.
+Each file is then read, or refused with the ValueError of its reader, in one line that
+begins with the file.
 """
 
 import copy
@@ -19,7 +21,23 @@ from v3dg._json import is_one_line
 
 LONG = "a number of 5,000 digits"  # which stands for one
 ODD = [[], [26], [[]], [None], {}, {"a": 1}, None, True, False, "", "a", "0", "\x1b[31m", LONG]
-ODD += [0, 1, -1, 2, 0.5, -0.0, 1e300, -1e300, 1e-320, 26, 5121, 1 << 31, 1 << 63, -(1 << 63), 10**400]
+ODD += [
+    0,
+    1,
+    -1,
+    2,
+    0.5,
+    -0.0,
+    1e300,
+    -1e300,
+    1e-320,
+    26,
+    5121,
+    1 << 31,
+    1 << 63,
+    -(1 << 63),
+    10**400,
+]
 ERRORS = (ValueError, FileNotFoundError)
 
 
@@ -75,7 +93,9 @@ def glb_kind(folder, compressed):
     def write(text):
         text = text.encode() + b" " * (-len(text) % 4)
         rest = content[20 + size :]
-        header = struct.pack("<IIIII", 0x46546C67, 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
+        header = struct.pack(
+            "<IIIII", 0x46546C67, 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A
+        )
         path.write_bytes(header + text + rest)
 
     return Kind(document, write, v3dg.read_asset, path)
@@ -129,7 +149,9 @@ def kind(request, tmp_path):
         return sog_kind(tmp_path)
     (tmp_path / "made").mkdir()
     name, _, number = request.param.partition(" ")
-    good = streamed(1) if name == "streamed" else good_files(tmp_path / "made")[name][int(number or 0)]
+    good = (
+        streamed(1) if name == "streamed" else good_files(tmp_path / "made")[name][int(number or 0)]
+    )
     read = {"scene": v3dg.read_scene, "cameras": read_cameras}.get(name, read_both)
     return json_kind(tmp_path, good, read)
 
@@ -142,7 +164,9 @@ def test_every_value_of_another_kind_is_named(kind):
             kind.read(kind.path)
         except ERRORS as error:
             text = str(error)
-            if not (kind.path.name in text or kind.path.parent.name in text) or not is_one_line(text):
+            if not (kind.path.name in text or kind.path.parent.name in text) or not is_one_line(
+                text
+            ):
                 faults.append(f"{change}: {text:.200}")
         except Exception as error:
             faults.append(f"{change}: {type(error).__name__}: {error!s:.200}")

@@ -1,4 +1,5 @@
-"""The source tree keeps its layout: what is missing or forgotten in it is named here."""
+"""The source tree keeps its layout: what is missing or forgotten in it is named
+here."""
 
 import ast
 import os
@@ -14,7 +15,8 @@ from v3dg._extras import EXTRAS
 
 ROOT = Path(__file__).parent.parent
 CSRC = ROOT / "csrc"
-# What each folder of csrc/ may include beside itself. A folder includes only what stands before it here.
+# What each folder of csrc/ may include beside itself. A folder includes only what
+# stands before it here.
 MAY_INCLUDE = {
     "base": set(),
     "math": {"base"},
@@ -30,7 +32,17 @@ MAY_INCLUDE = {
     "tile_bin": {"base", "math", "frame"},
     "rasterize": {"base", "math", "frame"},
     "fit_group": {"base", "math", "frame", "project", "tile_bin", "rasterize"},
-    "draw": {"base", "math", "frame", "quantize", "residency", "select", "project", "tile_bin", "rasterize"},
+    "draw": {
+        "base",
+        "math",
+        "frame",
+        "quantize",
+        "residency",
+        "select",
+        "project",
+        "tile_bin",
+        "rasterize",
+    },
     "levels": {
         "base",
         "math",
@@ -66,7 +78,9 @@ TESTED_WITH = {"tile_bin": "rasterize"}
 OPERATIONS = sorted(p.name for p in CSRC.iterdir() if p.is_dir() and p.name not in NOT_OPERATIONS)
 SOURCES = sorted(str(p.relative_to(ROOT)) for p in CSRC.rglob("*") if p.suffix in {".cpp", ".cu"})
 MODULES = sorted((ROOT / "v3dg").rglob("*.py"))
-MEASURING = sorted(p for part in ("evaluation", "worlds") for p in (ROOT / "benchmarks" / part).rglob("*.py"))
+MEASURING = sorted(
+    p for part in ("evaluation", "worlds") for p in (ROOT / "benchmarks" / part).rglob("*.py")
+)
 MOST_LINES_A_FUNCTION = 60
 
 
@@ -101,10 +115,13 @@ def test_headers_are_included_once():
 
 
 def folders_included(folder):
-    """Folders of csrc/ that the sources of one of them include, and which source that is."""
+    """Folders of csrc/ that the sources of one of them include, and which source that
+    is."""
     for path in (CSRC / folder).iterdir():
         if path.suffix in {".h", ".cpp", ".cu", ".cuh"}:
-            for name in re.findall(r'^#include "([^"/]+)/', path.read_text(encoding="utf-8"), re.MULTILINE):
+            for name in re.findall(
+                r'^#include "([^"/]+)/', path.read_text(encoding="utf-8"), re.MULTILINE
+            ):
                 yield name, path
 
 
@@ -137,10 +154,15 @@ def cmake_list(name):
 
 
 def test_host_sources_know_nothing_of_the_cuda_runtime():
-    """What is compiled without CUDA, too, sees CUDA only through the contracts or behind V3DG_WITH_CUDA."""
-    behind_the_flag = re.compile(r"^#if V3DG_WITH_CUDA$.*?^#(?:else|endif)", re.MULTILINE | re.DOTALL)
+    """What is compiled without CUDA, too, sees CUDA only through the contracts or
+    behind V3DG_WITH_CUDA."""
+    behind_the_flag = re.compile(
+        r"^#if V3DG_WITH_CUDA$.*?^#(?:else|endif)", re.MULTILINE | re.DOTALL
+    )
     todo = {
-        CSRC.parent / s for n in ("V3DG_SIMD_SOURCES", "V3DG_SOURCES", "V3DG_BINDINGS") for s in cmake_list(n)
+        CSRC.parent / s
+        for n in ("V3DG_SIMD_SOURCES", "V3DG_SOURCES", "V3DG_BINDINGS")
+        for s in cmake_list(n)
     }
     seen = set()
     while todo:
@@ -158,14 +180,20 @@ def test_kernels_are_started_by_launch_alone():
 
 
 def test_bindings_give_pythons_lock_up_by_a_type_of_ours():
-    """With pybind11's, a thread that Python ends aborts the process (bindings/python_lock.h)."""
+    """With pybind11's, a thread that Python ends aborts the process
+    (bindings/python_lock.h)."""
     pythons = re.compile(r"gil_scoped|PyEval_\w+Thread|PyGILState_Ensure|Py_BEGIN_ALLOW_THREADS")
-    users = [p.name for p in CSRC.rglob("*") if p.is_file() and pythons.search(p.read_text(encoding="utf-8"))]
+    users = [
+        p.name
+        for p in CSRC.rglob("*")
+        if p.is_file() and pythons.search(p.read_text(encoding="utf-8"))
+    ]
     assert sorted(users) == ["python_lock.cpp", "python_lock.h"]
 
 
 def imports_of(path, *, inside_functions):
-    """Modules that a Python file imports, except for type checkers; and the names that it takes from them."""
+    """Modules that a Python file imports, except for type checkers; and the names that
+    it takes from them."""
     names, todo = set(), [ast.parse(path.read_text(encoding="utf-8"))]
     while todo:
         node = todo.pop()
@@ -202,11 +230,15 @@ def rooms_imported(path, rooms):
 def order_of_v3dg():
     """Each after what it imports, as CONTRIBUTING.md promises."""
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    return re.search(r"imports only what stands before it.*?```text\n(.*?)```", text, re.DOTALL)[1].split()
+    return re.search(r"imports only what stands before it.*?```text\n(.*?)```", text, re.DOTALL)[
+        1
+    ].split()
 
 
 def test_every_module_of_v3dg_has_its_place_in_the_order():
-    assert sorted(order_of_v3dg()) == sorted({room_of(module_name(path)) for path in MODULES} | {"_core"})
+    assert sorted(order_of_v3dg()) == sorted(
+        {room_of(module_name(path)) for path in MODULES} | {"_core"}
+    )
 
 
 @pytest.mark.parametrize("path", MODULES, ids=module_name)
@@ -226,7 +258,9 @@ def test_modules_do_not_import_in_a_circle():
     for name, path in modules.items():
         # What a module takes from the package that it is in is another module of it.
         below[name] = {
-            m for m in imports_when_loaded(path) & modules.keys() if not f"{name}.".startswith(f"{m}.")
+            m
+            for m in imports_when_loaded(path) & modules.keys()
+            if not f"{name}.".startswith(f"{m}.")
         }
     while below:
         ready = {name for name, imported in below.items() if not imported & below.keys()}

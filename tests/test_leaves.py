@@ -137,7 +137,9 @@ def test_leaves_on_disk_are_those_in_memory(tmp_path, small, sh_degree):
     small(node=5000, bucket=600)
     with ExitStack() as stack:
         with pytest.warns(cleaning.AssetWarning) as told_again:
-            disk = stack.enter_context(leaves_on_disk(paths, tmp_path / "scratch", memory=0, config=CONFIG))
+            disk = stack.enter_context(
+                leaves_on_disk(paths, tmp_path / "scratch", memory=0, config=CONFIG)
+            )
         assert isinstance(disk, DiskLeaves)
         assert [str(w.message) for w in told] == [str(w.message) for w in told_again]
         for leaves in (memory, disk, pickle.loads(pickle.dumps(disk))):
@@ -148,10 +150,18 @@ def test_leaves_on_disk_are_those_in_memory(tmp_path, small, sh_degree):
             assert list(leaves.dropped) == list(cleaning.examine(read).counts)
             assert leaves.digest == digest_of(read)
             assert_same(leaves.read(0, len(expected)), expected)
-            for first, last in ((0, 0), (0, 1), (599, 1201), (len(expected) - 3, len(expected)), (7, 7)):
+            for first, last in (
+                (0, 0),
+                (0, 1),
+                (599, 1201),
+                (len(expected) - 3, len(expected)),
+                (7, 7),
+            ):
                 assert_same(leaves.read(first, last), expected.subset(slice(first, last)))
         with ThreadPoolExecutor(8) as pool:
-            for i, part in enumerate(pool.map(lambda i: disk.read(i * 1000, i * 1000 + 1000), range(60))):
+            for i, part in enumerate(
+                pool.map(lambda i: disk.read(i * 1000, i * 1000 + 1000), range(60))
+            ):
                 assert_same(part, expected.subset(slice(i * 1000, i * 1000 + 1000)))
     assert not (tmp_path / "scratch").exists()
 
@@ -175,8 +185,12 @@ def test_clusters_larger_than_memory_keep_the_order_of_the_file(tmp_path, small)
     v3dg.write_asset(tmp_path / "a.ply", asset)
     small(node=10, bucket=10)
     config = BuildConfig(cluster_size=300)
-    with leaves_on_disk([tmp_path / "a.ply"], tmp_path / "scratch", memory=0, config=config) as leaves:
-        assert_same(leaves.read(0, 1000), in_split_order(v3dg.read_asset(tmp_path / "a.ply"), config))
+    with leaves_on_disk(
+        [tmp_path / "a.ply"], tmp_path / "scratch", memory=0, config=config
+    ) as leaves:
+        assert_same(
+            leaves.read(0, 1000), in_split_order(v3dg.read_asset(tmp_path / "a.ply"), config)
+        )
         assert_same(
             leaves.read(200, 501),
             in_split_order(v3dg.read_asset(tmp_path / "a.ply"), config).subset(slice(200, 501)),
@@ -186,7 +200,9 @@ def test_clusters_larger_than_memory_keep_the_order_of_the_file(tmp_path, small)
 def test_an_asset_that_fits_makes_no_scratch(tmp_path):
     asset = some_asset(1000, 1)
     v3dg.write_asset(tmp_path / "a.ply", asset)
-    with leaves_on_disk([tmp_path / "a.ply"], tmp_path / "s", memory=PLENTY, config=CONFIG) as leaves:
+    with leaves_on_disk(
+        [tmp_path / "a.ply"], tmp_path / "s", memory=PLENTY, config=CONFIG
+    ) as leaves:
         assert isinstance(leaves, MemoryLeaves)
         assert not (tmp_path / "s").exists()
         assert_same(leaves.read(0, 1000), in_split_order(v3dg.read_asset(tmp_path / "a.ply")))
@@ -223,7 +239,9 @@ def test_lower_degrees_get_zeros(tmp_path, small):
 
 def every_kind(folder, asset):
     """Files of all kinds that can be written here, and of some that cannot."""
-    paths = [folder / name for name in ("a.ply", "b.compressed.ply", "c.spz", "d.sog", "e.splat", "f.pt")]
+    paths = [
+        folder / name for name in ("a.ply", "b.compressed.ply", "c.spz", "d.sog", "e.splat", "f.pt")
+    ]
     for path in paths[:4]:
         v3dg.write_asset(path, asset)
     records = np.zeros(
@@ -234,7 +252,12 @@ def every_kind(folder, asset):
     paths[4].write_bytes(records.tobytes())
     torch = pytest.importorskip("torch")
     g = asset.torch()
-    tensors = {"means": g.means, "scales": g.scales.log(), "quats": g.quats, "opacities": g.opacities.logit()}
+    tensors = {
+        "means": g.means,
+        "scales": g.scales.log(),
+        "quats": g.quats,
+        "opacities": g.opacities.logit(),
+    }
     torch.save({"splats": {**tensors, "sh0": g.sh[:, :1], "shN": g.sh[:, 1:]}}, paths[5])
     return paths
 
@@ -244,12 +267,24 @@ def test_files_are_read_in_any_runs_of_rows(tmp_path, sh_degree):
     for encoding in ("ascii", "binary_big_endian"):
         asset = some_asset(1500, sh_degree)
         v3dg.write_asset(tmp_path / f"{encoding}.ply", asset, encoding=encoding)
-    paths = [*every_kind(tmp_path, asset), tmp_path / "ascii.ply", tmp_path / "binary_big_endian.ply"]
+    paths = [
+        *every_kind(tmp_path, asset),
+        tmp_path / "ascii.ply",
+        tmp_path / "binary_big_endian.ply",
+    ]
     for path in paths:
         whole = v3dg.read_asset(path)
         file = open_asset(path)
         assert (file.num_gaussians, file.sh_degree) == (len(whole), whole.sh_degree)
-        for first, last in ((0, 0), (0, 700), (700, 701), (701, 1500), (3, 5), (255, 513), (1500, 1500)):
+        for first, last in (
+            (0, 0),
+            (0, 700),
+            (700, 701),
+            (701, 1500),
+            (3, 5),
+            (255, 513),
+            (1500, 1500),
+        ):
             assert_same(file.read(first, last), whole.subset(slice(first, last)))
 
 
@@ -260,7 +295,9 @@ def test_rows_with_lists_are_read_in_runs(tmp_path):
     head, mark, rows = path.read_bytes().partition(b"end_header\n")
     records = np.frombuffer(rows, np.uint8).reshape(900, -1)
     lists = [bytes([i % 5]) + bytes(i % 5) + row.tobytes() for i, row in enumerate(records)]
-    head = head.replace(b"property float x\n", b"property list uchar uchar tags\nproperty float x\n")
+    head = head.replace(
+        b"property float x\n", b"property list uchar uchar tags\nproperty float x\n"
+    )
     (tmp_path / "lists.ply").write_bytes(head + mark + b"".join(lists))
     whole, file = v3dg.read_asset(path), open_asset(tmp_path / "lists.ply")
     for first, last in ((0, 300), (300, 301), (301, 900), (10, 20), (500, 900)):
@@ -313,7 +350,9 @@ def test_wrong_values_can_be_refused(tmp_path, small):
             [tmp_path / "a.ply"], tmp_path / "s", memory=0, config=CONFIG, unusable="refuse"
         ).__enter__(),
     ):
-        with pytest.raises(ValueError, match="expected gaussians that can be drawn, got others: 1 of 50"):
+        with pytest.raises(
+            ValueError, match="expected gaussians that can be drawn, got others: 1 of 50"
+        ):
             leaves()
 
 
@@ -330,7 +369,9 @@ def test_too_little_memory_is_told_before_work_begins(tmp_path):
 def test_a_file_that_must_be_read_whole_says_what_it_takes(tmp_path):
     v3dg.write_asset(tmp_path / "a.spz", some_asset(400_000))
     with (
-        pytest.raises(ValueError, match=r"memory: expected at least \d+ MiB for .*a.spz, whose format"),
+        pytest.raises(
+            ValueError, match=r"memory: expected at least \d+ MiB for .*a.spz, whose format"
+        ),
         leaves_on_disk([tmp_path / "a.spz"], tmp_path / "s", memory=100 << 20, config=CONFIG),
     ):
         pass
@@ -348,7 +389,9 @@ def test_too_small_a_disk_is_told_before_work_begins(tmp_path, small, monkeypatc
     assert not (tmp_path / "s").exists()
 
 
-@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()]
+)
 @pytest.mark.parametrize("writes", [0, 1, 2, 3, 5, 40])
 def test_an_error_leaves_no_scratch(tmp_path, small, monkeypatch, error, writes):
     v3dg.write_asset(tmp_path / "a.ply", some_asset(1000))
@@ -385,7 +428,9 @@ def test_files_that_change_meanwhile_are_found(tmp_path, small, monkeypatch):
 
     monkeypatch.setattr(external_split, "split", meanwhile)
     with (
-        pytest.raises(ValueError, match=r"a.ply: expected a file that does not change while it is read"),
+        pytest.raises(
+            ValueError, match=r"a.ply: expected a file that does not change while it is read"
+        ),
         leaves_on_disk([path], tmp_path / "s", memory=0, config=CONFIG),
     ):
         pass
@@ -449,7 +494,12 @@ def child(folder, memory, paths, end="pass"):
 
 @pytest.mark.parametrize(
     ("suffix", "sh_degree", "mib", "mib_for_all"),
-    [(".ply", 0, 64, 180), (".ply", 3, 200, 500), (".compressed.ply", 3, 200, 500), (".spz", 0, 110, 230)],
+    [
+        (".ply", 0, 64, 180),
+        (".ply", 3, 200, 500),
+        (".compressed.ply", 3, 200, 500),
+        (".spz", 0, 110, 230),
+    ],
 )
 def test_peak_memory_is_what_was_given(tmp_path, suffix, sh_degree, mib, mib_for_all):
     paths = [tmp_path / f"{i}{suffix}" for i in range(3)]
@@ -475,7 +525,9 @@ def test_scratch_of_a_killed_build_is_removed_by_the_next(tmp_path):
     process.stdout.close()
     assert (tmp_path / "s" / "rows").exists()
     v3dg.write_asset(tmp_path / "b.ply", some_asset(10))
-    with leaves_on_disk([tmp_path / "b.ply"], tmp_path / "s", memory=PLENTY, config=CONFIG) as leaves:
+    with leaves_on_disk(
+        [tmp_path / "b.ply"], tmp_path / "s", memory=PLENTY, config=CONFIG
+    ) as leaves:
         assert leaves.num_gaussians == 10
         assert not (tmp_path / "s" / "rows").exists()
     assert not (tmp_path / "s").exists()

@@ -1,4 +1,5 @@
-"""What all readers and writers of files have in common: whatever lies there, an error says what and where.
+"""What all readers and writers of files have in common: whatever lies there, an error
+says what and where.
 
 Damage that only one format can have is in the tests of that format.
 """
@@ -44,7 +45,9 @@ def read_asset(path):
     def read_in_parts(path):
         file = open_asset(path)
         cuts = [0, file.num_gaussians // 2, file.num_gaussians]
-        return Gaussians.concatenate([file.read(first, last) for first, last in itertools.pairwise(cuts)])
+        return Gaussians.concatenate(
+            [file.read(first, last) for first, last in itertools.pairwise(cuts)]
+        )
 
     try:
         whole = v3dg.read_asset(path)
@@ -93,7 +96,11 @@ READERS = {
     "compressed ply": ("a.ply", lambda folder: written(folder / "w.compressed.ply"), read_asset),
     "spz": ("a.spz", lambda folder: written(folder / "w.spz"), read_asset),
     "spz 4": ("a.spz", lambda _: (FIXTURES / "sh3_v4.spz").read_bytes(), read_asset),
-    "ksplat": ("a.ksplat", lambda _: (FIXTURES / "sh3_mkkellogg_2.ksplat").read_bytes(), read_asset),
+    "ksplat": (
+        "a.ksplat",
+        lambda _: (FIXTURES / "sh3_mkkellogg_2.ksplat").read_bytes(),
+        read_asset,
+    ),
     "sog": ("a.sog", lambda _: (FIXTURES / "sh3.sog").read_bytes(), read_asset),
     "glb": ("a.glb", lambda folder: written(folder / "w.glb"), read_asset),
     "hier": ("a.hier", lambda _: hier_of(OF_DEGREE_3, half=False), read_asset),
@@ -235,7 +242,8 @@ def test_every_truncation_is_refused(tmp_path, reader):
     good = content(tmp_path)
     # The last number of a text is still a number when its last digits are gone.
     last = good.rfind(b" ") + 1 if reader == "ply" else len(good)
-    # Every offset of a bundle is in its own tests, and of the others most bytes are not looked at.
+    # Every offset of a bundle is in its own tests, and of the others most bytes are not
+    # looked at.
     step = {"bundle": 37, "sog": 37, "ksplat": 37, "checkpoint": 37}.get(reader, 1)
     for size in range(0, last, step):
         (tmp_path / name).write_bytes(good[:size])
@@ -268,7 +276,10 @@ JSON_TEXTS = {
     "an unknown escape": (rb'{"a": "\x41"}', "Invalid \\escape"),
     "two documents": (b"{} {}", "Extra data"),
     "a leading zero": (b'{"a": 01}', "Expecting ',' delimiter"),
-    "more digits than are safe": (b'{"a": ' + b"9" * 10_000 + b"}", "got a file that does not parse"),
+    "more digits than are safe": (
+        b'{"a": ' + b"9" * 10_000 + b"}",
+        "got a file that does not parse",
+    ),
     "bytes that are no UTF-8": (b'{"a": "\xff"}', "can't decode byte 0xff"),
     "UTF-8 of a surrogate": (b'{"a": "\xed\xa0\x80"}', "can't decode byte 0xed"),
     "overlong UTF-8": (b'{"a": "\xc0\xaf"}', "can't decode byte 0xc0"),
@@ -293,9 +304,21 @@ SURROGATE = "\ud800"
 @pytest.mark.parametrize(
     ("place", "value", "message"),
     [
-        (["bundles", "donut"], SURROGATE, "bundles.donut: expected a string without control characters"),
-        (["cameras", 0, "name"], SURROGATE, "cameras[0].name: expected a string without control characters"),
-        (["cameras", 0, "name"], "a\nb", "cameras[0].name: expected a string without control characters"),
+        (
+            ["bundles", "donut"],
+            SURROGATE,
+            "bundles.donut: expected a string without control characters",
+        ),
+        (
+            ["cameras", 0, "name"],
+            SURROGATE,
+            "cameras[0].name: expected a string without control characters",
+        ),
+        (
+            ["cameras", 0, "name"],
+            "a\nb",
+            "cameras[0].name: expected a string without control characters",
+        ),
         (["a\nb"], 3, '"a\\nb": expected one of format, version, bundles, instances, cameras'),
         (["a" * 99], 3, f'"{"a" * 56}...: expected one of format, version'),
         (["version"], True, "version: expected 1"),
@@ -322,19 +345,31 @@ def test_extreme_values_of_a_scene_are_refused(tmp_path, place, value, message):
 
 CLAIMS = {
     "gaussians": ("a.ply", ply_header(*vertex_lines(10**12))),
-    "gaussians as text": ("a.ply", ply_header(*vertex_lines(10**12), format_line="format ascii 1.0")),
+    "gaussians as text": (
+        "a.ply",
+        ply_header(*vertex_lines(10**12), format_line="format ascii 1.0"),
+    ),
     "list items": (
         "a.ply",
-        ply_header("element face 1", "property list uint double n", *vertex_lines(0)) + b"\xff" * 40,
+        ply_header("element face 1", "property list uint double n", *vertex_lines(0))
+        + b"\xff" * 40,
     ),
-    "rows of another element": ("a.ply", ply_header("element face 99999999999999", "property int a")),
+    "rows of another element": (
+        "a.ply",
+        ply_header("element face 99999999999999", "property int a"),
+    ),
     "header bytes of a bundle": ("a.v3dg", (1 << 40).to_bytes(8, "little") + bytes(100)),
     "clusters": (
         "a.v3dg",
         (lambda text: len(text).to_bytes(8, "little") + text)(
             json.dumps(
                 {
-                    "__metadata__": {"format": "v3dg", "version": "1", "sh_degree": "0", "config": "{}"},
+                    "__metadata__": {
+                        "format": "v3dg",
+                        "version": "1",
+                        "sh_degree": "0",
+                        "config": "{}",
+                    },
                     **{
                         name: {"dtype": "U8", "shape": [1 << 40], "data_offsets": [0, 1 << 40]}
                         for name in ("pages", "clusters.level", "groups.parent", "pages.bytes")
@@ -375,8 +410,13 @@ def test_nothing_that_is_read_can_be_executed():
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
                 names.add(node.func.id)
             assert not names & forbidden, f"{path.name}, line {node.lineno}"
-            is_load = isinstance(node, ast.Call) and ast.unparse(node.func) in ("np.load", "torch.load")
-            assert not is_load or "weights_only=True" in ast.unparse(node), f"{path.name}, line {node.lineno}"
+            is_load = isinstance(node, ast.Call) and ast.unparse(node.func) in (
+                "np.load",
+                "torch.load",
+            )
+            assert not is_load or "weights_only=True" in ast.unparse(node), (
+                f"{path.name}, line {node.lineno}"
+            )
 
 
 ASSET = random_gaussians(np.random.default_rng(0), 200)
@@ -444,6 +484,7 @@ def test_a_full_disk_is_named_and_leaves_what_was_there(tmp_path, writer, num_by
 
 
 def test_enough_is_tried():
-    """Two hundred broken inputs at the least, not counting changed bytes and truncations."""
+    """Two hundred broken inputs at the least, not counting changed bytes and
+    truncations."""
     here = len(READERS) * (len(CONTENTS) + len(PLACES) + 4) + 2 * len(JSON_TEXTS) + len(CLAIMS)
     assert here + len(HOSTILE) > 200

@@ -12,11 +12,14 @@ def picture(seed, height=40, width=56):
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[0:height, 0:width] / 10
     waves = np.stack([np.sin(x + k) * np.cos(y - 2 * k) for k in range(3)], -1)
-    return np.clip(0.5 + 0.3 * waves + 0.05 * rng.standard_normal(waves.shape), 0, 1).astype(np.float32)
+    return np.clip(0.5 + 0.3 * waves + 0.05 * rng.standard_normal(waves.shape), 0, 1).astype(
+        np.float32
+    )
 
 
 def ssim_by_windows(a, b):
-    """SSIM by its definition: one weighted 11x11 window after another, mirrored at the border, in double."""
+    """SSIM by its definition: one weighted 11x11 window after another, mirrored at the
+    border, in double."""
     offsets = np.arange(-5, 6)
     window = np.exp(-(offsets[:, None] ** 2 + offsets[None] ** 2) / (2 * 1.5**2))
     window = (window / window.sum())[:, :, None]
@@ -26,7 +29,10 @@ def ssim_by_windows(a, b):
         for j in range(a.shape[1] - 10):
             p, q = a[i : i + 11, j : j + 11], b[i : i + 11, j : j + 11]
             mean_p, mean_q = (window * p).sum((0, 1)), (window * q).sum((0, 1))
-            var_p, var_q = (window * (p - mean_p) ** 2).sum((0, 1)), (window * (q - mean_q) ** 2).sum((0, 1))
+            var_p, var_q = (
+                (window * (p - mean_p) ** 2).sum((0, 1)),
+                (window * (q - mean_q) ** 2).sum((0, 1)),
+            )
             cov = (window * (p - mean_p) * (q - mean_q)).sum((0, 1))
             values.append(
                 (2 * mean_p * mean_q + 1e-4)
@@ -128,8 +134,18 @@ def test_box_downsample_keeps_torch():
     [
         ([[0.0]], np.zeros((8, 8, 3)), TypeError, "reference: expected a NumPy array"),
         (np.zeros((8, 8)), np.zeros((8, 8)), ValueError, r"reference: expected shape \(H, W, 3\)"),
-        (np.zeros((8, 8, 3)), np.zeros((8, 9, 3)), ValueError, "test: expected the reference's shape"),
-        (np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8, 3)), ValueError, "divide 8-bit pictures by 255"),
+        (
+            np.zeros((8, 8, 3)),
+            np.zeros((8, 9, 3)),
+            ValueError,
+            "test: expected the reference's shape",
+        ),
+        (
+            np.zeros((8, 8, 3), np.uint8),
+            np.zeros((8, 8, 3)),
+            ValueError,
+            "divide 8-bit pictures by 255",
+        ),
         (np.zeros((0, 8, 3)), np.zeros((0, 8, 3)), ValueError, "at least one pixel"),
     ],
 )
@@ -170,4 +186,6 @@ def test_truth_clips_samples_before_it_averages_them():
     samples = render(bright, camera.scaled(2), tolerance=0, device="cpu").color
     assert samples.max() > 2
     expected = metrics.box_downsample(np.clip(samples, 0, 1), 2)
-    np.testing.assert_array_equal(metrics.draw_truth(bright, camera, device="cpu"), to_8bit(expected))
+    np.testing.assert_array_equal(
+        metrics.draw_truth(bright, camera, device="cpu"), to_8bit(expected)
+    )

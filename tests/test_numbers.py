@@ -1,4 +1,5 @@
-"""Every number that users pass: used, or refused in one line that names it; no cast, crash or warning."""
+"""Every number that users pass: used, or refused in one line that names it; no cast,
+crash or warning."""
 
 import inspect
 import math
@@ -40,7 +41,8 @@ def exported(write, **given):
         write(BUNDLE, folder, **given)
 
 
-# Each function with arguments that are right; those that are numbers, or arrays of them, are tried.
+# Each function with arguments that are right; those that are numbers, or arrays of
+# them, are tried.
 CALLS = {
     "refine_bundle": (
         lambda **numbers: v3dg.refine_bundle(BUNDLE, device="cpu", progress=False, **numbers),
@@ -84,7 +86,10 @@ CALLS = {
         lambda **given: scene_of_two().set_importance(**given),
         {"importance": 1.0, "ids": [0]},
     ),
-    "select": (lambda **given: v3dg.select(BUNDLE, CAMERA, device="cpu", **given), options(fade=1.05)),
+    "select": (
+        lambda **given: v3dg.select(BUNDLE, CAMERA, device="cpu", **given),
+        options(fade=1.05),
+    ),
     "render": (
         lambda **given: v3dg.render(BUNDLE, CAMERA, device="cpu", **given).stats,
         options(fade=1.05, background=(0, 0, 0), min_transmittance=0.001),
@@ -111,7 +116,10 @@ CALLS = {
         {"quaternion": (1, 0, 0, 0), "position": (1, 2, 3), "scale": 2.0},
     ),
     "write_site": (lambda **given: exported(v3dg.write_site, **given), {"chunk": 1 << 20}),
-    "write_streamed_sog": (lambda **given: exported(v3dg.write_streamed_sog, **given), {"chunk": 1 << 20}),
+    "write_streamed_sog": (
+        lambda **given: exported(v3dg.write_streamed_sog, **given),
+        {"chunk": 1 << 20},
+    ),
     "Selection.gaussians": (
         lambda **given: selection().gaussians(device="cpu", **given),
         {"origin": (0, 0, 0)},
@@ -120,7 +128,16 @@ CALLS = {
 VALUES = [
     *(2**31, 2**32, 2**63, 2**64, 2**128, 10**400, -(2**64), -(10**400)),
     *(1e39, 1e300, -1e300, 5e-324, math.inf, -math.inf, math.nan),
-    *(1j, "many", b"\n", np.float64(1e300), np.array([1.0, 2.0]), np.ones((2, 2)) + 1j, None, object()),
+    *(
+        1j,
+        "many",
+        b"\n",
+        np.float64(1e300),
+        np.array([1.0, 2.0]),
+        np.ones((2, 2)) + 1j,
+        None,
+        object(),
+    ),
 ]
 
 
@@ -146,7 +163,11 @@ def test_number_is_used_or_named(name, argument):
                 call(**given)
         except (ValueError, IndexError) as error:
             text = str(error)
-            problem = None if re.search(rf"\b{argument}\b", text.split(": expected")[0]) else "is not named"
+            problem = (
+                None
+                if re.search(rf"\b{argument}\b", text.split(": expected")[0])
+                else "is not named"
+            )
             problem = "has many lines" if "\n" in text else problem
         except Exception as error:
             problem, text = f"ends in {type(error).__name__}", str(error)

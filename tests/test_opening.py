@@ -1,4 +1,5 @@
-"""Opening bundles: tables are read and hashed while they are looked at, and several files at once."""
+"""Opening bundles: tables are read and hashed while they are looked at, and several
+files at once."""
 
 import os
 
@@ -116,11 +117,14 @@ def test_damage_of_large_tables_is_found_wherever_it_is(large, tmp_path):
     data = bytearray(large.read_bytes())
     start = 8 + int.from_bytes(data[:8], "little") + 120_000 * 56 + -(120_000 * 56) % 4096
     path = tmp_path / "damaged.v3dg"
-    # Values that every check lets pass: a bit of a box, of the hash of a page, and of the file's own hash.
+    # Values that every check lets pass: a bit of a box, of the hash of a page, and of
+    # the file's own hash.
     for place in (start + 8 * 120_001 + 12 * 120_000 + 1_000_000, len(data) - 20, len(data) - 1):
         data[place] ^= 1
         path.write_bytes(data)
-        with pytest.raises(ValueError, match=r"damaged\.v3dg: hash: the header and tables do not match it"):
+        with pytest.raises(
+            ValueError, match=r"damaged\.v3dg: hash: the header and tables do not match it"
+        ):
             Bundle.open(path)
         data[place] ^= 1
     for end in (len(data) - 1, len(data) - (3 << 20)):
@@ -137,7 +141,9 @@ def test_damage_is_called_damage_where_a_table_cannot_be(tmp_path):
     place = bytes(data).index(bundle.clusters.offset.tobytes())
     data[place] ^= 1  # the first offset is 0
     path.write_bytes(data)
-    with pytest.raises(ValueError, match=r"damaged\.v3dg: hash: the header and tables do not match it"):
+    with pytest.raises(
+        ValueError, match=r"damaged\.v3dg: hash: the header and tables do not match it"
+    ):
         Bundle.open(path)
 
 
@@ -179,8 +185,12 @@ def test_a_scene_file_has_its_bundles_once_and_by_name(tmp_path):
     for number, bundle in enumerate(bundles):
         bundle.write(tmp_path / f"{number}.v3dg")
     scene = v3dg.Scene()
-    scene.add([Bundle.open(tmp_path / f"{number % 6}.v3dg") for number in range(6)], np.zeros((6, 3)))
+    scene.add(
+        [Bundle.open(tmp_path / f"{number % 6}.v3dg") for number in range(6)], np.zeros((6, 3))
+    )
     v3dg.write_scene(tmp_path / "scene.json", scene, [f"{number % 3}.v3dg" for number in range(6)])
     opened = v3dg.open(tmp_path / "scene.json")
-    assert [bundle.path for bundle in opened.bundles] == [str(tmp_path / f"{n}.v3dg") for n in range(3)]
+    assert [bundle.path for bundle in opened.bundles] == [
+        str(tmp_path / f"{n}.v3dg") for n in range(3)
+    ]
     assert opened.instance_bundle.tolist() == [0, 1, 2, 0, 1, 2]

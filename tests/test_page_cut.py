@@ -1,4 +1,5 @@
-"""The cut of a scene of which only some pages are resident: exact, and it tells what it misses."""
+"""The cut of a scene of which only some pages are resident: exact, and it tells what it
+misses."""
 
 import numpy as np
 import pytest
@@ -39,7 +40,9 @@ def scene_of(rng, *, sh_degree=0):
     """Instances of two bundles: one as a build lays it out, and a tree of any shape."""
     asset = blob(rng, int(rng.integers(1, 400)), sh_degree=sh_degree)
     scene = random_scene(rng, lod_bundle(rng, asset, int(rng.integers(2, 30))), 5)
-    tree = random_bundle(int(rng.integers(1 << 30)), num_levels=int(rng.integers(1, 6)), sh_degree=sh_degree)
+    tree = random_bundle(
+        int(rng.integers(1 << 30)), num_levels=int(rng.integers(1, 6)), sh_degree=sh_degree
+    )
     scene.add(tree, positions=rng.normal(size=(3, 3)), importance=np.float32(rng.uniform(0.1, 10)))
     return scene
 
@@ -77,7 +80,9 @@ def test_pages_that_fade_in_before_those_above_them_would_be_counted():
         scene, camera, tolerance, _ = random_batch(bundle, rng, 200)
         core = resident_scene(scene, [shift], begins=[begins])
         cut = core.select(camera.core, rule(tolerance, fade=1.3, cull=False, frame=8))
-        wrong += count_wrong(cut.instance_ids, cut.cluster_ids, 200, number, whole, parts_of(cut.weights))
+        wrong += count_wrong(
+            cut.instance_ids, cut.cluster_ids, 200, number, whole, parts_of(cut.weights)
+        )
     assert wrong > 100
 
 
@@ -106,7 +111,8 @@ def test_groups_are_refined_as_far_as_their_pages_have_faded_in(seed, fade):
         refined = np.minimum(ramp, (arrived(begins[b], frame) * there[b])[:-1])
         clusters, mine = scene.bundles[b].clusters, cut.instance_ids == i
         expected = (
-            np.append(refined, 1.0)[clusters.parent_group] - np.append(refined, 0.0)[clusters.own_group]
+            np.append(refined, 1.0)[clusters.parent_group]
+            - np.append(refined, 0.0)[clusters.own_group]
         )
         weights = np.zeros(len(clusters))
         weights[cut.cluster_ids[mine]] = cut.weights[mine]
@@ -125,7 +131,9 @@ def test_violations_would_be_counted(fade):
     wrong = 0
     for _ in range(10):
         scene, camera, tolerance, _ = random_batch(bundle, rng, 200)
-        cut = resident_scene(scene, [shift]).select(camera.core, rule(tolerance, fade=fade, cull=False))
+        cut = resident_scene(scene, [shift]).select(
+            camera.core, rule(tolerance, fade=fade, cull=False)
+        )
         parts = None if fade is None else parts_of(cut.weights)
         wrong += count_wrong(cut.instance_ids, cut.cluster_ids, 200, number, whole, parts)
     assert wrong > 100
@@ -139,7 +147,9 @@ def test_cut_refines_what_is_wanted_and_there(seed):
     camera, min_level = random_camera(rng), int(rng.integers(0, 3))
     tolerance = a_tolerance(rng, scene, camera)
     there, shifts = partly_there(rng, scene)
-    cut = resident_scene(scene, shifts).select(camera.core, rule(tolerance, None, min_level, cull=False))
+    cut = resident_scene(scene, shifts).select(
+        camera.core, rule(tolerance, None, min_level, cull=False)
+    )
     expected = []
     for i, metrics in enumerate(group_metrics(scene, camera)):
         b = scene.instance_bundle[i]
@@ -172,7 +182,9 @@ def test_loading_what_is_missing_leads_to_the_cut_of_all_pages(seed, has_budget,
     asked = [np.zeros(len(shift), bool) for shift in shifts]
     for _ in range(100):
         needs = core.page_needs(camera.core, rule(**options))
-        missing = [np.flatnonzero((n > 1) & (s == ABSENT)) for n, s in zip(needs, shifts, strict=True)]
+        missing = [
+            np.flatnonzero((n > 1) & (s == ABSENT)) for n, s in zip(needs, shifts, strict=True)
+        ]
         if not any(map(len, missing)):
             break
         for ever, pages in zip(asked, missing, strict=True):
@@ -187,7 +199,8 @@ def test_loading_what_is_missing_leads_to_the_cut_of_all_pages(seed, has_budget,
     np.testing.assert_array_equal(cut.instance_ids, whole.instance_ids)
     np.testing.assert_array_equal(cut.cluster_ids, whole.cluster_ids)
     np.testing.assert_array_equal(weights_of(cut), whole.weights)
-    # What was missed is still needed, or is above what nearly is. Else it would go, and be missed again.
+    # What was missed is still needed, or is above what nearly is. Else it would go, and
+    # be missed again.
     for bundle, ever, need in zip(scene.bundles, asked, needs, strict=True):
         above = np.append(bundle.groups.parent, -1)  # of the coarsest page nothing is
         needed = np.zeros(len(ever), bool)
@@ -226,10 +239,18 @@ def test_all_pages_are_as_good_as_no_table(device):
     for _ in range(10):
         scene = scene_of(rng)
         camera = random_camera(rng)
-        shifts = [random_shift(rng, b, np.ones(max(b.num_pages, 1), bool))[0] for b in scene.bundles]
+        shifts = [
+            random_shift(rng, b, np.ones(max(b.num_pages, 1), bool))[0] for b in scene.bundles
+        ]
         core = resident_scene(scene, shifts, device)
         tolerance = a_tolerance(rng, scene, camera)
-        for options in ({}, {"budget": 300}, {"min_level": 1}, {"fade": 1.3}, {"fade": 1.3, "budget": 300}):
+        for options in (
+            {},
+            {"budget": 300},
+            {"min_level": 1},
+            {"fade": 1.3},
+            {"fade": 1.3, "budget": 300},
+        ):
             try:
                 whole = select(scene, camera, tolerance=tolerance, device=device, **options)
             except ValueError:
@@ -264,7 +285,8 @@ def test_both_devices_choose_the_same_of_what_is_there():
 
 @pytest.mark.parametrize("fade", [None, 1.5])
 def test_pages_are_drawn_from_wherever_they_lie(device, fade):
-    """The same cut of the same pages, in order and in any order with other rows in between."""
+    """The same cut of the same pages, in order and in any order with other rows in
+    between."""
     rng = np.random.default_rng(2)
     for _ in range(5):
         scene = Scene()
@@ -293,7 +315,8 @@ def moved_rows(bundle, shift, num_rows):
     """The bundle's gaussians at their places; what is in between is poison."""
     count = max(num_rows, bundle.num_gaussians)
     arrays = {
-        n: np.full((count, *a.shape[1:]), np.nan, np.float32) for n, a in vars(bundle.gaussians).items()
+        n: np.full((count, *a.shape[1:]), np.nan, np.float32)
+        for n, a in vars(bundle.gaussians).items()
     }
     first, length = page_rows(bundle)
     for page in np.flatnonzero(shift != ABSENT):
@@ -308,7 +331,10 @@ def test_wrong_shape_of_pages_is_refused():
     bundle = random_bundle(0)
     with pytest.raises(ValueError, match="page_shift"):
         _core.ClusterTable(
-            **vars(bundle.clusters) | {n: getattr(bundle.groups, n) for n in ("ball", "weight", "level")},
+            **vars(bundle.clusters)
+            | {n: getattr(bundle.groups, n) for n in ("ball", "weight", "level")},
             page_shift=np.zeros(2, np.int64),
         )
-    assert residency.scene(bundle, CPU).core.page_needs(random_camera(np.random.default_rng(0)).core, rule())
+    assert residency.scene(bundle, CPU).core.page_needs(
+        random_camera(np.random.default_rng(0)).core, rule()
+    )

@@ -16,16 +16,23 @@ from v3dg.metrics import has_flip
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """An object with levels of another tool and of its makers, and the same asset as a scene."""
+    """An object with levels of another tool and of its makers, and the same asset as a
+    scene."""
     folder = tmp_path_factory.mktemp("pairs")
     asset = make_person(2000, seed=3)
     v3dg.write_asset(folder / "thing.ply", asset)
     v3dg.write_asset(folder / "half.ply", asset.subset(np.arange(0, 2000, 2)))
     (folder / "peers" / "thing").mkdir(parents=True)
-    pairs_subject.pack_level(folder / "peers" / "thing" / "d_12.5.npz", asset.subset(np.arange(0, 2000, 8)))
+    pairs_subject.pack_level(
+        folder / "peers" / "thing" / "d_12.5.npz", asset.subset(np.arange(0, 2000, 8))
+    )
     (folder / "peers" / "place").mkdir()
-    pairs_subject.pack_level(folder / "peers" / "place" / "d_12.5.npz", asset.subset(np.arange(3, 2000, 8)))
-    camera = v3dg.Camera.look_at((3, 0, 1), asset.means.mean(axis=0), fov_x=0.5, width=120, height=60)
+    pairs_subject.pack_level(
+        folder / "peers" / "place" / "d_12.5.npz", asset.subset(np.arange(3, 2000, 8))
+    )
+    camera = v3dg.Camera.look_at(
+        (3, 0, 1), asset.means.mean(axis=0), fov_x=0.5, width=120, height=60
+    )
     v3dg.write_cameras(folder / "cameras.json", {"near": camera, "other": camera})
     about = {
         "thing": {
@@ -64,7 +71,8 @@ def test_level_is_at_home_at_two_px2_of_the_ball_a_gaussian(folder):
     thing = subject(folder, "thing")
     for factor in (1, 4):
         for size in thing.sizes(300, factor, widest=1 << 20):
-            # The ball touches the sides of the picture: its footprint is the disc in it, seen from near by.
+            # The ball touches the sides of the picture: its footprint is the disc in
+            # it, seen from near by.
             half = size.camera.width / 2
             angle = math.atan(half / size.camera.fx)
             footprint = 2 * math.pi * (1 - math.cos(angle)) * size.camera.fx**2
@@ -84,7 +92,9 @@ def test_scene_is_drawn_at_two_px2_of_the_picture_a_gaussian(folder):
 def test_window_shows_a_part_of_the_picture(folder):
     thing = subject(folder, "thing")
     for size in thing.sizes(300, 8, widest=40):
-        whole, part = (v3dg.rasterize(thing.asset, camera).color for camera in (size.camera, size.window))
+        whole, part = (
+            v3dg.rasterize(thing.asset, camera).color for camera in (size.camera, size.window)
+        )
         x, y = (size.camera.K - size.window.K)[:2, 2].astype(int)
         assert part.shape[:2] == (40, 40)
         assert part.max() > 0
@@ -93,7 +103,9 @@ def test_window_shows_a_part_of_the_picture(folder):
 
 @pytest.fixture(scope="module")
 def merged(folder):
-    return v3dg.build_bundle(v3dg.read_asset(folder / "thing.ply"), config=v3dg.BuildConfig(steps=0))
+    return v3dg.build_bundle(
+        v3dg.read_asset(folder / "thing.ply"), config=v3dg.BuildConfig(steps=0)
+    )
 
 
 @pytest.mark.parametrize("count", [1900, 300, 40, 6])
@@ -149,10 +161,13 @@ def test_study_compares_at_equal_counts(folder, tmp_path):
             assert rows["place", "d", "12.5 %, d", factor]["gaussians"] == in_picture
             assert rows["place", "ours", "12.5 %, d", factor]["gaussians"] <= in_picture
     best = [row for row in best if row["asset"] == "thing"]
-    # A second run measures one method again and a new one, and takes the others from the first.
+    # A second run measures one method again and a new one, and takes the others from
+    # the first.
     known = (tmp_path / "all" / "pairs.json",)
     methods = ("refined", "merged")
-    again = pairs.Measure(folder, tmp_path / "again", methods=methods, known=known, only=("thing",), refine=2)
+    again = pairs.Measure(
+        folder, tmp_path / "again", methods=methods, known=known, only=("thing",), refine=2
+    )
     with pytest.raises(SystemExit, match="expected results of"):
         pairs.measure(again)
     for name in ("percents", "factors", "widest", "views", "device"):
@@ -167,7 +182,9 @@ def test_study_compares_at_equal_counts(folder, tmp_path):
     assert second["changes"] == {"refine": 2}
     assert sorted(map(str, others)) == sorted(map(str, result["rows"]))
     assert second["builds"]["thing"].keys() == {"ours_seconds", "merged_seconds", "refined_seconds"}
-    pairs_report.report(pairs_report.Report(tmp_path / "again" / "pairs.json", tmp_path / "pairs.md"))
+    pairs_report.report(
+        pairs_report.Report(tmp_path / "again" / "pairs.json", tmp_path / "pairs.md")
+    )
     text = (tmp_path / "pairs.md").read_text()
     of_refined = pairs_report.best_others(second["rows"], "refined")
     assert len(of_refined) == len(best)
@@ -204,7 +221,14 @@ def test_build_settings_reach_our_levels_and_the_record(folder, tmp_path):
 
 def test_tolerances_compare_a_cut_with_all_gaussians():
     def row(asset, tolerance, flip, psnr):
-        return {"asset": asset, "width": 64, "tolerance": tolerance, "flip": flip, "psnr": psnr, "share": 0.5}
+        return {
+            "asset": asset,
+            "width": 64,
+            "tolerance": tolerance,
+            "flip": flip,
+            "psnr": psnr,
+            "share": 0.5,
+        }
 
     rows = [row("a", 0.0, 0.1, 30.0), row("a", 3.0, 0.05, 31.0)]
     rows += [row("b", 0.0, 0.1, 30.0), row("b", 3.0, 0.2, 28.0)]

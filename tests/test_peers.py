@@ -52,14 +52,22 @@ LAYOUT = {
         {"scale": 1, "quaternion": [0.8, 0.6, 0, 0], "position": [0.5, 0, 0]},
     ],
     "cameras": [
-        {"name": "a", "width": 96, "height": 54, "fov_x": 0.8, "fov_y": 0.467, "transform_matrix": CAMERA}
+        {
+            "name": "a",
+            "width": 96,
+            "height": 54,
+            "fov_x": 0.8,
+            "fov_y": 0.467,
+            "transform_matrix": CAMERA,
+        }
     ],
 }
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """An object and two of them, and peers: one that draws right, one that does not, one that crashes."""
+    """An object and two of them, and peers: one that draws right, one that does not,
+    one that crashes."""
     folder = tmp_path_factory.mktemp("peers")
     files = {
         "layout.json": json.dumps(LAYOUT),
@@ -110,14 +118,20 @@ def frames(found, renderer):
 
 def test_every_view_is_drawn_with_every_filter_by_everyone(found):
     views = {("layout", "a", 96, 0.0), ("layout", "a", 192, 0.0)}
-    for scene, names in {"thing": ("eye level", "from above"), "random 0.0003 M": ("front",)}.items():
+    for scene, names in {
+        "thing": ("eye level", "from above"),
+        "random 0.0003 M": ("front",),
+    }.items():
         for name in names:
             views |= {(scene, name, 96, 0.3), (scene, name, 192, 0.3), (scene, name, 96, 0.0)}
     for renderer in ("v3dg.Renderer", "v3dg.rasterize", "gsplat packed", "gsplat"):
         rows = frames(found, renderer)
         keys = [(row["scene"], row["view"], row["width"], row["filter_px2"]) for row in rows]
         assert sorted(keys) == sorted(views)
-        assert all(row["repeats"] == 7 and 0 < row["least_ms"] <= row["ms"] <= row["p95_ms"] for row in rows)
+        assert all(
+            row["repeats"] == 7 and 0 < row["least_ms"] <= row["ms"] <= row["p95_ms"]
+            for row in rows
+        )
     assert {row["filter_px2"] for row in frames(found, "Faster-GS")} == {0.3}
 
 
@@ -140,7 +154,9 @@ def test_errors_are_those_of_the_pictures(found):
 def test_training_is_measured_and_its_gradients_compared(found):
     trained = {(row["renderer"], row["scene"]) for row in found["training"]}
     renderers = ("v3dg.rasterize", "gsplat packed", "gsplat", "Faster-GS")
-    assert trained == {(name, scene) for name in renderers for scene in ("thing", "random 0.0003 M")}
+    assert trained == {
+        (name, scene) for name in renderers for scene in ("thing", "random 0.0003 M")
+    }
     errors = {row["renderer"]: row["relative_l2"] for row in found["gradients"]}
     for name in ("v3dg.rasterize", "gsplat packed", "gsplat"):
         assert 0 < max(errors[name].values()) < 1e-3
@@ -161,15 +177,22 @@ def test_page_says_who_is_quickest_and_what_failed(folder, found):
     page = (folder / "peers.md").read_text()
     row = next(row for row in frames(found, "Faster-GS") if row["scene"] == "thing")
     everyone = [
-        r for r in found["frame"] if all(r[k] == row[k] for k in ("scene", "view", "width", "filter_px2"))
+        r
+        for r in found["frame"]
+        if all(r[k] == row[k] for k in ("scene", "view", "width", "filter_px2"))
     ]
     ms = {
-        "v3dg": min(r["ms"] for r in everyone if r["renderer"] in ("v3dg.Renderer", "v3dg.rasterize")),
+        "v3dg": min(
+            r["ms"] for r in everyone if r["renderer"] in ("v3dg.Renderer", "v3dg.rasterize")
+        ),
         "v3dg, 1e-4": next(r["ms"] for r in everyone if r["renderer"] == "v3dg.Renderer, 1e-4"),
         "gsplat": min(r["ms"] for r in everyone if r["renderer"].startswith("gsplat")),
         "Faster-GS": row["ms"],
     }
-    cells = [*(f"{value:.3f}" for value in ms.values()), f"{ms['v3dg'] / min(ms['gsplat'], row['ms']):.2f}"]
+    cells = [
+        *(f"{value:.3f}" for value in ms.values()),
+        f"{ms['v3dg'] / min(ms['gsplat'], row['ms']):.2f}",
+    ]
     assert f"| {' | '.join(['scene', 'view', 'px', 'filter', *ms, 'ours / fastest'])} |" in page
     assert f"| thing | eye level | 96 | 0.3 | {' | '.join(cells)} |" in page
     assert "- flashgs_0.3: ImportError: no such kernel" in page

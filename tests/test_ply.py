@@ -1,4 +1,5 @@
-"""Reading and writing 3DGS .ply files. NumPy makes the files and says what they mean, not ours."""
+"""Reading and writing 3DGS .ply files. NumPy makes the files and says what they mean,
+not ours."""
 
 import os
 import re
@@ -75,7 +76,9 @@ class Element:
                 rows.append((" ".join(str(value) for value in values) + newline).encode())
             else:
                 order = "<" if encoding == "binary_little_endian" else ">"
-                rows.extend(np.array(value, order + value.dtype.str[1:]).tobytes() for value in values)
+                rows.extend(
+                    np.array(value, order + value.dtype.str[1:]).tobytes() for value in values
+                )
         return b"".join(rows)
 
 
@@ -103,7 +106,9 @@ def expected_gaussians(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     sh = stacked("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :]
     if num_rest:
         rest = stacked(*(f"f_rest_{i}" for i in range(num_rest)))
-        sh = np.concatenate([sh, rest.reshape(len(rest), 3, num_rest // 3).transpose(0, 2, 1)], axis=1)
+        sh = np.concatenate(
+            [sh, rest.reshape(len(rest), 3, num_rest // 3).transpose(0, 2, 1)], axis=1
+        )
     quats = stacked("rot_0", "rot_1", "rot_2", "rot_3")
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     return {
@@ -128,7 +133,9 @@ def random_gaussians(num: int, degree: int, seed: int = 0) -> Gaussians:
     return Gaussians(**{name: array.astype(np.float32) for name, array in arrays.items()})
 
 
-def assert_close(got: Gaussians, wanted: Gaussians | dict[str, np.ndarray], *, scale_error: float) -> None:
+def assert_close(
+    got: Gaussians, wanted: Gaussians | dict[str, np.ndarray], *, scale_error: float
+) -> None:
     """Means and SH agree exactly, what is computed up to rounding."""
     for name in NAMES:
         value = wanted[name] if isinstance(wanted, dict) else getattr(wanted, name)
@@ -141,7 +148,8 @@ def assert_close(got: Gaussians, wanted: Gaussians | dict[str, np.ndarray], *, s
         np.testing.assert_allclose(getattr(got, name), value, rtol=rtol, atol=atol, err_msg=name)
 
 
-# A log scale of up to 12 is rounded to float32: 12 * 2^-24 on the log, the same relative error on the scale.
+# A log scale of up to 12 is rounded to float32: 12 * 2^-24 on the log, the same
+# relative error on the scale.
 ROUND_TRIP_SCALE_ERROR = 8e-7
 # The same double, from two libraries' exp, rounded once to float32.
 READ_SCALE_ERROR = 1.2e-7
@@ -162,7 +170,8 @@ def test_what_is_written_reads_back(tmp_path_factory, num, degree, encoding, see
 
 @st.composite
 def layouts(draw):
-    """(bytes of a file, meaning of its columns): any order, types, encoding, line ends, extra content."""
+    """(bytes of a file, meaning of its columns): any order, types, encoding, line ends,
+    extra content."""
     num = draw(st.integers(0, 6))
     columns = random_columns(num, draw(st.integers(0, 3)), draw(st.integers(0, 99)))
     main_type = draw(st.sampled_from(["f4", "f8"]))
@@ -184,7 +193,10 @@ def layouts(draw):
     fixed = Element("chunk", {"low": np.ones(num_others, "f8"), "flag": np.ones(num_others, "i2")})
     with_lists = Element(
         "face",
-        {"indices": [np.arange(i, dtype="u2") for i in range(num_others)], "area": np.ones(num_others, "f4")},
+        {
+            "indices": [np.arange(i, dtype="u2") for i in range(num_others)],
+            "area": np.ones(num_others, "f4"),
+        },
         count_type,
     )
     for element in (fixed, with_lists, Element("nothing", {})):
@@ -225,7 +237,9 @@ def test_rest_coefficients_are_channel_by_channel_in_the_file(tmp_path):
     sh = np.arange(12, dtype=np.float32).reshape(1, 4, 3)  # coefficient k, channel c holds 3 k + c
     one = random_gaussians(1, 1)
     path = tmp_path / "one.ply"
-    write_asset(path, Gaussians(one.means, one.quats, one.scales, one.opacities, sh), encoding="ascii")
+    write_asset(
+        path, Gaussians(one.means, one.quats, one.scales, one.opacities, sh), encoding="ascii"
+    )
     lines = path.read_text().splitlines()
     names = [line.split()[2] for line in lines if line.startswith("property")]
     row = dict(zip(names, lines[-1].split(), strict=True))
@@ -330,7 +344,10 @@ def header(*lines: str, format_line: str = "format binary_little_endian 1.0") ->
 
 
 def vertex_lines(count: object = 1, degree: int = 0) -> list[str]:
-    return [f"element vertex {count}", *(f"property float {name}" for name in property_names(degree))]
+    return [
+        f"element vertex {count}",
+        *(f"property float {name}" for name in property_names(degree)),
+    ]
 
 
 ASCII = "format ascii 1.0"
@@ -341,7 +358,10 @@ HOSTILE = {
     "bad magic": (b"PLY\n" + header()[4:], "expected a first line 'ply', got 'PLY'"),
     "no text": (bytes(range(256)) * 9, "expected a first line 'ply', got '????"),
     "one endless line": (b"ply" + b"a" * 2_000_000, "expected a first line 'ply', got 'plyaaaa"),
-    "no end": (header()[:-11], "expected end_header within the first 1048576 bytes, got none in 36"),
+    "no end": (
+        header()[:-11],
+        "expected end_header within the first 1048576 bytes, got none in 36",
+    ),
     "endless header": (
         b"ply\n" + b"comment a\n" * 300_000,
         "expected end_header within the first 1048576 bytes, got none in",
@@ -353,7 +373,8 @@ HOSTILE = {
     "format twice": (header(ASCII), "header line 3: expected one line 'format', got a second"),
     "format unknown": (
         header(format_line="format binary_pdp_endian 1.0"),
-        "header line 2: expected format ascii, binary_little_endian or binary_big_endian, got 'binary_pdp",
+        "header line 2: expected format ascii, binary_little_endian or binary_big_endian, got "
+        "'binary_pdp",
     ),
     "version": (
         header(format_line="format ascii 2.0"),
@@ -371,7 +392,10 @@ HOSTILE = {
         header(*vertex_lines(-5)),
         "header line 3: expected a count of element 'vertex', got '-5'",
     ),
-    "fractional count": (header(*vertex_lines("1e9")), "expected a count of element 'vertex', got '1e9'"),
+    "fractional count": (
+        header(*vertex_lines("1e9")),
+        "expected a count of element 'vertex', got '1e9'",
+    ),
     "count beyond 64 bits": (
         header(*vertex_lines(10**20)),
         "expected a count of element 'vertex', got '1000",
@@ -394,7 +418,8 @@ HOSTILE = {
     ),
     "truncated": (
         header(*vertex_lines(2)) + b"\0" * (2 * ROW_BYTES - 1),
-        "expected 2 rows of element 'vertex' with 56 bytes each, got 111 bytes; the file is truncated",
+        "expected 2 rows of element 'vertex' with 56 bytes each, got 111 bytes; the file is "
+        "truncated",
     ),
     "property before element": (
         header("property float x"),
@@ -417,7 +442,10 @@ HOSTILE = {
         "header line 67: expected at most 64 elements, got one more",
     ),
     "no vertex": (header("element face 0"), "expected one element 'vertex', got 0"),
-    "two vertices": (header(*vertex_lines(0), *vertex_lines(0)), "expected one element 'vertex', got 2"),
+    "two vertices": (
+        header(*vertex_lines(0), *vertex_lines(0)),
+        "expected one element 'vertex', got 2",
+    ),
     "duplicate property": (
         header(*vertex_lines(0), "property float x"),
         "expected each vertex property once, got 'x' twice",
@@ -447,7 +475,10 @@ HOSTILE = {
         header(*vertex_lines(0), *(f"property float f_rest_{i}" for i in range(10))),
         "expected 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), got 10",
     ),
-    "f_rest of degree 4": (header(*vertex_lines(0, 4)), "expected 0, 9, 24 or 45 properties f_rest_*"),
+    "f_rest of degree 4": (
+        header(*vertex_lines(0, 4)),
+        "expected 0, 9, 24 or 45 properties f_rest_*",
+    ),
     "f_rest with a gap": (
         header(*vertex_lines(0, 1), "property float y2").replace(b"f_rest_8", b"f_rest_9"),
         "expected vertex properties f_rest_8, got",
@@ -482,11 +513,15 @@ HOSTILE = {
         "vertex 0: expected a number, got '?[31m?'",
     ),
     "ascii with a list that is too long": (
-        header(*vertex_lines(1), "property list uchar int n", format_line=ASCII) + b"0 " * 14 + b"1e300 1 2",
+        header(*vertex_lines(1), "property list uchar int n", format_line=ASCII)
+        + b"0 " * 14
+        + b"1e300 1 2",
         "vertex 0: expected at least 15 numbers, got 17",
     ),
     "ascii with a list of negative length": (
-        header(*vertex_lines(1), "property list uchar int n", format_line=ASCII) + b"0 " * 14 + b"-1",
+        header(*vertex_lines(1), "property list uchar int n", format_line=ASCII)
+        + b"0 " * 14
+        + b"-1",
         "vertex 0: expected a length of list 'n', got -1",
     ),
     "ascii in one line of many megabytes": (
@@ -579,7 +614,10 @@ def test_a_pipe_is_refused_without_waiting(tmp_path):
 
 
 def test_other_suffixes_are_refused(tmp_path):
-    for call in (lambda path: read_asset(path), lambda path: write_asset(path, random_gaussians(1, 0))):
+    for call in (
+        lambda path: read_asset(path),
+        lambda path: write_asset(path, random_gaussians(1, 0)),
+    ):
         with pytest.raises(
             ValueError, match=r"a\.obj: expected a file name that ends in \.(compressed\.)?ply, "
         ):
@@ -598,7 +636,10 @@ def test_unusual_names_work(tmp_path):
     ("change", "message"),
     [
         (lambda g: g.scales.__setitem__((2, 1), -1), r"scales\[2\]: expected values >= 0, got -1"),
-        (lambda g: g.opacities.__setitem__(7, 1.5), r"opacities\[7\]: expected values in \[0, 1\], got 1\.5"),
+        (
+            lambda g: g.opacities.__setitem__(7, 1.5),
+            r"opacities\[7\]: expected values in \[0, 1\], got 1\.5",
+        ),
         (
             lambda g: g.opacities.__setitem__(7, -0.5),
             r"opacities\[7\]: expected values in \[0, 1\], got -0\.5",
@@ -618,7 +659,9 @@ def test_a_failed_save_changes_nothing(tmp_path, change, message, encoding):
 
 
 def test_save_refuses_what_it_cannot_write(tmp_path):
-    with pytest.raises(ValueError, match=r"encoding: expected 'binary_little_endian' or .* got 'text'"):
+    with pytest.raises(
+        ValueError, match=r"encoding: expected 'binary_little_endian' or .* got 'text'"
+    ):
         write_asset(tmp_path / "a.ply", random_gaussians(1, 0), encoding="text")
     with pytest.raises(TypeError, match="gaussians: expected Gaussians, got int"):
         write_asset(tmp_path / "a.ply", 3)
@@ -654,7 +697,9 @@ print(loaded - start, peak() - loaded)
 """
 
 
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux's account of peak memory")
+@pytest.mark.skipif(
+    not Path("/proc/self/status").exists(), reason="needs Linux's account of peak memory"
+)
 def test_reading_needs_the_result_and_writing_next_to_nothing(tmp_path):
     num = 400_000
     names = property_names(3)
@@ -664,15 +709,23 @@ def test_reading_needs_the_result_and_writing_next_to_nothing(tmp_path):
         file.write(text.encode())
         for _ in range(10):
             file.write(np.ones((num // 10, len(names)), "<f4").tobytes())
-    command = [sys.executable, "-c", PEAK_MEMORY, str(tmp_path / "big.ply"), str(tmp_path / "copy.ply")]
-    # Each thread has a buffer, half a megabyte for writing; with more threads the bound would grow.
+    command = [
+        sys.executable,
+        "-c",
+        PEAK_MEMORY,
+        str(tmp_path / "big.ply"),
+        str(tmp_path / "copy.ply"),
+    ]
+    # Each thread has a buffer, half a megabyte for writing; with more threads the bound
+    # would grow.
     environment = {**os.environ, "OMP_NUM_THREADS": "4"}
     environment["PYTHONPATH"] = str(Path(__import__("v3dg").__file__).parents[1])
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     read_bytes, write_bytes = map(int, done.stdout.split())
     file_bytes = (tmp_path / "big.ply").stat().st_size
-    # The promise is twice the file. The arrays are as large as the file; 16 MiB is left for buffers (4 x 0.25
-    # MiB), thread stacks and what the allocator rounds up. A reader that held the file as well would need 2.
+    # The promise is twice the file. The arrays are as large as the file; 16 MiB is left
+    # for buffers (4 x 0.25 MiB), thread stacks and what the allocator rounds up. A
+    # reader that held the file as well would need 2.
     assert read_bytes < file_bytes + 16 * 2**20 < 1.2 * file_bytes
     assert write_bytes < 16 * 2**20
     assert (tmp_path / "copy.ply").stat().st_size == file_bytes

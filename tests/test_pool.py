@@ -1,4 +1,5 @@
-"""Pools: pictures of scenes of which only a part is in memory, settled and not, and with faults."""
+"""Pools: pictures of scenes of which only a part is in memory, settled and not, and
+with faults."""
 
 import itertools
 import os
@@ -44,7 +45,8 @@ def path(asset, tmp_path):
 
 @pytest.fixture(params=["mixed", "coded"])
 def scene(request, asset, path):
-    """Instances of files, each of another SH degree: of codes, or also of rows and of a bundle in memory."""
+    """Instances of files, each of another SH degree: of codes, or also of rows and of a
+    bundle in memory."""
     rng, scene = np.random.default_rng(1), Scene()
     is_coded = request.param == "coded"
     many = coded(asset, path.with_name("many.v3dg")) if is_coded else Bundle.open(path)
@@ -64,8 +66,11 @@ def coded(bundle, path):
 
 
 def scaled(scene, memory):
-    """As many bytes for a scene of codes as are for one of rows: about as many gaussians."""
-    return memory if any(bundle.codec == "float32" for bundle in scene.bundles) else int(0.3 * memory)
+    """As many bytes for a scene of codes as are for one of rows: about as many
+    gaussians."""
+    return (
+        memory if any(bundle.codec == "float32" for bundle in scene.bundles) else int(0.3 * memory)
+    )
 
 
 def status(renderer):
@@ -181,7 +186,9 @@ def test_resident_gaussian_of_a_quantised_bundle_takes_its_code(tmp_path, device
     made = lod_bundle(rng, blob(rng, 40_000, sh_degree=sh_degree), 170)
     bundle = coded(made, tmp_path / "coded.v3dg")
     ends = [bundle.page_range(page) for page in range(bundle.num_pages - 1)]
-    slot = max(int(bundle.clusters.offset[page.stop] - bundle.clusters.offset[page.start]) for page in ends)
+    slot = max(
+        int(bundle.clusters.offset[page.stop] - bundle.clusters.offset[page.start]) for page in ends
+    )
     few, many = (memory_for(bundle, device, count) for count in (100, 200))
     of_gaussians = 7 / 8 * (many - few)  # the rest is for pages on their way
     assert 16 + 8 * sh_degree < of_gaussians / (100 * slot) <= most
@@ -203,7 +210,8 @@ def test_frames_become_finer_until_nothing_is_missing(scene, device):
 
 @pytest.mark.parametrize(("memory", "most"), [("64MB", 1), ("8MB", 3), ("4MB", 5)])
 def test_few_pictures_miss_pages_after_a_teleport(device, monkeypatch, memory, most):
-    """No more than their bytes call for, of which an eighth of the pool is on the way at once, and one more.
+    """No more than their bytes call for, of which an eighth of the pool is on the way
+    at once, and one more.
 
     Pages of all levels are asked for at once: there are 13 of them.
     """
@@ -227,7 +235,9 @@ def test_few_pictures_miss_pages_after_a_teleport(device, monkeypatch, memory, m
 def test_shortage_raises_the_tolerance_from_frame_to_frame(scene, device):
     renderer = Renderer(scene, device=device, memory=scaled(scene, 150_000))
     tolerances = [FINE["tolerance"]]
-    while tolerances[-1] <= 1 and len(tolerances) < 20_000:  # a quick frame comes before the next decision
+    while (
+        tolerances[-1] <= 1 and len(tolerances) < 20_000
+    ):  # a quick frame comes before the next decision
         tolerances.append(renderer.render(CAMERA, **FINE).stats.tolerance)
     steps = np.array(tolerances[1:]) / tolerances[:-1]
     assert (steps <= 1.0201).all()
@@ -237,10 +247,13 @@ def test_shortage_raises_the_tolerance_from_frame_to_frame(scene, device):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_pages_are_there_together_with_those_above_them(scene, device, seed, monkeypatch):
-    """In every order of frames and of pages that have been read, with too little room for most views."""
+    """In every order of frames and of pages that have been read, with too little room
+    for most views."""
     monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
     rng = np.random.default_rng(seed)
-    renderer = Renderer(scene, device=device, memory=scaled(scene, int(rng.integers(60_000, 160_000))))
+    renderer = Renderer(
+        scene, device=device, memory=scaled(scene, int(rng.integers(60_000, 160_000)))
+    )
     num_changes, before = 0, None
     for _ in range(80):
         eye = rng.choice([1.5, 4.0, 12.0]) * rng.normal(size=3)
@@ -256,13 +269,16 @@ def test_pages_are_there_together_with_those_above_them(scene, device, seed, mon
             assert pages[bundle.groups.parent][pages[:-1]].all()
         now = core.status()
         assert sum(pages[:-1].sum() for pages in there) == now.num_resident <= now.num_slots
-        num_changes += before is not None and any((a & ~b).any() for a, b in zip(before, there, strict=True))
+        num_changes += before is not None and any(
+            (a & ~b).any() for a, b in zip(before, there, strict=True)
+        )
         before = there
     assert num_changes > 0  # pages left, too
 
 
 def order_of_reading(scene, monkeypatch):
-    """(bundle, page) of what a picture misses, in the order in which it is read; a page comes with each."""
+    """(bundle, page) of what a picture misses, in the order in which it is read; a page
+    comes with each."""
     monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
     renderer = Renderer(scene, device="cpu", memory="64MB")
     renderer.render(CAMERA, **FINE)
@@ -286,7 +302,8 @@ def test_no_page_is_read_before_those_above_it(scene, monkeypatch):
 
 
 def test_neighbours_in_a_file_are_read_one_after_another(path, monkeypatch):
-    """Levels are as long as a stretch of 512 KiB or shorter, but the finest one, which is longer."""
+    """Levels are as long as a stretch of 512 KiB or shorter, but the finest one, which
+    is longer."""
     bundle = Bundle.open(path)
     scene = Scene()
     scene.add(bundle)
@@ -298,7 +315,8 @@ def test_neighbours_in_a_file_are_read_one_after_another(path, monkeypatch):
 
 
 def film_of_arriving_pages(scene, device, options, num_frames=150):
-    """Pictures of a camera at rest from the coarsest level on, and in how many frames pages have faded in."""
+    """Pictures of a camera at rest from the coarsest level on, and in how many frames
+    pages have faded in."""
     renderer, pictures, arrived = Renderer(scene, device=device, memory="64MB"), [], []
     for _ in range(num_frames):
         image = renderer.render(CAMERA, **options)
@@ -315,7 +333,8 @@ def film_of_arriving_pages(scene, device, options, num_frames=150):
 
 
 def worst_tile(pictures):
-    """Root mean square, in 255ths, of the tile that changes most from one picture to the next."""
+    """Root mean square, in 255ths, of the tile that changes most from one picture to
+    the next."""
     changes = (np.square(255.0 * (b - a)).mean(-1) for a, b in itertools.pairwise(pictures))
     return max(np.sqrt(tile_means(change).max()) for change in changes)
 
@@ -367,7 +386,8 @@ def test_without_a_fade_pages_are_there_at_once(scene, device, monkeypatch):
 
 
 def test_pages_that_come_again_fade_in_again(device, monkeypatch):
-    """With room for what one view needs, not for two, and with frames without a fade in between.
+    """With room for what one view needs, not for two, and with frames without a fade in
+    between.
 
     None leaves that the picture before showed.
     """
@@ -499,7 +519,9 @@ def test_truncated_file_is_an_error_and_not_a_crash(path, device):
     renderer = Renderer(bundle, device=device, memory="64MB")
     os.truncate(path, int(bundle._file.places[2]))
     draws_coarser(renderer)
-    with pytest.raises(ValueError, match=r"asset\.v3dg: page \d+ is not there; the file was truncated"):
+    with pytest.raises(
+        ValueError, match=r"asset\.v3dg: page \d+ is not there; the file was truncated"
+    ):
         renderer.settle(CAMERA, tolerance=0.0)
 
 
@@ -582,14 +604,20 @@ def test_child_of_a_fork_is_told_to_make_another(path):
 
 @pytest.mark.parametrize("num_threads", [2, 4])
 def test_stills_of_threads_are_settled(path, num_threads):
-    """They share a pool that has room for about one view: no thread draws from what another one brought."""
+    """They share a pool that has room for about one view: no thread draws from what
+    another one brought."""
     scene = Scene()
     scene.add(Bundle.open(path), positions=[[-1.0, 0, 0], [1, 0, 0]])
     cameras = [CAMERA, NEAR, AWAY] * 8
-    expected = [arrays(render(scene, camera, device="cpu", memory=300_000, **FINE)) for camera in cameras[:3]]
+    expected = [
+        arrays(render(scene, camera, device="cpu", memory=300_000, **FINE))
+        for camera in cameras[:3]
+    ]
     with ThreadPoolExecutor(num_threads) as threads:
         images = list(
-            threads.map(lambda camera: render(scene, camera, device="cpu", memory=300_000, **FINE), cameras)
+            threads.map(
+                lambda camera: render(scene, camera, device="cpu", memory=300_000, **FINE), cameras
+            )
         )
     for k, image in enumerate(images):
         assert image.stats.missing == 0
@@ -598,7 +626,8 @@ def test_stills_of_threads_are_settled(path, num_threads):
 
 
 def test_only_the_last_pool_of_stills_is_kept(path):
-    """A pool has threads and memory, which a bundle that is drawn with many sizes would pile up."""
+    """A pool has threads and memory, which a bundle that is drawn with many sizes would
+    pile up."""
     bundle = Bundle.open(path)
     render(bundle, CAMERA, device="cpu", memory="64MB", **FINE)
     before = len(os.listdir("/proc/self/task"))
@@ -617,7 +646,8 @@ def test_stills_of_one_size_share_a_pool_whatever_its_text(path):
 
 
 def test_children_of_a_fork_draw_stills(path):
-    """They have a pool of their own, though the parent's threads may be at work in the other one."""
+    """They have a pool of their own, though the parent's threads may be at work in the
+    other one."""
     bundle = Bundle.open(path)
     expected = arrays(render(bundle, NEAR, device="cpu", memory="64MB", **FINE))
     is_over = threading.Event()
@@ -645,7 +675,8 @@ def test_children_of_a_fork_draw_stills(path):
 
 
 def test_picking_from_a_pool_of_another_process_is_refused(path):
-    """Also while another thread of the parent draws: it does not wait for that thread's lock for ever."""
+    """Also while another thread of the parent draws: it does not wait for that thread's
+    lock for ever."""
     bundle = Bundle.open(path)
     renderer = Renderer(bundle, device="cpu", memory="64MB")
     renderer.settle(CAMERA, **FINE)
@@ -697,7 +728,8 @@ def test_devices_need_the_same_pages(scene):
 
 @pytest.mark.gpu
 def test_pictures_that_are_drawn_ahead_are_finished_later(scene):
-    """Many in flight, of views that need other pages each, without a look at any of them."""
+    """Many in flight, of views that need other pages each, without a look at any of
+    them."""
     renderer = Renderer(scene, device="cuda", memory=scaled(scene, 150_000))
     rng = np.random.default_rng(5)
     cameras = [
@@ -716,7 +748,8 @@ def test_pictures_that_are_drawn_ahead_are_finished_later(scene):
 
 @pytest.mark.gpu
 def test_pages_that_leave_before_a_frame_has_them_are_not_drawn(scene):
-    """Several pictures are looked at without one in between that takes what came and left meanwhile."""
+    """Several pictures are looked at without one in between that takes what came and
+    left meanwhile."""
     renderer = Renderer(scene, device="cuda", memory=scaled(scene, 150_000))
     rng = np.random.default_rng(7)
     for _ in range(20):
@@ -730,7 +763,9 @@ def test_pages_that_leave_before_a_frame_has_them_are_not_drawn(scene):
         for camera in cameras[:2]:
             renderer.settle(camera, tolerance=30.0)
             image = renderer.render(camera, tolerance=30.0)
-            assert_same(image, render(scene, camera, device="cuda", tolerance=image.stats.tolerance))
+            assert_same(
+                image, render(scene, camera, device="cuda", tolerance=image.stats.tolerance)
+            )
 
 
 @pytest.mark.gpu

@@ -1,4 +1,5 @@
-"""Pools of a size that is chosen: from what is free on the device, and only where not all fits there."""
+"""Pools of a size that is chosen: from what is free on the device, and only where not
+all fits there."""
 
 import numpy as np
 import pytest
@@ -31,7 +32,9 @@ def free(monkeypatch):
     def set_free(num_bytes, where=None):
         real = v3dg.pool.free_on
         monkeypatch.setattr(
-            v3dg.pool, "free_on", lambda device: num_bytes if where in (None, device) else real(device)
+            v3dg.pool,
+            "free_on",
+            lambda device: num_bytes if where in (None, device) else real(device),
         )
 
     return set_free
@@ -43,7 +46,8 @@ def assert_same(image, expected):
 
 
 def size_of(path, device):
-    """What all of a bundle takes on the device, and on the host beside it if that is another."""
+    """What all of a bundle takes on the device, and on the host beside it if that is
+    another."""
     return residency.bytes_to_add([Bundle.open(path)], _device.resolve(device))
 
 
@@ -64,7 +68,9 @@ def test_what_does_not_fit_gets_a_pool_and_says_so(path, device, free):
     still = render(bundle, CAMERA, device=device, tolerance=0.5)
     assert still.stats.memory == needed // 2
     assert still.stats.missing == 0
-    whole = render(Bundle.open(path), CAMERA, device=device, memory=None, tolerance=still.stats.tolerance)
+    whole = render(
+        Bundle.open(path), CAMERA, device=device, memory=None, tolerance=still.stats.tolerance
+    )
     assert_same(still, whole)
     assert not bundle.is_in_memory
 
@@ -123,7 +129,9 @@ def test_a_scene_that_outgrows_what_is_free_goes_on_in_a_pool(path, device, free
     renderer.settle(CAMERA, tolerance=2.0)
     image = renderer.render(CAMERA, tolerance=2.0)
     assert image.stats.memory == renderer.memory == needed // 2
-    assert_same(image, render(scene, CAMERA, device=device, memory=None, tolerance=image.stats.tolerance))
+    assert_same(
+        image, render(scene, CAMERA, device=device, memory=None, tolerance=image.stats.tolerance)
+    )
 
 
 def test_what_needs_all_is_drawn_of_all(path, device, free):
@@ -185,9 +193,13 @@ def test_residency_tells_what_waits_for_pages_from_what_is_wanted(scene, monkeyp
 
     def share_missing(image):
         covered = image.alpha > alpha_there
-        return np.abs(image.color[covered] / image.alpha[covered][:, None] - there).max(axis=1) > 0.1
+        return (
+            np.abs(image.color[covered] / image.alpha[covered][:, None] - there).max(axis=1) > 0.1
+        )
 
-    monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)  # so that nothing is read until it is asked for
+    monkeypatch.setattr(
+        v3dg.pool, "NUM_THREADS", 0
+    )  # so that nothing is read until it is asked for
     renderer = Renderer(scene, device="cpu", memory="64MB", color_by="residency")
     first = renderer.render(CAMERA, **options)
     assert share_missing(first).mean() > 0.99  # the coarsest, everywhere

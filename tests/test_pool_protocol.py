@@ -1,14 +1,16 @@
 """A model of how a pool settles, of which all interleavings are tried.
 
-The threads of csrc/residency/page_pool.cpp are three here: one that settles a view and then draws it, the
-one that decides, and one that reads. A step is what a thread does while it holds the lock, or what it does
-without it; any thread that can take a step may take the next one. The view needs a page and, below it,
-another one, which its cut asks for only once the first is in the page table of its frame. An earlier frame,
-of another view, may have left needs that are not decided about; deciding about them may bring a page of its
-own, and may raise the tolerance.
+The threads of csrc/residency/page_pool.cpp are three here: one that settles a view and
+then draws it, the one that decides, and one that reads. A step is what a thread does
+while it holds the lock, or what it does without it; any thread that can take a step may
+take the next one. The view needs a page and, below it, another one, which its cut asks
+for only once the first is in the page table of its frame. An earlier frame, of another
+view, may have left needs that are not decided about; deciding about them may bring a
+page of its own, and may raise the tolerance.
 
-`RULES` are what the pool does so that a settled view is drawn complete. Without any one of them the model
-finds an interleaving that draws a picture with a page missing or at a raised tolerance.
+`RULES` are what the pool does so that a settled view is drawn complete. Without any one
+of them the model finds an interleaving that draws a picture with a page missing or at a
+raised tolerance.
 """
 
 from dataclasses import dataclass, replace
@@ -18,10 +20,11 @@ import pytest
 
 UPPER, LOWER, OTHER = "upper", "lower", "other"
 SETTLED_VIEW, EARLIER_VIEW = "settled", "earlier"
-# The view is settled once the pool has decided about it and its own frame, whose page table the cut used,
-# missed nothing.
+# The view is settled once the pool has decided about it and its own frame, whose page
+# table the cut used, missed nothing.
 ABSENT_PAGES = "absent pages"
-# Before it settles, earlier needs are forgotten, and a round that is under way is waited for.
+# Before it settles, earlier needs are forgotten, and a round that is under way is
+# waited for.
 CLEAN_START = "clean start"
 RULES = frozenset({ABSENT_PAGES, CLEAN_START})
 
@@ -58,7 +61,8 @@ class State:
 
 
 def cut(table):
-    """Pages that the view asks for with this page table: the lower one only below the upper one."""
+    """Pages that the view asks for with this page table: the lower one only below the
+    upper one."""
     return frozenset({UPPER, LOWER}) if UPPER in table else frozenset({UPPER})
 
 
@@ -120,7 +124,8 @@ def deciding_steps(state):
             is_served=False,
         )
         if state.decides is not None:
-            # What comes in this round is noted as missing, for the needs are looked at first.
+            # What comes in this round is noted as missing, for the needs are looked at
+            # first.
             absent = state.decides.pages - state.resident
             after = replace(
                 after,

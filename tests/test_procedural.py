@@ -88,7 +88,8 @@ def test_tree_stands_on_the_ground(kind):
 
 def test_kinds_of_trees_differ_in_shape():
     shapes = [
-        np.ptp(np.percentile(make_tree(8000, kind=k).means, (1, 99), axis=0), axis=0) for k in TREE_KINDS
+        np.ptp(np.percentile(make_tree(8000, kind=k).means, (1, 99), axis=0), axis=0)
+        for k in TREE_KINDS
     ]
     slimness = [z / max(x, y) for x, y, z in shapes]
     assert max(slimness) > 3 * min(slimness)
@@ -102,7 +103,8 @@ def test_donut_has_a_hole_and_lies_around_the_origin():
 
 
 def test_icing_shines():
-    """Towards the mirrored sun the icing is brighter than from below it: at degree 3 by much."""
+    """Towards the mirrored sun the icing is brighter than from below it: at degree 3 by
+    much."""
     donut = make_donut(8000)
     top = (donut.means[:, 2] > 0.03) & (donut.opacities > 0.5)
     assert np.percentile(np.abs(donut.sh[top, 9:]).max(axis=(1, 2)), 90) > 0.05
@@ -127,7 +129,9 @@ def test_faces_of_the_temple_look_outwards():
             assert normal @ outwards > 0
         elif face.material == "column":
             axis = patch.points.mean(axis=0)
-            assert (np.sum((patch.points - axis)[:, :2] * patch.normals[:, :2], axis=1) > 0).mean() > 0.95
+            assert (
+                np.sum((patch.points - axis)[:, :2] * patch.normals[:, :2], axis=1) > 0
+            ).mean() > 0.95
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -141,7 +145,8 @@ def test_person_has_human_measures(seed):
 
 @pytest.mark.parametrize("make", [make_donut, make_temple, make_person])
 def test_surfaces_are_spread_like_trained_ones(make):
-    """Within factors of what was measured on a trained asset: docs/worlds.md has both."""
+    """Within factors of what was measured on a trained asset: docs/worlds.md has
+    both."""
     asset = make(60_000)
     thin, middle, long = np.sort(asset.scales, axis=1).T
     assert 2 < np.median(long / middle) < 4.5
@@ -156,7 +161,8 @@ def test_leaves_are_thin_and_let_light_through():
     thin, _, long = np.sort(tree.scales, axis=1).T
     assert np.median(long / thin) > 8
     assert (tree.opacities < 0.75).mean() > 0.2
-    # Against the sun a leaf is brighter than along it: the linear terms of green follow the sun's direction.
+    # Against the sun a leaf is brighter than along it: the linear terms of green follow
+    # the sun's direction.
     from benchmarks.worlds.procedural._light import TO_SUN
 
     linear = tree.sh[:, 1:4, 1] @ np.array([TO_SUN[1], -TO_SUN[2], TO_SUN[0]])

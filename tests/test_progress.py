@@ -35,4 +35,9 @@ def test_a_log_gets_four_lines():
         [sys.executable, "-c", LONG], capture_output=True, text=True, env=ENVIRONMENT, check=True
     )
     assert done.stdout == ""
-    assert [line.rsplit(": ")[-1] for line in done.stderr.splitlines()] == ["25 %", "50 %", "75 %", "100 %"]
+    assert [line.rsplit(": ")[-1] for line in done.stderr.splitlines()] == [
+        "25 %",
+        "50 %",
+        "75 %",
+        "100 %",
+    ]

@@ -131,7 +131,8 @@ def test_reference_harmonics_are_orthonormal():
     angle = 2 * np.pi * np.arange(16) / 16
     radius = np.sqrt(1 - z * z)[:, None]
     directions = np.stack(
-        [radius * np.cos(angle), radius * np.sin(angle), np.broadcast_to(z[:, None], (8, 16))], axis=2
+        [radius * np.cos(angle), radius * np.sin(angle), np.broadcast_to(z[:, None], (8, 16))],
+        axis=2,
     )
     basis = reference_sh.basis(directions.reshape(-1, 3), 3).reshape(8, 16, 16)
     gram = np.einsum("z,zak,zal->kl", weight, basis, basis) * 2 * np.pi / 16

@@ -1,4 +1,5 @@
-"""Codes of gaussians: bounds that follow from the steps, the formula written anew, and extreme clusters."""
+"""Codes of gaussians: bounds that follow from the steps, the formula written anew, and
+extreme clusters."""
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ DEGREES = (0, 1, 2, 3)
 
 
 def random_clusters(seed, sh_degree, num_clusters=6, most=60):
-    """Gaussians as they are in assets, in clusters of a unit of length somewhere; and where those begin."""
+    """Gaussians as they are in assets, in clusters of a unit of length somewhere; and
+    where those begin."""
     rng = np.random.default_rng(seed)
     sizes = rng.integers(1, most, num_clusters)
     n = int(sizes.sum())
@@ -49,7 +51,8 @@ def ranges_of(values, offset):
     """(N, ...) least and largest value of each one's cluster."""
     sizes = np.diff(offset)
     least, most = (
-        np.repeat(f.reduceat(values, offset[:-1], axis=0), sizes, 0) for f in (np.minimum, np.maximum)
+        np.repeat(f.reduceat(values, offset[:-1], axis=0), sizes, 0)
+        for f in (np.minimum, np.maximum)
     )
     return least.astype(np.float64), most.astype(np.float64)
 
@@ -71,12 +74,15 @@ def covariances(gaussians):
 def test_errors_are_those_of_the_steps(seed, sh_degree):
     gaussians, offset = random_clusters(seed, sh_degree)
     out = rounded(gaussians, offset)
-    # Half a step; at the upper end, the step's rounding to 12 bits adds up to two steps; float32 rounds last.
+    # Half a step; at the upper end, the step's rounding to 12 bits adds up to two
+    # steps; float32 rounds last.
     least, most = ranges_of(gaussians.means, offset)
     step = (most - least) / 4095
     error = np.abs(out.means - gaussians.means.astype(np.float64))
     at_end = gaussians.means > most - 2.5 * step
-    assert (error <= np.where(at_end, 2.5, 0.501) * step + np.spacing(np.abs(most).astype(np.float32))).all()
+    assert (
+        error <= np.where(at_end, 2.5, 0.501) * step + np.spacing(np.abs(most).astype(np.float32))
+    ).all()
     assert np.abs(out.opacities - gaussians.opacities).max() <= 0.5 / 255 + 1e-7
     # Half a step, or what rounding the ends of the range inwards to float16 leaves out.
     least, most = ranges_of(gaussians.sh[:, 0], offset)
@@ -90,13 +96,15 @@ def test_shapes_keep_to_their_steps(seed):
     """Axes may have another order, so covariances are compared."""
     gaussians, offset = random_clusters(seed, 0)
     out = rounded(gaussians, offset)
-    # Half a step of the bits of floats is at most so much of a scale; the ends of the range are 2^-8 coarser.
+    # Half a step of the bits of floats is at most so much of a scale; the ends of the
+    # range are 2^-8 coarser.
     bits = gaussians.scales.view(np.int32)
     least, most = ranges_of(np.stack([bits.min(1), bits.max(1)], axis=1), offset)
     relative = 0.5 * (most[:, 1] - least[:, 0]) / 1023 * 2.0**-23 + 2.0**-8
     error = np.abs(np.sort(out.scales, axis=1) / np.sort(gaussians.scales, axis=1) - 1).max(axis=1)
     assert (error <= relative).all()
-    # Three components half a step of 1/666 off, w at least 0.75: an angle of 2 sqrt(3) / 1332 / 0.75.
+    # Three components half a step of 1/666 off, w at least 0.75: an angle of 2 sqrt(3)
+    # / 1332 / 0.75.
     angle = 2 * np.sqrt(3) * 0.5 / 666 / 0.74
     expected, got = covariances(gaussians), covariances(out)
     largest = gaussians.scales.max(axis=1).astype(np.float64) ** 2
@@ -119,12 +127,15 @@ def test_small_coefficients_have_small_steps(sh_degree):
             most = 2 ** (reference.sh_bits(sh_degree, band)[channel] - 1) - 1
             unit = largest / most**2
             # Between squares n² and (n+1)² of a unit that float16 has to 2^-11.
-            assert (error <= unit * (np.sqrt(np.abs(value) / unit) + 0.5) + largest * 2.0**-10).all()
+            assert (
+                error <= unit * (np.sqrt(np.abs(value) / unit) + 0.5) + largest * 2.0**-10
+            ).all()
 
 
 @pytest.mark.parametrize("sh_degree", DEGREES)
 def test_the_formula_is_that_of_the_reference(sh_degree):
-    """Bit for bit, also where products are not rounded before they are added: no code needs it."""
+    """Bit for bit, also where products are not rounded before they are added: no code
+    needs it."""
     gaussians, offset = random_clusters(9, sh_degree)
     page = _core.encode_page(gaussians.rows, offset)
     out = decoded(page, offset, gaussians)
@@ -135,7 +146,8 @@ def test_the_formula_is_that_of_the_reference(sh_degree):
 
 
 def extreme_clusters(rng, n, sh_degree):
-    """Any floats that a bundle can hold: alike, tiny, huge, far from the origin, of every size at once."""
+    """Any floats that a bundle can hold: alike, tiny, huge, far from the origin, of
+    every size at once."""
 
     def values(*shape):
         exponent = rng.integers(-38, 39)
@@ -154,13 +166,18 @@ def extreme_clusters(rng, n, sh_degree):
 
     opacities = np.abs(np.clip(values(n), -1, 1))
     return Gaussians(
-        values(n, 3), values(n, 4), np.abs(values(n, 3)), opacities, values(n, (sh_degree + 1) ** 2, 3)
+        values(n, 3),
+        values(n, 4),
+        np.abs(values(n, 3)),
+        opacities,
+        values(n, (sh_degree + 1) ** 2, 3),
     )
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_extreme_clusters_become_finite_gaussians_that_stay_as_they_are(seed):
-    """What was decoded gives the same page again: an interrupted build goes on with what it would have."""
+    """What was decoded gives the same page again: an interrupted build goes on with
+    what it would have."""
     rng = np.random.default_rng(seed)
     for _ in range(150):
         n, sh_degree = int(rng.integers(1, 40)), int(rng.integers(0, 4))
@@ -197,10 +214,14 @@ def test_one_gaussian_keeps_its_place_and_the_ends_of_opacity():
 def test_scales_of_all_sizes_keep_their_order_of_magnitude():
     gaussians, _ = random_clusters(3, 0)
     n = len(gaussians)
-    gaussians.scales[:] = np.float32(10.0) ** np.linspace(-12, 12, 3 * n, dtype=np.float32).reshape(n, 3)
+    gaussians.scales[:] = np.float32(10.0) ** np.linspace(-12, 12, 3 * n, dtype=np.float32).reshape(
+        n, 3
+    )
     gaussians.quats[:] = [1, 0, 0, 0]
     out = rounded(gaussians, np.array([0, n]))
-    np.testing.assert_allclose(out.scales, gaussians.scales, rtol=0.5 * 80 / 1023 + 2.0**-8)  # of 80 octaves
+    np.testing.assert_allclose(
+        out.scales, gaussians.scales, rtol=0.5 * 80 / 1023 + 2.0**-8
+    )  # of 80 octaves
 
 
 def test_flat_gaussians_stay_flat():
@@ -208,7 +229,9 @@ def test_flat_gaussians_stay_flat():
     gaussians.scales[:, 1] = 0
     out = rounded(gaussians, offset)
     assert (out.scales.min(axis=1) < out.scales.max(axis=1) / 8000).all()
-    assert np.abs(np.log2(out.scales).min(axis=1) - np.log2(out.scales).max(axis=1) + 14).max() < 0.1
+    assert (
+        np.abs(np.log2(out.scales).min(axis=1) - np.log2(out.scales).max(axis=1) + 14).max() < 0.1
+    )
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -253,5 +276,7 @@ def test_wrong_arguments_are_refused():
         _core.page_code_bytes(4)
     page[-12] = 0x7FC00000  # the means' least, in the ranges of the last cluster
     page.view(np.float32)[4 * len(gaussians)] = np.nan
-    with pytest.raises(ValueError, match="cluster 0 of the page: expected ranges of finite numbers"):
+    with pytest.raises(
+        ValueError, match="cluster 0 of the page: expected ranges of finite numbers"
+    ):
         _core.decode_page(page, offset, gaussians.rows)

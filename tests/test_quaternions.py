@@ -1,4 +1,5 @@
-"""A quaternion's length is no part of what it says: forward, backward, in scenes and in files."""
+"""A quaternion's length is no part of what it says: forward, backward, in scenes and in
+files."""
 
 import numpy as np
 import pytest
@@ -65,7 +66,9 @@ def test_gradients_grow_as_one_over_the_length(device, exponent):
 @pytest.mark.parametrize("exponent", [-125, 126])
 def test_gradients_of_the_shortest_and_longest_are_finite(device, exponent):
     torch = pytest.importorskip("torch")
-    assert all(np.isfinite(gradient).all() for gradient in gradients_at(exponent, torch.float32, device))
+    assert all(
+        np.isfinite(gradient).all() for gradient in gradients_at(exponent, torch.float32, device)
+    )
 
 
 @pytest.mark.parametrize("exponent", [-900, -500, -310, 360, 500, 900])
@@ -86,7 +89,9 @@ def test_transform_does_not_depend_on_the_length(exponent):
     expected = asset.transform(normalised(quaternion), (1, 2, 3), 2.0)
     got = asset.transform(np.ldexp(quaternion, exponent), (1, 2, 3), 2.0)
     for name in ("means", "scales", "sh"):
-        np.testing.assert_allclose(getattr(got, name), getattr(expected, name), rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(
+            getattr(got, name), getattr(expected, name), rtol=1e-6, atol=1e-6
+        )
     np.testing.assert_allclose(normalised(got.quats), normalised(expected.quats), atol=1e-6)
 
 
@@ -147,7 +152,12 @@ def test_views_of_any_length_look_the_same_way(factor):
 def test_text_files_may_hold_doubles_of_any_length(tmp_path):
     names = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity")
     names += ("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
-    header = ["ply", "format ascii 1.0", "element vertex 2", *(f"property double {name}" for name in names)]
+    header = [
+        "ply",
+        "format ascii 1.0",
+        "element vertex 2",
+        *(f"property double {name}" for name in names),
+    ]
     rows = ["0 0 0 0 0 0 0 0 0 0 3e-200 0 0 4e-200", "0 0 0 0 0 0 0 0 0 0 3e200 0 0 4e200"]
     (tmp_path / "doubles.ply").write_text("\n".join([*header, "end_header", *rows, ""]))
     quats = v3dg.read_asset(tmp_path / "doubles.ply").quats

@@ -110,8 +110,12 @@ CROWDS = {
     "on a plane": lambda rng, num: np.full(num, 2.0),
     "on three planes": lambda rng, num: rng.integers(1, 4, num),
     "on sheets": lambda rng, num: 1 + rng.integers(0, 7, num) ** 2 + rng.uniform(0, 1e-4, num),
-    "behind one": lambda rng, num: np.where(np.arange(num) == num // 2, 0.02, rng.uniform(3, 3.001, num)),
-    "before one": lambda rng, num: np.where(np.arange(num) == num // 2, 1e6, rng.uniform(3, 3.001, num)),
+    "behind one": lambda rng, num: np.where(
+        np.arange(num) == num // 2, 0.02, rng.uniform(3, 3.001, num)
+    ),
+    "before one": lambda rng, num: np.where(
+        np.arange(num) == num // 2, 1e6, rng.uniform(3, 3.001, num)
+    ),
 }
 
 
@@ -161,7 +165,9 @@ def test_every_count_of_gaussians(device, num):
     assert_pictures_agree(draw(device, gaussians, camera, filter_px2=0.1), picture, PICTURE_FLOAT)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (31, 33), (32, 32), (33, 31), (64, 65), (129, 3)])
+@pytest.mark.parametrize(
+    "size", [(1, 1), (1, 40), (40, 1), (31, 33), (32, 32), (33, 31), (64, 65), (129, 3)]
+)
 def test_every_image_size(device, size):
     camera = scenes.camera(*size, fx=40.0)
     gaussians = scenes.random_gaussians(7, camera, 60, size_px=(1, 8))
@@ -219,7 +225,8 @@ def test_pixels_stop_behind_the_one_that_hides_the_rest(device, min_transmittanc
 
 @pytest.mark.parametrize("min_transmittance", [1e-4, 1e-3, 1e-2])
 def test_no_more_light_is_lost_than_asked_for(device, min_transmittance):
-    """Also where gaussians are opaque, which takes all light but a thousandth at once."""
+    """Also where gaussians are opaque, which takes all light but a thousandth at
+    once."""
     camera = scenes.CAMERAS["plain"]
     loose = scenes.trained_like(31, camera, 2000)
     gaussians = scenes.replaced(
@@ -236,14 +243,21 @@ def test_no_more_light_is_lost_than_asked_for(device, min_transmittance):
 @pytest.mark.parametrize("value", [-1e-9, 1.001, np.nan, "much"])
 def test_a_share_of_light_is_refused_that_is_none(value):
     camera = scenes.CAMERAS["plain"]
-    with pytest.raises(ValueError, match=r"min_transmittance: expected a share of light, 0 to 0\.99, got"):
-        v3dg.render(scenes.trained_like(32, camera, 5), camera, min_transmittance=value, device="cpu")
+    with pytest.raises(
+        ValueError, match=r"min_transmittance: expected a share of light, 0 to 0\.99, got"
+    ):
+        v3dg.render(
+            scenes.trained_like(32, camera, 5), camera, min_transmittance=value, device="cpu"
+        )
 
 
 def test_assets_are_drawn_as_rasterized_unless_asked(device):
     camera = scenes.CAMERAS["plain"]
     gaussians = scenes.trained_like(33, camera, 600)
-    rendered, expected = draw_stopped(device, gaussians, camera, None), draw(device, gaussians, camera)
+    rendered, expected = (
+        draw_stopped(device, gaussians, camera, None),
+        draw(device, gaussians, camera),
+    )
     # On CUDA an asset is drawn from covariances made beforehand, which round otherwise.
     assert np.abs(rendered.color - expected.color).max() <= 1e-5
     stopped = draw_stopped(device, gaussians, camera, 1e-3)
@@ -273,8 +287,12 @@ def test_background_is_composed_last(device):
 
 
 def test_empty_set_shows_the_background(device):
-    raster = draw(device, scenes.gaussians(np.zeros((0, 3))), scenes.camera(5, 3), background=(0.1, 0.2, 0.3))
-    np.testing.assert_array_equal(raster.color, np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (3, 5, 3)))
+    raster = draw(
+        device, scenes.gaussians(np.zeros((0, 3))), scenes.camera(5, 3), background=(0.1, 0.2, 0.3)
+    )
+    np.testing.assert_array_equal(
+        raster.color, np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (3, 5, 3))
+    )
     assert not raster.alpha.any()
     assert not raster.depth.any()
 
@@ -290,13 +308,17 @@ def test_equal_depths_are_drawn_in_the_order_of_their_index(device):
 
 
 def test_depths_too_far_apart_for_an_entry_keep_their_order(torch):
-    # 30 bits of depth and 23 of places are one more than an entry has, so that neighbours in depth tie.
+    # 30 bits of depth and 23 of places are one more than an entry has, so that
+    # neighbours in depth tie.
     count = 4_300_000
     generator = np.random.default_rng(1)
     depths = (np.float32(0.02).view(np.uint32) + generator.integers(0, 64, count)).astype(np.uint32)
     means = np.c_[0.02 * generator.uniform(-0.5, 0.5, (count, 2)), depths.view(np.float32)]
     near = scenes.gaussians(
-        means, scales=1.6e-4, opacities=0.1, color=generator.uniform(size=(count, 3)).astype(np.float32)
+        means,
+        scales=1.6e-4,
+        opacities=0.1,
+        color=generator.uniform(size=(count, 3)).astype(np.float32),
     )
     far = scenes.gaussians([[0, 0, 1e18]], scales=3e16, opacities=0.1)
     camera = v3dg.Camera(np.eye(4), [[64, 0, 32], [0, 64, 32], [0, 0, 1]], 64, 64)
@@ -312,7 +334,9 @@ def test_order_of_the_arrays_does_not_matter(device):
     camera = scenes.CAMERAS["off_centre"]
     gaussians = scenes.trained_like(6, camera, 300)
     order = np.random.default_rng(0).permutation(300)
-    assert digest(draw(device, gaussians, camera)) == digest(draw(device, gaussians.subset(order), camera))
+    assert digest(draw(device, gaussians, camera)) == digest(
+        draw(device, gaussians.subset(order), camera)
+    )
 
 
 def test_gaussians_out_of_sight_change_nothing(device):
@@ -354,7 +378,11 @@ def test_antialiased_keeps_what_a_small_gaussian_adds_to_the_picture(device):
 
 def test_numpy_in_numpy_out():
     raster = v3dg.rasterize(scenes.gaussians([0, 0, 1.0]), scenes.camera(20, 10))
-    for array, shape in ((raster.color, (10, 20, 3)), (raster.alpha, (10, 20)), (raster.depth, (10, 20))):
+    for array, shape in (
+        (raster.color, (10, 20, 3)),
+        (raster.alpha, (10, 20)),
+        (raster.depth, (10, 20)),
+    ):
         assert isinstance(array, np.ndarray)
         assert array.dtype == np.float32
         assert array.shape == shape
@@ -362,7 +390,11 @@ def test_numpy_in_numpy_out():
 
 def test_torch_in_torch_out(torch, device):
     raster = v3dg.rasterize(scenes.gaussians([0, 0, 1.0]).torch(device), scenes.camera(20, 10))
-    for tensor, shape in ((raster.color, (10, 20, 3)), (raster.alpha, (10, 20)), (raster.depth, (10, 20))):
+    for tensor, shape in (
+        (raster.color, (10, 20, 3)),
+        (raster.alpha, (10, 20)),
+        (raster.depth, (10, 20)),
+    ):
         assert isinstance(tensor, torch.Tensor)
         assert tensor.device.type == device
         assert tensor.dtype == torch.float32
@@ -370,7 +402,9 @@ def test_torch_in_torch_out(torch, device):
         assert not tensor.requires_grad
 
 
-@pytest.mark.parametrize("mode", [{}, {"filter_px2": 0.3, "antialiased": True, "background": (1, 0.5, 0)}])
+@pytest.mark.parametrize(
+    "mode", [{}, {"filter_px2": 0.3, "antialiased": True, "background": (1, 0.5, 0)}]
+)
 def test_numpy_and_torch_are_drawn_alike(torch, mode):
     camera = scenes.CAMERAS["off_centre"]
     gaussians = scenes.random_gaussians(2, camera, 40, sh_degree=2)
@@ -454,7 +488,9 @@ BACKGROUND = (0.3, -0.2, 0.8)
 def test_gradients_in_double_are_those_of_autograd(torch, camera, mode):
     from reference import rasterize_torch
 
-    gaussians = scenes.random_gaussians(30, camera, 40, size_px=(0.5, 10), sh_degree=3, opacity=(0.02, 1.2))
+    gaussians = scenes.random_gaussians(
+        30, camera, 40, size_px=(0.5, 10), sh_degree=3, opacity=(0.02, 1.2)
+    )
     inputs = leaves(torch, gaussians, BACKGROUND, torch.float64)
     got = torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs)
     raster = rasterize_torch.rasterize(*inputs, camera, **mode)
@@ -490,7 +526,9 @@ def test_gradients_are_finite_differences(torch, name, mode):
     assert (picture.alpha > 0).mean() > 0.5
     assert (picture.contribution > 0).all()
     inputs = leaves(torch, gaussians, BACKGROUND, torch.float64)
-    gradients = torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs)
+    gradients = torch.autograd.grad(
+        weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs
+    )
     generator = torch.Generator().manual_seed(0)
     step = 1e-6
     for i, (input_name, gradient) in enumerate(zip(INPUTS, gradients, strict=True)):
@@ -508,7 +546,9 @@ def test_gradients_are_finite_differences(torch, name, mode):
             measured = (values[0] - values[1]) / (2 * step)
             size = gradient.norm().item() * direction.norm().item()
             error = abs((gradient * direction).sum().item() - measured)
-            assert error <= FINITE_DIFFERENCE.relative * size + FINITE_DIFFERENCE.absolute, input_name
+            assert error <= FINITE_DIFFERENCE.relative * size + FINITE_DIFFERENCE.absolute, (
+                input_name
+            )
 
 
 def test_each_coordinate_is_its_finite_difference(torch):
@@ -516,7 +556,9 @@ def test_each_coordinate_is_its_finite_difference(torch):
     mode = {"filter_px2": 0.1, "antialiased": True}
     gaussians = smooth_scene(camera, mode, num=3)
     inputs = leaves(torch, gaussians, BACKGROUND, torch.float64)
-    gradients = torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs)
+    gradients = torch.autograd.grad(
+        weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs
+    )
     step = 1e-6
     for i, gradient in enumerate(gradients):
         for k in range(gradient.numel()):
@@ -532,9 +574,12 @@ def test_each_coordinate_is_its_finite_difference(torch):
 
 
 def gradients_of(torch, gaussians, camera, dtype, device, *, background=BACKGROUND, **mode):
-    """Gradients of weighted_sum by the five inputs and the background, as NumPy arrays."""
+    """Gradients of weighted_sum by the five inputs and the background, as NumPy
+    arrays."""
     inputs = leaves(torch, gaussians, background, dtype, device)
-    return host(torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs))
+    return host(
+        torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs)
+    )
 
 
 def assert_gradients_are_those_in_double(torch, gaussians, camera, device, **mode):
@@ -562,10 +607,15 @@ def test_gradients_of_every_degree(torch, device, sh_degree):
 
 @GRADIENT_MODES
 def test_gradients_over_many_tiles(torch, device, mode):
-    """Gaussians over hundreds of tiles beside such of a pixel, and pixels that stop early."""
+    """Gaussians over hundreds of tiles beside such of a pixel, and pixels that stop
+    early."""
     camera = scenes.camera(517, 389, fx=300.0, pose=scenes.pose(9))
-    small = scenes.random_gaussians(42, camera, 3000, size_px=(0.5, 6), opacity=(0.1, 1.0), sh_degree=1)
-    large = scenes.random_gaussians(43, camera, 60, size_px=(40, 150), opacity=(0.8, 1.2), sh_degree=1)
+    small = scenes.random_gaussians(
+        42, camera, 3000, size_px=(0.5, 6), opacity=(0.1, 1.0), sh_degree=1
+    )
+    large = scenes.random_gaussians(
+        43, camera, 60, size_px=(40, 150), opacity=(0.8, 1.2), sh_degree=1
+    )
     gaussians = v3dg.Gaussians.concatenate([small, large])
     alpha = v3dg.rasterize(gaussians, camera, **mode).alpha
     assert (alpha > 0.999).any()
@@ -617,7 +667,9 @@ def test_pictures_can_be_differentiated_in_any_order_and_again(torch, device):
 def test_gradients_are_the_same_on_every_run(torch, device):
     camera = scenes.camera(131, 97, fx=90.0, cx=60.0, cy=55.0, pose=scenes.pose(8))
     gaussians = scenes.trained_like(20, camera, 1500)
-    first, *others = (gradients_of(torch, gaussians, camera, torch.float32, device) for _ in range(4))
+    first, *others = (
+        gradients_of(torch, gaussians, camera, torch.float32, device) for _ in range(4)
+    )
     for other in others:
         for a, b in zip(first, other, strict=True):
             np.testing.assert_array_equal(a, b)
@@ -683,7 +735,9 @@ def test_gaussians_that_are_not_drawn_have_zero_gradients(torch, device):
 
 def test_no_gaussians_leave_the_background_its_gradient(torch, device):
     nothing = scenes.gaussians(np.zeros((0, 3)))
-    *gradients, d_background = gradients_of(torch, nothing, scenes.camera(70, 50), torch.float32, device)
+    *gradients, d_background = gradients_of(
+        torch, nothing, scenes.camera(70, 50), torch.float32, device
+    )
     assert [g.shape for g in gradients] == [getattr(nothing, n).shape for n in scenes.NAMES]
     assert_close(
         d_background,
@@ -723,8 +777,12 @@ def test_gradient_descent_finds_a_moved_gaussian(torch, device):
 
 
 def draw_with_gsplat(gsplat, torch, inputs, camera, filter_px2, antialiased=False):
-    """gsplat's colour, alpha and expected depth of the five inputs before the background."""
-    view, K = (torch.tensor(m, dtype=torch.float32, device="cuda")[None] for m in (camera.viewmat, camera.K))
+    """gsplat's colour, alpha and expected depth of the five inputs before the
+    background."""
+    view, K = (
+        torch.tensor(m, dtype=torch.float32, device="cuda")[None]
+        for m in (camera.viewmat, camera.K)
+    )
     pictures, alpha, _ = gsplat.rasterization(
         *inputs[:5],
         view,
@@ -756,7 +814,8 @@ def test_pictures_and_gradients_are_gsplats(torch, antialiased, sh_degree):
     theirs = draw_with_gsplat(gsplat, torch, inputs, camera, **mode)
     for got, expected in zip((ours.color, ours.alpha), theirs[:2], strict=True):
         error = (got - expected).abs()
-        # A contribution at the threshold of 1/255, or the one at which a pixel stops, may be taken or left.
+        # A contribution at the threshold of 1/255, or the one at which a pixel stops,
+        # may be taken or left.
         assert error.max() < PICTURE_FLOAT.flip
         assert (error > 1e-3).float().mean() < 1e-3
     got = host(torch.autograd.grad(weighted_sum(torch, ours), inputs))
@@ -791,7 +850,8 @@ np.savez(sys.argv[1], *out[0])
 
 
 def run_elsewhere(path, what, **environment):
-    """Arrays that RUN makes in a process of its own, or None where the processor lacks the instructions."""
+    """Arrays that RUN makes in a process of its own, or None where the processor lacks
+    the instructions."""
     done = subprocess.run(
         [sys.executable, "-c", RUN, str(path), what],
         env=TESTS_ENVIRONMENT | environment,
@@ -808,7 +868,8 @@ def run_elsewhere(path, what, **environment):
 
 def test_number_of_threads_changes_nothing(torch, tmp_path):
     one, two, five = (
-        run_elsewhere(tmp_path / f"{n}.npz", "gradients", OMP_NUM_THREADS=n) for n in ("1", "2", "5")
+        run_elsewhere(tmp_path / f"{n}.npz", "gradients", OMP_NUM_THREADS=n)
+        for n in ("1", "2", "5")
     )
     assert all(np.abs(a).max() > 0 for a in one)
     for a, b, c in zip(one, two, five, strict=True):

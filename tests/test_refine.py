@@ -29,7 +29,8 @@ def bundle():
 
 
 def distance_to_asset(bundle, device):
-    """Mean difference between cuts of several counts, from four sides, and the asset."""
+    """Mean difference between cuts of several counts, from four sides, and the
+    asset."""
     errors = []
     for camera in v3dg.turntable((0, 0, 0), 3.0, 4, width=48, height=48):
         truth = draw_truth(bundle.level_gaussians(0), camera, "cpu", 4).astype(np.float32) / 255
@@ -63,7 +64,9 @@ def test_tables_and_level_0_stay(bundle, device):
 
 
 def test_a_quantised_bundle_stays_one(bundle, device):
-    coded = v3dg.Bundle(bundle.clusters, bundle.groups, bundle.gaussians, bundle.config, "quantized")
+    coded = v3dg.Bundle(
+        bundle.clusters, bundle.groups, bundle.gaussians, bundle.config, "quantized"
+    )
     refined = refine_bundle(coded, steps=3, drop=0, device=device, progress=False)
     assert refined.codec == "quantized"
 
@@ -81,11 +84,18 @@ def test_the_same_seed_gives_the_same_bits(bundle, device):
 def test_threads_do_not_change_the_result(bundle, tmp_path):
     bundle.write(tmp_path / "bundle.v3dg")
     program = (
-        "import v3dg, v3dg.refine, sys; b = v3dg.Bundle.open(sys.argv[1]); v3dg.refine._WEIGHED = 50;"
-        "v3dg.refine_bundle(b, steps=10, drop=0.1, device='cpu', progress=False).write(sys.argv[2])"
+        "import v3dg, v3dg.refine, sys; b = v3dg.Bundle.open(sys.argv[1]); v3dg.refine._WEIGHED = "
+        "50;v3dg.refine_bundle(b, steps=10, drop=0.1, device='cpu', "
+        "progress=False).write(sys.argv[2])"
     )
     for threads in ("1", "3"):
-        command = [sys.executable, "-c", program, tmp_path / "bundle.v3dg", tmp_path / f"{threads}.v3dg"]
+        command = [
+            sys.executable,
+            "-c",
+            program,
+            tmp_path / "bundle.v3dg",
+            tmp_path / f"{threads}.v3dg",
+        ]
         subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": threads})
     assert (tmp_path / "1.v3dg").read_bytes() == (tmp_path / "3.v3dg").read_bytes()
 
@@ -193,7 +203,8 @@ def test_pictures_from_cameras_are_taken_there(bundle):
 
 
 def test_cuts_from_inside_are_of_coarse_levels_where_no_other_is_small_enough(bundle):
-    """Groups around the eye are refined at any tolerance: below what that leaves there are whole levels."""
+    """Groups around the eye are refined at any tolerance: below what that leaves there
+    are whole levels."""
     center = np.median(bundle.level_gaussians(0).means, axis=0)
     camera = v3dg.Camera.look_at(
         center, center + np.array([0, 0, 1]), (0, 1, 0), fov_x=1.5, width=96, height=96
@@ -241,15 +252,20 @@ def test_cuts_from_a_camera_come_closer_to_the_asset(bundle, device):
         return np.mean([np.abs(host(picture) - truth).mean() for picture in drawn])
 
     around = refine_bundle(bundle, steps=150, drop=0, device=device, progress=False)
-    there = refine_bundle(bundle, cameras=[camera], steps=150, drop=0, device=device, progress=False)
+    there = refine_bundle(
+        bundle, cameras=[camera], steps=150, drop=0, device=device, progress=False
+    )
     assert error(there) < error(around) < error(bundle)
 
 
 def weights_of(bundle, device, steps, cameras=()):
-    """What `steps` pictures show of each gaussian, and how many have it in their cuts."""
+    """What `steps` pictures show of each gaussian, and how many have it in their
+    cuts."""
     gaussians = on(device, bundle.gaussians)
     config = fit_config(BuildConfig(steps=steps, first_steps=steps, filter_px2=0.1), 0, 1)
-    return _core.weigh_cuts(config, gaussians.rows, pictures_of(bundle, cameras), _core.FitProgress())
+    return _core.weigh_cuts(
+        config, gaussians.rows, pictures_of(bundle, cameras), _core.FitProgress()
+    )
 
 
 def test_what_is_seen_of_gaussians_adds_up_to_the_alpha_of_pictures(bundle, device):
@@ -284,7 +300,9 @@ def test_what_is_not_looked_at_stays(bundle, device):
     camera = v3dg.Camera.look_at((0.75, 0, 0.6), (0.75, 0, 0), (0, 1, 0), 0.5, width=64, height=64)
     _, num_looks = weights_of(bundle, "cpu", 2000, [camera])
     assert (num_looks == 0).any()
-    refined = refine_bundle(bundle, cameras=[camera], steps=1, drop=0.5, device=device, progress=False)
+    refined = refine_bundle(
+        bundle, cameras=[camera], steps=1, drop=0.5, device=device, progress=False
+    )
     offset = bundle.clusters.offset[:-1]
     is_unseen = np.maximum.reduceat(num_looks, offset) == 0
     before, after = (np.diff(b.clusters.offset) for b in (bundle, refined))
@@ -320,7 +338,9 @@ def test_what_nobody_sees_is_dropped_of_all_levels_but_the_first(device, tmp_pat
         assert after.sum() < 0.1 * before.sum()
         assert (~after).sum() > 0.9 * (~before).sum()
     for name in ("level", "own_group", "parent_group", "filter_px2"):
-        np.testing.assert_array_equal(getattr(refined.clusters, name), getattr(bundle.clusters, name))
+        np.testing.assert_array_equal(
+            getattr(refined.clusters, name), getattr(bundle.clusters, name)
+        )
     refined.write(tmp_path / "refined.v3dg")
     again = v3dg.Bundle.open(tmp_path / "refined.v3dg")
     camera = v3dg.turntable((0, 0, 0), 3.0, 1, width=64, height=64)[0]
@@ -363,7 +383,8 @@ def arguments(bundle, device, config, pictures):
 
 
 def test_a_step_goes_down_the_slope_of_the_loss(bundle, device):
-    """The first step of Adam has the size of the step and the sign of the slope, whatever that is."""
+    """The first step of Adam has the size of the step and the sign of the slope,
+    whatever that is."""
     torch = pytest.importorskip("torch")
     sizes = dict(zip(SIZES, (1e-4, 2e-4, 3e-4, 4e-4, 5e-4, 6e-4), strict=True))
     config = replace(BuildConfig(), steps=1, first_steps=1, filter_px2=0.1, **sizes)
@@ -383,7 +404,8 @@ def test_a_step_goes_down_the_slope_of_the_loss(bundle, device):
     leaves = bundle.level_gaussians(0)
     larger = v3dg.rasterize(leaves, shown.scaled(samples))
     wanted = [
-        torch.tensor(box_downsample(a, samples).astype(np.float64)) for a in (larger.color, larger.alpha)
+        torch.tensor(box_downsample(a, samples).astype(np.float64))
+        for a in (larger.color, larger.alpha)
     ]
     loss = (drawn.color - wanted[0]).abs().mean() + 0.5 * (drawn.alpha - wanted[1]).abs().mean()
     loss.backward()
@@ -411,7 +433,9 @@ def test_a_step_goes_down_the_slope_of_the_loss(bundle, device):
         step, slope = step[moves], slope[moves]
         is_steep = np.abs(slope) > 0.05 * np.abs(slope).max()
         assert is_steep.sum() > 20
-        np.testing.assert_allclose(step[is_steep], -size * np.sign(slope[is_steep]), rtol=0.05, err_msg=name)
+        np.testing.assert_allclose(
+            step[is_steep], -size * np.sign(slope[is_steep]), rtol=0.05, err_msg=name
+        )
     others = np.ones(bundle.num_gaussians, bool)
     others[rows[~is_level_0]] = False
     for name, values in vars(bundle.gaussians).items():

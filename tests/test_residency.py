@@ -1,4 +1,5 @@
-"""What is kept of bundles and scenes: made once a device, given back with its owner or all at once."""
+"""What is kept of bundles and scenes: made once a device, given back with its owner or
+all at once."""
 
 import gc
 import itertools
@@ -29,7 +30,8 @@ def where(device):
 
 @pytest.fixture
 def made(monkeypatch):
-    """Counts what is made: the name of each kind of the core's, as often as one was made."""
+    """Counts what is made: the name of each kind of the core's, as often as one was
+    made."""
     made = []
     for name in ("ClusterTable", "Model", "Palette", "SceneFrame", "ResidentScene"):
         monkeypatch.setattr(_core, name, counted(getattr(_core, name), made))
@@ -88,7 +90,9 @@ def test_added_bundle_leaves_the_others_where_they_are(where, made):
     again = Scene()
     again.add(first)
     again.add(second, positions=(1.0, 0, 0))
-    np.testing.assert_array_equal(host(image.color), host(render(again, CAMERA, device=where).color))
+    np.testing.assert_array_equal(
+        host(image.color), host(render(again, CAMERA, device=where).color)
+    )
 
 
 def test_scene_is_taken_over_as_it_is_now(where):
@@ -114,7 +118,10 @@ def test_scene_is_taken_over_as_it_is_now(where):
 
 
 def drawn_and_chosen(scene, where):
-    image, cut = render(scene, CAMERA, depth=True, device=where), select(scene, CAMERA, device=where)
+    image, cut = (
+        render(scene, CAMERA, depth=True, device=where),
+        select(scene, CAMERA, device=where),
+    )
     return *host((image.color, image.alpha, image.depth)), cut.instance_ids, cut.cluster_ids
 
 
@@ -149,7 +156,10 @@ def test_what_is_cleared_is_made_again(where):
     assert residency.num_bytes(where) == 0
     assert residency.table(asset) is not table
     assert residency.model(asset, where) is not model
-    for again in (render(asset, CAMERA, device=where), renderer.render(CAMERA)):  # which keeps what it has
+    for again in (
+        render(asset, CAMERA, device=where),
+        renderer.render(CAMERA),
+    ):  # which keeps what it has
         np.testing.assert_array_equal(host(again.color), host(image.color))
 
 
@@ -187,7 +197,8 @@ def test_threads_get_the_same(where, made):
 
 
 def test_no_lock_is_held_for_ever_in_a_child():
-    """A fork while another thread was asking leaves the child a lock that nobody gives back."""
+    """A fork while another thread was asking leaves the child a lock that nobody gives
+    back."""
     kept = Residency()
     with ThreadPoolExecutor(1) as pool:
         pool.submit(kept.lock.acquire).result()  # by a thread that a child has not

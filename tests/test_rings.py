@@ -98,5 +98,7 @@ def test_an_empty_pile_passes_time():
 def test_wrong_shapes_and_radii_are_refused():
     with pytest.raises(ValueError, match=r"expected shapes \(N, 3\), \(N, 4\), \(N,\)"):
         pile_of(np.zeros((2, 3)), np.zeros((1, 4)))
-    with pytest.raises(ValueError, match="tube: expected a radius between 0 and the ring's 1, got 2"):
+    with pytest.raises(
+        ValueError, match="tube: expected a radius between 0 and the ring's 1, got 2"
+    ):
         Pile([[0, 0, 0]], [FLAT], [1.0], ring=1.0, tube=2.0)

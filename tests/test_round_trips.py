@@ -1,4 +1,5 @@
-"""What comes back of everything that is written: as many gaussians, and nearly the same pictures.
+"""What comes back of everything that is written: as many gaussians, and nearly the same
+pictures.
 
 The bounds are below what the tables of docs/formats.md have for two donuts.
 """
@@ -63,7 +64,9 @@ def test_assets_come_back(tmp_path, asset, name, options, least_db):
 
 def test_a_web_page_comes_back(tmp_path, bundle):
     write_site(bundle, tmp_path / "site", up="-y")  # which turns nothing
-    assert_back(v3dg.read_asset(tmp_path / "site" / "lod-meta.json"), bundle.level_gaussians(0), 50.0)
+    assert_back(
+        v3dg.read_asset(tmp_path / "site" / "lod-meta.json"), bundle.level_gaussians(0), 50.0
+    )
 
 
 def test_tiles_come_back(tmp_path, bundle):

@@ -70,8 +70,14 @@ def test_quarter_turn_about_z_takes_x_to_y():
         ({"positions": np.zeros((2, 2))}, r"positions: expected shape \(I, 3\), got \(2, 2\)"),
         ({"positions": [[0, 0, np.nan]]}, "positions: expected finite numbers, got nan"),
         ({"positions": "here"}, "positions: expected numbers, got str"),
-        ({"quaternions": [[1, 0, 0, 0]] * 2}, r"quaternions: expected shape \(1, 4\), got \(2, 4\)"),
-        ({"quaternions": [0, 0, 0, 0]}, "quaternions: expected a rotation, got a quaternion of zeros"),
+        (
+            {"quaternions": [[1, 0, 0, 0]] * 2},
+            r"quaternions: expected shape \(1, 4\), got \(2, 4\)",
+        ),
+        (
+            {"quaternions": [0, 0, 0, 0]},
+            "quaternions: expected a rotation, got a quaternion of zeros",
+        ),
         ({"quaternions": [np.inf, 0, 0, 0]}, "quaternions: expected finite numbers, got inf"),
         ({"scales": [1, 2]}, r"scales: expected shape \(1,\), got \(2,\)"),
         ({"scales": -1}, "scales: expected positive numbers, got -1"),
@@ -117,7 +123,9 @@ def small_scene():
     return scene
 
 
-@pytest.mark.parametrize("take", [copy.copy, copy.deepcopy, lambda s: pickle.loads(pickle.dumps(s))])
+@pytest.mark.parametrize(
+    "take", [copy.copy, copy.deepcopy, lambda s: pickle.loads(pickle.dumps(s))]
+)
 def test_copies_of_scenes_and_cuts_go_their_own_way(take):
     scene, same = small_scene(), small_scene()
     cut = select(scene, CAMERA, tolerance=0.1, device="cpu")
@@ -139,7 +147,9 @@ def test_copies_of_scenes_and_cuts_go_their_own_way(take):
     np.testing.assert_array_equal(of_copy.color, render(scene, CAMERA, cut=cut, device="cpu").color)
 
 
-@pytest.mark.parametrize("take", [lambda s: s, copy.deepcopy, lambda s: pickle.loads(pickle.dumps(s))])
+@pytest.mark.parametrize(
+    "take", [lambda s: s, copy.deepcopy, lambda s: pickle.loads(pickle.dumps(s))]
+)
 def test_what_is_handed_out_cannot_be_written_to(take):
     scene = small_scene()
     cut = take(select(scene, CAMERA, tolerance=0.1, device="cpu"))
@@ -161,7 +171,8 @@ def test_what_was_given_stays_the_users():
 
 
 def test_cut_of_instances_that_are_gone_is_refused():
-    """Though others have come in their places, of other bundles; not because others came or they moved."""
+    """Though others have come in their places, of other bundles; not because others
+    came or they moved."""
     scene = small_scene()
     cut = select(scene, CAMERA, tolerance=0.1, device="cpu")
     num = len(cut.gaussians(device="cpu"))

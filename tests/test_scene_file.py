@@ -49,7 +49,10 @@ def test_written_scene_reads_back_the_same(tmp_path_factory, positions, seed):
         np.testing.assert_array_equal(cameras_again[name].viewmat, camera.viewmat)
         np.testing.assert_array_equal(cameras_again[name].K, camera.K)
         assert cameras_again[name].near == camera.near
-        assert (cameras_again[name].width, cameras_again[name].height) == (camera.width, camera.height)
+        assert (cameras_again[name].width, cameras_again[name].height) == (
+            camera.width,
+            camera.height,
+        )
     assert [entry.name for entry in path.parent.iterdir()] == ["scene.json"]
 
 
@@ -72,14 +75,21 @@ GOOD = {
 
 
 def put(path, document):
-    path.write_text(document if isinstance(document, str) else json.dumps(document), encoding="utf-8")
+    path.write_text(
+        document if isinstance(document, str) else json.dumps(document), encoding="utf-8"
+    )
     return path
 
 
 def test_instances_are_added_at_once_whatever_their_order(tmp_path, monkeypatch):
     """So that time grows with their number, and not with its square."""
     instances = [{"bundle": "ab"[i % 2], "position": [i, 0, 0]} for i in range(100)]
-    document = {"format": "v3dg-scene", "version": 1, "bundles": {"a": "a", "b": "b"}, "instances": instances}
+    document = {
+        "format": "v3dg-scene",
+        "version": 1,
+        "bundles": {"a": "a", "b": "b"},
+        "instances": instances,
+    }
     path = tmp_path / "scene.json"
     path.write_text(json.dumps(document))
     calls, add = [], Scene.add
@@ -102,7 +112,9 @@ def test_bundles_are_opened_beside_the_file(tmp_path):
 
 def test_missing_bundle_is_named(tmp_path):
     path = put(tmp_path / "scene.json", GOOD)
-    with pytest.raises(FileNotFoundError, match=r"scene\.json: bundles\.donut: expected a bundle at .*donut"):
+    with pytest.raises(
+        FileNotFoundError, match=r"scene\.json: bundles\.donut: expected a bundle at .*donut"
+    ):
         read_scene(path)
 
 
@@ -124,12 +136,36 @@ def changed(place, value, document=GOOD):
     [
         (["instances", 3, "scale"], -1, "instances[3].scale: expected a positive number, got -1"),
         (["instances", 3, "scale"], True, "instances[3].scale: expected a number, got true"),
-        (["instances", 3, "importance"], 0, "instances[3].importance: expected a positive number, got 0"),
-        (["instances", 3, "importance"], "x", 'instances[3].importance: expected a number, got "x"'),
-        (["instances", 3, "importance"], 1e39, "instances[3].importance: expected a positive number that a"),
-        (["instances", 3, "importance"], 1e-50, "instances[3].importance: expected a positive number that a"),
-        (["instances", 0, "position"], [1, 2], "instances[0].position: expected 3 numbers, got [1, 2]"),
-        (["instances", 0, "position", 1], "x", 'instances[0].position[1]: expected a number, got "x"'),
+        (
+            ["instances", 3, "importance"],
+            0,
+            "instances[3].importance: expected a positive number, got 0",
+        ),
+        (
+            ["instances", 3, "importance"],
+            "x",
+            'instances[3].importance: expected a number, got "x"',
+        ),
+        (
+            ["instances", 3, "importance"],
+            1e39,
+            "instances[3].importance: expected a positive number that a",
+        ),
+        (
+            ["instances", 3, "importance"],
+            1e-50,
+            "instances[3].importance: expected a positive number that a",
+        ),
+        (
+            ["instances", 0, "position"],
+            [1, 2],
+            "instances[0].position: expected 3 numbers, got [1, 2]",
+        ),
+        (
+            ["instances", 0, "position", 1],
+            "x",
+            'instances[0].position[1]: expected a number, got "x"',
+        ),
         (
             ["instances", 0, "position", 1],
             10**400,
@@ -140,7 +176,11 @@ def changed(place, value, document=GOOD):
             [0, 0, 0, 0],
             "instances[1].quaternion: expected a quaternion that",
         ),
-        (["instances", 1, "bundle"], "tree", 'instances[1].bundle: expected a name from bundles, got "tree"'),
+        (
+            ["instances", 1, "bundle"],
+            "tree",
+            'instances[1].bundle: expected a name from bundles, got "tree"',
+        ),
         (
             ["instances", 1, "position"],
             None,
@@ -159,8 +199,16 @@ def changed(place, value, document=GOOD):
         (["version"], 2, "version: expected 1, which is what this build reads, got 2"),
         (["version"], None, "top level: expected the field version"),
         (["cameras", 0, "width"], 0, "cameras[0].width: expected a positive whole number, got 0"),
-        (["cameras", 0, "target"], None, "cameras[0]: expected either viewmat and K, or eye and target"),
-        (["cameras", 0, "target"], [0, -8, 2], "cameras[0].target: expected a point away from the eye"),
+        (
+            ["cameras", 0, "target"],
+            None,
+            "cameras[0]: expected either viewmat and K, or eye and target",
+        ),
+        (
+            ["cameras", 0, "target"],
+            [0, -8, 2],
+            "cameras[0].target: expected a point away from the eye",
+        ),
         (["cameras", 0, "fov_x"], 4, "cameras[0].fov_x: expected radians between 0 and pi, got 4"),
         (
             ["cameras", 1, "name"],
@@ -171,7 +219,11 @@ def changed(place, value, document=GOOD):
         (["cameras", 1, "viewmat", 2, 2], -1, "cameras[1].viewmat: expected a rotation"),
         (["cameras", 1, "K", 0, 0], 0, "cameras[1].K: expected positive focal lengths"),
         (["cameras", 1, "near"], 0, "cameras[1].near: expected a positive number, got 0"),
-        (["cameras", 1, "up"], [0, 0, 1], "cameras[1]: expected either viewmat and K, or eye and target"),
+        (
+            ["cameras", 1, "up"],
+            [0, 0, 1],
+            "cameras[1]: expected either viewmat and K, or eye and target",
+        ),
     ],
 )
 def test_bad_values_are_named_by_their_place(tmp_path, place, value, message):
@@ -186,7 +238,9 @@ def test_bad_values_are_named_by_their_place(tmp_path, place, value, message):
 def test_files_that_are_not_json_are_refused(tmp_path, text):
     path = tmp_path / "scene.json"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    with pytest.raises(ValueError, match=r"scene\.json: expected JSON, got a file that does not parse"):
+    with pytest.raises(
+        ValueError, match=r"scene\.json: expected JSON, got a file that does not parse"
+    ):
         read_scene(path)
 
 
@@ -200,7 +254,8 @@ MATRIX = [[1, 0, 0, 0], [0, 0, -1, -5], [0, 1, 0, 1], [0, 0, 0, 1]]
 
 
 def published_layout():
-    """As the paper's code has them: two assets, one with the notes of the program that placed it."""
+    """As the paper's code has them: two assets, one with the notes of the program that
+    placed it."""
     camera = {
         "camera_name": "camera_0",
         "camera_width": 64,
@@ -211,19 +266,30 @@ def published_layout():
     }
     pose = {"scale": 0.5, "quaternions": [1, 0, 0, 0], "positions": [0, 0, 0]}
     other = {"scale": 2.0, "quaternions": [0, 1, 0, 0], "positions": [1, 2, 3]}
-    asset = {"ply_suffix": "point_cloud/fused.ply", "bundle_kind": "trees", "bundle_name": "oak_250414_n4096"}
+    asset = {
+        "ply_suffix": "point_cloud/fused.ply",
+        "bundle_kind": "trees",
+        "bundle_name": "oak_250414_n4096",
+    }
     return {
         "layouts": [
             {
                 "layout_name": "layout_0",
                 "assets": [
-                    {"asset_kind": "trees", "asset_name": "oak", **asset, "instances": [pose, other]},
+                    {
+                        "asset_kind": "trees",
+                        "asset_name": "oak",
+                        **asset,
+                        "instances": [pose, other],
+                    },
                     {
                         "asset_kind": "donut",
                         "asset_name": "donut",
                         **asset,
                         "scene_max_3d_box": [1, 1, 1],
-                        "instances": [{"i_asset": 1, "instance_name": "instance_2", "center_x": 0.1, **pose}],
+                        "instances": [
+                            {"i_asset": 1, "instance_name": "instance_2", "center_x": 0.1, **pose}
+                        ],
                     },
                 ],
                 "cameras": [camera, {**camera, "camera_name": "camera_1"}],
@@ -252,14 +318,19 @@ def test_published_layouts_find_bundles_where_a_build_puts_them(tmp_path):
     """Beside the layout, or beside the assets of the published code."""
     (tmp_path / "layouts").mkdir()
     path = put(tmp_path / "layouts" / "layout.json", published_layout())
-    with pytest.raises(FileNotFoundError, match=r"layouts\[0\]\.assets\[0\]\.asset_name: .*oak\.v3dg or "):
+    with pytest.raises(
+        FileNotFoundError, match=r"layouts\[0\]\.assets\[0\]\.asset_name: .*oak\.v3dg or "
+    ):
         read_scene(path)
     BUNDLE.write(tmp_path / "layouts" / "donut.v3dg")
     place = tmp_path / "_3dgs-assets" / "trees" / "oak" / "point_cloud"
     place.mkdir(parents=True)
     OTHER.write(place / "fused.v3dg")
     scene, _ = read_scene(path)
-    assert [bundle.num_gaussians for bundle in scene.bundles] == [OTHER.num_gaussians, BUNDLE.num_gaussians]
+    assert [bundle.num_gaussians for bundle in scene.bundles] == [
+        OTHER.num_gaussians,
+        BUNDLE.num_gaussians,
+    ]
 
 
 def test_repeated_camera_names_of_a_layout_get_their_place(tmp_path):
@@ -280,7 +351,14 @@ def flat_layout():
             {"scale": 2, "quaternion": [0, 1, 0, 0], "position": [1, 2, 3]},
         ],
         "cameras": [
-            {"name": "0", "width": 64, "height": 48, "fov_x": 0.8, "fov_y": 0.6, "transform_matrix": MATRIX}
+            {
+                "name": "0",
+                "width": 64,
+                "height": 48,
+                "fov_x": 0.8,
+                "fov_y": 0.6,
+                "transform_matrix": MATRIX,
+            }
         ],
     }
 
@@ -290,7 +368,9 @@ def test_flat_layouts_are_read(tmp_path):
     scene, cameras = read_scene(path, bundles={"donut.ply": BUNDLE})
     np.testing.assert_array_equal(scene.scales, [0.5, 2])
     np.testing.assert_allclose(cameras["0"].position, [0, -5, 1])
-    with pytest.raises(FileNotFoundError, match=r"layout\.json: asset: expected a bundle at .*donut\.v3dg"):
+    with pytest.raises(
+        FileNotFoundError, match=r"layout\.json: asset: expected a bundle at .*donut\.v3dg"
+    ):
         read_scene(path)
     BUNDLE.write(tmp_path / "donut.v3dg")
     assert len(read_scene(path)[0]) == 2
@@ -302,7 +382,11 @@ def test_flat_layouts_are_read(tmp_path):
         (["layouts"], [], "layouts: expected one layout, got 0"),
         (["layouts"], [{}, {}], "layouts: expected one layout, got 2; each layout is a scene"),
         (["layouts", 0, "assets"], None, "layouts[0]: expected the field assets"),
-        (["layouts", 0, "assets", 1, "asset_name"], 3, "layouts[0].assets[1].asset_name: expected a string"),
+        (
+            ["layouts", 0, "assets", 1, "asset_name"],
+            3,
+            "layouts[0].assets[1].asset_name: expected a string",
+        ),
         (
             ["layouts", 0, "assets", 0, "instances", 1, "scale"],
             0,

@@ -25,7 +25,9 @@ from v3dg import BuildConfig, Bundle, Camera, Gaussians, Scene, _core, build_bun
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 seeds = st.integers(0, 2**32 - 1)
 # Where the scene lies, how far the cameras are from it: far, within, at the very place.
-places = st.sampled_from([(0.0, 5.0), (0.0, 100.0), (0.0, 0.3), (0.0, 1e6), (1e6, 5.0), (-3e9, 50.0)])
+places = st.sampled_from(
+    [(0.0, 5.0), (0.0, 100.0), (0.0, 0.3), (0.0, 1e6), (1e6, 5.0), (-3e9, 50.0)]
+)
 
 
 def pairs(selection):
@@ -46,9 +48,14 @@ def bundles(draw):
     rng = np.random.default_rng(seed)
     origin = draw(st.sampled_from([0.0, 10.0, 1e4]))
     asset = blob(
-        rng, draw(st.integers(1, 120)), origin=origin, size=draw(st.sampled_from([1e-3, 1.0, 100.0]))
+        rng,
+        draw(st.integers(1, 120)),
+        origin=origin,
+        size=draw(st.sampled_from([1e-3, 1.0, 100.0])),
     )
-    return lod_bundle(rng, asset, draw(st.integers(2, 30)), group_size=draw(st.sampled_from([2, 4, 8])))
+    return lod_bundle(
+        rng, asset, draw(st.integers(2, 30)), group_size=draw(st.sampled_from([2, 4, 8]))
+    )
 
 
 def tolerances_of(draw, scene, camera):
@@ -105,7 +112,8 @@ def test_metrics_agree_with_reference(seed, footprint, place):
     for i, metric in enumerate(group_metrics(scene, camera, footprint=footprint)):
         expected = np.array(reference.metrics(scene, i, camera, footprint))
         if footprint == "solid_angle":
-            # Near a ball's surface the area is steep in the distance, which float32 holds to 1e-7.
+            # Near a ball's surface the area is steep in the distance, which float32
+            # holds to 1e-7.
             near = np.array(
                 [
                     footprint_is_steep(ball, reference.eye_in_instance(scene, i, camera))
@@ -117,7 +125,9 @@ def test_metrics_agree_with_reference(seed, footprint, place):
             np.testing.assert_allclose(metric, expected, rtol=1e-4)
         else:
             depth = depths(scene, i, camera)
-            clear = np.abs(depth) > 1e-2 * np.linalg.norm(reference.eye_in_instance(scene, i, camera))
+            clear = np.abs(depth) > 1e-2 * np.linalg.norm(
+                reference.eye_in_instance(scene, i, camera)
+            )
             np.testing.assert_allclose(metric[clear], expected[clear], rtol=1e-3)
 
 
@@ -128,10 +138,14 @@ def footprint_is_steep(ball, eye):
 
 def depths(scene, i, camera):
     forward = scene.rotations[i].T @ camera.viewmat[2, :3]
-    return (scene.bundles[0].groups.ball[:, :3] - reference.eye_in_instance(scene, i, camera)) @ forward
+    return (
+        scene.bundles[0].groups.ball[:, :3] - reference.eye_in_instance(scene, i, camera)
+    ) @ forward
 
 
-@given(seed=seeds, footprint=st.sampled_from(["solid_angle", "paper"]), tolerance=st.floats(1e-4, 1e4))
+@given(
+    seed=seeds, footprint=st.sampled_from(["solid_angle", "paper"]), tolerance=st.floats(1e-4, 1e4)
+)
 def test_cut_agrees_with_reference(seed, footprint, tolerance):
     rng = np.random.default_rng(seed)
     scene = random_scene(rng, random_bundle(seed, num_levels=4), 3)
@@ -140,7 +154,9 @@ def test_cut_agrees_with_reference(seed, footprint, tolerance):
     for metric in group_metrics(scene, camera, footprint=footprint):
         if (np.abs(metric - tolerance) <= 1e-3 * tolerance).any():
             return  # rounding may decide
-    selection = select(scene, camera, tolerance=tolerance, footprint=footprint, cull=False, device="cpu")
+    selection = select(
+        scene, camera, tolerance=tolerance, footprint=footprint, cull=False, device="cpu"
+    )
     assert pairs(selection) == reference.cut(scene, camera, tolerance, footprint)
 
 
@@ -158,7 +174,10 @@ def test_tolerance_equal_to_a_metric_fits(device, footprint):
         just_below = select(bundle, camera, tolerance=float(below), **options)
         children = np.flatnonzero(bundle.clusters.parent_group == g)
         assert not np.isin(children, at.cluster_ids).any()
-        assert np.isin(np.flatnonzero(bundle.clusters.own_group == g), just_below.cluster_ids).sum() == 0
+        assert (
+            np.isin(np.flatnonzero(bundle.clusters.own_group == g), just_below.cluster_ids).sum()
+            == 0
+        )
 
 
 def test_tolerance_orders_the_detail():
@@ -182,7 +201,11 @@ def test_turning_the_camera_changes_nothing(bundle, seed):
     for angle in rng.uniform(0, 2 * np.pi, 3):
         # A turn about the eye at the origin: exact, so that not a bit may change.
         viewmat = np.eye(4)
-        viewmat[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        viewmat[:3, :3] = [
+            [np.cos(angle), 0, np.sin(angle)],
+            [0, 1, 0],
+            [-np.sin(angle), 0, np.cos(angle)],
+        ]
         other = Camera(viewmat, camera.K, 64, 48)
         for a, b in zip(group_metrics(scene, camera), group_metrics(scene, other), strict=True):
             np.testing.assert_array_equal(a, b)
@@ -227,7 +250,10 @@ def test_moving_scene_and_camera_together_changes_nothing(shift):
 def frames(gaussians, scene, i, camera):
     """Means and covariances in camera space, in double precision."""
     turn = camera.viewmat[:3, :3] @ scene.rotations[i]
-    means = scene.scales[i] * gaussians.means.astype(np.float64) @ scene.rotations[i].T + scene.positions[i]
+    means = (
+        scene.scales[i] * gaussians.means.astype(np.float64) @ scene.rotations[i].T
+        + scene.positions[i]
+    )
     means = means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     return means, scene.scales[i] ** 2 * turn @ covariances(gaussians) @ turn.T
 
@@ -240,7 +266,9 @@ def test_frustum_never_drops_what_a_pixel_shows(seed, distance, off_center):
     scene = random_scene(rng, bundle, 4, spread=2.0)
     camera = random_camera(rng, distance=distance, near=float(rng.choice([0.01, 1.0])))
     if off_center:
-        K = camera.K + np.array([[0, 0, rng.uniform(-40, 40)], [0, 0, rng.uniform(-40, 40)], [0, 0, 0]])
+        K = camera.K + np.array(
+            [[0, 0, rng.uniform(-40, 40)], [0, 0, rng.uniform(-40, 40)], [0, 0, 0]]
+        )
         camera = Camera(camera.viewmat, K, camera.width, camera.height, camera.near)
     tolerance = float(rng.choice([0.0, 0.5, 100.0]))
     everything = pairs(select(scene, camera, tolerance=tolerance, cull=False, device="cpu"))
@@ -255,8 +283,9 @@ def test_frustum_never_drops_what_a_pixel_shows(seed, distance, off_center):
 
 @pytest.mark.parametrize("side", range(4))
 def test_frustum_keeps_needles_whose_image_leans_in(side):
-    # The needle lies beside the image and along its edge, past the eye. Its projection is linearised at its
-    # mean, outside the image, so its picture lies across the edge although the needle itself does not.
+    # The needle lies beside the image and along its edge, past the eye. Its projection
+    # is linearised at its mean, outside the image, so its picture lies across the edge
+    # although the needle itself does not.
     asset = Gaussians(
         means=np.zeros((1, 3), np.float32),
         quats=np.array([[1, 0, 0, 0]], np.float32),
@@ -294,7 +323,8 @@ def test_frustum_drops_most_of_what_lies_outside():
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("num_bundles", [8, 9, 40])
 def test_bundles_of_different_filters_are_cut_as_if_alone(device, num_bundles):
-    # A wide filter reaches far beyond the frustum, so each bundle has a frustum of its own.
+    # A wide filter reaches far beyond the frustum, so each bundle has a frustum of its
+    # own.
     rng = np.random.default_rng(num_bundles)
     scene = Scene()
     for b in range(num_bundles):
@@ -327,7 +357,10 @@ def test_order_counts_and_scenes_of_several_bundles(bundle, other, seed):
     selection = select(scene, camera, tolerance=float(rng.choice([0, 0.5, 50])), device="cpu")
     assert pairs(selection) == sorted(set(pairs(selection)))
     assert selection.instance_ids.dtype == selection.cluster_ids.dtype == np.int32
-    sizes = [np.diff(scene.bundles[scene.instance_bundle[i]].clusters.offset)[c] for i, c in pairs(selection)]
+    sizes = [
+        np.diff(scene.bundles[scene.instance_bundle[i]].clusters.offset)[c]
+        for i, c in pairs(selection)
+    ]
     assert selection.num_gaussians == sum(sizes)
     assert len(selection.filters_px2) == len(selection.antialiased) == selection.num_gaussians
     for i in range(len(scene)):
@@ -357,9 +390,13 @@ def test_bad_arguments_are_refused():
         select(bundle, camera, tolerance=-1, device="cpu")
     with pytest.raises(ValueError, match="tolerance: expected 0 px² or more, got nan"):
         select(bundle, camera, tolerance=float("nan"), device="cpu")
-    with pytest.raises(ValueError, match="footprint: expected 'solid_angle' or 'paper', got 'ball'"):
+    with pytest.raises(
+        ValueError, match="footprint: expected 'solid_angle' or 'paper', got 'ball'"
+    ):
         select(bundle, camera, tolerance=1, footprint="ball", device="cpu")
-    with pytest.raises(ValueError, match="device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got 'tpu'"):
+    with pytest.raises(
+        ValueError, match="device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got 'tpu'"
+    ):
         select(bundle, camera, tolerance=1, device="tpu")
     for device in ("cpu", "auto"):
         with pytest.raises(TypeError, match="subject: expected a Scene or a Bundle, got int"):
@@ -396,7 +433,10 @@ def test_both_devices_choose_the_same():
     rng = np.random.default_rng(21)
     for _ in range(30):
         scene = random_scene(rng, lod_bundle(rng, blob(rng, 300), 8), 200, spread=10)
-        scene.add(random_bundle(int(rng.integers(1 << 30)), num_levels=4), positions=rng.normal(size=(5, 3)))
+        scene.add(
+            random_bundle(int(rng.integers(1 << 30)), num_levels=4),
+            positions=rng.normal(size=(5, 3)),
+        )
         camera = random_camera(rng)
         metric = np.concatenate(group_metrics(scene, camera))
         tolerance = float(rng.choice(metric[np.isfinite(metric)]))
@@ -413,7 +453,8 @@ OPTIONS = [{}, {"fade": 1.3}, {"min_level": 7}, {"footprint": "paper"}]
 
 
 def lane_scene(count):
-    """Instances that need a table, its last clusters or their tops alone, in every order; and a camera."""
+    """Instances that need a table, its last clusters or their tops alone, in every
+    order; and a camera."""
     rng = np.random.default_rng(count)
     config = BuildConfig(cluster_size=32, steps=0, num_views=1)
     made = [build_bundle(blob(rng, size), config=config, progress=False) for size in (700, 40, 1)]
@@ -431,7 +472,8 @@ def test_both_devices_choose_the_same_of_what_a_lane_asks(count, options):
     scene, camera = lane_scene(count)
     for tolerance in (0.1, 3.0, 100.0):
         cpu, cuda = (
-            select(scene, camera, tolerance=tolerance, device=device, **options) for device in ("cpu", "cuda")
+            select(scene, camera, tolerance=tolerance, device=device, **options)
+            for device in ("cpu", "cuda")
         )
         same(cpu, cuda)
         assert (cpu.num_gaussians, cpu.tolerance) == (cuda.num_gaussians, cuda.tolerance)
@@ -441,7 +483,8 @@ def test_both_devices_choose_the_same_of_what_a_lane_asks(count, options):
 
 @pytest.mark.parametrize("options", OPTIONS)
 def test_many_instances_are_cut_as_each_alone(options):
-    """Of many instances of a bundle those clusters are not asked that a distance rules out."""
+    """Of many instances of a bundle those clusters are not asked that a distance rules
+    out."""
     scene, camera = lane_scene(200)
     for tolerance in (0.1, 3.0, 100.0):
         whole = select(scene, camera, tolerance=tolerance, device="cpu", **options)

@@ -50,14 +50,18 @@ def transparent(gaussians):
 def test_pruning_agrees_with_reference(device, seed, count, data):
     wanted = data.draw(st.integers(1, count))
     g = random_gaussians(seed, count, sh_degree=1)
-    assert same(prune(device, g, [count], [wanted]), g.subset(np.array(reference.survivors(g, wanted))))
+    assert same(
+        prune(device, g, [count], [wanted]), g.subset(np.array(reference.survivors(g, wanted)))
+    )
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 64, 100])
 def test_pruning_keeps_the_first_of_equals(device, count):
     g = scenes.gaussians(np.zeros((count, 3)), color=np.arange(3 * count).reshape(count, 3))
     wanted = (count + 1) // 2
-    assert same(prune(device, g, [count], [wanted]), g.subset(np.array(reference.survivors(g, wanted))))
+    assert same(
+        prune(device, g, [count], [wanted]), g.subset(np.array(reference.survivors(g, wanted)))
+    )
 
 
 def test_each_octant_keeps_its_share(device):
@@ -92,7 +96,9 @@ def test_merging_conserves_moments(device, seed, count, data):
     g = transparent(random_gaussians(seed, count, sh_degree=1))
     before, after = reference.moments(g), reference.moments(merge(device, g, [count], [wanted]))
     for name in ("mean", "second", "sh"):
-        assert_close(getattr(after, name) / before.weight, getattr(before, name) / before.weight, MERGE_FLOAT)
+        assert_close(
+            getattr(after, name) / before.weight, getattr(before, name) / before.weight, MERGE_FLOAT
+        )
     assert_close(after.weight, before.weight, MERGE_FLOAT)
 
 
@@ -121,7 +127,9 @@ def test_equal_gaussians_merge_into_their_like(device):
     assert_close(np.sort(one.scales), np.sort(g.scales), MERGE_FLOAT)
     assert_close(one.opacities, 8 * g.opacities, MERGE_FLOAT)
     # Ties by index: the first two pair up.
-    assert same(merge(device, copies, [8], [7]).subset(slice(1, None)), copies.subset(slice(2, None)))
+    assert same(
+        merge(device, copies, [8], [7]).subset(slice(1, None)), copies.subset(slice(2, None))
+    )
 
 
 SHAPES = {
@@ -135,7 +143,9 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("quat", [(1, 0, 0, 0), (0, 1, 0, 0), (0.5, 0.5, 0.5, 0.5), (0.3, -0.2, 0.9, 0.1)])
+@pytest.mark.parametrize(
+    "quat", [(1, 0, 0, 0), (0, 1, 0, 0), (0.5, 0.5, 0.5, 0.5), (0.3, -0.2, 0.9, 0.1)]
+)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_scales_and_rotation_make_up_the_covariance(device, shape, quat):
     """The eigenvalues that equal, vanish or differ by millions."""
@@ -144,7 +154,9 @@ def test_scales_and_rotation_make_up_the_covariance(device, shape, quat):
     one, expected = merge(device, g, [2], [1]), reference.merged(g)
     eigenvalues = np.sort(np.linalg.eigvalsh(expected.covariance))
     size = eigenvalues[-1]
-    assert_close(np.sort(one.scales[0].astype(np.float64) ** 2) / size, eigenvalues / size, MERGE_FLOAT)
+    assert_close(
+        np.sort(one.scales[0].astype(np.float64) ** 2) / size, eigenvalues / size, MERGE_FLOAT
+    )
     assert_close(reference.covariances(one)[0] / size, expected.covariance / size, MERGE_FLOAT)
     assert_close(np.linalg.norm(one.quats[0]), 1, MERGE_FLOAT)
 
@@ -199,8 +211,16 @@ def test_no_gaussians_give_none(device, method):
 @pytest.mark.parametrize(
     ("in_offset", "out_offset", "message"),
     [
-        ([0, 3], [0, 4], "out_offset: expected 1 to as many gaussians as come in, segment 0 has others"),
-        ([0, 3], [0, 0], "out_offset: expected 1 to as many gaussians as come in, segment 0 has others"),
+        (
+            [0, 3],
+            [0, 4],
+            "out_offset: expected 1 to as many gaussians as come in, segment 0 has others",
+        ),
+        (
+            [0, 3],
+            [0, 0],
+            "out_offset: expected 1 to as many gaussians as come in, segment 0 has others",
+        ),
         ([0, 2], [0, 1], "expected segments from 0"),
         ([1, 3], [0, 1], "expected segments from 0"),
         ([0, 3], [1, 2], "expected segments from 0"),

@@ -1,4 +1,5 @@
-"""Two eyes that share one cut: it is exact for the nearer one, and leaves out what neither may see."""
+"""Two eyes that share one cut: it is exact for the nearer one, and leaves out what
+neither may see."""
 
 import dataclasses
 import pickle
@@ -29,7 +30,8 @@ def scene():
 
 
 def stereo_cameras(count=20, seed=1):
-    """Near and far, with eyes close together and far apart, of different fields of view and sizes."""
+    """Near and far, with eyes close together and far apart, of different fields of view
+    and sizes."""
     rng = np.random.default_rng(seed)
     for _ in range(count):
         eye = rng.normal(size=3) * rng.choice([1.0, 6.0, 20.0])
@@ -56,7 +58,8 @@ def options_of(k, scene, stereo):
 
 
 def test_the_cut_is_that_of_the_nearer_eye(scene):
-    """Refined where either eye alone refines; each eye's cut is at least as coarse on every path."""
+    """Refined where either eye alone refines; each eye's cut is at least as coarse on
+    every path."""
     groups_of = [bundle.clusters for bundle in scene.bundles]
     for stereo in stereo_cameras():
         if stereo.left.fx != stereo.right.fx:
@@ -96,7 +99,9 @@ def test_nothing_that_an_eye_sees_is_left_out(scene, device):
             for one in (cut, whole_cut):
                 same_picture(picture, render(scene, eye, cut=one, device=device))
         assert (
-            pictures[0].stats.gaussians_selected == cut.num_gaussians == pictures[1].stats.gaussians_selected
+            pictures[0].stats.gaussians_selected
+            == cut.num_gaussians
+            == pictures[1].stats.gaussians_selected
         )
         assert pictures[0].stats.tolerance == cut.tolerance
 
@@ -128,7 +133,9 @@ def test_a_budget_holds_for_both(scene, device):
 def test_both_eyes_are_settled(scene, device):
     stereo = next(stereo_cameras(seed=7))
     pictures = render(scene, stereo, tolerance=1.0, device=device, memory="64MB")
-    for picture, other in zip(pictures, render(scene, stereo, tolerance=1.0, device=device), strict=True):
+    for picture, other in zip(
+        pictures, render(scene, stereo, tolerance=1.0, device=device), strict=True
+    ):
         assert picture.stats.missing == 0
         same_picture(picture, other)
 
@@ -154,7 +161,9 @@ def test_frames_that_are_too_small_are_drawn_again(scene):
     stereo = next(stereo_cameras())
     first = Renderer(scene, device="cuda").render(stereo, tolerance=0.0)
     residency.clear()
-    for picture, other in zip(first, render(scene, stereo, tolerance=0.0, device="cuda"), strict=True):
+    for picture, other in zip(
+        first, render(scene, stereo, tolerance=0.0, device="cuda"), strict=True
+    ):
         same_picture(picture, other)
 
 
@@ -170,4 +179,6 @@ def test_what_is_no_stereo_camera_is_refused(scene):
         select(scene, stereo, footprint="paper", device="cpu")
     again = pickle.loads(pickle.dumps(stereo))
     assert np.array_equal(again.right.viewmat, stereo.right.viewmat)
-    np.testing.assert_allclose(stereo.right.position - stereo.left.position, [0.1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(
+        stereo.right.position - stereo.left.position, [0.1, 0, 0], atol=1e-12
+    )

@@ -1,4 +1,5 @@
-"""`v3dg/_core.pyi` says what the compiled module has: names, properties, and parameters in their order."""
+"""`v3dg/_core.pyi` says what the compiled module has: names, properties, and parameters
+in their order."""
 
 import ast
 import enum
@@ -45,7 +46,8 @@ def parameters_of(definition):
 
 
 def signatures_in_docstring(name, text):
-    """Parameters of each overload, from the lines that pybind11 begins a docstring with."""
+    """Parameters of each overload, from the lines that pybind11 begins a docstring
+    with."""
     overloads = re.findall(rf"^\d+\. {name}(\(.*)$", text, re.MULTILINE)
     lines = overloads or re.findall(rf"\A{name}(\(.*)", text)
     assert lines, f"{name}: expected a docstring with a signature, got {text!r}"
@@ -55,7 +57,8 @@ def signatures_in_docstring(name, text):
 
 
 def members_of_module(owner):
-    """What a module or class has by name: signatures, the members of a class, or the kind of attribute."""
+    """What a module or class has by name: signatures, the members of a class, or the
+    kind of attribute."""
     if isinstance(owner, enum.EnumMeta):
         return dict.fromkeys(owner.__members__, WRITABLE)
     found = {}
@@ -66,7 +69,9 @@ def members_of_module(owner):
             found[name] = READ_ONLY if value.fset is None else WRITABLE
         elif not callable(value):
             found[name] = WRITABLE
-        elif is_compared(name) and not isinstance(value, types.WrapperDescriptorType):  # one of object's
+        elif is_compared(name) and not isinstance(
+            value, types.WrapperDescriptorType
+        ):  # one of object's
             found[name] = signatures_in_docstring(name, getattr(owner, name).__doc__)
     return public(found)
 
@@ -103,7 +108,8 @@ def public(members):
 
 
 def as_built(stub, module):
-    """What of the stub the module must have: without CUDA, not what the bindings have for CUDA alone."""
+    """What of the stub the module must have: without CUDA, not what the bindings have
+    for CUDA alone."""
     if _core.has_cuda or not (isinstance(stub, dict) and isinstance(module, dict)):
         return stub
     return {

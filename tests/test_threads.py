@@ -1,4 +1,5 @@
-"""Several threads, forked processes, torch beside us: the same results, and no deadlock."""
+"""Several threads, forked processes, torch beside us: the same results, and no
+deadlock."""
 
 import copy
 import hashlib
@@ -25,7 +26,9 @@ SECONDS = 120  # more than any of this takes, on a machine that has more to do
 
 
 def digest(*arrays):
-    return hashlib.sha256(b"".join(np.ascontiguousarray(host(a)).tobytes() for a in arrays)).hexdigest()
+    return hashlib.sha256(
+        b"".join(np.ascontiguousarray(host(a)).tobytes() for a in arrays)
+    ).hexdigest()
 
 
 def asset(seed=20, num=3000):
@@ -33,7 +36,9 @@ def asset(seed=20, num=3000):
 
 
 def picture(gaussians, device="cpu"):
-    raster = v3dg.rasterize(gaussians if device == "cpu" else gaussians.torch(device), CAMERA, filter_px2=0.1)
+    raster = v3dg.rasterize(
+        gaussians if device == "cpu" else gaussians.torch(device), CAMERA, filter_px2=0.1
+    )
     return digest(raster.color, raster.alpha, raster.depth)
 
 
@@ -77,7 +82,10 @@ def bundle_of(gaussians, device="cpu"):
         (picture, [asset(seed) for seed in range(3)]),
         (gradient, [asset(seed) for seed in range(3)]),
         (frame_and_cut, [crowd(seed) for seed in range(3)]),
-        (bundle_of, [asset(seed, 100 + 200 * seed) for seed in range(3)]),  # of groups of several sizes
+        (
+            bundle_of,
+            [asset(seed, 100 + 200 * seed) for seed in range(3)],
+        ),  # of groups of several sizes
     ],
     ids=["rasterize", "backward", "render", "build"],
 )
@@ -92,7 +100,8 @@ def test_threads_get_what_one_gets_alone(work, subjects, device):
 
 
 def test_threads_may_draw_a_bundle_that_was_never_drawn(device):
-    """What is kept of a bundle is made when it is first drawn, by all of them at once."""
+    """What is kept of a bundle is made when it is first drawn, by all of them at
+    once."""
     expected = frame(crowd(3), device)
     scene, start = crowd(3), threading.Barrier(8)
 
@@ -148,7 +157,8 @@ def hasty():
 
 
 def while_another_changes(change, work, times):
-    """What `work` gives, so often, while a thread calls `change` with 0, 1, 2 and so on."""
+    """What `work` gives, so often, while a thread calls `change` with 0, 1, 2 and so
+    on."""
     stop = threading.Event()
 
     def go_on():
@@ -170,19 +180,26 @@ def while_another_changes(change, work, times):
 def test_frames_of_a_scene_that_moves_are_old_or_new(device, hasty):
     scene, rng = crowd(5), np.random.default_rng(0)
     poses = [
-        {"positions": rng.normal(size=(40, 3)), "quaternions": rng.normal(size=(40, 4)), "scales": size}
+        {
+            "positions": rng.normal(size=(40, 3)),
+            "quaternions": rng.normal(size=(40, 4)),
+            "scales": size,
+        }
         for size in (0.5, 1.5)
     ]
     expected = set()
     for pose in poses:
         scene.move(**pose)
         expected.add(frame(scene, device))
-    found = while_another_changes(lambda i: scene.move(**poses[i % 2]), lambda: frame(scene, device), 20)
+    found = while_another_changes(
+        lambda i: scene.move(**poses[i % 2]), lambda: frame(scene, device), 20
+    )
     assert set(found) <= expected
 
 
 def test_frames_of_a_scene_that_grows_and_shrinks_are_old_or_new(device, hasty):
-    """A bundle that comes in the middle, too; and a cut of what is gone is refused or drawn as it was."""
+    """A bundle that comes in the middle, too; and a cut of what is gone is refused or
+    drawn as it was."""
     scene, other = crowd(6), crowd(7).bundles[0]
     cut = v3dg.select(scene, CAMERA, tolerance=2.0, device=device)
 
@@ -262,7 +279,8 @@ def call_what_takes_long(folder):
 
 
 def test_other_threads_go_on_while_the_core_is_at_work(tmp_path, monkeypatch):
-    """A thread that looks at the clock all the time is never kept from it for most of a call."""
+    """A thread that looks at the clock all the time is never kept from it for most of a
+    call."""
     pytest.importorskip("torch")
     looks, stop, blocked = [], threading.Event(), dict.fromkeys(LONG, 1.0)
 
@@ -354,7 +372,8 @@ show()
 
 
 def test_processes_may_be_forked_while_threads_draw(expected):
-    """As data loaders do: multiprocessing's fork, from a process whose threads are at work."""
+    """As data loaders do: multiprocessing's fork, from a process whose threads are at
+    work."""
     script = """
 import multiprocessing, threading
 stop = threading.Event()
@@ -397,7 +416,8 @@ for t in threads: t.join()
     "libasan" in Path("/proc/self/maps").read_text(), reason="the address checks need all addresses"
 )
 def test_memory_that_runs_out_is_an_error_and_nothing_else():
-    """At any moment: the process goes on, and once there is memory again, the results are the same."""
+    """At any moment: the process goes on, and once there is memory again, the results
+    are the same."""
     script = """
 import resource
 from collections import Counter
@@ -419,15 +439,21 @@ for work, subject in ((picture, asset()), (gradient, asset()), (frame, crowd()),
     print(work.__name__, seen["MemoryError"] > 0, work(subject) == expected)
 """
     pytest.importorskip("torch")
-    # One arena that gives back at once what it is given, so that the limit is soon felt.
-    allocator = {"MALLOC_ARENA_MAX": "1", "MALLOC_TRIM_THRESHOLD_": "0", "MALLOC_MMAP_THRESHOLD_": "16384"}
+    # One arena that gives back at once what it is given, so that the limit is soon
+    # felt.
+    allocator = {
+        "MALLOC_ARENA_MAX": "1",
+        "MALLOC_TRIM_THRESHOLD_": "0",
+        "MALLOC_MMAP_THRESHOLD_": "16384",
+    }
     printed = run(script, OMP_NUM_THREADS="1", **allocator)
     works = ("picture", "gradient", "frame", "bundle_of")
     assert printed == [word for work in works for word in (work, "True", "True")]
 
 
 def test_thread_that_ends_before_its_first_line_is_an_error(monkeypatch):
-    """As it does where there is no memory to begin; threading.Thread would wait for it for ever."""
+    """As it does where there is no memory to begin; threading.Thread would wait for it
+    for ever."""
     starts_nothing = SimpleNamespace(start_new_thread=lambda work, arguments: 0)
     monkeypatch.setattr(sys.modules["v3dg.levels.fit"], "_thread", starts_nothing)
     with pytest.raises(MemoryError, match="ended at once"):

@@ -1,4 +1,5 @@
-"""Two CUDA devices in one process: work is done where its arrays are, whichever device is the current one."""
+"""Two CUDA devices in one process: work is done where its arrays are, whichever device
+is the current one."""
 
 import numpy as np
 import pytest
@@ -49,7 +50,9 @@ def first_device():
 
 @pytest.mark.parametrize("subject", [composed_scene(0), asset(1)], ids=["scene", "asset"])
 def test_picture_is_the_same_on_the_other_device(subject):
-    here, there = (render(subject, CAMERA, depth=True, device=f"cuda:{number}") for number in (0, 1))
+    here, there = (
+        render(subject, CAMERA, depth=True, device=f"cuda:{number}") for number in (0, 1)
+    )
     assert_same(here, there)
     assert_same(there, here, "cuda:1")
     assert there.stats.gaussians_in_frustum == here.stats.gaussians_in_frustum
@@ -96,14 +99,18 @@ def test_scene_that_moves_is_drawn_on_both():
 
 def test_cut_is_the_same_on_the_other_device():
     scene = composed_scene(6)
-    here, there = (select(scene, CAMERA, tolerance=0.5, device=f"cuda:{number}") for number in (0, 1))
+    here, there = (
+        select(scene, CAMERA, tolerance=0.5, device=f"cuda:{number}") for number in (0, 1)
+    )
     np.testing.assert_array_equal(here.instance_ids, there.instance_ids)
     np.testing.assert_array_equal(here.cluster_ids, there.cluster_ids)
     gathered = [there.gaussians(device=f"cuda:{number}") for number in (0, 1)]
     assert [str(g.means.device) for g in gathered] == ["cuda:0", "cuda:1"]
     for name in scenes.NAMES:
         np.testing.assert_array_equal(*(host(getattr(g, name)) for g in gathered))
-    images = [render(scene, CAMERA, cut=here, depth=True, device=f"cuda:{number}") for number in (0, 1)]
+    images = [
+        render(scene, CAMERA, cut=here, depth=True, device=f"cuda:{number}") for number in (0, 1)
+    ]
     assert_same(*images)
 
 
@@ -168,25 +175,38 @@ def test_rows_of_two_devices_are_refused():
     here, there = (asset(11, 10).torch(f"cuda:{number}") for number in (0, 1))
     for name in scenes.NAMES[1:]:
         arrays = {n: getattr(here, n) for n in scenes.NAMES} | {name: getattr(there, name)}
-        with pytest.raises(ValueError, match=f"{name}: expected .*cuda:0 like the others, got .*cuda:1"):
+        with pytest.raises(
+            ValueError, match=f"{name}: expected .*cuda:0 like the others, got .*cuda:1"
+        ):
             _core.Rows(**arrays)
-        with pytest.raises(ValueError, match=f"{name}: expected device cuda:0 like the others, got cuda:1"):
+        with pytest.raises(
+            ValueError, match=f"{name}: expected device cuda:0 like the others, got cuda:1"
+        ):
             Gaussians(**arrays)
 
 
 def test_frame_refuses_what_is_on_the_other_device():
     bundle = scenes_lod.lod_bundle(np.random.default_rng(12), asset(12), 64)
     frame = _core.SceneFrame(0)
-    with pytest.raises(ValueError, match="models: expected what is on the frame's device, got others"):
+    with pytest.raises(
+        ValueError, match="models: expected what is on the frame's device, got others"
+    ):
         frame.set_models([residency.model(bundle, Device(1))], [])
     colors = np.zeros((len(bundle.clusters.level), 3), np.float32)
     palette = _core.Palette(residency.table(bundle), colors, 1)
-    with pytest.raises(ValueError, match="palettes: expected what is on the frame's device, got others"):
+    with pytest.raises(
+        ValueError, match="palettes: expected what is on the frame's device, got others"
+    ):
         frame.set_models([residency.model(bundle, Device(0))], [palette])
     scene = Scene.of(bundle)
     residency.set_models(frame, [bundle], Device(0), "cluster")
-    rule = _core.Rule(tolerance_px2=1.0, budget=None, min_level=0, footprint="solid_angle", culls=True)
+    rule = _core.Rule(
+        tolerance_px2=1.0, budget=None, min_level=0, footprint="solid_angle", culls=True
+    )
     with pytest.raises(ValueError, match="scene: expected one on the frame's device"):
         frame.draw(
-            residency.scene(scene, Device(1)).core, CAMERA.core, rule, shade_of([0, 0, 0], None, False, True)
+            residency.scene(scene, Device(1)).core,
+            CAMERA.core,
+            rule,
+            shade_of([0, 0, 0], None, False, True),
         )

@@ -1,4 +1,5 @@
-"""Values that cross into the compiled module: each refuses what it cannot be, and names it."""
+"""Values that cross into the compiled module: each refuses what it cannot be, and names
+it."""
 
 import re
 
@@ -11,7 +12,13 @@ from v3dg import _core
 from v3dg._device import CPU
 from v3dg.residency import residency
 
-CAMERA = {"viewmat": np.eye(4), "K": np.diag([50.0, 50.0, 1.0]), "width": 64, "height": 48, "near": 0.01}
+CAMERA = {
+    "viewmat": np.eye(4),
+    "K": np.diag([50.0, 50.0, 1.0]),
+    "width": 64,
+    "height": 48,
+    "near": 0.01,
+}
 SHADE = _core.Shade(background=[0, 0, 0], min_transmittance=1e-3, with_depth=True)
 RULE = {
     "tolerance_px2": 3.0,
@@ -28,7 +35,9 @@ INSTANCES = {
     "importance": np.ones(2, np.float32),
 }
 FIT = {
-    **dict.fromkeys(("steps", "views_per_step", "num_views", "supersample", "image_size", "seed"), 1),
+    **dict.fromkeys(
+        ("steps", "views_per_step", "num_views", "supersample", "image_size", "seed"), 1
+    ),
     **dict.fromkeys(("px2_per_gaussian", "distance", "filter_px2", "final_step", "beta2"), 1.0),
     **dict.fromkeys(("loss_l1", "loss_dssim", "loss_alpha"), 1.0),
     **dict.fromkeys(("step_position", "step_log_scale", "step_quat"), 1.0),
@@ -69,7 +78,11 @@ def test_a_setting_of_another_type_is_refused(name):
     ("change", "error", "message"),
     [
         ({"viewmat": np.eye(3)}, ValueError, "viewmat: expected shape (4, 4), got (3, 3)"),
-        ({"viewmat": np.eye(4, dtype=np.float32)}, ValueError, "viewmat: expected dtype float64, got float3"),
+        (
+            {"viewmat": np.eye(4, dtype=np.float32)},
+            ValueError,
+            "viewmat: expected dtype float64, got float3",
+        ),
         ({"viewmat": np.eye(8)[::2, ::2]}, ValueError, "viewmat: expected a C-contiguous array"),
         ({"viewmat": np.eye(4).tolist()}, TypeError, "incompatible constructor arguments"),
         ({"K": np.eye(4)}, ValueError, "K: expected shape (3, 3), got (4, 4)"),
@@ -85,7 +98,8 @@ def test_wrong_cameras_are_refused(change, error, message):
 
 
 @pytest.mark.parametrize(
-    "window", [(-1, 0, 3, 3), (0, -1, 3, 3), (0, 0, 65, 3), (0, 0, 3, 49), (5, 5, 5, 9), (5, 9, 9, 5)]
+    "window",
+    [(-1, 0, 3, 3), (0, -1, 3, 3), (0, 0, 65, 3), (0, 0, 3, 49), (5, 5, 5, 9), (5, 9, 9, 5)],
 )
 def test_windows_outside_of_the_picture_are_refused(window):
     message = f"window: expected x0 < x1 and y0 < y1 within 64 x 48 px, got {window}"
@@ -145,7 +159,11 @@ def test_rule_has_the_tolerance_that_is_compared_with():
         ("bundle", np.zeros(2, np.int64), "bundle: expected dtype int32, got int64"),
         ("bundle", np.zeros((2, 1), np.int32), "bundle: expected shape (N,), got (2, 1)"),
         ("positions", np.zeros((3, 3)), "positions: expected shape (2, 3), got (3, 3)"),
-        ("positions", np.zeros((2, 3), np.float32), "positions: expected dtype float64, got float32"),
+        (
+            "positions",
+            np.zeros((2, 3), np.float32),
+            "positions: expected dtype float64, got float32",
+        ),
         ("quaternions", np.zeros((2, 3)), "quaternions: expected shape (2, 4), got (2, 3)"),
         ("scales", np.ones((2, 1)), "scales: expected shape (2,), got (2, 1)"),
         ("scales", np.ones(4)[::2], "scales: expected a C-contiguous array"),
@@ -209,7 +227,10 @@ def test_rows_of_mixed_types_are_refused(name):
         ({"scales": (4, 1)}, "scales: expected shape (4, 3), got (4, 1)"),
         ({"opacities": (4, 1)}, "opacities: expected shape (4,), got (4, 1)"),
         ({"sh": (4, 5, 3)}, "sh: expected shape (N, K, 3) with K of 1, 4, 9 or 16, got (4, 5, 3)"),
-        ({"sh": (4, 25, 3)}, "sh: expected shape (N, K, 3) with K of 1, 4, 9 or 16, got (4, 25, 3)"),
+        (
+            {"sh": (4, 25, 3)},
+            "sh: expected shape (N, K, 3) with K of 1, 4, 9 or 16, got (4, 25, 3)",
+        ),
         ({"sh": (4, 27)}, "sh: expected shape (N, K, 3) with K of 1, 4, 9 or 16, got (4, 27)"),
         ({"sh": (3, 9, 3)}, "sh: expected shape (4, 9, 3), got (3, 9, 3)"),
     ],
@@ -223,7 +244,9 @@ def test_rows_of_wrong_shapes_are_refused(change, message):
 @pytest.mark.parametrize("name", SHAPES)
 def test_what_is_no_array_is_refused(name):
     for value in (None, [0.0] * 4, "means"):
-        with pytest.raises(TypeError, match=rf"{name}: expected .*, got <class '{type(value).__name__}'>"):
+        with pytest.raises(
+            TypeError, match=rf"{name}: expected .*, got <class '{type(value).__name__}'>"
+        ):
             rows(**{name: value})
 
 
@@ -259,21 +282,35 @@ def test_other_values_are_refused():
             ("tables", "ClusterTable", lambda w=wrong: scene.set_bundles([w])),
             ("models", "Model", lambda w=wrong: frame.set_models([w], [])),
             ("palettes", "Palette", lambda w=wrong: frame.set_models([model], [w])),
-            ("table", "ClusterTable", lambda w=wrong: _core.Palette(w, np.zeros((1, 3), np.float32), -1)),
+            (
+                "table",
+                "ClusterTable",
+                lambda w=wrong: _core.Palette(w, np.zeros((1, 3), np.float32), -1),
+            ),
             ("scene", "ResidentScene", lambda w=wrong: frame.draw(w, camera, rule, SHADE)),
             ("model", "Model", lambda w=wrong: _core.AssetFrame(w)),
         ):
-            with pytest.raises(TypeError, match=rf"{name}: expected {expected}, got <class '.*{kind}'>"):
+            with pytest.raises(
+                TypeError, match=rf"{name}: expected {expected}, got <class '.*{kind}'>"
+            ):
                 call()
         with pytest.raises(TypeError, match="incompatible function arguments"):
             _core.group_metrics([wrong], _core.Instances(**INSTANCES), camera, rule)
 
 
 def test_frame_refuses_a_scene_of_other_bundles():
-    """It may have the gaussians of bundles that the scene has not yet, but not of others in their places."""
+    """It may have the gaussians of bundles that the scene has not yet, but not of
+    others in their places."""
     bundles = [random_bundle(seed) for seed in (1, 2)]
     one, two = map(residency.table, bundles)
-    for has, tables in ((1, [two]), (1, [one, two]), (2, [two, one]), (0, [one]), (2, []), (2, [one])):
+    for has, tables in (
+        (1, [two]),
+        (1, [one, two]),
+        (2, [two, one]),
+        (0, [one]),
+        (2, []),
+        (2, [one]),
+    ):
         frame, scene = _core.SceneFrame(-1), _core.ResidentScene(-1)
         frame.set_models([residency.model(bundle, CPU) for bundle in bundles[:has]], [])
         scene.set_bundles(tables)
@@ -281,7 +318,9 @@ def test_frame_refuses_a_scene_of_other_bundles():
         if tables == [one, two][: len(tables)] and len(tables) <= has:
             assert not frame.draw(*arguments).alpha.any()
             continue
-        with pytest.raises(ValueError, match="scene: expected one of the bundles that the frame has the"):
+        with pytest.raises(
+            ValueError, match="scene: expected one of the bundles that the frame has the"
+        ):
             frame.draw(*arguments)
 
 

@@ -111,14 +111,19 @@ def test_bundle_keeps_what_is_up_and_commands_say_what_they_took(rng, tmp_path):
     assert run("build", tmp_path / "flat.ply", "--up", "x", "--device", "cpu").returncode == 0
     assert up_of(v3dg.Bundle.open(tmp_path / "flat.v3dg")) == ("x", "as its file says")
     for name, line in (
-        ("flat.ply", "flat.ply: z is up, guessed from the plane of its gaussians; --up says otherwise\n"),
+        (
+            "flat.ply",
+            "flat.ply: z is up, guessed from the plane of its gaussians; --up says otherwise\n",
+        ),
         ("flat.v3dg", "flat.v3dg: x is up, as its file says; --up says otherwise\n"),
     ):
         how = ("--size", 32, 32, "--device", "cpu", "-o")
         done = run("render", tmp_path / name, *how, tmp_path / f"{name}.png")
         assert (done.returncode, done.stderr) == (0, "")
         assert done.stdout.endswith(line)
-        given = run("render", tmp_path / name, *how, tmp_path / "given.png", "--up", line.split()[1])
+        given = run(
+            "render", tmp_path / name, *how, tmp_path / "given.png", "--up", line.split()[1]
+        )
         assert given.returncode == 0
         assert "is up" not in given.stdout
         assert (tmp_path / f"{name}.png").read_bytes() == (tmp_path / "given.png").read_bytes()
@@ -128,7 +133,8 @@ def test_bundle_keeps_what_is_up_and_commands_say_what_they_took(rng, tmp_path):
 
 
 def at_a_terminal(*arguments, answers, cwd):
-    """What a command says on stderr and on stdout to who types these lines, and its exit code."""
+    """What a command says on stderr and on stdout to who types these lines, and its
+    exit code."""
     ours, theirs = pty.openpty()
     command = [*COMMAND, *map(str, arguments)]
     process = subprocess.Popen(
@@ -160,7 +166,8 @@ ASKED = "round.ply: which way is up, x, y, z, -x, -y, -z? [-y] "
 
 
 @pytest.mark.parametrize(
-    ("answers", "up", "times"), [("\n", "-y", 1), ("z\n", "z", 1), ("up\n x \n", "x", 2), ("\x04", "-y", 1)]
+    ("answers", "up", "times"),
+    [("\n", "-y", 1), ("z\n", "z", 1), ("up\n x \n", "x", 2), ("\x04", "-y", 1)],
 )
 def test_a_build_asks_at_a_terminal_what_nothing_tells(rng, tmp_path, answers, up, times):
     v3dg.write_asset(tmp_path / "round.ply", spread(rng, (1, 1, 1)))
@@ -169,9 +176,14 @@ def test_a_build_asks_at_a_terminal_what_nothing_tells(rng, tmp_path, answers, u
     assert (code, asked.count(ASKED)) == (0, times), asked
     assert up_of(v3dg.Bundle.open(tmp_path / "round.v3dg")) == (up, "as its file says")
     for more in (("--up", "y"), ("--resume",)):
-        asked, _, code = at_a_terminal("build", "round.ply", *how, *more, answers="\n", cwd=tmp_path)
+        asked, _, code = at_a_terminal(
+            "build", "round.ply", *how, *more, answers="\n", cwd=tmp_path
+        )
         assert (code, asked.count("which way")) == (0, 0)
-    for name, scales in (("flat", (3, 2, 0.5)), ("round", (1, 1, 1))):  # what tells, and without a terminal
+    for name, scales in (
+        ("flat", (3, 2, 0.5)),
+        ("round", (1, 1, 1)),
+    ):  # what tells, and without a terminal
         v3dg.write_asset(tmp_path / f"{name}.ply", spread(rng, scales))
         run_here = at_a_terminal if name == "flat" else run
         given = {"answers": "\n"} if name == "flat" else {}
@@ -183,13 +195,17 @@ def test_a_build_asks_at_a_terminal_what_nothing_tells(rng, tmp_path, answers, u
 def test_commands_that_use_what_is_up_ask_at_a_terminal_once(rng, tmp_path):
     v3dg.write_asset(tmp_path / "round.ply", spread(rng, (1, 1, 1)))
     how = ("--size", 32, 32, "--device", "cpu", "--output")
-    asked, said, code = at_a_terminal("render", "round.ply", *how, "a.png", answers="x\n", cwd=tmp_path)
+    asked, said, code = at_a_terminal(
+        "render", "round.ply", *how, "a.png", answers="x\n", cwd=tmp_path
+    )
     assert (code, asked.count(ASKED)) == (0, 1), asked
     assert said.endswith("round.ply: x is up, as you said; --up says otherwise\n")
     assert run("render", "round.ply", *how, "b.png", "--up", "x", cwd=tmp_path).returncode == 0
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     done = run("render", "round.ply", *how, "b.png", cwd=tmp_path)
-    assert done.stdout.endswith("round.ply: -y is up, as most trained assets have it; --up says otherwise\n")
+    assert done.stdout.endswith(
+        "round.ply: -y is up, as most trained assets have it; --up says otherwise\n"
+    )
 
 
 def test_what_is_told_is_not_guessed():

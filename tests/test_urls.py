@@ -97,7 +97,9 @@ def bundle(there, tmp_path):
     return bundle
 
 
-@pytest.mark.parametrize("url", ["memory://in/a.ply", Path("memory://in/a.ply"), "memory://in/a%2Eply?x=1"])
+@pytest.mark.parametrize(
+    "url", ["memory://in/a.ply", Path("memory://in/a.ply"), "memory://in/a%2Eply?x=1"]
+)
 def test_assets_are_read_from_urls(there, asset, url):
     if "%" in str(url):
         there.mv("/in/a.ply", "/in/a%2Eply?x=1")
@@ -112,7 +114,9 @@ def test_opening_a_bundle_fetches_its_tables(fetched, many, capsys):
     assert cli.main(["info", URL]) == 0
     assert num_bytes(fetched) <= size - pages + 4096
     assert bundle.path == URL
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(bundle)).groups.ball, bundle.groups.ball)
+    np.testing.assert_array_equal(
+        pickle.loads(pickle.dumps(bundle)).groups.ball, bundle.groups.ball
+    )
     assert pickle.loads(pickle.dumps(bundle)).path == URL
 
 
@@ -121,18 +125,23 @@ def test_pictures_fetch_what_they_need_and_no_part_twice(fetched, many):
     before = num_bytes(fetched)
     renderer = v3dg.Renderer(bundle, device="cpu")
     renderer.settle(FAR, **COARSE)
-    assert same_picture(renderer.render(FAR, **COARSE), v3dg.render(here, FAR, device="cpu", **COARSE))
+    assert same_picture(
+        renderer.render(FAR, **COARSE), v3dg.render(here, FAR, device="cpu", **COARSE)
+    )
     of_far = num_bytes(fetched) - before
     assert 0 < of_far < bundle.page_bytes / 4
     assert same_picture(
-        v3dg.render(bundle, FAR, device="cpu", **COARSE), v3dg.render(here, FAR, device="cpu", **COARSE)
+        v3dg.render(bundle, FAR, device="cpu", **COARSE),
+        v3dg.render(here, FAR, device="cpu", **COARSE),
     )
     assert num_bytes(fetched) - before == of_far
     assert not bundle.is_in_memory
     picture = v3dg.render(bundle, NEAR, device="cpu", **FINE)
     assert same_picture(picture, v3dg.render(here, NEAR, device="cpu", **FINE))
     for level in range(bundle.num_levels):
-        np.testing.assert_array_equal(bundle.level_gaussians(level).means, here.level_gaussians(level).means)
+        np.testing.assert_array_equal(
+            bundle.level_gaussians(level).means, here.level_gaussians(level).means
+        )
     np.testing.assert_array_equal(v3dg.open(URL).gaussians.sh, here.gaussians.sh)
     # Blocks in which pages meet may have been on their way for two of them.
     assert num_bytes(fetched) <= many.stat().st_size + 1024 * len(fetched)
@@ -169,7 +178,9 @@ def test_a_server_that_fails_leaves_the_picture_coarser_and_is_named(there, many
         with pytest.raises(OSError, match="503, Service Unavailable"):
             v3dg.Renderer(other, device="cpu", memory="64MB")  # reads the coarsest page
     renderer.settle(NEAR, **FINE)
-    assert same_picture(renderer.render(NEAR, **FINE), v3dg.render(many, NEAR, device="cpu", **FINE))
+    assert same_picture(
+        renderer.render(NEAR, **FINE), v3dg.render(many, NEAR, device="cpu", **FINE)
+    )
 
 
 def test_a_server_that_does_not_answer_ends_the_wait(there, many, monkeypatch):
@@ -188,11 +199,15 @@ def test_a_server_that_does_not_answer_ends_the_wait(there, many, monkeypatch):
     assert time.monotonic() - start < 30
     answers.set()
     renderer.settle(NEAR, **FINE)
-    assert same_picture(renderer.render(NEAR, **FINE), v3dg.render(many, NEAR, device="cpu", **FINE))
+    assert same_picture(
+        renderer.render(NEAR, **FINE), v3dg.render(many, NEAR, device="cpu", **FINE)
+    )
 
 
 @pytest.mark.parametrize("is_shorter", [False, True])
-def test_what_changes_at_its_url_is_an_error_until_it_is_opened_again(there, many, tmp_path, is_shorter):
+def test_what_changes_at_its_url_is_an_error_until_it_is_opened_again(
+    there, many, tmp_path, is_shorter
+):
     bundle = v3dg.open(URL)
     if is_shorter:
         there.pipe_file("/in/many.v3dg", many.read_bytes()[:5000])
@@ -268,7 +283,9 @@ class _Handler(http.server.SimpleHTTPRequestHandler):
             return self.send_error(404)
         body = path.read_bytes()
         asked = (
-            re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", "")) if self.knows_ranges else None
+            re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))
+            if self.knows_ranges
+            else None
         )
         if asked:
             self.send_response(206)
@@ -304,7 +321,9 @@ def web(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("knows_ranges", [True, False])
-def test_bundles_of_a_web_server_are_read_in_parts(web, tmp_path, knows_ranges, monkeypatch, capsys):
+def test_bundles_of_a_web_server_are_read_in_parts(
+    web, tmp_path, knows_ranges, monkeypatch, capsys
+):
     web.handler.knows_ranges = knows_ranges
     rng = np.random.default_rng(0)
     lod_bundle(rng, blob(rng, 5000, sh_degree=1), 32).write(tmp_path / "many.v3dg")
@@ -319,7 +338,10 @@ def test_bundles_of_a_web_server_are_read_in_parts(web, tmp_path, knows_ranges, 
     picture = v3dg.render(url, NEAR, device="cpu", **FINE)
     assert same_picture(picture, v3dg.render("many.v3dg", NEAR, device="cpu", **FINE))
     assert cli.main(["render", url.replace("many", "none"), "--device", "cpu"]) == 1
-    assert f"{web.address}/none.v3dg: the server answered 404 Not Found; check" in capsys.readouterr().err
+    assert (
+        f"{web.address}/none.v3dg: the server answered 404 Not Found; check"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_file_here_of_that_name_comes_first(there, asset, tmp_path, monkeypatch):
@@ -337,7 +359,12 @@ def test_commands_take_urls_and_write_into_the_working_folder(
     assert cli.main(["info", "memory://in/a.ply"]) == 0
     assert capsys.readouterr().out.startswith("memory://in/a.ply: asset, ")
     assert cli.main(["build", "memory://in/a.ply", "--quiet", "--device", "cpu"]) == 0
-    assert cli.main(["render", "memory://in/a.v3dg", "--device", "cpu", "--size", "16", "16", "--json"]) == 0
+    assert (
+        cli.main(
+            ["render", "memory://in/a.v3dg", "--device", "cpu", "--size", "16", "16", "--json"]
+        )
+        == 0
+    )
     assert '"subject": "memory://in/a.v3dg"' in capsys.readouterr().out
     assert cli.main(["export", "memory://in/a.v3dg", "--quiet"]) == 0
     assert sorted(path.name for path in Path().iterdir()) == ["a.png", "a.v3dg", "a_web"]
@@ -346,7 +373,10 @@ def test_commands_take_urls_and_write_into_the_working_folder(
 @pytest.mark.parametrize(
     ("url", "message"),
     [
-        ("memory://in/none.ply", r"memory://in/none\.ply: there is no such file; check the address"),
+        (
+            "memory://in/none.ply",
+            r"memory://in/none\.ply: there is no such file; check the address",
+        ),
         ("nowhere://in/a.ply", "Protocol not known: nowhere"),
         ("memory://in/scene.json", "expected a scene that is here, got a URL"),
         ("memory://in/lod-meta.json", "got one of a file that names others"),
@@ -379,7 +409,9 @@ def test_no_scene_is_saved_with_what_goes_at_the_end(there, bundle, tmp_path):
 
 def test_without_fsspec_the_error_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "fsspec", None)
-    with pytest.raises(ImportError, match=r"files at URLs: expected fsspec.*pip install 'fsspec\[http\]"):
+    with pytest.raises(
+        ImportError, match=r"files at URLs: expected fsspec.*pip install 'fsspec\[http\]"
+    ):
         v3dg.open("memory://in/b.ply")
 
 
@@ -474,9 +506,13 @@ def test_what_is_shown_of_a_bundle_has_no_password_and_its_copy_knows_it(web, tm
     [
         (
             Reach.PUBLIC,
-            "8.8.8.8 1.1.1.1 172.32.0.1 2606:4700::1111 ::ffff:8.8.8.8 64:ff9b::808:808 2002:808:808::1",
+            "8.8.8.8 1.1.1.1 172.32.0.1 2606:4700::1111 ::ffff:8.8.8.8 64:ff9b::808:808 "
+            "2002:808:808::1",
         ),
-        (Reach.PRIVATE, "10.0.0.1 172.16.0.1 172.31.255.255 192.168.1.1 100.64.0.1 198.18.0.1 203.0.113.9"),
+        (
+            Reach.PRIVATE,
+            "10.0.0.1 172.16.0.1 172.31.255.255 192.168.1.1 100.64.0.1 198.18.0.1 203.0.113.9",
+        ),
         (
             Reach.PRIVATE,
             "fc00::1 fd12::1 fec0::1 2001:db8::1 ::ffff:10.0.0.1 2002:c0a8:101::1 64:ff9b::a00:1",
@@ -484,9 +520,13 @@ def test_what_is_shown_of_a_bundle_has_no_password_and_its_copy_knows_it(web, tm
         (Reach.PRIVATE, "64:ff9b:1::1 100::1 4000::1"),
         (
             Reach.HOST,
-            "127.0.0.1 127.255.0.9 0.0.0.0 0.1.2.3 169.254.169.254 224.0.0.1 255.255.255.255 240.0.0.1",
+            "127.0.0.1 127.255.0.9 0.0.0.0 0.1.2.3 169.254.169.254 224.0.0.1 255.255.255.255 "
+            "240.0.0.1",
         ),
-        (Reach.HOST, "::1 :: fe80::1 fe80::1%eth0 ff02::1 ::ffff:127.0.0.1 ::ffff:0.0.0.0 ::127.0.0.1"),
+        (
+            Reach.HOST,
+            "::1 :: fe80::1 fe80::1%eth0 ff02::1 ::ffff:127.0.0.1 ::ffff:0.0.0.0 ::127.0.0.1",
+        ),
         (Reach.HOST, "64:ff9b::7f00:1 2002:7f00:1::1 2001:0:808:808::80ff:fffe"),
     ],
 )
@@ -511,7 +551,8 @@ NAMES = {
 
 @pytest.fixture
 def names(web, monkeypatch):
-    """Hosts by name, all of which this server is: 127.0.0.1 counts as public, all else as private."""
+    """Hosts by name, all of which this server is: 127.0.0.1 counts as public, all else
+    as private."""
     known = dict(NAMES)
 
     async def resolve(host, port):
@@ -551,7 +592,10 @@ def redirecting(web, places):
         {"/a.ply": "http://[::ffff:127.0.0.2]:{port}/b.ply"},
         {"/a.ply": "http://0.0.0.0:{port}/b.ply"},
         {"/a.ply": "//private.test:{port}/b.ply"},
-        {"/a.ply": "http://also-public.test:{port}/c.ply", "/c.ply": "http://private.test:{port}/b.ply"},
+        {
+            "/a.ply": "http://also-public.test:{port}/c.ply",
+            "/c.ply": "http://private.test:{port}/b.ply",
+        },
     ],
 )
 def test_no_public_server_sends_us_on_to_a_private_address(web, names, tmp_path, places):
@@ -600,12 +644,20 @@ def test_an_address_is_checked_once_more_when_a_connection_is_made(web, monkeypa
 @pytest.mark.parametrize(
     ("name", "kind", "message"),
     [
-        ("status 401", PermissionError, "the server answered 401 Unauthorized; check user, password"),
+        (
+            "status 401",
+            PermissionError,
+            "the server answered 401 Unauthorized; check user, password",
+        ),
         ("status 403", PermissionError, "the server answered 403 Forbidden; "),
         ("status 404", FileNotFoundError, "the server answered 404 Not Found; check the address"),
         ("status 410", FileNotFoundError, "the server answered 410 Gone; "),
         ("status 418", ConnectionError, "the server answered 418 "),
-        ("status 503", ConnectionError, "the server answered 503 Service Unavailable; try again later"),
+        (
+            "status 503",
+            ConnectionError,
+            "the server answered 503 Service Unavailable; try again later",
+        ),
         ("status 504", TimeoutError, "the server answered 504 Gateway Timeout; "),
         ("never answers", TimeoutError, "the server did not answer in time; "),
         ("drips a part", TimeoutError, "the server did not answer in time; "),
@@ -613,22 +665,40 @@ def test_an_address_is_checked_once_more_when_a_connection_is_made(web, monkeypa
         ("reset", ConnectionError, "the connection was lost or could not be made"),
         ("no HTTP", ConnectionError, "the server's answer is not valid HTTP"),
         ("redirects to itself", ConnectionError, "expected at most 10 redirects, got more"),
-        ("redirects to a file", ConnectionError, "the server sent us on to what is no address of the web"),
+        (
+            "redirects to a file",
+            ConnectionError,
+            "the server sent us on to what is no address of the web",
+        ),
         ("gzip bomb", ConnectionError, "expected the file as it is, got a compressed answer"),
         ("404 without end", FileNotFoundError, "the server answered 404"),
         ("claims 4 TB, honest parts", ValueError, "size: expected "),
         ("part without end", ValueError, "expected at most 1024 bytes, got more"),
-        ("part longer than asked", ValueError, r"expected 1024 bytes at 0, got \d+; it has changed"),
-        ("parts, then none", ConnectionError, "the server gave parts of the file before and now does not"),
+        (
+            "part longer than asked",
+            ValueError,
+            r"expected 1024 bytes at 0, got \d+; it has changed",
+        ),
+        (
+            "parts, then none",
+            ConnectionError,
+            "the server gave parts of the file before and now does not",
+        ),
         ("whole without end", ValueError, r"expected at most \d+ bytes, got more"),
         ("forged tables of 1 GB", ValueError, "clusters: expected at most 262144"),
-        ("forged tables of 4 TB", ValueError, "clusters: expected at most 39268534564 for its pages"),
+        (
+            "forged tables of 4 TB",
+            ValueError,
+            "clusters: expected at most 39268534564 for its pages",
+        ),
         ("forged tables of 2 TB", ValueError, "tables: expected at most 1073741824 bytes at a URL"),
         ("unknown size without end", ValueError, "expected at most 1048576 bytes, got more"),
         ("asset without end", ValueError, r"expected at most \d+ bytes, got more"),
     ],
 )
-def test_a_server_that_lies_is_an_error_that_says_what_is_wrong(name, kind, message, tmp_path, monkeypatch):
+def test_a_server_that_lies_is_an_error_that_says_what_is_wrong(
+    name, kind, message, tmp_path, monkeypatch
+):
     pytest.importorskip("aiohttp")
     monkeypatch.setattr("v3dg._urls.http.PATIENCE_S", 0.5)
     monkeypatch.setattr("v3dg._urls.opened._MOST_UNKNOWN_BYTES", 1 << 20)
@@ -649,7 +719,9 @@ def test_a_server_that_lies_is_an_error_that_says_what_is_wrong(name, kind, mess
 def test_hosts_that_are_not_there_are_errors_that_say_so(web, monkeypatch):
     web.shutdown()
     web.server_close()
-    with pytest.raises(ConnectionRefusedError, match="the connection was refused; check host and port"):
+    with pytest.raises(
+        ConnectionRefusedError, match="the connection was refused; check host and port"
+    ):
         v3dg.open(f"{web.address}/a.ply")
     with pytest.raises(ConnectionError, match="the name of the host is not known"):
         v3dg.open("http://nowhere.invalid/a.ply")
@@ -663,7 +735,9 @@ def test_a_server_without_tls_is_an_error_that_says_so(web):
 def test_no_more_is_fetched_than_there_is_room_for(web, tmp_path, monkeypatch):
     v3dg.write_asset(tmp_path / "a.ply", random_gaussians(np.random.default_rng(0), 300))
     monkeypatch.setattr("v3dg._urls.opened._SPARE_BYTES", 1 << 60)
-    with pytest.raises(OSError, match=r"/a\.ply: no room for it in .*; set TMPDIR to a folder with more"):
+    with pytest.raises(
+        OSError, match=r"/a\.ply: no room for it in .*; set TMPDIR to a folder with more"
+    ):
         v3dg.open(f"{web.address}/a.ply")
     assert web.sent == []
 
@@ -703,7 +777,9 @@ def test_nothing_fetched_stays_however_a_process_ends(web, tmp_path, ends_by):
 
 
 @pytest.mark.parametrize("has_tags", [True, False])
-def test_an_asset_that_changed_is_read_anew_and_another_is_not_fetched_twice(web, tmp_path, has_tags):
+def test_an_asset_that_changed_is_read_anew_and_another_is_not_fetched_twice(
+    web, tmp_path, has_tags
+):
     first, second = (random_gaussians(np.random.default_rng(seed), 300) for seed in (0, 1))
     if not has_tags:
         web.handler.date_time_string = lambda *_: ""
@@ -724,7 +800,9 @@ def test_descriptors_of_what_has_changed_are_closed(web, tmp_path):
         os.utime(tmp_path / "a.ply", (time_s, time_s))
         v3dg.open(f"{web.address}/a.ply")
         gc.collect()
-        counts.append(sum(os.readlink(f"/proc/self/fd/{n}").endswith("(deleted)") for n in _descriptors()))
+        counts.append(
+            sum(os.readlink(f"/proc/self/fd/{n}").endswith("(deleted)") for n in _descriptors())
+        )
     assert counts[-1] == counts[0]
 
 
@@ -732,13 +810,17 @@ def _descriptors():
     return [name for name in os.listdir("/proc/self/fd") if os.path.islink(f"/proc/self/fd/{name}")]
 
 
-@pytest.mark.parametrize("name", ["a.ply", "a.spz", "a.sog", "a.glb", "a.compressed.ply", "a.usdc", "a.usda"])
+@pytest.mark.parametrize(
+    "name", ["a.ply", "a.spz", "a.sog", "a.glb", "a.compressed.ply", "a.usdc", "a.usda"]
+)
 def test_every_format_is_read_from_a_url_and_names_it_in_errors(there, tmp_path, name, capsys):
     if ".usd" in name:
         pytest.importorskip("pxr")
     v3dg.write_asset(tmp_path / name, random_gaussians(np.random.default_rng(0), 300))
     there.put_file(str(tmp_path / name), f"/in/{name}")
-    np.testing.assert_array_equal(v3dg.open(f"memory://in/{name}").means, v3dg.open(tmp_path / name).means)
+    np.testing.assert_array_equal(
+        v3dg.open(f"memory://in/{name}").means, v3dg.open(tmp_path / name).means
+    )
     there.pipe_file(f"/in/{name}", (tmp_path / name).read_bytes()[:200])
     with pytest.raises(ValueError, match=rf"memory://in/{re.escape(name)}") as caught:
         v3dg.open(f"memory://in/{name}")

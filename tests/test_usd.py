@@ -19,7 +19,9 @@ from pxr import Gf, Usd, UsdGeom, UsdLod, UsdValidation
 
 def assert_same(found, wanted, rtol=0.0):
     for name, values in vars(found).items():
-        np.testing.assert_allclose(values, getattr(wanted, name), rtol=rtol, atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(
+            values, getattr(wanted, name), rtol=rtol, atol=1e-6, err_msg=name
+        )
 
 
 def assert_valid(path):
@@ -81,7 +83,8 @@ def test_a_bundle_has_its_levels(tmp_path, seed):
 
 
 def test_usd_chooses_the_level_that_selection_has(tmp_path):
-    """Level 1 begins where half of its groups are enough, for a picture of 1920 x 1080."""
+    """Level 1 begins where half of its groups are enough, for a picture of 1920 x
+    1080."""
     bundle = random_bundle(3, num_levels=4)
     write_usd(bundle, tmp_path / "a.usdc", up="z")
     stage = Usd.Stage.Open(os.fspath(tmp_path / "a.usdc"))
@@ -116,8 +119,11 @@ def test_a_scene_is_a_point_instancer(tmp_path):
     world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath("/world")))
     np.testing.assert_allclose([0, 1, 0, 0] @ world, [0, 0, 1, 0], atol=1e-6)  # y becomes z
     for i, matrix in enumerate(matrices):
-        # USD has vectors as rows; instances are before the prototypes' own transforms, which have none.
-        np.testing.assert_allclose(matrix[:3, :3].T, scene.scales[i] * scene.rotations[i], atol=1e-3)
+        # USD has vectors as rows; instances are before the prototypes' own transforms,
+        # which have none.
+        np.testing.assert_allclose(
+            matrix[:3, :3].T, scene.scales[i] * scene.rotations[i], atol=1e-3
+        )
         np.testing.assert_allclose(matrix[3, :3], scene.positions[i], atol=1e-5)
     with pytest.raises(ValueError, match="without instances, got instances in /world/instances"):
         v3dg.read_asset(tmp_path / "a.usdc")
@@ -129,7 +135,15 @@ def test_the_command_writes_a_file(tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("b.usdc: ")
     assert len(v3dg.read_asset(tmp_path / "b.usdc")) == len(random_bundle(3).level_gaussians(0))
-    fails(1, "no/b.usdc: expected an existing folder", "export", "3 a.v3dg", "-o", "no/b.usdc", cwd=tmp_path)
+    fails(
+        1,
+        "no/b.usdc: expected an existing folder",
+        "export",
+        "3 a.v3dg",
+        "-o",
+        "no/b.usdc",
+        cwd=tmp_path,
+    )
 
 
 def test_bad_files_are_refused(tmp_path):
@@ -149,7 +163,9 @@ def test_bad_files_are_refused(tmp_path):
 
 def test_a_file_of_another_kind_is_told_by_its_name(tmp_path):
     (tmp_path / "a.ply").touch()
-    with pytest.raises(ValueError, match=r"a\.ply: expected a file name ending in \.usd, \.usda, \.usdc$"):
+    with pytest.raises(
+        ValueError, match=r"a\.ply: expected a file name ending in \.usd, \.usda, \.usdc$"
+    ):
         v3dg.read_usd_scene(tmp_path / "a.ply")
 
 
@@ -178,7 +194,9 @@ def world_means(scene):
     """Means of all gaussians of the finest levels, in the world."""
     found = [scene.bundles[b].level_gaussians(0).means for b in scene.instance_bundle]
     poses = zip(found, scene.rotations, scene.scales, scene.positions, strict=True)
-    means = np.concatenate([scale * means @ turn.T + position for means, turn, scale, position in poses])
+    means = np.concatenate(
+        [scale * means @ turn.T + position for means, turn, scale, position in poses]
+    )
     return means[np.lexsort(np.round(means.T, 3))]
 
 
@@ -201,10 +219,13 @@ def test_a_scene_reads_back_as_a_scene(tmp_path):
 
 @pytest.mark.parametrize("is_instanceable", [True, False])
 def test_references_to_an_asset_are_instances_of_it(tmp_path, is_instanceable):
-    """Of files beside, in Xforms in Xforms; what is alone has one, and changed values are another asset."""
+    """Of files beside, in Xforms in Xforms; what is alone has one, and changed values
+    are another asset."""
     asset = Usd.Stage.CreateNew(os.fspath(tmp_path / "asset.usdc"))
     asset.SetDefaultPrim(UsdGeom.Xform.Define(asset, "/house").GetPrim())
-    v3dg.formats.usd.define(asset, "/house/walls", random_gaussians(np.random.default_rng(0), 50, 1))
+    v3dg.formats.usd.define(
+        asset, "/house/walls", random_gaussians(np.random.default_rng(0), 50, 1)
+    )
     asset.GetRootLayer().Save()
     stage = Usd.Stage.CreateNew(os.fspath(tmp_path / "world.usda"))
     UsdGeom.SetStageUpAxis(stage, "Y")
@@ -234,10 +255,14 @@ def test_references_to_an_asset_are_instances_of_it(tmp_path, is_instanceable):
 
 def test_instancers_may_hold_instancers_and_hide_instances(tmp_path):
     stage = Usd.Stage.CreateNew(os.fspath(tmp_path / "world.usda"))
-    v3dg.formats.usd.define(stage, "/rows/row/tree", random_gaussians(np.random.default_rng(0), 20, 0))
+    v3dg.formats.usd.define(
+        stage, "/rows/row/tree", random_gaussians(np.random.default_rng(0), 20, 0)
+    )
     for path, step in (("/rows", (0, 10, 0)), ("/rows/row", (1, 0, 0))):
         instancer = UsdGeom.PointInstancer.Define(stage, path)
-        instancer.CreatePrototypesRel().SetTargets([f"{path}/{'row' if path == '/rows' else 'tree'}"])
+        instancer.CreatePrototypesRel().SetTargets(
+            [f"{path}/{'row' if path == '/rows' else 'tree'}"]
+        )
         instancer.CreateProtoIndicesAttr([0, 0, 0])
         instancer.CreatePositionsAttr([Gf.Vec3f(*step) * k for k in range(3)])
         # In half precision, as most programs write them.
@@ -247,7 +272,9 @@ def test_instancers_may_hold_instancers_and_hide_instances(tmp_path):
     scene = v3dg.open(tmp_path / "world.usda")
     assert len(scene.bundles) == 1
     turn = v3dg.rotations.rotation_from_quaternion(np.array([0.5, 0.5, -0.5, 0.5]))
-    wanted = [np.array([0, 10, 0]) * row + turn @ [tree, 0, 0] for row in (0, 2) for tree in range(3)]
+    wanted = [
+        np.array([0, 10, 0]) * row + turn @ [tree, 0, 0] for row in (0, 2) for tree in range(3)
+    ]
     np.testing.assert_allclose(scene.positions, wanted, atol=1e-5)
     np.testing.assert_allclose(scene.rotations, np.broadcast_to(turn @ turn, (6, 3, 3)), atol=1e-5)
 

@@ -1,4 +1,5 @@
-"""The viewer without a browser; test_viewer_tab.py and test_viewer_browser.py open it in one."""
+"""The viewer without a browser; test_viewer_tab.py and test_viewer_browser.py open it
+in one."""
 
 import contextlib
 import math
@@ -94,7 +95,9 @@ def scene_view(crowd, device):
 
 def drawn(scene_view, view, device, **options):
     """What `v3dg.render` draws there, and its figures."""
-    image = v3dg.render(scene_view.scene, view.camera(*SIZE, scene_view.near), device=device, **options)
+    image = v3dg.render(
+        scene_view.scene, view.camera(*SIZE, scene_view.near), device=device, **options
+    )
     color = image.color if device == "cpu" else image.color.cpu().numpy()
     return to_8bit(color), image.stats
 
@@ -134,7 +137,9 @@ def test_alpha_and_depth_are_shown(scene_view, view, device):
     camera = view.camera(*SIZE, scene_view.near)
     options = {"tolerance": 0.0, "fade": DEFAULT_FADE, "depth": True}
     image = v3dg.render(scene_view.scene, camera, **options, device=device)
-    alpha, depth = (np.asarray(p if device == "cpu" else p.cpu()) for p in (image.alpha, image.depth))
+    alpha, depth = (
+        np.asarray(p if device == "cpu" else p.cpu()) for p in (image.alpha, image.depth)
+    )
     shown = scene_view.frame(view, SIZE, Settings(shows="alpha", tolerance=0.0))
     np.testing.assert_array_equal(shown.pixels, np.repeat(to_8bit(alpha)[..., None], 3, axis=2))
     shown = scene_view.frame(view, SIZE, Settings(shows="depth", tolerance=0.0))
@@ -160,7 +165,8 @@ def test_an_empty_picture_is_black_in_every_mode(scene_view):
     [([0.1] * 5, 5), ([0.1] * 40, 40), ([1.0, 0.999, 0.5, 0.5], 1), ([0.91] * 8, 3)],
 )
 def test_count_is_of_the_gaussians_that_a_pixel_is_blended_of(opacities, count):
-    """A gaussian that would take the transmittance to 1e-4 or below is not blended, nor what is behind it."""
+    """A gaussian that would take the transmittance to 1e-4 or below is not blended, nor
+    what is behind it."""
     scene_view = SceneView(stack(opacities), device="cpu")
     camera = AXIS.camera(33, 33, 0.01)
     cut = v3dg.select(scene_view.scene, camera, device="cpu")
@@ -194,9 +200,13 @@ def test_error_is_the_share_of_the_tolerance_that_is_used(share, device):
     scene.add(bundle, positions=[[-2, 0, 0], [3, 8, 0]])
     scene_view, size = SceneView(scene, device=device), (120, 60)
     view = look_at((0, -12, 0), (0, 0, 0), (0, 0, 1), 0.6, 2.0)
-    near, far = (metrics.max() for metrics in scenes_lod.group_metrics(scene, view.camera(*size, 0.01)))
+    near, far = (
+        metrics.max() for metrics in scenes_lod.group_metrics(scene, view.camera(*size, 0.01))
+    )
     assert far < 0.5 * near
-    frame = scene_view.frame(view, size, Settings(shows="error", tolerance=float(near) / share, fade=None))
+    frame = scene_view.frame(
+        view, size, Settings(shows="error", tolerance=float(near) / share, fade=None)
+    )
     assert frame.value_range == (0.0, pytest.approx(near / share))
     camera = view.camera(*size, 0.01)
     alpha = v3dg.render(scene, camera, tolerance=float(near) / share, device="cpu").alpha[..., None]
@@ -206,16 +216,18 @@ def test_error_is_the_share_of_the_tolerance_that_is_used(share, device):
         np.testing.assert_allclose(frame.pixels[:, half].astype(int), wanted, atol=2)
     finest = scene_view.frame(view, size, Settings(shows="error", tolerance=0.0, fade=None)).pixels
     alpha = v3dg.render(scene, camera, tolerance=0.0, device="cpu").alpha[..., None]
-    np.testing.assert_allclose(finest.astype(int), to_8bit(_core.ramp(np.array(0.0)) * alpha), atol=2)
+    np.testing.assert_allclose(
+        finest.astype(int), to_8bit(_core.ramp(np.array(0.0)) * alpha), atol=2
+    )
 
 
 def test_difference_is_to_all_gaussians_and_amplified(scene_view, view):
     none = scene_view.frame(view, SIZE, Settings(shows="difference", tolerance=0.0, fade=None))
     assert not none.pixels.any()
     one, ten = (
-        scene_view.frame(view, SIZE, Settings(shows="difference", tolerance=20.0, gain=gain)).pixels.astype(
-            int
-        )
+        scene_view.frame(
+            view, SIZE, Settings(shows="difference", tolerance=20.0, gain=gain)
+        ).pixels.astype(int)
         for gain in (1, 10)
     )
     assert one.max() > 10
@@ -254,7 +266,10 @@ def test_asset_is_drawn_whole_and_has_one_level(view):
     assert scene_view.num_gaussians == 500
     for fade, filter_px2 in ((None, 0.0), (DEFAULT_FADE, 0.05)):
         frame = scene_view.frame(view, SIZE, Settings(fade=fade))
-        camera, how = view.camera(*SIZE, scene_view.near), {"filter_px2": filter_px2, "antialiased": True}
+        camera, how = (
+            view.camera(*SIZE, scene_view.near),
+            {"filter_px2": filter_px2, "antialiased": True},
+        )
         whole = to_8bit(v3dg.rasterize(asset, camera, **how).color)
         assert abs(frame.pixels.astype(int) - whole).max() <= 1
         assert whole.any()
@@ -368,7 +383,8 @@ def test_sizes_double_up_to_the_full_one():
 
 
 class FakeSceneView:
-    """Notes what is drawn; pictures of the widths in `hold` wait for a stop, up to a tolerance."""
+    """Notes what is drawn; pictures of the widths in `hold` wait for a stop, up to a
+    tolerance."""
 
     draws_all_while_moving, pool = False, None
 
@@ -389,7 +405,9 @@ class FakeSceneView:
                 raise Stopped
             time.sleep(1e-3)
         figures = SimpleNamespace(tolerance=next(self.tolerances, 1.0))
-        return Frame(np.full((size[1], size[0], 3), view, np.uint8), figures, settings.shows, None, None)
+        return Frame(
+            np.full((size[1], size[0], 3), view, np.uint8), figures, settings.shows, None, None
+        )
 
 
 class NoPacer:
@@ -420,7 +438,9 @@ def rendering(request):
         is_final.set()
 
     loop = RenderLoop(scene_view, send, fail, getattr(request, "param", None))
-    yield SimpleNamespace(loop=loop, scene_view=scene_view, sent=sent, errors=errors, is_final=is_final)
+    yield SimpleNamespace(
+        loop=loop, scene_view=scene_view, sent=sent, errors=errors, is_final=is_final
+    )
     assert loop.close(SECONDS)
 
 
@@ -437,7 +457,9 @@ def test_a_request_is_answered_small_and_then_in_full(rendering):
 
 @pytest.mark.parametrize("rendering", [NoPacer()], indirect=True)
 @pytest.mark.parametrize(("budget", "sent"), [(None, 1), (100, 4)])
-def test_at_rest_pictures_follow_until_the_tolerance_of_a_budget_has_arrived(rendering, budget, sent):
+def test_at_rest_pictures_follow_until_the_tolerance_of_a_budget_has_arrived(
+    rendering, budget, sent
+):
     rendering.scene_view.draws_all_while_moving = True
     rendering.scene_view.tolerances = iter((4.0, 3.0, 2.0, 2.0))
     rendering.loop.ask(Request(7, (160, 80), Settings(budget=budget)))
@@ -611,13 +633,17 @@ def view_at(path, seconds):
 
 def turned(angle, sign=1.0):
     return View(
-        (sign * math.cos(angle / 2), 0.0, 0.0, sign * math.sin(angle / 2)), (angle, 2.0, 3.0), 0.7, 1.5
+        (sign * math.cos(angle / 2), 0.0, 0.0, sign * math.sin(angle / 2)),
+        (angle, 2.0, 3.0),
+        0.7,
+        1.5,
     )
 
 
 def test_path_goes_through_its_views():
     views = [
-        look_at((math.cos(a), math.sin(2 * a), a), (0, 0, 0), (0, 0, 1), 0.7 + a / 9, 1.5) for a in (0, 1, 2)
+        look_at((math.cos(a), math.sin(2 * a), a), (0, 0, 0), (0, 0, 1), 0.7 + a / 9, 1.5)
+        for a in (0, 1, 2)
     ]
     path = path_of(views, 2.0)
     assert path.times.tolist() == [0.0, 2.0, 4.0]
@@ -631,7 +657,9 @@ def test_path_goes_through_its_views():
 
 
 def test_path_does_not_care_for_a_quaternions_sign():
-    plain, flipped = (path_of([turned(0.1), turned(0.5, sign), turned(0.9)]) for sign in (1.0, -1.0))
+    plain, flipped = (
+        path_of([turned(0.1), turned(0.5, sign), turned(0.9)]) for sign in (1.0, -1.0)
+    )
     for t in np.linspace(0, 2, 9):
         assert abs(np.dot(view_at(plain, t).wxyz, view_at(flipped, t).wxyz)) == pytest.approx(1)
 
@@ -647,7 +675,9 @@ def test_path_is_smooth_where_times_are_uneven():
     path = CameraPath([(seconds, turned(angle)) for seconds, angle in angles])
     hair = 1e-5
     for joint in path.times[1:-1]:
-        before, at, after = (np.array(view_at(path, joint + shift).position) for shift in (-hair, 0, hair))
+        before, at, after = (
+            np.array(view_at(path, joint + shift).position) for shift in (-hair, 0, hair)
+        )
         np.testing.assert_allclose((at - before) / hair, (after - at) / hair, atol=1e-3)
 
 

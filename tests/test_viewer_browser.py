@@ -1,4 +1,5 @@
-"""The viewer in Chromium, as a person uses it. Needs playwright, and Chromium where PATH finds it."""
+"""The viewer in Chromium, as a person uses it. Needs playwright, and Chromium where
+PATH finds it."""
 
 import base64
 import io
@@ -21,7 +22,9 @@ pytest.importorskip("playwright.sync_api")
 
 pytestmark = [
     pytest.mark.witness,
-    pytest.mark.skipif(chromium.PROGRAM is None, reason="neither chromium nor google-chrome is installed"),
+    pytest.mark.skipif(
+        chromium.PROGRAM is None, reason="neither chromium nor google-chrome is installed"
+    ),
 ]
 
 SECONDS = 60
@@ -87,7 +90,9 @@ class Tab:
         """The middle of the picture, where nothing lies over it."""
         box = self.page.locator("#stage").bounding_box()
         clip = box | {"y": 90, "height": box["height"] - 220}
-        return np.asarray(Image.open(io.BytesIO(self.page.screenshot(clip=clip))).convert("RGB")).astype(int)
+        return np.asarray(
+            Image.open(io.BytesIO(self.page.screenshot(clip=clip))).convert("RGB")
+        ).astype(int)
 
     def view(self):
         """What the address says of the camera and the settings."""
@@ -187,7 +192,8 @@ def test_page_asks_what_is_up_where_that_is_assumed(browser, site):
 
 
 def test_drag_is_answered_while_the_mouse_is_still_down(tab):
-    """First by the picture that is there, moved; then by drafts, which say what they are."""
+    """First by the picture that is there, moved; then by drafts, which say what they
+    are."""
     first = tab.settled()
     tab.page.mouse.move(200, 400)
     tab.page.mouse.down()
@@ -210,13 +216,17 @@ def test_moved_picture_is_nearly_the_one_that_follows(browser, site):
         first = tab.settled()
         tab.page.evaluate("viewer.link.send = () => {}")  # so that no picture follows
         tab.drag((200, 300), (260, 300))
-        tab.page.wait_for_timeout(300)  # where frames take the browser long, it follows so often only
+        tab.page.wait_for_timeout(
+            300
+        )  # where frames take the browser long, it follows so often only
         moved = tab.seen()
         assert differ(first, moved) > 0.02
         tab.page.evaluate("delete viewer.link.send; viewer.asked = null; viewer.redraw()")
         after = tab.settled()
     middle = np.s_[:, 100:400]
-    assert abs(moved[middle] - after[middle]).mean() < 0.2 * abs(first[middle] - after[middle]).mean()
+    assert (
+        abs(moved[middle] - after[middle]).mean() < 0.2 * abs(first[middle] - after[middle]).mean()
+    )
 
 
 def test_larger_pictures_of_where_the_camera_was_are_left_out(tab):
@@ -340,7 +350,8 @@ def test_gamepad_moves_and_turns(browser, site):
         tab.settled()
         before = tab.view()
         tab.page.evaluate(
-            f"navigator.getGamepads = () => [{pad}]; window.dispatchEvent(new Event('gamepadconnected'))"
+            f"navigator.getGamepads = () => [{pad}]; window.dispatchEvent(new "
+            "Event('gamepadconnected'))"
         )
         tab.page.wait_for_timeout(500)
         tab.page.evaluate("navigator.getGamepads = () => []")
@@ -376,7 +387,12 @@ def test_link_leads_to_the_same_picture(browser, site, tab):
 
 
 @pytest.mark.parametrize(
-    "hash", ["#at=1,2&turn=x&show=nothing&mode=fall&fov=NaN&up=q", "#%E0%A4%A", "#at=1e999,0,0&turn=0,0,0,0"]
+    "hash",
+    [
+        "#at=1,2&turn=x&show=nothing&mode=fall&fov=NaN&up=q",
+        "#%E0%A4%A",
+        "#at=1e999,0,0&turn=0,0,0,0",
+    ],
 )
 def test_wrong_links_show_the_scene(browser, site, hash):
     with Tab(browser, site.url + "/" + hash) as tab:
@@ -385,7 +401,9 @@ def test_wrong_links_show_the_scene(browser, site, hash):
 
 def test_a_link_that_asks_for_what_is_not_there_is_told_so(browser, site):
     with Tab(browser, site.url + "/#show=residency&split=0.5") as tab:
-        tab.page.wait_for_function("() => document.querySelector('#notices').innerText.includes('residency')")
+        tab.page.wait_for_function(
+            "() => document.querySelector('#notices').innerText.includes('residency')"
+        )
         assert "mode residency is not there" in tab.page.inner_text("#notices")
         view = tab.view()
         assert "show" not in view
@@ -432,10 +450,14 @@ def test_clicked_instance_is_selected_moved_undone_and_saved(browser, site):
     scene.add(site.scene_view.scene.bundles[0], positions=[(0, 0, 0), (4, 0, 0)], scales=[0.5, 0.5])
     pair = Site(SceneView(scene, device="cpu"), name="pair", port=0)
     try:
-        with Tab(browser, pair.url + "/#at=2,-14,0&turn=0.70710678,-0.70710678,0,0&focus=2,0,0") as tab:
+        with Tab(
+            browser, pair.url + "/#at=2,-14,0&turn=0.70710678,-0.70710678,0,0&focus=2,0,0"
+        ) as tab:
             before = tab.settled()
             layer = tab.page.locator("#overlay")
-            assert layer.evaluate("e => e.style.opacity") == "0"  # nothing to blend over the picture
+            assert (
+                layer.evaluate("e => e.style.opacity") == "0"
+            )  # nothing to blend over the picture
             at = tab.page.evaluate("viewer.overlay.place([4, 0, 0])")
             tab.page.mouse.click(*at)
             tab.page.wait_for_function("() => viewer.selected?.instance === 1")
@@ -457,7 +479,9 @@ def test_clicked_instance_is_selected_moved_undone_and_saved(browser, site):
             tab.open("Instances")
             name, content = tab.saved("Save scene (.json)")
             (site.folder / name).write_bytes(content)
-            np.testing.assert_array_equal(v3dg.read_scene(site.folder / name)[0].positions, scene.positions)
+            np.testing.assert_array_equal(
+                v3dg.read_scene(site.folder / name)[0].positions, scene.positions
+            )
             for _ in range(3):
                 tab.page.keyboard.press("Control+z")
             tab.page.keyboard.press("Escape")
@@ -498,7 +522,10 @@ def test_photographs_lie_over_the_picture_of_their_camera(browser, site, tmp_pat
     Image.fromarray(np.full((48, 64, 3), (0, 200, 0), np.uint8)).save(tmp_path / "side.png")
     camera = v3dg.Camera.look_at((0, 3, 0), (0, 0, 0), width=64, height=48)
     captured = Site(
-        site.scene_view, cameras={"side": camera}, photographs={"side": tmp_path / "side.png"}, port=0
+        site.scene_view,
+        cameras={"side": camera},
+        photographs={"side": tmp_path / "side.png"},
+        port=0,
     )
     try:
         with Tab(browser, captured.url) as tab:
@@ -521,7 +548,9 @@ def test_photographs_lie_over_the_picture_of_their_camera(browser, site, tmp_pat
 
 
 def test_phone_has_the_picture_to_itself(browser, site):
-    with Tab(browser, site.url, (390, 760), has_touch=True, is_mobile=True, device_scale_factor=2) as tab:
+    with Tab(
+        browser, site.url, (390, 760), has_touch=True, is_mobile=True, device_scale_factor=2
+    ) as tab:
         picture = tab.settled()
         assert tab.page.locator("#stage").bounding_box()["width"] == 390
         assert not tab.page.locator("#panel").is_visible()

@@ -154,14 +154,21 @@ def request(path="/", **headers):
 TAB = {"Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
 
 
-@pytest.mark.parametrize("relation", ["cross-site", "same-site", "", "Same-Origin", "none, cross-site"])
+@pytest.mark.parametrize(
+    "relation", ["cross-site", "same-site", "", "Same-Origin", "none, cross-site"]
+)
 def test_pages_of_other_sites_are_shown_nothing(opened, relation):
-    """The browser says how they are related to the viewer, also for pictures, which have no Origin."""
+    """The browser says how they are related to the viewer, also for pictures, which
+    have no Origin."""
     site = opened()
     for path in ("/", "/main.js", "/photograph/0", "/connection"):
         for destination in ("image", "script", "style", "iframe", "object", "empty"):
             for mode in ("no-cors", "cors", "navigate"):
-                said = {"Sec-Fetch-Mode": mode, "Sec-Fetch-Dest": destination, "Sec-Fetch-Site": relation}
+                said = {
+                    "Sec-Fetch-Mode": mode,
+                    "Sec-Fetch-Dest": destination,
+                    "Sec-Fetch-Site": relation,
+                }
                 assert status(site, path, **said) == 403, (path, said)
     assert not connects(site, **{"Sec-Fetch-Site": relation})
     assert not connects(site, **{"Sec-Fetch-Site": relation}, **TAB)
@@ -177,7 +184,9 @@ def test_a_link_on_another_page_opens_the_viewer_in_a_tab(opened):
 @pytest.mark.parametrize("relation", ["same-origin", "none"])
 def test_the_viewers_own_page_is_let_in(opened, relation):
     site = opened()
-    assert status(site, "/main.js", **{"Sec-Fetch-Site": relation, "Sec-Fetch-Dest": "script"}) == 200
+    assert (
+        status(site, "/main.js", **{"Sec-Fetch-Site": relation, "Sec-Fetch-Dest": "script"}) == 200
+    )
     assert connects(site, **{"Sec-Fetch-Site": relation, "Sec-Fetch-Mode": "websocket"})
 
 
@@ -240,7 +249,14 @@ def test_a_page_is_shown_in_no_other_and_runs_only_its_own_files(opened):
 
 @pytest.mark.parametrize(
     "path",
-    ["/../gate.py", "/%2e%2e/gate.py", "/page/index.html", "/photograph/0", "/thumbnail/0", "/photograph/x"],
+    [
+        "/../gate.py",
+        "/%2e%2e/gate.py",
+        "/page/index.html",
+        "/photograph/0",
+        "/thumbnail/0",
+        "/photograph/x",
+    ],
 )
 def test_nothing_but_the_page_is_handed_out(opened, path):
     assert status(opened(), path) == 404
@@ -251,7 +267,9 @@ def test_photographs_of_cameras_are_handed_out_small(opened, tmp_path):
     (tmp_path / "b.png").write_bytes(b"no picture")
     camera = v3dg.Camera.look_at((9, 0, 0), (0, 0, 0), width=64, height=48)
     photographs = {name: tmp_path / f"{name}.png" for name in ("a", "b", "gone")}
-    site = opened(cameras=dict.fromkeys(("none", "a", "b", "gone"), camera), photographs=photographs)
+    site = opened(
+        cameras=dict.fromkeys(("none", "a", "b", "gone"), camera), photographs=photographs
+    )
     connection = http.client.HTTPConnection("127.0.0.1", site.port, timeout=SECONDS)
     for path, size in (("/photograph/1", (1600, 600)), ("/thumbnail/1", (240, 90))):
         connection.request("GET", path)
@@ -303,7 +321,12 @@ def test_other_machines_need_the_token(opened, blob_view, host):
     assert gate.refusal(other) is not None
     if host == "0.0.0.0":
         assert status(site) == 403
-        assert status(site, token) == status(site, token + "?x") == status(site, token + "main.js") == 200
+        assert (
+            status(site, token)
+            == status(site, token + "?x")
+            == status(site, token + "main.js")
+            == 200
+        )
         assert status(site, token + ".." + token) == 404
         assert not connects(site)
         assert gets_a_picture(site, blob_view, token)
@@ -327,7 +350,9 @@ def test_where_no_port_is_free_the_viewer_does_not_wait_for_ever(blob_view):
         Site(blob_view, port=65535)
 
 
-@pytest.mark.parametrize("window", [(100_000, 100_000), (1 << 20, 1), (1, 1 << 20), (4096, 4096), (30, 20)])
+@pytest.mark.parametrize(
+    "window", [(100_000, 100_000), (1 << 20, 1), (1, 1 << 20), (4096, 4096), (30, 20)]
+)
 def test_the_largest_picture_is_not_the_windows(window):
     view = {"wxyz": (1, 0, 0, 0), "position": (0, 0, 0), "fov_y": 1, "aspect": 1}
     look = messages.read_message(json.dumps({"type": "look", "view": view, "size": window}))
@@ -397,7 +422,8 @@ def hostile(rng, messages, kinds):
 
 
 def test_no_message_ends_the_viewer(opened, blob_view, capfd):
-    """Thousands of wrong ones, with right ones between, while the viewer draws: it is silent and goes on."""
+    """Thousands of wrong ones, with right ones between, while the viewer draws: it is
+    silent and goes on."""
     aside = v3dg.Camera.look_at((9, 0, 0), (0, 0, 0), width=64, height=48)
     site, rng = opened(cameras={"aside": aside}), random.Random(7)
     kinds = [kind.__struct_config__.tag for kind in messages.Message.__args__]

@@ -1,4 +1,5 @@
-"""The viewer with a pool: pictures that become those of all as pages come in, and what it leaves out."""
+"""The viewer with a pool: pictures that become those of all as pages come in, and what
+it leaves out."""
 
 import math
 import threading
@@ -34,9 +35,14 @@ def scene(tmp_path_factory):
 
 
 @pytest.mark.parametrize("shows", ["appearance", "level", "cluster", "depth", "alpha"])
-@pytest.mark.parametrize("given", [{"tolerance": 1.0}, {"tolerance": 2.0, "fade": None}, {"budget": 3000}])
+@pytest.mark.parametrize(
+    "given", [{"tolerance": 1.0}, {"tolerance": 2.0, "fade": None}, {"budget": 3000}]
+)
 def test_a_picture_that_waits_is_that_of_all(scene, shows, given):
-    whole, pooled = SceneView(scene, device="cpu", memory=None), SceneView(scene, device="cpu", memory="64MB")
+    whole, pooled = (
+        SceneView(scene, device="cpu", memory=None),
+        SceneView(scene, device="cpu", memory="64MB"),
+    )
     settings = Settings(shows=shows, **given)
     for view in (VIEW, ASIDE):
         expected = whole.frame(view, SIZE, settings)
@@ -63,7 +69,10 @@ def test_residency_shows_what_is_missing_until_it_is_there(scene):
     first = pooled.frame(VIEW, SIZE, settings)
     assert first.figures.missing > 0
     settled = pooled.frame(VIEW, SIZE, settings, None, None, math.inf)
-    alpha = pooled.frame(VIEW, SIZE, Settings(shows="alpha", tolerance=0.5, fade=None)).pixels[..., :1] / 255
+    alpha = (
+        pooled.frame(VIEW, SIZE, Settings(shows="alpha", tolerance=0.5, fade=None)).pixels[..., :1]
+        / 255
+    )
     there = to_8bit(_core.missing_colors(np.zeros(())) * alpha)
     np.testing.assert_allclose(settled.pixels.astype(int), there, atol=2)
     assert (first.pixels[..., 0] > first.pixels[..., 2] + 20).any()  # yellow or red
@@ -84,7 +93,10 @@ def test_residency_shows_what_is_missing_until_it_is_there(scene):
     ids=lambda s: f"{s.shows}-{s.split}-{'frozen' if s.frozen else 'free'}",
 )
 def test_what_is_compared_frozen_and_measured_is_that_of_all(scene, settings):
-    whole, pooled = SceneView(scene, device="cpu", memory=None), SceneView(scene, device="cpu", memory="64MB")
+    whole, pooled = (
+        SceneView(scene, device="cpu", memory=None),
+        SceneView(scene, device="cpu", memory="64MB"),
+    )
     assert set(pooled.modes) == {*whole.modes, "residency"}
     assert pooled.shows_cuts
     expected = whole.frame(VIEW, SIZE, settings)
@@ -129,7 +141,10 @@ def test_a_pool_without_room_for_all_compares_with_the_finest_that_it_has_room_f
 
 
 def test_a_click_finds_what_is_resident(scene):
-    whole, pooled = SceneView(scene, device="cpu", memory=None), SceneView(scene, device="cpu", memory="64MB")
+    whole, pooled = (
+        SceneView(scene, device="cpu", memory=None),
+        SceneView(scene, device="cpu", memory="64MB"),
+    )
     settings = Settings(tolerance=0.5, fade=None)
     places = [(x, y) for x in range(4, SIZE[0], 16) for y in range(4, SIZE[1], 16)]
     early = [pooled.pick(VIEW, SIZE, *place, settings) for place in places]  # of the coarsest pages
@@ -143,7 +158,11 @@ def test_a_click_finds_what_is_resident(scene):
     for one, other in zip(found, expected, strict=True):
         assert (one is None) == (other is None)
         if one is not None:
-            assert (one.instance, one.cluster, one.level) == (other.instance, other.cluster, other.level)
+            assert (one.instance, one.cluster, one.level) == (
+                other.instance,
+                other.cluster,
+                other.level,
+            )
             assert (one.weight, one.depth) == (other.weight, other.depth)
 
 
@@ -187,7 +206,12 @@ def test_a_still_is_cut_once_and_a_settled_one_twice(scene, monkeypatch):
 @pytest.fixture
 def loop(scene):
     """A render loop over a pool, and what it sent: (frame, is it final, number)."""
-    pooled, sent, is_final, errors = SceneView(scene, device="cpu", memory="64MB"), [], threading.Event(), []
+    pooled, sent, is_final, errors = (
+        SceneView(scene, device="cpu", memory="64MB"),
+        [],
+        threading.Event(),
+        [],
+    )
 
     def send(*frame):
         sent.append(frame)

@@ -1,4 +1,5 @@
-"""The viewer's server and command: where they listen, what a tab begins with, and how they end."""
+"""The viewer's server and command: where they listen, what a tab begins with, and how
+they end."""
 
 import contextlib
 import os
@@ -23,7 +24,8 @@ from v3dg.viewer.server import Site, start_view
 websockets = pytest.importorskip("websockets")
 
 pytestmark = [
-    # A site that closes while somebody is just connecting leaves its end of the connection to the collector.
+    # A site that closes while somebody is just connecting leaves its end of the
+    # connection to the collector.
     pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning"),
     pytest.mark.usefixtures("collected_connections"),
 ]
@@ -76,7 +78,9 @@ def test_an_axis_that_is_none_is_refused_by_the_viewer(blob_bundle):
 
 
 def test_address_of_another_machine_is_refused(blob_view):
-    with pytest.raises(ValueError, match=r"host: expected an address of this machine, got 192\.0\.2\.1"):
+    with pytest.raises(
+        ValueError, match=r"host: expected an address of this machine, got 192\.0\.2\.1"
+    ):
         Site(blob_view, host="192.0.2.1")
 
 
@@ -111,7 +115,8 @@ def viewing(bundle, folder, *options):
         text=True,
         env=environment,
         start_new_session=True,
-        # Whoever starts the tests in the background has them ignore interrupts, and children inherit that.
+        # Whoever starts the tests in the background has them ignore interrupts, and
+        # children inherit that.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     try:
@@ -184,7 +189,10 @@ def test_photographs_of_cameras_are_found(tmp_path):
         (tmp_path / "images" / name).write_bytes(b"")
     names = ("a.jpg", "images/b", "images/c.png", "x" * 5000)
     by_colmap = _photographs(tmp_path / "sparse" / "0", names)
-    assert {name: path.name for name, path in by_colmap.items()} == {"a.jpg": "a.jpg", "images/b": "b.png"}
+    assert {name: path.name for name, path in by_colmap.items()} == {
+        "a.jpg": "a.jpg",
+        "images/b": "b.png",
+    }
     assert _photographs(tmp_path / "transforms.json", names).keys() == {"a.jpg", "images/b"}
 
 
@@ -192,10 +200,13 @@ INTERRUPTS = int(os.environ.get("V3DG_INTERRUPTS", "1"))
 JOBS = ("film", "picture", "play", "cameras")
 
 
-@pytest.mark.parametrize("signals", [(signal.SIGINT,), (signal.SIGINT,) * 2, (signal.SIGTERM, signal.SIGINT)])
+@pytest.mark.parametrize(
+    "signals", [(signal.SIGINT,), (signal.SIGINT,) * 2, (signal.SIGTERM, signal.SIGINT)]
+)
 @pytest.mark.parametrize("turn", range(INTERRUPTS))
 def test_command_ends_at_once_whatever_a_tab_does(blob_bundle, blob_view, tmp_path, signals, turn):
-    """V3DG_INTERRUPTS sets the turns; each interrupts at another moment of drawing and of jobs that begin."""
+    """V3DG_INTERRUPTS sets the turns; each interrupts at another moment of drawing and
+    of jobs that begin."""
     viewer_client = pytest.importorskip("viewer_client")
     home, end = start_view(blob_view, (0, 0, 1)), time.monotonic() + random.uniform(0.2, 1.0)
     with viewing(blob_bundle, tmp_path) as (process, line):
@@ -223,7 +234,10 @@ def test_command_ends_at_once_whatever_a_tab_does(blob_bundle, blob_view, tmp_pa
         ),
         (["asset.ply", "--port", "70000"], "--port: expected 0 to 65535, got 70000"),
         (["asset.ply", "--tolerance", "inf"], "--tolerance: expected a number, got inf"),
-        (["asset.ply", "--host", "192.0.2.1"], "host: expected an address of this machine, got 192.0.2.1"),
+        (
+            ["asset.ply", "--host", "192.0.2.1"],
+            "host: expected an address of this machine, got 192.0.2.1",
+        ),
         (["nothing.v3dg"], "nothing.v3dg: expected a file, got a path that does not exist"),
     ],
 )

@@ -1,7 +1,9 @@
-"""What a page of another site learns of the viewer, in Chromium: nothing, not even the size of a picture.
+"""What a page of another site learns of the viewer, in Chromium: nothing, not even the
+size of a picture.
 
-Needs playwright, and Chromium where PATH finds it. The other page is at another port, under the viewer's name
-(the browser calls that the same site) and under another one (a cross site).
+Needs playwright, and Chromium where PATH finds it. The other page is at another port,
+under the viewer's name (the browser calls that the same site) and under another one (a
+cross site).
 """
 
 import http.server
@@ -22,7 +24,9 @@ pytest.importorskip("playwright.sync_api")
 
 pytestmark = [
     pytest.mark.witness,
-    pytest.mark.skipif(chromium.PROGRAM is None, reason="neither chromium nor google-chrome is installed"),
+    pytest.mark.skipif(
+        chromium.PROGRAM is None, reason="neither chromium nor google-chrome is installed"
+    ),
 ]
 
 SECONDS = 60
@@ -63,7 +67,17 @@ PROBES = """async (viewer) => {
   learned.sizes = entries.reduce((sum, entry) => sum + entry.decodedBodySize + entry.transferSize, 0);
   return learned;
 }"""
-NAMES = ("photograph", "thumbnail", "missing", "icon", "anonymous", "script", "module", "style", "video")
+NAMES = (
+    "photograph",
+    "thumbnail",
+    "missing",
+    "icon",
+    "anonymous",
+    "script",
+    "module",
+    "style",
+    "video",
+)
 NAMES += ("embedded", "fetched", "opaque", "kept", "connection")
 NOTHING = dict.fromkeys(NAMES, "nothing")
 FRAME = """(viewer) => new Promise((resolve) => {
@@ -79,7 +93,9 @@ def site(tmp_path_factory):
     rng = np.random.default_rng(0)
     photograph = tmp_path_factory.mktemp("photographs") / "a.png"
     Image.fromarray(rng.integers(0, 255, (90, 160, 3), np.uint8)).save(photograph)
-    scene_view = SceneView(scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 300, size=0.3), 64), device="cpu")
+    scene_view = SceneView(
+        scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 300, size=0.3), 64), device="cpu"
+    )
     camera = v3dg.Camera.look_at((6, 0, 0), (0, 0, 0), width=160, height=90)
     site = Site(scene_view, cameras={"a": camera}, photographs={"a": photograph}, port=0)
     yield site
@@ -113,7 +129,8 @@ def other_port():
 
 @pytest.fixture(params=["127.0.0.1", "localhost"])
 def other(browser, other_port, request):
-    """A page of the same site, and of another one; the viewer is opened as 127.0.0.1."""
+    """A page of the same site, and of another one; the viewer is opened as
+    127.0.0.1."""
     page = browser.new_page()
     page.goto(f"http://{request.param}:{other_port}/")
     yield page

@@ -1,4 +1,5 @@
-"""A tab of the viewer, from the page's side of its connection, which viewer_client plays."""
+"""A tab of the viewer, from the page's side of its connection, which viewer_client
+plays."""
 
 import io
 import time
@@ -82,8 +83,15 @@ def test_page_is_told_what_there_is(tab, site):
     assert tab.hello["up"] == [0, 0, 1]
     assert [camera["name"] for camera in tab.hello["cameras"]] == ["aside"]
     assert tab.hello["cameras"][0]["view"]["position"] == [9, 0, 0]
-    assert (tab.scene["name"], tab.scene["instances"], tab.scene["has_files"]) == ("blobs", 30, True)
-    assert len({tuple(color) for color in tab.scene["level_colors"]}) == site.scene.bundles[0].num_levels
+    assert (tab.scene["name"], tab.scene["instances"], tab.scene["has_files"]) == (
+        "blobs",
+        30,
+        True,
+    )
+    assert (
+        len({tuple(color) for color in tab.scene["level_colors"]})
+        == site.scene.bundles[0].num_levels
+    )
 
 
 def test_tab_gets_a_small_picture_and_then_the_full_one(site):
@@ -173,7 +181,10 @@ def test_frozen_cut_is_kept_until_it_is_let_go(tab, site):
     selected = tab.figures["gaussians_selected"]
     x, y, z = site.home.position
     tab.change(frozen=asdict(site.home))
-    tab.look(look_at((6 * x, 6 * y, 6 * z), (0, 0, 0), (0, 0, 1), site.home.fov_y, site.home.aspect), SIZE)
+    tab.look(
+        look_at((6 * x, 6 * y, 6 * z), (0, 0, 0), (0, 0, 1), site.home.fov_y, site.home.aspect),
+        SIZE,
+    )
     settled(tab)
     assert tab.figures["gaussians_selected"] == selected
     tab.change(frozen=None)

@@ -1,4 +1,5 @@
-"""Parts of a picture on the CPU: the same bits as in the whole, however many gaussians there are."""
+"""Parts of a picture on the CPU: the same bits as in the whole, however many gaussians
+there are."""
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ CAMERA = Camera.look_at((0, -6, 1), (0, 0, 0), (0, 0, 1), 0.9, width=203, height
 
 def crowd(rng, count, num_gaussians=400):
     """Many instances of one bundle around the origin."""
-    bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, num_gaussians, size=0.2, sh_degree=1), 64)
+    bundle = scenes_lod.lod_bundle(
+        rng, scenes_lod.blob(rng, num_gaussians, size=0.2, sh_degree=1), 64
+    )
     scene = Scene()
     quaternions = rng.normal(size=(count, 4))
     scene.add(bundle, positions=rng.normal(size=(count, 3)), quaternions=quaternions)
@@ -37,7 +40,9 @@ def draw_window(scene, camera, window):
 
 
 def assert_windows_are_parts(scene, camera, windows):
-    image = render(scene, camera, tolerance=0.0, background=(0.1, 0.2, 0.3), depth=True, device="cpu")
+    image = render(
+        scene, camera, tolerance=0.0, background=(0.1, 0.2, 0.3), depth=True, device="cpu"
+    )
     assert (image.alpha > 0.5).mean() > 0.1
     for x0, y0, x1, y1 in windows:
         *part, stats = draw_window(scene, camera, (x0, y0, x1, y1))
@@ -68,5 +73,7 @@ def test_picture_of_more_gaussians_than_memory_takes_at_once_is_the_same():
     "window", [(-1, 0, 3, 3), (0, 0, 204, 3), (0, 0, 3, 118), (5, 5, 5, 9), (5, 9, 9, 5)]
 )
 def test_windows_that_are_not_in_the_picture_are_refused(window):
-    with pytest.raises(ValueError, match="window: expected x0 < x1 and y0 < y1 within 203 x 117 px, got"):
+    with pytest.raises(
+        ValueError, match="window: expected x0 < x1 and y0 < y1 within 203 x 117 px, got"
+    ):
         draw_window(crowd(np.random.default_rng(2), 1), CAMERA, window)

@@ -99,7 +99,9 @@ def test_crowd_stands_in_a_grid_and_looks_one_way():
 def test_every_camera_sees_some_of_the_crowd():
     world = worlds.crowd(16, 2000, persons=1)
     config = v3dg.BuildConfig(steps=0)
-    bundle = v3dg.build_bundle(world.assets["person_00"].make(), config=config, progress=False, device="cpu")
+    bundle = v3dg.build_bundle(
+        world.assets["person_00"].make(), config=config, progress=False, device="cpu"
+    )
     scene = worlds.scene_of(world, {"person_00": bundle})
     for name, camera in world.cameras(width=64, height=36).items():
         assert v3dg.render(scene, camera, device="cpu").color.any(), name
@@ -122,7 +124,11 @@ def test_donuts_lie_still_on_the_ground_and_on_each_other(sea):
 def test_donuts_hardly_overlap(sea):
     placement = sea.placements["donut"]
     pile = worlds.Pile(
-        placement.positions, placement.quaternions, placement.scales, ring=worlds.RING, tube=worlds.TUBE
+        placement.positions,
+        placement.quaternions,
+        placement.scales,
+        ring=worlds.RING,
+        tube=worlds.TUBE,
     )
     assert pile.deepest_overlap() < 0.25
 
@@ -156,7 +162,9 @@ def test_scene_of_a_world_draws():
 
 def test_a_written_world_is_read_and_drawn(tmp_path):
     world = worlds.crowd(5, 2000, persons=2, seed=1)
-    path = worlds.write_world(world, tmp_path / "new", config=v3dg.BuildConfig(steps=0), progress=False)
+    path = worlds.write_world(
+        world, tmp_path / "new", config=v3dg.BuildConfig(steps=0), progress=False
+    )
     assert path == tmp_path / "new" / "crowd.json"
     assert sorted(p.name for p in path.parent.iterdir()) == [
         *("crowd.json", "person_00.ply", "person_00.v3dg", "person_01.ply", "person_01.v3dg"),
@@ -167,7 +175,9 @@ def test_a_written_world_is_read_and_drawn(tmp_path):
     assert np.array_equal(scene.positions, all_of(world, "positions"))
     assert len(v3dg.read_asset(path.parent / "person_00.ply")) == 2000
     assert (
-        v3dg.render(scene, world.cameras(width=64, height=36)["059_camera_19"], device="cpu").alpha.max()
+        v3dg.render(
+            scene, world.cameras(width=64, height=36)["059_camera_19"], device="cpu"
+        ).alpha.max()
         > 0.5
     )
 
@@ -205,9 +215,22 @@ def test_an_interrupted_world_goes_on(tmp_path, monkeypatch):
 
 
 def test_command_line_writes_a_world(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(worlds.SMALL, "crowd", {"instances": 2, "num_gaussians": 2000, "persons": 1})
+    monkeypatch.setitem(
+        worlds.SMALL, "crowd", {"instances": 2, "num_gaussians": 2000, "persons": 1}
+    )
     folder = tmp_path / "people"
-    arguments = ["world", "crowd", "-o", str(folder), "--seed", "3", "--device", "cpu", "--quiet", "--json"]
+    arguments = [
+        "world",
+        "crowd",
+        "-o",
+        str(folder),
+        "--seed",
+        "3",
+        "--device",
+        "cpu",
+        "--quiet",
+        "--json",
+    ]
     assert PROGRAM.main(arguments) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["output"] == str(folder / "crowd.json")

@@ -1,4 +1,5 @@
-"""Level of detail for 3D Gaussian Splatting: build bundles of clusters, select a cut, draw it."""
+"""Level of detail for 3D Gaussian Splatting: build bundles of clusters, select a cut,
+draw it."""
 
 from v3dg import _start as _start  # first: from there on, commands hear Ctrl-C
 
@@ -7,8 +8,8 @@ from importlib.util import find_spec as _find_spec
 
 if _find_spec("v3dg._core") is None:
     raise ImportError(
-        f"v3dg: the compiled module is missing in {__path__[0]}; if this is the source folder, start Python "
-        "elsewhere (after `pip install .`) or install with `pip install -e .`"
+        f"v3dg: the compiled module is missing in {__path__[0]}; if this is the source folder, "
+        "start Python elsewhere (after `pip install .`) or install with `pip install -e .`"
     )
 
 from v3dg._version import __version__
@@ -33,7 +34,23 @@ from v3dg.view import view
 
 __all__ = ["BuildConfig", "Bundle", "Clusters", "Gaussians", "Groups"]
 __all__ += ["__version__", "build_bundle", "read_asset", "refine_bundle", "write_asset"]
-__all__ += ["Camera", "Scene", "read_cameras", "read_scene", "turntable", "write_cameras", "write_scene"]
-__all__ += ["DEFAULT_FADE", "DEFAULT_TOLERANCE", "Image", "Pick", "RenderedImage", "Renderer", "Stats"]
+__all__ += [
+    "Camera",
+    "Scene",
+    "read_cameras",
+    "read_scene",
+    "turntable",
+    "write_cameras",
+    "write_scene",
+]
+__all__ += [
+    "DEFAULT_FADE",
+    "DEFAULT_TOLERANCE",
+    "Image",
+    "Pick",
+    "RenderedImage",
+    "Renderer",
+    "Stats",
+]
 __all__ += ["Selection", "StereoCamera", "pick", "rasterize", "render", "select", "view"]
 __all__ += ["read_usd_scene", "write_site", "write_streamed_sog", "write_tiles", "write_usd"]

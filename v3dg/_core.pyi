@@ -7,8 +7,9 @@ from typing import Any, Literal, TypeAlias, overload
 import numpy as np
 from numpy.typing import NDArray
 
-# NumPy's on the host, torch's on a CUDA device. It cannot be narrower: torch need not be installed, so its
-# tensor has no type here, and which of the two a result is follows from the device, which no type knows.
+# NumPy's on the host, torch's on a CUDA device. It cannot be narrower: torch need not
+# be installed, so its tensor has no type here, and which of the two a result is follows
+# from the device, which no type knows.
 Array: TypeAlias = Any
 
 Float32: TypeAlias = NDArray[np.float32]
@@ -29,7 +30,9 @@ def num_cuda_devices() -> int: ...
 class Camera:
     """A pinhole camera, or a window of its image, as every operation takes it."""
 
-    def __init__(self, *, viewmat: Float64, K: Float64, width: int, height: int, near: float) -> None: ...
+    def __init__(
+        self, *, viewmat: Float64, K: Float64, width: int, height: int, near: float
+    ) -> None: ...
     def window(self, x0: int, y0: int, x1: int, y1: int) -> Camera: ...
     @property
     def position(self) -> Float64: ...
@@ -81,7 +84,9 @@ class Instances:
 class Rows:
     """The arrays of gaussians, on the host or on a CUDA device."""
 
-    def __init__(self, means: Array, quats: Array, scales: Array, opacities: Array, sh: Array) -> None: ...
+    def __init__(
+        self, means: Array, quats: Array, scales: Array, opacities: Array, sh: Array
+    ) -> None: ...
     def __len__(self) -> int: ...
     @property
     def device(self) -> int: ...
@@ -179,13 +184,21 @@ class HashedRead:
 class HashedReader:
     def __init__(self) -> None: ...
     def read(
-        self, path: str, descriptor: int, before: bytes, offset: int, num_bytes: int, in_pieces: bool
+        self,
+        path: str,
+        descriptor: int,
+        before: bytes,
+        offset: int,
+        num_bytes: int,
+        in_pieces: bool,
     ) -> HashedRead: ...
 
 class Codes:
     """All pages of a bundle as codes, on the host; borrows the arrays."""
 
-    def __init__(self, pages: Int32, first_cluster: Int64, offset: Int64, sh_degree: int) -> None: ...
+    def __init__(
+        self, pages: Int32, first_cluster: Int64, offset: Int64, sh_degree: int
+    ) -> None: ...
 
 # gather
 def gather(
@@ -248,8 +261,8 @@ def group_metrics(
 class Tape:
     """What rasterize leaves for rasterize_backward; it keeps the gaussians."""
 
-# Colour, alpha, depth where it is wanted, counts and times where it was the host that drew, the tape where it
-# is to be kept.
+# Colour, alpha, depth where it is wanted, counts and times where it was the host that
+# drew, the tape where it is to be kept.
 def rasterize(
     gaussians: Rows,
     camera: Camera,
@@ -262,7 +275,8 @@ def rasterize(
     plain_colors: bool = ...,
 ) -> tuple[Array, Array, Array | None, dict[str, float] | None, Tape | None]: ...
 
-# Gradients of the columns and of the background; of those by centres on the image the sum and the sizes.
+# Gradients of the columns and of the background; of those by centres on the image the
+# sum and the sizes.
 def rasterize_backward(
     tape: Tape,
     d_color: Array | None,
@@ -272,7 +286,8 @@ def rasterize_backward(
     with_sizes: bool = ...,
 ) -> tuple[Array, Array, Array, Array, Array, Array, Array | None, Array | None]: ...
 
-# How many times larger balls of level 1 are to be, (G, 4); and balls of each level after they have grown.
+# How many times larger balls of level 1 are to be, (G, 4); and balls of each level
+# after they have grown.
 def first_selected(
     leaves: Rows,
     level: Rows,
@@ -285,7 +300,8 @@ def first_selected(
 ) -> Float32: ...
 def grown_balls(balls: list[Float32], growth: Float32) -> list[Float32]: ...
 
-# Centres, depths, conics, opacities and radii; zeros for gaussians that are not in sight.
+# Centres, depths, conics, opacities and radii; zeros for gaussians that are not in
+# sight.
 def ellipses(
     gaussians: Rows,
     camera: Camera,
@@ -298,7 +314,8 @@ def ellipses(
 
 # scene
 class Stop:
-    """Asks, from any thread, for a picture under way to be given up: it is then left unfinished."""
+    """Asks, from any thread, for a picture under way to be given up: it is then left
+    unfinished."""
 
     def request(self) -> None: ...
     @property
@@ -379,10 +396,17 @@ class ResidentScene:
     def __init__(self, device: int) -> None: ...
     def set_bundles(self, tables: list[ClusterTable]) -> None: ...
     def set_instances(
-        self, bundle: Int32, importance: Float32, positions: Array, quaternions: Array, scales: Array
+        self,
+        bundle: Int32,
+        importance: Float32,
+        positions: Array,
+        quaternions: Array,
+        scales: Array,
     ) -> None: ...
     def set_poses(self, positions: Array, quaternions: Array, scales: Array) -> None: ...
-    def select(self, camera: Camera | Eyes, rule: Rule, steps: BudgetSteps | None = None) -> Cut: ...
+    def select(
+        self, camera: Camera | Eyes, rule: Rule, steps: BudgetSteps | None = None
+    ) -> Cut: ...
     def page_needs(self, camera: Camera, rule: Rule) -> list[Float32]: ...
 
 class PoolStatus:
@@ -423,7 +447,12 @@ class PagePool:
     """Pages of bundles in a fixed amount of memory of one device."""
 
     def __init__(
-        self, tables: list[ClusterTable], sources: list[Any], device: int, num_bytes: int, num_threads: int
+        self,
+        tables: list[ClusterTable],
+        sources: list[Any],
+        device: int,
+        num_bytes: int,
+        num_threads: int,
     ) -> None: ...
     def settle_step(
         self, scene: ResidentScene, camera: Camera | Eyes, rule: Rule, begins: bool
@@ -441,7 +470,8 @@ class Palette:
     def __init__(self, table: ClusterTable, sh: NDArray[np.float32], device: int) -> None: ...
 
 class Shade:
-    """What is behind a picture, when its pixels stop, and whether their depth is drawn."""
+    """What is behind a picture, when its pixels stop, and whether their depth is
+    drawn."""
 
     def __init__(
         self, *, background: Sequence[float], min_transmittance: float, with_depth: bool

@@ -1,4 +1,5 @@
-"""Where work runs: on the CPU, with NumPy arrays, or on a CUDA device, with torch tensors."""
+"""Where work runs: on the CPU, with NumPy arrays, or on a CUDA device, with torch
+tensors."""
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -31,7 +32,8 @@ class Device:
         return "cpu"
 
     def current(self) -> AbstractContextManager[object]:
-        """Make it torch's current device inside the context; does nothing for the CPU."""
+        """Make it torch's current device inside the context; does nothing for the
+        CPU."""
         if not self.is_cuda:
             return nullcontext()
         import torch
@@ -45,15 +47,19 @@ CPU = Device()
 def resolve(device: str | Device) -> Device:
     """The device that "auto", "cpu", "cuda" or "cuda:1" stands for.
 
-    "cuda" is torch's current device, "auto" the same if nothing is missing for it, else the CPU.
+    "cuda" is torch's current device, "auto" the same if nothing is missing for it, else
+    the CPU.
 
     Raises:
         ValueError: The name is none of these.
-        RuntimeError: Something is missing for a CUDA device that was asked for; the CPU does not replace it.
+        RuntimeError: Something is missing for a CUDA device that was asked for; the CPU
+            does not replace it.
     """
     name = str(device)
     kind, _, number = name.partition(":")
-    if kind not in ("auto", "cpu", "cuda") or (name != kind and (kind != "cuda" or not number.isdecimal())):
+    if kind not in ("auto", "cpu", "cuda") or (
+        name != kind and (kind != "cuda" or not number.isdecimal())
+    ):
         raise ValueError(f"device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got {name!r}")
     if kind == "cpu":
         return CPU
@@ -84,7 +90,8 @@ def missing_for_cuda() -> str | None:
         return _extras.missing("torch")
     if not torch.cuda.is_available():
         return (
-            f"expected a torch that can use the CUDA device, got {torch.__version__}; install one with CUDA"
+            "expected a torch that can use the CUDA device, "
+            f"got {torch.__version__}; install one with CUDA"
         )
     return None
 
@@ -106,14 +113,16 @@ def of(array: Array) -> Device:
 
 
 def place(gaussians: Gaussians, device: Device) -> Gaussians:
-    """The gaussians as NumPy arrays (on the CPU) or as tensors on a CUDA device, without gradients."""
+    """The gaussians as NumPy arrays (on the CPU) or as tensors on a CUDA device,
+    without gradients."""
     if not device.is_cuda:
         return gaussians.numpy()
     return Gaussians(*(array.detach() for array in vars(gaussians.torch(str(device))).values()))
 
 
 def place_rows(array: Array, rows: npt.NDArray[np.bool_], device: Device) -> Array:
-    """The marked rows of an array, as NumPy's (on the CPU) or as a CUDA tensor, without gradients."""
+    """The marked rows of an array, as NumPy's (on the CPU) or as a CUDA tensor, without
+    gradients."""
     if isinstance(array, np.ndarray) and not device.is_cuda:
         return array[rows]
     import torch
@@ -153,7 +162,8 @@ def to_host(array: Array) -> npt.NDArray[Any]:
 
 @contextmanager
 def memory_errors() -> Iterator[None]:
-    """Turn torch's error for too little device memory into MemoryError, which the core raises."""
+    """Turn torch's error for too little device memory into MemoryError, which the core
+    raises."""
     try:
         yield
     except RuntimeError as error:
@@ -188,10 +198,14 @@ def with_this_stream(work: Callable[[], None], device: Device) -> Callable[[], N
 
 
 def spare_memory(device: Device) -> None:
-    """Have torch free its cached memory on a device if it is much, because the core cannot use it."""
+    """Have torch free its cached memory on a device if it is much, because the core
+    cannot use it."""
     if not device.is_cuda:
         return
     import torch
 
-    if torch.cuda.memory_reserved(device.number) - torch.cuda.memory_allocated(device.number) > _MUCH_MEMORY:
+    if (
+        torch.cuda.memory_reserved(device.number) - torch.cuda.memory_allocated(device.number)
+        > _MUCH_MEMORY
+    ):
         torch.cuda.empty_cache()

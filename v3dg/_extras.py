@@ -31,7 +31,10 @@ def missing(module: str) -> str:
     extra = EXTRAS[module]
     packages = [package for package in EXTRAS.values() if package.purpose == extra.purpose]
     needed = " ".join(f"'{package.requirement}'" for package in packages)
-    return f"{extra.purpose}: expected {extra.requirement}, got none or an older one; pip install {needed}"
+    return (
+        f"{extra.purpose}: expected {extra.requirement}, got none or an older one; "
+        f"pip install {needed}"
+    )
 
 
 def load(module: str) -> ModuleType:

@@ -22,11 +22,13 @@ _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
-    """Yield the name of an empty file beside `path`; it replaces `path` at the end, or is removed on failure.
+    """Yield the name of an empty file beside `path`; it replaces `path` at the end, or
+    is removed on failure.
 
-    The content is on the disk before the file gets its name. It has the permissions of the file that it
-    replaces, and the owner and group where the system allows it. A link at `path` stays a link, to the new
-    file; a link at the temporary name is not followed.
+    The content is on the disk before the file gets its name. It has the permissions of
+    the file that it replaces, and the owner and group where the system allows it. A
+    link at `path` stays a link, to the new file; a link at the temporary name is not
+    followed.
 
     Raises:
         IsADirectoryError: `path` is a folder.
@@ -37,10 +39,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
     path = os.fspath(path)  # refuses a number, which open() would take for an open file
     status_of_replaced(path)
     folder, name = os.path.split(os.path.realpath(path))
-    # Only the start of the name: a name may have at most 255 bytes, and a character has up to four.
+    # Only the start of the name: a name may have at most 255 bytes, and a character has
+    # up to four.
     temporary = os.path.join(folder, f".{name[:40]}.{secrets.token_hex(8)}.tmp")
     with naming_errors(path, temporary):
-        # The file is private until it gets the permissions of the file that it replaces.
+        # The file is private until it gets the permissions of the file that it
+        # replaces.
         os.close(os.open(temporary, _NEW_FILE, 0o600))
         try:
             yield temporary
@@ -52,7 +56,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
 
 
 def put_in_place(private: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
-    """Flush a private file to the disk and move it to `path`, with the permissions of the replaced file."""
+    """Flush a private file to the disk and move it to `path`, with the permissions of
+    the replaced file."""
     replaced = status_of_replaced(path)
     with naming_errors(path, os.fspath(private)):
         with open(private, "rb") as file:
@@ -76,7 +81,8 @@ def file_mode_mask(status_path: str = "/proc/self/status") -> int:
         match = re.search(r"^Umask:\s*([0-7]+)$", status, re.MULTILINE)
         if match:
             return int(match[1], 8)
-    # Without /proc it can be read by setting it alone. What another thread makes meanwhile is private.
+    # Without /proc it can be read by setting it alone. What another thread makes
+    # meanwhile is private.
     with _MASK_LOCK:
         mask = os.umask(0o077)
         os.umask(mask)
@@ -84,7 +90,8 @@ def file_mode_mask(status_path: str = "/proc/self/status") -> int:
 
 
 def status_of_replaced(path: str | os.PathLike[str]) -> os.stat_result | None:
-    """The status of the file that will be replaced, or None if there is none; raises as `replacing`."""
+    """The status of the file that will be replaced, or None if there is none; raises as
+    `replacing`."""
     try:
         status = os.stat(path)
     except FileNotFoundError:
@@ -92,14 +99,16 @@ def status_of_replaced(path: str | os.PathLike[str]) -> os.stat_result | None:
     if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
     check(path, stat.S_ISREG(status.st_mode), "the path of a file, got a device or a pipe")
-    # Renaming needs only the permissions of the folder; opening the file checks its own.
+    # Renaming needs only the permissions of the folder; opening the file checks its
+    # own.
     os.close(os.open(path, os.O_WRONLY | os.O_CLOEXEC))
     return status
 
 
 @contextlib.contextmanager
 def naming_errors(path: str | os.PathLike[str], other_name: str | None = None) -> Iterator[None]:
-    """Put the name of the file into the system's errors, which for an open file have none or `other_name`."""
+    """Put the name of the file into the system's errors, which for an open file have
+    none or `other_name`."""
     try:
         yield
     except OSError as error:
@@ -110,18 +119,22 @@ def naming_errors(path: str | os.PathLike[str], other_name: str | None = None) -
 
 @contextlib.contextmanager
 def telling(path: str | os.PathLike[str], expected: str) -> Iterator[None]:
-    """Turn every exception of a library into one ValueError: none documents what damaged content raises."""
+    """Turn every exception of a library into one ValueError: none documents what
+    damaged content raises."""
     try:
         yield
     except MemoryError:
         raise
     except Exception as error:
         text = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"{os.fspath(path)}: expected {expected}, got {ascii(text[:200])[1:-1]}") from None
+        raise ValueError(
+            f"{os.fspath(path)}: expected {expected}, got {ascii(text[:200])[1:-1]}"
+        ) from None
 
 
 def write_at(descriptor: int, data: bytes | bytearray | memoryview, offset: int) -> None:
-    """Write all data from an offset of a file on, in pieces, so that signals are handled between them."""
+    """Write all data from an offset of a file on, in pieces, so that signals are
+    handled between them."""
     view = memoryview(data)
     while view:
         count = os.pwrite(descriptor, view[:_PIECE_BYTES], offset)
@@ -130,7 +143,8 @@ def write_at(descriptor: int, data: bytes | bytearray | memoryview, offset: int)
 
 
 def read_at(descriptor: int, out: npt.NDArray[np.generic], offset: int) -> bool:
-    """Fill an array with the bytes from an offset of a file on; False if the file ends before."""
+    """Fill an array with the bytes from an offset of a file on; False if the file ends
+    before."""
     view = out.reshape(-1).view(np.uint8).data
     while view:
         count = os.preadv(descriptor, [view[:_PIECE_BYTES]], offset)
@@ -147,12 +161,14 @@ def check_folder(path: Path) -> None:
 
 
 def check_bundle_name(path: str | os.PathLike[str]) -> None:
-    """Refuse a name that `v3dg.open` would not recognise as a bundle's, with ValueError."""
+    """Refuse a name that `v3dg.open` would not recognise as a bundle's, with
+    ValueError."""
     check(path, Path(path).suffix == ".v3dg", "a file name ending in .v3dg; v3dg.open goes by it")
 
 
 def open_regular(path: str | os.PathLike[str]) -> int:
-    """Open a file to read, and return its descriptor; ValueError for a directory, a device or a pipe."""
+    """Open a file to read, and return its descriptor; ValueError for a directory, a
+    device or a pipe."""
     # O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):

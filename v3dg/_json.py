@@ -1,4 +1,5 @@
-"""Strict JSON, and values that know their place in the file, so that errors can name it."""
+"""Strict JSON, and values that know their place in the file, so that errors can name
+it."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ _LARGEST_SIDE = 1 << 20  # px of a picture
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse strict JSON: no NaN, no key twice, no unbounded nesting; ValueError otherwise."""
+    """Parse strict JSON: no NaN, no key twice, no unbounded nesting; ValueError
+    otherwise."""
     try:
         return json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
     except RecursionError:
@@ -54,19 +56,23 @@ def shown(value: object) -> str:
 
 
 def is_one_line(text: str) -> bool:
-    """Whether text can be part of a message: no control characters, no halves of surrogate pairs."""
+    """Whether text can be part of a message: no control characters, no halves of
+    surrogate pairs."""
     return not any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in text)
 
 
 def read_json(path: str | os.PathLike[str]) -> Node:
-    """Read a JSON file; ValueError unless it is a regular file with strict JSON in UTF-8."""
+    """Read a JSON file; ValueError unless it is a regular file with strict JSON in
+    UTF-8."""
     path = Path(path)
     with _files.naming_errors(path), open(_files.open_regular(path), "rb") as file:
         content = file.read()
     try:
         return Node(parse_json(content.decode("utf-8")), path.name, "")
     except ValueError as error:
-        raise ValueError(f"{path.name}: expected JSON, got a file that does not parse: {error}") from error
+        raise ValueError(
+            f"{path.name}: expected JSON, got a file that does not parse: {error}"
+        ) from error
 
 
 def write_json(path: str | os.PathLike[str], document: object) -> None:
@@ -76,7 +82,8 @@ def write_json(path: str | os.PathLike[str], document: object) -> None:
 
 
 class Node:
-    """A JSON value with its place: the name of the file, and its path in the document."""
+    """A JSON value with its place: the name of the file, and its path in the
+    document."""
 
     def __init__(self, value: Any, file: str, path: str) -> None:
         self.value = value
@@ -94,7 +101,8 @@ class Node:
         return self.problem(text)
 
     def attempt(self, make: Callable[[], T]) -> T:
-        """What ``make`` makes of the fields; its ValueErrors, which begin with a field, get their place."""
+        """What ``make`` makes of the fields; its ValueErrors, which begin with a field,
+        get their place."""
         try:
             return make()
         except ValueError as error:
@@ -122,7 +130,8 @@ class Node:
     def items(
         self, expected: str = "an array", min_length: int = 0, max_length: float = math.inf
     ) -> Iterator[Node]:
-        """An array's values, lazily: the nodes of a large array take far more memory than the file."""
+        """An array's values, lazily: the nodes of a large array take far more memory
+        than the file."""
         if not isinstance(self.value, list) or not min_length <= len(self.value) <= max_length:
             raise self.error(expected)
         return (Node(value, self.file, f"{self.path}[{i}]") for i, value in enumerate(self.value))
@@ -150,7 +159,10 @@ class Node:
         return self.value
 
     def number(
-        self, expected: str = "a finite number", lower_bound: float = -math.inf, upper_bound: float = math.inf
+        self,
+        expected: str = "a finite number",
+        lower_bound: float = -math.inf,
+        upper_bound: float = math.inf,
     ) -> float:
         """A number strictly between two bounds."""
         if isinstance(self.value, bool) or not isinstance(self.value, int | float):

@@ -26,14 +26,16 @@ class _Judge(NamedTuple):
 
 
 class Judges:
-    """Processes that measure items: each starts when it is first needed, and ends at `close`."""
+    """Processes that measure items: each starts when it is first needed, and ends at
+    `close`."""
 
     def __init__(self) -> None:
         self._cores = len(os.sched_getaffinity(0))
         self._judges: list[_Judge] = []
 
     def measured(self, items: Iterable[T], measure: Callable[[T], R]) -> Iterator[tuple[T, R]]:
-        """Items with the result of ``measure`` for each, in order; later items are made meanwhile.
+        """Items with the result of ``measure`` for each, in order; later items are made
+        meanwhile.
 
         ``measure`` is a function of a module, for other processes import it.
         """
@@ -49,7 +51,8 @@ class Judges:
             while waiting:
                 measured_item, pipe = waiting.popleft()
                 yield measured_item, cast(R, _answer(pipe))
-        except BaseException:  # answers that are still to come would be taken for those of later items
+        except BaseException:
+            # answers that are still to come would be taken for those of later items
             self.close()
             raise
 
@@ -57,11 +60,12 @@ class Judges:
         """The pipe to a process, which is started if it is the next one."""
         if number == len(self._judges):
             resource_tracker.ensure_running()  # it unblocks signals once it has started
-            # Ctrl-C is for this process alone: a process that starts must not be interrupted before it can
-            # ignore it.
+            # Ctrl-C is for this process alone: a process that starts must not be
+            # interrupted before it can ignore it.
             previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
             try:
-                # A forked process would inherit CUDA and OpenMP in a state that neither survives.
+                # A forked process would inherit CUDA and OpenMP in a state that neither
+                # survives.
                 context = multiprocessing.get_context("spawn")
                 pipe, pipe_of_judge = context.Pipe()
                 process = context.Process(target=_judge, args=(pipe_of_judge,), daemon=True)

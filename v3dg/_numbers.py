@@ -27,7 +27,8 @@ class _Tensor(Protocol):
 
 
 def floats(values: object, name: str, expected: str = "numbers") -> Floats:
-    """A new array of doubles, from numbers, arrays or torch's tensors; ValueError unless all are finite."""
+    """A new array of doubles, from numbers, arrays or torch's tensors; ValueError
+    unless all are finite."""
     try:
         if hasattr(values, "detach"):
             array = np.asarray(cast(_Tensor, values).numpy(force=True))
@@ -38,7 +39,9 @@ def floats(values: object, name: str, expected: str = "numbers") -> Floats:
         with np.errstate(over="ignore"):
             array = np.array(array, dtype=np.float64, order="C")
     except OverflowError:
-        raise ValueError(f"{name}: expected {expected} that a double can hold, got a larger one") from None
+        raise ValueError(
+            f"{name}: expected {expected} that a double can hold, got a larger one"
+        ) from None
     except (TypeError, ValueError, RuntimeError):
         kind = type(values).__name__
         dtype = getattr(values, "dtype", None)
@@ -66,7 +69,11 @@ def vector(values: object, name: str, shape: tuple[int, ...] = (3,)) -> Floats:
 
 def color(values: object, name: str) -> list[float]:
     """Three numbers that the core can hold."""
-    if type(values) is tuple and len(values) == 3 and all(type(v) is float and 0 <= v <= 1 for v in values):
+    if (
+        type(values) is tuple
+        and len(values) == 3
+        and all(type(v) is float and 0 <= v <= 1 for v in values)
+    ):
         return list(values)  # the quick way, for every frame
     array = vector(values, name)
     largest = np.abs(array).max()
@@ -102,7 +109,9 @@ def positive(value: object, name: str) -> float:
     return real(value, name, "a positive number", 5e-324, MOST_DOUBLE)
 
 
-def whole(value: object, name: str, expected: str, lower_bound: int, upper_bound: int = MOST_INT) -> int:
+def whole(
+    value: object, name: str, expected: str, lower_bound: int, upper_bound: int = MOST_INT
+) -> int:
     """One whole number of ``lower_bound`` to ``upper_bound``; ValueError otherwise."""
     try:
         number = operator.index(cast(SupportsIndex, value))
@@ -130,12 +139,14 @@ def check(name: str | os.PathLike[str], holds: object, expected: str) -> None:
 
 
 def refuse(name: str | os.PathLike[str], expected: str) -> NoReturn:
-    """Raise the ValueError of `check`, for callers that compose the message only if it is needed."""
+    """Raise the ValueError of `check`, for callers that compose the message only if it
+    is needed."""
     raise ValueError(f"{os.fspath(name)}: expected {expected}")
 
 
 def check_type(name: str, value: object, kind: type, expected: str) -> None:
-    """Raise TypeError unless a value is an instance of ``kind``, which messages call ``expected``."""
+    """Raise TypeError unless a value is an instance of ``kind``, which messages call
+    ``expected``."""
     if not isinstance(value, kind):
         advice = ""
         if isinstance(value, str | os.PathLike) and kind.__name__ == "Camera":

@@ -1,4 +1,5 @@
-"""Progress of long work: a bar in a terminal, a few lines in a log, or calls of a function."""
+"""Progress of long work: a bar in a terminal, a few lines in a log, or calls of a
+function."""
 
 import logging
 import sys
@@ -10,7 +11,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 Progress: TypeAlias = bool | Callable[[int, int, str], object]
-"""Whether to show progress; or a function that is called with the work done, the total, and a text."""
+"""Whether to show progress; or a function that is called with the work done, the total,
+and a text."""
 
 _LOG = logging.getLogger("v3dg")
 _LOG.addHandler(logging.NullHandler())

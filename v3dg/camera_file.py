@@ -1,4 +1,5 @@
-"""Camera files: the `transforms.json` of nerfstudio, instant-ngp and NeRF's synthetic scenes.
+"""Camera files: the `transforms.json` of nerfstudio, instant-ngp and NeRF's synthetic
+scenes.
 
 And folders with cameras: nerfstudio's runs, and COLMAP's models, with its own library.
 """
@@ -15,15 +16,27 @@ import numpy as np
 from v3dg import _extras
 from v3dg._json import Node, read_json, write_json
 from v3dg._numbers import check, one_of, refuse
-from v3dg.cameras import Camera, Floats, check_cameras, intrinsics, is_rotation, viewmat_from_blender
+from v3dg.cameras import (
+    Camera,
+    Floats,
+    check_cameras,
+    intrinsics,
+    is_rotation,
+    viewmat_from_blender,
+)
 
-# COLMAP's camera models that are pinholes apart from distortion, which is checked separately.
+# COLMAP's camera models that are pinholes apart from distortion, which is checked
+# separately.
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-_UNDISTORT = "undistort the pictures first, or leave it out: distortion='ignore', or --distortion ignore"
+_UNDISTORT = (
+    "undistort the pictures first, or leave it out: distortion='ignore', or --distortion ignore"
+)
 _RUN = "config.yml"  # identifies a run of nerfstudio
 _MODEL = ("images.bin", "images.txt")  # identify a model of COLMAP
-_DATA = re.compile(r"^\s*data: (?:&\w+ )?!!python/object/apply:pathlib\.\w+\n((?:\s*- .*\n)+)", re.MULTILINE)
+_DATA = re.compile(
+    r"^\s*data: (?:&\w+ )?!!python/object/apply:pathlib\.\w+\n((?:\s*- .*\n)+)", re.MULTILINE
+)
 # From a camera with x right, y up, z backward to one with x right, y down, z forward.
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
@@ -35,22 +48,29 @@ def read_cameras(
     distortion: Literal["refuse", "ignore"] = "refuse",
     applied_transform: Literal["keep", "undo"] = "keep",
 ) -> dict[str, Camera]:
-    """Read the cameras of a nerfstudio `transforms.json`, in file order (docs/scene.md).
+    """Read the cameras of a nerfstudio `transforms.json`, in file order
+    (docs/scene.md).
 
-    Or those of a folder: of a model of COLMAP, binary or text, by their images' names, with the extra
-    `colmap`; or of a run of nerfstudio (also by its `config.yml`), in the frame that it trained in.
+    Or those of a folder: of a model of COLMAP, binary or text, by their images' names,
+    with the extra `colmap`; or of a run of nerfstudio (also by its `config.yml`), in
+    the frame that it trained in.
 
-    A camera is named by its `file_path`; if any is missing or repeats, all are named by their number, from 0.
-    Pictures, depths, masks and point clouds that the file names are not read.
+    A camera is named by its `file_path`; if any is missing or repeats, all are named by
+    their number, from 0. Pictures, depths, masks and point clouds that the file names
+    are not read.
 
     Args:
-        size: Width and height in px for a file that has neither `w` and `h` nor focal lengths in px.
-        distortion: Whether lens distortion is an error, or left out: cameras are pinholes.
-        applied_transform: Whether cameras stay in the frame of the file, or `applied_transform` and
-            `applied_scale` are undone, for assets in the frame that the data had before.
+        size: Width and height in px for a file that has neither `w` and `h` nor focal
+            lengths in px.
+        distortion: Whether lens distortion is an error, or left out: cameras are
+            pinholes.
+        applied_transform: Whether cameras stay in the frame of the file, or
+            `applied_transform` and `applied_scale` are undone, for assets in the frame
+            that the data had before.
 
     Raises:
-        ValueError: The content is not valid, or has other cameras than pinholes; names the place in it.
+        ValueError: The content is not valid, or has other cameras than pinholes; names
+            the place in it.
         OSError: The file cannot be read.
     """
     one_of(distortion, "distortion", ("refuse", "ignore"))
@@ -103,7 +123,9 @@ def _read_frame(
         near = fields["near"].positive()
     viewmat = node.attempt(partial(viewmat_from_blender, _rows(fields["transform_matrix"])))
     for transform, scale in transforms:  # each leads back to the world before it was applied
-        with np.errstate(over="ignore", invalid="ignore"):  # Camera refuses values that are not finite
+        with np.errstate(
+            over="ignore", invalid="ignore"
+        ):  # Camera refuses values that are not finite
             viewmat = viewmat @ (np.diag([scale, scale, scale, 1.0]) @ transform)
             viewmat[:3] /= scale  # the camera keeps a scale of 1
     return node.attempt(partial(Camera, viewmat, K, width, height, near))
@@ -124,13 +146,16 @@ def _data_of(run: Path) -> Path:
             files.append(file)
     existing = next((file for file in files if file.is_file()), None)
     if existing is None:
-        tried = " or ".join(map(str, dict.fromkeys(files))) or "a path under data:, which it has not"
+        tried = (
+            " or ".join(map(str, dict.fromkeys(files))) or "a path under data:, which it has not"
+        )
         refuse(run / _RUN, f"the run's data at {tried}, got none; put it there")
     return existing
 
 
 def _trained(run: Path) -> tuple[Floats, float]:
-    """The transform from the frame of a run's training to that of its data, as `_applied` returns it."""
+    """The transform from the frame of a run's training to that of its data, as
+    `_applied` returns it."""
     top = read_json(run / "dataparser_transforms.json").some_fields(("transform", "scale"))
     matrix = _rows(top["transform"])
     scale = top["scale"].positive()
@@ -150,13 +175,21 @@ def _read_colmap(folder: Path, distortion: str) -> dict[str, Camera]:
     try:
         model = pycolmap.Reconstruction(os.fspath(models[0]))
     except (RuntimeError, ValueError, IndexError) as error:
-        raise ValueError(f"{models[0]}: expected a model of COLMAP, got {str(error)[:200]!a}") from None
+        raise ValueError(
+            f"{models[0]}: expected a model of COLMAP, got {str(error)[:200]!a}"
+        ) from None
     cameras = {}
     for _, image in sorted(model.images.items()):
         camera = model.cameras[image.camera_id]
-        is_right = camera.is_perspective_pinhole() and (camera.is_undistorted() or distortion == "ignore")
+        is_right = camera.is_perspective_pinhole() and (
+            camera.is_undistorted() or distortion == "ignore"
+        )
         expected = "a pinhole without lens distortion"
-        check(f"{models[0]}: {image.name}", is_right, f"{expected}, got {camera.model_name}; {_UNDISTORT}")
+        check(
+            f"{models[0]}: {image.name}",
+            is_right,
+            f"{expected}, got {camera.model_name}; {_UNDISTORT}",
+        )
         K = np.diag([camera.focal_length_x, camera.focal_length_y, 1.0])
         K[0, 2] = camera.principal_point_x
         K[1, 2] = camera.principal_point_y
@@ -167,7 +200,8 @@ def _read_colmap(folder: Path, distortion: str) -> dict[str, Camera]:
 
 
 def write_cameras(path: str | os.PathLike[str], cameras: Mapping[str, Camera]) -> None:
-    """Write named cameras as a nerfstudio `transforms.json`; `read_cameras` gives the same cameras."""
+    """Write named cameras as a nerfstudio `transforms.json`; `read_cameras` gives the
+    same cameras."""
     check_cameras(cameras)
     frames = []
     for name, camera in cameras.items():
@@ -192,7 +226,9 @@ def write_cameras(path: str | os.PathLike[str], cameras: Mapping[str, Camera]) -
 def _check_is_pinhole(fields: Mapping[str, Node], distortion: str) -> None:
     model = fields.get("camera_model")
     if model is not None and model.value not in _PINHOLES:
-        raise model.error(f"a pinhole camera ({', '.join(_PINHOLES)})", "undistort the pictures first")
+        raise model.error(
+            f"a pinhole camera ({', '.join(_PINHOLES)})", "undistort the pictures first"
+        )
     fisheye = fields.get("is_fisheye")
     if fisheye is not None and fisheye.value not in (False, 0):
         raise fisheye.error("a pinhole camera", "undistort the pictures first")
@@ -204,7 +240,8 @@ def _check_is_pinhole(fields: Mapping[str, Node], distortion: str) -> None:
 
 
 def _rows(node: Node) -> Floats:
-    """A matrix of 3 or 4 rows as (4, 4); a fourth row is ignored, as by other readers."""
+    """A matrix of 3 or 4 rows as (4, 4); a fourth row is ignored, as by other
+    readers."""
     num_rows = 4
     if isinstance(node.value, list) and len(node.value) == 3:
         num_rows = 3
@@ -214,7 +251,8 @@ def _rows(node: Node) -> Floats:
 
 
 def _applied(top: Mapping[str, Node]) -> tuple[Floats, float]:
-    """The (4, 4) rotation and translation, then the scale, that were applied to the file's positions."""
+    """The (4, 4) rotation and translation, then the scale, that were applied to the
+    file's positions."""
     transform: Floats = np.eye(4)
     if "applied_transform" in top:
         transform = _rows(top["applied_transform"])
@@ -238,7 +276,9 @@ def _intrinsics(
             "expected w and h, in the frame or at the top, got focal lengths in px and no size"
         )
     elif size is None:
-        raise frame.problem("expected w and h, in the frame or at the top, got neither; give the size")
+        raise frame.problem(
+            "expected w and h, in the frame or at the top, got neither; give the size"
+        )
     else:
         width, height = size
     if "fl_x" in focal:
@@ -254,7 +294,9 @@ def _intrinsics(
             fov_y = focal["camera_angle_y"].field_of_view()
         K = frame.attempt(partial(intrinsics, fov_x, fov_y, width, height))
     else:
-        raise frame.problem("expected fl_x or camera_angle_x, in the frame or at the top, got neither")
+        raise frame.problem(
+            "expected fl_x or camera_angle_x, in the frame or at the top, got neither"
+        )
     for axis, name in enumerate(("cx", "cy")):
         if name in fields:
             K[axis, 2] = fields[name].number()

@@ -1,4 +1,5 @@
-"""Pinhole cameras: made from matrices, from two points, from Blender's convention, or on a turntable."""
+"""Pinhole cameras: made from matrices, from two points, from Blender's convention, or
+on a turntable."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +22,8 @@ AXES: tuple[Axis, ...] = get_args(Axis)
 
 DEFAULT_FOV_X = 0.785398163397448  # 45 degrees
 _MAX_TURNTABLE_CAMERAS = 1_000_000  # more would take minutes and is most likely a typo
-# Largest deviation of the rows of a rotation from orthonormal: matrices are often stored as float32 text.
+# Largest deviation of the rows of a rotation from orthonormal: matrices are often
+# stored as float32 text.
 ROTATION_TOLERANCE = 1e-4
 
 
@@ -29,7 +31,8 @@ ROTATION_TOLERANCE = 1e-4
 class Camera:
     """Pinhole camera in the OpenCV convention: x right, y down, z forward.
 
-    Pixel (i, j) has its centre at (i + ½, j + ½). Matrices are copied, in double precision.
+    Pixel (i, j) has its centre at (i + ½, j + ½). Matrices are copied, in double
+    precision.
 
     Args:
         viewmat: (4, 4) world to camera, a rotation and a translation.
@@ -59,13 +62,17 @@ class Camera:
         if viewmat[3].tolist() != [0, 0, 0, 1]:
             refuse("viewmat", f"the last row 0 0 0 1, got {_text(viewmat[3])}")
         K = vector(self.K, "K", (3, 3))
-        # Python numbers, because NumPy is slower for 9 or 16 of them, and every frame may have a new camera.
+        # Python numbers, because NumPy is slower for 9 or 16 of them, and every frame
+        # may have a new camera.
         (fx, skew, cx), (skew_y, fy, cy), last_row = K.tolist()
         if not (fx > 0 and fy > 0):
             refuse("K", f"positive focal lengths, got {fx:g} and {fy:g}")
         is_plain = skew == 0 == skew_y and last_row == [0, 0, 1]
-        check("K", is_plain, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got a matrix with skew or scale")
-        # One update of the dict is faster than object.__setattr__ for each field of a frozen class.
+        check(
+            "K", is_plain, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got a matrix with skew or scale"
+        )
+        # One update of the dict is faster than object.__setattr__ for each field of a
+        # frozen class.
         self.__dict__.update(
             viewmat=viewmat,
             K=K,
@@ -90,7 +97,8 @@ class Camera:
         height: int,
         near: float = 0.01,
     ) -> "Camera":
-        """Make a camera at ``eye`` that has ``target`` at the image's centre and ``up`` upwards.
+        """Make a camera at ``eye`` that has ``target`` at the image's centre and ``up``
+        upwards.
 
         Args:
             eye: (3,) position in the world.
@@ -99,7 +107,8 @@ class Camera:
             fov_x: Horizontal field of view in radians; pixels are square.
 
         Raises:
-            ValueError: The target is at the eye, or ``up`` lies along the view direction.
+            ValueError: The target is at the eye, or ``up`` lies along the view
+                direction.
         """
         position = vector(eye, "eye")
         goal = vector(target, "target")
@@ -107,16 +116,26 @@ class Camera:
         with np.errstate(over="ignore"):
             distance = np.linalg.norm(goal - position)
         check("target", distance > 0, f"a point away from the eye, got {_text(goal)} for both")
-        check("eye, target", np.isfinite(distance), f"a distance that a double can hold, got {_text(goal)}")
+        check(
+            "eye, target",
+            np.isfinite(distance),
+            f"a distance that a double can hold, got {_text(goal)}",
+        )
         forward = (goal - position) / distance
-        upwards = up_vector / (np.abs(up_vector).max() or 1.0)  # squares neither overflow nor underflow
+        upwards = up_vector / (
+            np.abs(up_vector).max() or 1.0
+        )  # squares neither overflow nor underflow
         right = np.cross(forward, upwards)
         length = np.linalg.norm(right)
         is_independent = length > 1e-9 * np.linalg.norm(upwards)
-        check("up", is_independent, f"a direction that is not along the view, got {_text(up_vector)}")
+        check(
+            "up", is_independent, f"a direction that is not along the view, got {_text(up_vector)}"
+        )
         right /= length
         rotation = np.stack([right, np.cross(forward, right), forward])
-        return cls(rigid(rotation, position), intrinsics(fov_x, None, width, height), width, height, near)
+        return cls(
+            rigid(rotation, position), intrinsics(fov_x, None, width, height), width, height, near
+        )
 
     @classmethod
     def from_blender(
@@ -129,10 +148,12 @@ class Camera:
         *,
         near: float = 0.01,
     ) -> "Camera":
-        """Make a camera from a camera-to-world matrix in Blender's convention: x right, y up, z backward.
+        """Make a camera from a camera-to-world matrix in Blender's convention: x right,
+        y up, z backward.
 
         Args:
-            transform_matrix: (4, 4) camera to world; it is replaced by the nearest rotation.
+            transform_matrix: (4, 4) camera to world; it is replaced by the nearest
+                rotation.
             fov_x: Horizontal field of view in radians.
             fov_y: Vertical field of view in radians; square pixels if None.
         """
@@ -155,7 +176,8 @@ class Camera:
         return Camera, (self.viewmat, self.K, self.width, self.height, self.near)
 
     def scaled(self, factor: int) -> "Camera":
-        """Return this camera with ``factor`` times the resolution, for supersampling."""
+        """Return this camera with ``factor`` times the resolution, for
+        supersampling."""
         factor = _side(factor, "factor")
         K = self.K * np.array([[factor], [factor], [1.0]])
         return replace(self, K=K, width=self.width * factor, height=self.height * factor)
@@ -167,7 +189,8 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class StereoCamera:
-    """Two cameras that look the same way, as the eyes in a headset do: they share one cut.
+    """Two cameras that look the same way, as the eyes in a headset do: they share one
+    cut.
 
     Raises:
         ValueError: The cameras have different rotations.
@@ -178,12 +201,16 @@ class StereoCamera:
 
     def __post_init__(self) -> None:
         has_same_rotation = np.array_equal(self.left.viewmat[:3, :3], self.right.viewmat[:3, :3])
-        expected = "a camera of the same rotation as the left one, got another; draw such cameras one by one"
+        expected = (
+            "a camera of the same rotation as the left one, got another; "
+            "draw such cameras one by one"
+        )
         check("right", has_same_rotation, expected)
 
     @classmethod
     def of(cls, camera: Camera, eye_distance: float) -> "StereoCamera":
-        """Eyes to the left and the right of a camera, at ``eye_distance`` world units from each other."""
+        """Eyes to the left and the right of a camera, at ``eye_distance`` world units
+        from each other."""
         shift = np.zeros((4, 4))
         shift[0, 3] = 0.5 * positive(eye_distance, "eye_distance")
         left = replace(camera, viewmat=camera.viewmat + shift)
@@ -236,12 +263,14 @@ def turntable(
     height: int = 800,
     near: float = 0.01,
 ) -> list[Camera]:
-    """Make ``n`` cameras evenly spaced on a circle around ``center``, all looking at it.
+    """Make ``n`` cameras evenly spaced on a circle around ``center``, all looking at
+    it.
 
     Args:
         center: (3,) point in the world.
         radius: Distance from the centre; > 0.
-        elevation: Angle above the plane through the centre, in radians, between -π/2 and π/2.
+        elevation: Angle above the plane through the centre, in radians, between -π/2
+            and π/2.
         up: (3,) axis of the turntable.
         fov_x: Horizontal field of view in radians.
     """
@@ -251,9 +280,15 @@ def turntable(
     n = whole(n, "n", "0 cameras or more", 0, _MAX_TURNTABLE_CAMERAS)
     if not max(1e-150, 1e-12 * np.abs(middle).max()) < radius < 1e150:
         expected = "a circle that double precision resolves"
-        raise ValueError(f"center, radius: expected {expected}, got {radius} around {_text(middle)}")
+        raise ValueError(
+            f"center, radius: expected {expected}, got {radius} around {_text(middle)}"
+        )
     elevation = real(elevation, "elevation")
-    check("elevation", abs(elevation) < math.pi / 2, f"an angle between -pi/2 and pi/2, got {elevation}")
+    check(
+        "elevation",
+        abs(elevation) < math.pi / 2,
+        f"an angle between -pi/2 and pi/2, got {elevation}",
+    )
     check("up", axis.any(), f"a direction, got {_text(axis)}")
     axis /= np.abs(axis).max()  # squares neither overflow nor underflow
     axis /= np.linalg.norm(axis)
@@ -267,12 +302,15 @@ def turntable(
         angle = 2 * math.pi * i / n
         outwards = math.cos(elevation) * (math.cos(angle) * start + math.sin(angle) * side)
         eye = middle + radius * (outwards + math.sin(elevation) * axis)
-        cameras.append(Camera.look_at(eye, middle, axis, fov_x, width=width, height=height, near=near))
+        cameras.append(
+            Camera.look_at(eye, middle, axis, fov_x, width=width, height=height, near=near)
+        )
     return cameras
 
 
 def rigid(rotation: Floats, eye: Floats) -> Floats:
-    """(4, 4) world to camera, from the rotation from world to camera and the position of the eye."""
+    """(4, 4) world to camera, from the rotation from world to camera and the position
+    of the eye."""
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation
     with np.errstate(over="ignore", invalid="ignore"):  # Camera refuses values that are not finite
@@ -302,7 +340,8 @@ def _check_rotation(matrix: Floats, name: str, advice: str = "") -> None:
 
 
 def viewmat_from_blender(transform_matrix: MatrixLike) -> Floats:
-    """(4, 4) world to camera from camera to world in Blender's convention, with the nearest rotation."""
+    """(4, 4) world to camera from camera to world in Blender's convention, with the
+    nearest rotation."""
     matrix = vector(transform_matrix, "transform_matrix", (4, 4))
     axes = matrix[:3, :3] * [1.0, -1.0, -1.0]
     _check_rotation(axes, "transform_matrix")
@@ -311,7 +350,8 @@ def viewmat_from_blender(transform_matrix: MatrixLike) -> Floats:
 
 
 def intrinsics(fov_x: float, fov_y: float | None, width: int, height: int) -> Floats:
-    """(3, 3) K from fields of view in radians, with a central principal point; fov_y None: square pixels."""
+    """(3, 3) K from fields of view in radians, with a central principal point; fov_y
+    None: square pixels."""
     width = _side(width, "width")
     height = _side(height, "height")
     fx = _focal(fov_x, "fov_x", width)

@@ -1,4 +1,5 @@
-"""Faults of an asset: gaussians that cannot be drawn, and gaussians far away from all others."""
+"""Faults of an asset: gaussians that cannot be drawn, and gaussians far away from all
+others."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,11 +11,14 @@ from v3dg import _core
 from v3dg.gaussians import Gaussians
 
 LARGEST = _core.most_length
-"""Largest coordinate or scale, in world units: squares of larger ones overflow float32."""
+"""Largest coordinate or scale, in world units: squares of larger ones overflow float32.
+"""
 SMALLEST_OPACITY = float(np.float32(_core.min_alpha))
-"""Pixels skip contributions with a smaller alpha, so a gaussian with a smaller opacity is never drawn."""
+"""Pixels skip contributions with a smaller alpha, so a gaussian with a smaller opacity
+is never drawn."""
 OUTLIER_DISTANCE = 20.0
-"""Distance from the median position, in median distances, beyond which lie sky, floaters and mistakes."""
+"""Distance from the median position, in median distances, beyond which lie sky,
+floaters and mistakes."""
 
 # Kinds of gaussians that cannot be drawn, in the order of the core's bits.
 _TEXT = {
@@ -42,9 +46,10 @@ class Findings:
 
     Attributes:
         drawable: (N,) bool, on the host.
-        counts: How many there are of each kind that cannot be drawn; kinds without any are left out, and a
-            gaussian can be of several.
-        num_wrong: Gaussians with wrong values; the others that cannot be drawn are valid, but transparent.
+        counts: How many there are of each kind that cannot be drawn; kinds without any
+            are left out, and a gaussian can be of several.
+        num_wrong: Gaussians with wrong values; the others that cannot be drawn are
+            valid, but transparent.
     """
 
     drawable: npt.NDArray[np.bool_]
@@ -81,11 +86,14 @@ def examine(asset: Gaussians) -> Findings:
         count = int((nonzero >> bit & 1).sum())
         if count:
             counts[kind] = count
-    return Findings(drawable=faults == 0, counts=counts, num_wrong=int((nonzero & _WRONG != 0).sum()))
+    return Findings(
+        drawable=faults == 0, counts=counts, num_wrong=int((nonzero & _WRONG != 0).sum())
+    )
 
 
 def outliers(means: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
-    """Which of (N, 3) finite positions lie far from all others: more than 20 times the median distance."""
+    """Which of (N, 3) finite positions lie far from all others: more than 20 times the
+    median distance."""
     if len(means) == 0:
         return np.zeros(0, bool)
     exact = means.astype(np.float64)
@@ -94,9 +102,11 @@ def outliers(means: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
 
 
 def ball_of_most(points: npt.NDArray[np.floating]) -> tuple[npt.NDArray[np.floating], float]:
-    """Centre (3,) and radius, above 0, of a ball around nearly all of N > 0 points (N, 3).
+    """Centre (3,) and radius, above 0, of a ball around nearly all of N > 0 points (N,
+    3).
 
-    It is the part to look at: trained assets have a few gaussians far away from all others.
+    It is the part to look at: trained assets have a few gaussians far away from all
+    others.
     """
     low, high = np.percentile(points, (1, 99), axis=0)
     return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)

@@ -1,7 +1,9 @@
-"""The main job without a download: build a bundle, place it 2,000 times, draw it from near to far.
+"""The main job without a download: build a bundle, place it 2,000 times, draw it from
+near to far.
 
-The result is one picture: the full asset above, the selected cut below, a column a distance, each with the
-gaussians drawn, the time, and the error to the full asset at twice the resolution.
+The result is one picture: the full asset above, the selected cut below, a column a
+distance, each with the gaussians drawn, the time, and the error to the full asset at
+twice the resolution.
 """
 
 import math
@@ -24,7 +26,8 @@ from v3dg.select import DEFAULT_TOLERANCE
 
 JsonObject: TypeAlias = dict[str, Any]
 
-# Distance from the eye to the donut in the middle, in radii of a donut, and height of the view in radians.
+# Distance from the eye to the donut in the middle, in radii of a donut, and height of
+# the view in radians.
 VIEWS = ((3.3, 0.36), (8.0, 0.36), (20.0, 0.36), (46.0, 0.38), (95.0, 0.42))
 _AZIMUTH = 0.80  # rad; the sun is then behind the camera
 _SKY = (0.6, 0.73, 0.85)
@@ -42,7 +45,8 @@ def run_demo(
     progress: Progress = True,
     device: str = "auto",
 ) -> JsonObject:
-    """Make an asset, build and place it, draw and measure every distance, and write the picture.
+    """Make an asset, build and place it, draw and measure every distance, and write the
+    picture.
 
     Args:
         num_gaussians: Of the asset.
@@ -54,7 +58,8 @@ def run_demo(
         What was made and measured, as JSON values.
 
     Raises:
-        ValueError: The picture cannot be written to ``output``, or an argument is out of range.
+        ValueError: The picture cannot be written to ``output``, or an argument is out
+            of range.
     """
     path = check_picture_path(output)
     chosen_device = _device.resolve(device)
@@ -67,7 +72,9 @@ def run_demo(
     full_row: list[tuple[str, Picture]] = []
     bundle_row: list[tuple[str, Picture]] = []
     for distance, elevation in counted(views, len(views), "draw", progress):
-        full, selected = _panels(scene, _camera(distance, elevation, size), tolerance, chosen_device)
+        full, selected = _panels(
+            scene, _camera(distance, elevation, size), tolerance, chosen_device
+        )
         full_row.append((f"full, distance {distance:g}: {full.text}", full.picture))
         bundle_row.append((f"bundle, distance {distance:g}: {selected.text}", selected.picture))
         columns.append({"distance": distance, "full": full.numbers, "bundle": selected.numbers})
@@ -94,7 +101,8 @@ def _field(bundle: Bundle, count: int, seed: int) -> Scene:
 
 
 def _camera(distance: float, elevation: float, size: tuple[int, int]) -> Camera:
-    """A camera that looks at the middle of the field: at a donut from near, at the whole hill from far."""
+    """A camera that looks at the middle of the field: at a donut from near, at the
+    whole hill from far."""
     horizontal = distance * math.cos(elevation)
     target = 0.42 / (1 + (distance / 12) ** 2)
     x = math.sin(_AZIMUTH) * horizontal
@@ -111,7 +119,9 @@ class _Panel(NamedTuple):
     picture: Picture
 
 
-def _panels(scene: Scene, camera: Camera, tolerance: float, device: Device) -> tuple[_Panel, _Panel]:
+def _panels(
+    scene: Scene, camera: Camera, tolerance: float, device: Device
+) -> tuple[_Panel, _Panel]:
     """The pictures of the full asset and of the selected cut."""
     truth = draw_truth(scene, camera, device, background=_SKY)
     full = _drawn(scene, camera, 0.0, truth, device)
@@ -119,7 +129,9 @@ def _panels(scene: Scene, camera: Camera, tolerance: float, device: Device) -> t
     return full, selected
 
 
-def _drawn(scene: Scene, camera: Camera, tolerance: float, truth: Picture, device: Device) -> _Panel:
+def _drawn(
+    scene: Scene, camera: Camera, tolerance: float, truth: Picture, device: Device
+) -> _Panel:
     image = render(scene, camera, tolerance=tolerance, background=_SKY, device=device)
     picture = to_8bit(image.color)
     stats = image.stats

@@ -1,4 +1,5 @@
-"""An asset that needs no download: a glazed donut, made from a seed, and a field of many."""
+"""An asset that needs no download: a glazed donut, made from a seed, and a field of
+many."""
 
 import math
 from dataclasses import dataclass
@@ -32,7 +33,8 @@ def make_donut(num_gaussians: int = 50_000, *, seed: int = 0) -> Gaussians:
         seed: The same seed gives the same gaussians.
 
     Returns:
-        NumPy gaussians of SH degree 1; z is up, the origin in the middle of the hole, the radius 1.
+        NumPy gaussians of SH degree 1; z is up, the origin in the middle of the hole,
+        the radius 1.
 
     Raises:
         ValueError: ``num_gaussians`` is below 1,000.
@@ -88,7 +90,8 @@ def _tube(count: int, rng: np.random.Generator) -> _Surface:
     """The dough with its icing, as this number of points."""
     azimuth = rng.uniform(0, 2 * np.pi, count)
     angles = np.linspace(-np.pi, np.pi, 1000)
-    # The angle in the section of the tube is 0 outside and pi/2 up; points spread evenly over the surface.
+    # The angle in the section of the tube is 0 outside and pi/2 up; points spread
+    # evenly over the surface.
     share = (_RING * (angles + np.pi) + _TUBE * np.sin(angles)) / (2 * np.pi * _RING)
     section_angle = np.interp(rng.random(count), share, angles)
     phase = rng.uniform(0, 2 * np.pi, (2, 4, 1))
@@ -99,7 +102,9 @@ def _tube(count: int, rng: np.random.Generator) -> _Surface:
     points, normals = _on_tube(azimuth, section_angle, _DOUGH + (_TUBE - _DOUGH) * np.sqrt(icing))
     waves = np.sin(points @ rng.normal(scale=9, size=(3, 6)) + rng.uniform(0, 6.28, 6))
     blotch = waves.mean(1, keepdims=True)
-    pale = np.exp(-((section_angle / 0.3) ** 2))[:, None]  # the stripe that floats while the dough is baked
+    pale = np.exp(-((section_angle / 0.3) ** 2))[
+        :, None
+    ]  # the stripe that floats while the dough is baked
     dough = np.array([0.42, 0.17, 0.035]) * (1 + 0.5 * blotch)
     dough += (np.array([0.7, 0.46, 0.19]) - dough) * pale
     albedo = dough + (np.array([0.66, 0.11, 0.27]) - dough) * icing[:, None]
@@ -127,15 +132,22 @@ def _sprinkles(count: int, rng: np.random.Generator) -> _Surface:
     places = rng.uniform(-_SPRINKLE_HALF, _SPRINKLE_HALF, (_SPRINKLES, count, 1)) * axis[:, None]
     points = seats[:, None] + places + _SPRINKLE_RADIUS * normals
     num = _SPRINKLES * count
-    albedo = np.repeat(_SPRINKLE_COLORS[np.arange(_SPRINKLES) % len(_SPRINKLE_COLORS)], count, axis=0)
+    albedo = np.repeat(
+        _SPRINKLE_COLORS[np.arange(_SPRINKLES) % len(_SPRINKLE_COLORS)], count, axis=0
+    )
     spacing = 0.7 * math.sqrt(4 * np.pi * _SPRINKLE_RADIUS * _SPRINKLE_HALF / count)
     return _Surface(
-        points.reshape(-1, 3), normals.reshape(-1, 3), albedo, np.full(num, spacing), np.full(num, 0.3)
+        points.reshape(-1, 3),
+        normals.reshape(-1, 3),
+        albedo,
+        np.full(num, spacing),
+        np.full(num, 0.3),
     )
 
 
 def _quats(normals: Floats, rng: np.random.Generator) -> Floats:
-    """Quaternions (n, 4) of rotations that take z to the normals, after a random turn about z."""
+    """Quaternions (n, 4) of rotations that take z to the normals, after a random turn
+    about z."""
     half = normals + np.array([0.0, 0.0, 1.0 + 1e-9])
     x, y, z = half.T / np.linalg.norm(half, axis=1)
     turn = rng.uniform(0, np.pi, len(normals))
@@ -145,9 +157,12 @@ def _quats(normals: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _lit(normals: Floats, albedo: Floats, gloss: Floats) -> Floats:
-    """Colours under a sun and a sky, with highlights that lean towards the sun's mirror image, (n, 4, 3)."""
+    """Colours under a sun and a sky, with highlights that lean towards the sun's mirror
+    image, (n, 4, 3)."""
     facing = np.maximum(normals @ _TO_SUN, 0)[:, None]
-    light = facing * np.array([1.5, 1.4, 1.2]) + (0.45 + 0.3 * normals[:, 2:]) * np.array([0.5, 0.55, 0.62])
+    light = facing * np.array([1.5, 1.4, 1.2]) + (0.45 + 0.3 * normals[:, 2:]) * np.array(
+        [0.5, 0.55, 0.62]
+    )
     color = np.clip(albedo * light, 0, 1) ** (1 / 2.2)
     lean = 0.35 * gloss[:, None] * facing**4 * (2 * facing * normals - _TO_SUN)
     x, y, z = lean.T[..., None] / _SH_C1 * np.ones(3)
@@ -159,7 +174,8 @@ def place_field(count: int = 2000, *, seed: int = 0) -> tuple[Floats, Floats, Fl
     """Place donuts side by side on a round hill, turned at random, at 3/4 to full size.
 
     Returns:
-        Positions (count, 3), quaternions (count, 4) w x y z and scales (count,), float64.
+        Positions (count, 3), quaternions (count, 4) w x y z and scales (count,),
+        float64.
 
     Raises:
         ValueError: ``count`` is below 1.

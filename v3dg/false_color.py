@@ -1,4 +1,5 @@
-"""False colours: palettes that show the level or the cluster that gaussians belong to, or what is missing."""
+"""False colours: palettes that show the level or the cluster that gaussians belong to,
+or what is missing."""
 
 from typing import Literal, TypeAlias
 
@@ -12,7 +13,8 @@ ColorBy: TypeAlias = Literal["appearance", "level", "cluster", "residency"]
 
 
 def palette_of(bundle: Bundle, color_by: ColorBy) -> npt.NDArray[np.float32] | None:
-    """Constant SH coefficients (C, 3) that clusters are drawn with; None for their own colours."""
+    """Constant SH coefficients (C, 3) that clusters are drawn with; None for their own
+    colours."""
     if color_by == "appearance":
         return None
     level = bundle.clusters.level

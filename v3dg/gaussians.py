@@ -17,7 +17,9 @@ from v3dg._numbers import check, check_type, positive, vector
 if TYPE_CHECKING:
     import torch
 
-Array: TypeAlias = Any  # numpy.ndarray or torch.Tensor; a union would make every use of a field a type error
+Array: TypeAlias = (
+    Any  # numpy.ndarray or torch.Tensor; a union would make every use of a field a type error
+)
 
 _NUM_SH = {1: 0, 4: 1, 9: 2, 16: 3}  # coefficients a channel -> degree
 
@@ -38,19 +40,23 @@ def _kind(value: object) -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Gaussians:
-    """N 3D Gaussians: NumPy arrays or torch tensors, float32, C-contiguous, all of one kind on one device.
+    """N 3D Gaussians: NumPy arrays or torch tensors, float32, C-contiguous, all of one
+    kind on one device.
 
-    Torch tensors may all be float64 instead, which `rasterize` then computes in; all else takes float32.
+    Torch tensors may all be float64 instead, which `rasterize` then computes in; all
+    else takes float32.
 
     Args:
         means: (N, 3) centres, in world units of the asset's own frame.
         quats: (N, 4) rotations as w, x, y, z; need not have length one.
-        scales: (N, 3) standard deviations along the rotated axes, in world units; not their logs.
+        scales: (N, 3) standard deviations along the rotated axes, in world units; not
+            their logs.
         opacities: (N,) in [0, 1]; not logits.
-        sh: (N, K, 3) spherical harmonics of RGB, K = (degree + 1)², degree 0 to 3; colour is their value in
-            the view direction plus ½.
+        sh: (N, K, 3) spherical harmonics of RGB, K = (degree + 1)², degree 0 to 3;
+            colour is their value in the view direction plus ½.
 
-    Kinds, shapes, dtypes and layout are checked here, values are not. Nothing is copied.
+    Kinds, shapes, dtypes and layout are checked here, values are not. Nothing is
+    copied.
 
     Raises:
         TypeError: an argument is not an array, or NumPy and torch are mixed.
@@ -71,7 +77,11 @@ class Gaussians:
         num = shape[0]
         for name, expected in (("quats", (num, 4)), ("scales", (num, 3)), ("opacities", (num,))):
             shape = tuple(getattr(self, name).shape)
-            check(name, shape == expected, f"shape {expected} to go with means {(num, 3)}, got {shape}")
+            check(
+                name,
+                shape == expected,
+                f"shape {expected} to go with means {(num, 3)}, got {shape}",
+            )
         shape = tuple(self.sh.shape)
         fits = any(shape == (num, count, 3) for count in _NUM_SH)
         check("sh", fits, f"shape ({num}, K, 3) with K 1, 4, 9 or 16, got {shape}")
@@ -104,12 +114,14 @@ class Gaussians:
         return _core.Rows(*map(_aligned, tensors))
 
     def subset(self, index: slice | Sequence[int] | Array) -> Gaussians:
-        """Take the gaussians that a slice, an array of M indices or a mask of N booleans names, in its order.
+        """Take the gaussians that a slice, an array of M indices or a mask of N
+        booleans names, in its order.
 
         A slice of step 1 shares memory with this object; everything else is copied.
 
         Raises:
-            TypeError: the index is a single number, or not made of integers or booleans.
+            TypeError: the index is a single number, or not made of integers or
+                booleans.
             ValueError: the index has more than one dimension.
             IndexError: out of range, or a mask of another length.
         """
@@ -124,7 +136,9 @@ class Gaussians:
                 rows = rows.cpu().numpy()
             if isinstance(rows, slice) or rows.dtype == bool:
                 return self._map(lambda array: np.ascontiguousarray(array[rows]))
-            return self._map(lambda array: array.take(rows, axis=0))  # unlike [rows], releases the GIL
+            return self._map(
+                lambda array: array.take(rows, axis=0)
+            )  # unlike [rows], releases the GIL
         if not isinstance(index, slice):
             import torch
 
@@ -139,7 +153,8 @@ class Gaussians:
         position: Array | npt.ArrayLike = (0.0, 0.0, 0.0),
         scale: float = 1.0,
     ) -> Gaussians:
-        """Return the gaussians in another frame: p goes to scale * rotation p + position; colours rotate.
+        """Return the gaussians in another frame: p goes to scale * rotation p +
+        position; colours rotate.
 
         The result is of the same kind and on the same device, without gradients.
 
@@ -156,7 +171,9 @@ class Gaussians:
         rotation /= np.abs(rotation).max()  # squares neither overflow nor underflow
         rotation /= np.linalg.norm(rotation)
         translation = vector(position, "position")
-        moved = Gaussians(*_core.transform(self.rows, rotation, translation, positive(scale, "scale")))
+        moved = Gaussians(
+            *_core.transform(self.rows, rotation, translation, positive(scale, "scale"))
+        )
         if _is_tensor(self.means):
             return moved.torch()
         return moved
@@ -177,7 +194,9 @@ class Gaussians:
             _check_kind(f"parts[{i}].means", part.means, parts[0].means)
             expected = parts[0].sh_degree
             is_right = part.sh_degree == expected
-            check(f"parts[{i}]", is_right, f"SH degree {expected} like parts[0], got {part.sh_degree}")
+            check(
+                f"parts[{i}]", is_right, f"SH degree {expected} like parts[0], got {part.sh_degree}"
+            )
         columns = zip(*(vars(part).values() for part in parts), strict=True)
         if _is_tensor(parts[0].means):
             import torch
@@ -186,15 +205,18 @@ class Gaussians:
         return Gaussians(*map(np.concatenate, columns))
 
     def numpy(self) -> Gaussians:
-        """Return the same gaussians as NumPy arrays, without gradients; copied only from another device."""
+        """Return the same gaussians as NumPy arrays, without gradients; copied only
+        from another device."""
         if not _is_tensor(self.means):
             return self
         return self._map(lambda tensor: tensor.detach().cpu().numpy())
 
     def torch(self, device: str | int | torch.device | None = None) -> Gaussians:
-        """Return the same gaussians as torch tensors on `device`; None: on theirs, NumPy arrays on the CPU.
+        """Return the same gaussians as torch tensors on `device`; None: on theirs,
+        NumPy arrays on the CPU.
 
-        Copied only when they move or when a NumPy array is read-only; gradients flow through a move.
+        Copied only when they move or when a NumPy array is read-only; gradients flow
+        through a move.
 
         Raises:
             ValueError: torch knows no such device.
@@ -249,7 +271,8 @@ def gaussian_bytes(sh_degree: int) -> int:
 
 
 def put(part: Gaussians, out: Gaussians, row: int) -> None:
-    """Copy gaussians on the host into others of the same SH degree or a higher one, from ``row`` on."""
+    """Copy gaussians on the host into others of the same SH degree or a higher one,
+    from ``row`` on."""
     for name, values in vars(part).items():
         target = getattr(out, name)[row : row + len(part)]
         if name == "sh":
@@ -263,7 +286,8 @@ def _dtype_name(array: Array) -> str:
 
 
 def _check_kind(name: str, array: Array, first: Array) -> None:
-    """Raise unless `array` is contiguous, float32 (tensors: or float64), of kind and device of `first`."""
+    """Raise unless `array` is contiguous, float32 (tensors: or float64), of kind and
+    device of `first`."""
     if not isinstance(array, np.ndarray) and not _is_tensor(array):
         raise TypeError(f"{name}: expected a NumPy array or a torch tensor, got {_kind(array)}")
     if _is_tensor(array) != _is_tensor(first):
@@ -276,14 +300,19 @@ def _check_kind(name: str, array: Array, first: Array) -> None:
     if _is_tensor(array):
         is_there = array.device == first.device
         check(name, is_there, f"device {first.device} like the others, got {array.device}")
-        check(name, array.is_contiguous(), "a contiguous tensor, got a strided one; call .contiguous()")
+        check(
+            name,
+            array.is_contiguous(),
+            "a contiguous tensor, got a strided one; call .contiguous()",
+        )
     else:
         expected = "a C-contiguous array, got a strided one; call numpy.ascontiguousarray"
         check(name, array.flags.c_contiguous, expected)
 
 
 def _checked_index(index: Array) -> Array:
-    """A mask or int64 indices; a tensor if ``index`` is one, otherwise a NumPy array."""
+    """A mask or int64 indices; a tensor if ``index`` is one, otherwise a NumPy
+    array."""
     array: Array
     if _is_tensor(index):
         array = index.detach()
@@ -310,7 +339,8 @@ def _checked_index(index: Array) -> Array:
 
 
 def _check_range(index: Array, count: int) -> None:
-    """Raise for a tensor of indices out of range, because on a CUDA device indexing would end the context."""
+    """Raise for a tensor of indices out of range, because on a CUDA device indexing
+    would end the context."""
     if str(index.dtype) == "torch.bool" or len(index) == 0:
         return
     for number in (int(index.max()), int(index.min())):

@@ -19,13 +19,14 @@ class Planes:
 
 
 class Image:
-    """A picture of H x W pixels: NumPy arrays, or torch tensors on the device that drew it.
+    """A picture of H x W pixels: NumPy arrays, or torch tensors on the device that drew
+    it.
 
     Attributes:
         color: (H, W, 3) premultiplied colour, the background composed last.
         alpha: (H, W) coverage.
-        depth: (H, W) expected depth along the camera's axis, 0 where nothing was drawn; an AttributeError
-            unless it was asked for.
+        depth: (H, W) expected depth along the camera's axis, 0 where nothing was drawn;
+            an AttributeError unless it was asked for.
     """
 
     def __init__(self, color: Array, alpha: Array, depth: Array | None) -> None:
@@ -51,7 +52,9 @@ class Image:
     def depth(self) -> Array:
         depth = self._planes.depth
         if depth is None:
-            raise AttributeError("depth: expected a picture that was drawn with depth=True, got one without")
+            raise AttributeError(
+                "depth: expected a picture that was drawn with depth=True, got one without"
+            )
         return depth
 
 
@@ -60,15 +63,17 @@ class Stats(NamedTuple):
 
     Attributes:
         gaussians_selected: Gaussians of the selected clusters.
-        gaussians_in_frustum: Of them, those in front of the near plane whose extent meets the image, before
-            any finer cull.
-        tolerance: px² that one gaussian of a coarser cluster stands for at most; with a budget, those with
-            which it is met; 0 for an asset.
+        gaussians_in_frustum: Of them, those in front of the near plane whose extent
+            meets the image, before any finer cull.
+        tolerance: px² that one gaussian of a coarser cluster stands for at most; with a
+            budget, those with which it is met; 0 for an asset.
         select_ms: Time to choose the clusters.
         draw_ms: Time to draw them.
-        levels: Gaussians selected, by level; empty on CUDA, of an asset and of a cut that was given.
-        missing: Pages that the picture misses, in place of which coarser ones are drawn; 0 where all is
-            resident, or the renderer has settled. This and the next as far as is known.
+        levels: Gaussians selected, by level; empty on CUDA, of an asset and of a cut
+            that was given.
+        missing: Pages that the picture misses, in place of which coarser ones are
+            drawn; 0 where all is resident, or the renderer has settled. This and the
+            next as far as is known.
         failed: Pages that cannot be read.
         bytes_in: Bytes of pages that came in with this picture.
         memory: Bytes of the pool that it was drawn from; None where all is resident.
@@ -89,8 +94,8 @@ class Stats(NamedTuple):
 class RenderedImage(Image):
     """An `Image` that says what it cost.
 
-    One that CUDA draws may still be under way; to look at one of its attributes waits until it is there, and
-    raises what went wrong.
+    One that CUDA draws may still be under way; to look at one of its attributes waits
+    until it is there, and raises what went wrong.
 
     Attributes:
         stats: What it cost.

@@ -47,8 +47,13 @@ _FILES: dict[str, Callable[[pathlib.Path], list[pathlib.Path]]] = {
     "": lambda path: [path],
 }
 
-# Checkpoints of gsplat, one for each GPU, and of nerfstudio, and what the code of the 3DGS paper writes.
-_RUNS = ("ckpts/ckpt_*.pt", "nerfstudio_models/step-*.ckpt", "point_cloud/iteration_*/point_cloud.ply")
+# Checkpoints of gsplat, one for each GPU, and of nerfstudio, and what the code of the
+# 3DGS paper writes.
+_RUNS = (
+    "ckpts/ckpt_*.pt",
+    "nerfstudio_models/step-*.ckpt",
+    "point_cloud/iteration_*/point_cloud.ply",
+)
 
 SUFFIXES = tuple(_READERS)
 """How the names of files end that `read_asset` reads."""
@@ -60,29 +65,34 @@ WRITE_SUFFIXES = tuple(_WRITERS)
 def read_asset(path: Path) -> Gaussians:
     """Read an asset; the end of the file's name tells its kind (docs/formats.md):
 
-    - `.ply`, as trainers write it: ascii or binary of either byte order, its properties in any order and of
-      any scalar type, among others that are ignored, for SH degree 0 to 3. Files hold log scales and logit
-      opacities; memory gets values, each computed in double precision and rounded once. Quaternions are
-      normalised, except those of length zero, which stay as they are. Values that are not finite are passed
-      on. Little more memory is needed than for the result. A compressed `.ply`, of PlayCanvas and
-      SuperSplat, is told by its content.
-    - `.glb`, glTF with KHR_gaussian_splatting, also compressed as `.spz`; the leaves of `.hier`, of H3DG.
-    - `.usd`, `.usda` and `.usdc`, OpenUSD, with the extra `usd`, whose library bounds what is read.
-    - `.splat`, of antimatter15; `.ksplat`, of mkkellogg; `.spz`, of Niantic, version 1 to 4; `.sog` of
-      PlayCanvas, version 2, or the `meta.json` of one that is not in a zip; the finest level of streamed SOG,
-      by its `lod-meta.json`.
-    - `.pt` and `.ckpt`, checkpoints of gsplat's trainer and of nerfstudio's splatfacto, from which nothing
-      but tensors is taken.
+    - `.ply`, as trainers write it: ascii or binary of either byte order, its properties
+      in any order and of any scalar type, among others that are ignored, for SH degree
+      0 to 3. Files hold log scales and logit opacities; memory gets values, each
+      computed in double precision and rounded once. Quaternions are normalised, except
+      those of length zero, which stay as they are. Values that are not finite are
+      passed on. Little more memory is needed than for the result. A compressed `.ply`,
+      of PlayCanvas and SuperSplat, is told by its content.
+    - `.glb`, glTF with KHR_gaussian_splatting, also compressed as `.spz`; the leaves of
+      `.hier`, of H3DG.
+    - `.usd`, `.usda` and `.usdc`, OpenUSD, with the extra `usd`, whose library bounds
+      what is read.
+    - `.splat`, of antimatter15; `.ksplat`, of mkkellogg; `.spz`, of Niantic, version 1
+      to 4; `.sog` of PlayCanvas, version 2, or the `meta.json` of one that is not in a
+      zip; the finest level of streamed SOG, by its `lod-meta.json`.
+    - `.pt` and `.ckpt`, checkpoints of gsplat's trainer and of nerfstudio's splatfacto,
+      from which nothing but tensors is taken.
 
-    With the extra `fsspec`, that file may be at a URL, which is fetched once by a process; not if it names
-    others.
+    With the extra `fsspec`, that file may be at a URL, which is fetched once by a
+    process; not if it names others.
 
-    Coordinates are those of the file: no axes are turned. Memory and time are bounded by the size of the file
-    (docs/robustness.md).
+    Coordinates are those of the file: no axes are turned. Memory and time are bounded
+    by the size of the file (docs/robustness.md).
 
     Raises:
-        ValueError: Another name, or the content is not of its kind; says what was expected and found.
-        OSError: The file cannot be opened or read (FileNotFoundError, IsADirectoryError, ...).
+        ValueError: Another name, or the content is not of its kind; says what was
+            expected and found.
+        OSError: The file cannot be opened or read (FileNotFoundError,
+            IsADirectoryError, ...).
     """
     file = open_asset(path)
     return file.read(0, file.num_gaussians)
@@ -96,10 +106,11 @@ def loaded(asset: Gaussians | Path) -> Gaussians:
 
 
 def open_asset(path: Path) -> AssetFile:
-    """Open an asset of any kind that `read_asset` reads, to read it in parts; errors as there.
+    """Open an asset of any kind that `read_asset` reads, to read it in parts; errors as
+    there.
 
-    `.ply`, `.splat` and `.compressed.ply` are read row by row. Of the others, reading the first rows takes
-    the memory for all.
+    `.ply`, `.splat` and `.compressed.ply` are read row by row. Of the others, reading
+    the first rows takes the memory for all.
     """
     reader = _by_name(path, _READERS)
     at_url = in_parts(path)
@@ -109,7 +120,8 @@ def open_asset(path: Path) -> AssetFile:
 
 
 def _open_fetched(at_url: FileAtUrl, reader: Callable[[Path], AssetFile]) -> AssetFile:
-    """An asset at a URL, which is whole here as long as this lives; its errors name the URL."""
+    """An asset at a URL, which is whole here as long as this lives; its errors name the
+    URL."""
     with reading(at_url) as local:
         file = reader(local)
         whole = None
@@ -126,7 +138,8 @@ def _open_fetched(at_url: FileAtUrl, reader: Callable[[Path], AssetFile]) -> Ass
 
 
 def run_files(folder: pathlib.Path) -> list[pathlib.Path]:
-    """What a run of gsplat, nerfstudio or the code of the 3DGS paper came to last: one asset together."""
+    """What a run of gsplat, nerfstudio or the code of the 3DGS paper came to last: one
+    asset together."""
     steps: dict[int, list[pathlib.Path]] = {}
     for pattern in _RUNS:
         for file in sorted(folder.glob(pattern)):
@@ -141,7 +154,8 @@ def run_files(folder: pathlib.Path) -> list[pathlib.Path]:
 
 
 def asset_bytes(path: Path) -> int:
-    """Bytes on disk of an asset that can be read: of all files that it names and that are there."""
+    """Bytes on disk of an asset that can be read: of all files that it names and that
+    are there."""
     names = _by_name(path, _FILES)
     at_url = in_parts(path)
     if isinstance(at_url, FileAtUrl):
@@ -160,31 +174,39 @@ def write_asset(
 
     The end of the name tells the kind (docs/formats.md has what each loses):
 
-    - `.ply`: the original layout without its normals, which are always zero: x y z, f_dc, f_rest (channel by
-      channel), opacity (logit), scale (log), rot. An opacity of 1 is written as logit 20 and of 0 as logit
-      -110, a scale of 0 as log -110: finite, and they read back as exactly 1, 0 and 0.
-    - `.compressed.ply`: 16 bytes a gaussian and one a coefficient of higher SH. The order changes.
+    - `.ply`: the original layout without its normals, which are always zero: x y z,
+      f_dc, f_rest (channel by channel), opacity (logit), scale (log), rot. An opacity
+      of 1 is written as logit 20 and of 0 as logit -110, a scale of 0 as log -110:
+      finite, and they read back as exactly 1, 0 and 0.
+    - `.compressed.ply`: 16 bytes a gaussian and one a coefficient of higher SH. The
+      order changes.
     - `.spz`: version 3, or another.
     - `.glb`: glTF 2.0 with KHR_gaussian_splatting, of float32 numbers.
-    - `.usd`, `.usda`, `.usdc`: OpenUSD, a ParticleField3DGaussianSplat of float32 numbers.
+    - `.usd`, `.usda`, `.usdc`: OpenUSD, a ParticleField3DGaussianSplat of float32
+      numbers.
     - `.sog`: version 2. The order changes.
 
     Args:
         gaussians: The asset, or its file.
         encoding: Of a `.ply`; the others have one only.
-        version: Of a `.spz`; 3 if None. Version 2 is for viewers from before 2025, 4 for those since 2026.
+        version: Of a `.spz`; 3 if None. Version 2 is for viewers from before 2025, 4
+            for those since 2026.
 
     Raises:
-        ValueError: Another name, an unknown encoding, or values that the format cannot hold: a negative
-            scale, an opacity outside [0, 1]; in all but `.ply` also what is not finite, and quaternions of
-            length zero.
+        ValueError: Another name, an unknown encoding, or values that the format cannot
+            hold: a negative scale, an opacity outside [0, 1]; in all but `.ply` also
+            what is not finite, and quaternions of length zero.
         OSError: The file cannot be written.
     """
     gaussians = loaded(gaussians)
     check_type("gaussians", gaussians, Gaussians, "Gaussians")
     write = _by_name(path, _WRITERS)
     if version is not None:
-        check("version", write is spz.write, f"none for {os.fspath(path)}, which is no .spz, got {version}")
+        check(
+            "version",
+            write is spz.write,
+            f"none for {os.fspath(path)}, which is no .spz, got {version}",
+        )
         write = partial(spz.write, version=version)
     if write is ply.write:
         one_of(encoding, "encoding", get_args(PlyEncoding))
@@ -203,4 +225,6 @@ def _by_name(path: Path, formats: Mapping[str, Format]) -> Format:
     advice = ""
     if formats is not _WRITERS:
         advice = "; v3dg.open opens bundles (.v3dg) and scenes (.json)"
-    raise ValueError(f"{shown(path)}: expected a file name that ends in {', '.join(formats)}{advice}")
+    raise ValueError(
+        f"{shown(path)}: expected a file name that ends in {', '.join(formats)}{advice}"
+    )

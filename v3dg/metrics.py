@@ -1,7 +1,8 @@
 """How far apart two pictures are: PSNR, SSIM and FLIP; FLIP needs the extra `flip`.
 
-All take a reference and a test picture (H,W,3), display values in [0,1] (sRGB as shown, not linear light), as
-NumPy arrays or torch tensors, and are means over the whole picture. Nothing is cropped.
+All take a reference and a test picture (H,W,3), display values in [0,1] (sRGB as shown,
+not linear light), as NumPy arrays or torch tensors, and are means over the whole
+picture. Nothing is cropped.
 """
 
 import importlib.util
@@ -21,7 +22,8 @@ from v3dg.render import render
 from v3dg.scene import Subject
 
 FLIP_PIXELS_PER_DEGREE = 67.0
-"""A 0.7 m wide 4K display seen from 0.7 m: the viewing condition that FLIP's authors use."""
+"""A 0.7 m wide 4K display seen from 0.7 m: the viewing condition that FLIP's authors
+use."""
 
 MIN_TRANSMITTANCE = 1e-4
 """Where pixels of the truth stop, a tenth of where those of pictures do."""
@@ -30,19 +32,24 @@ FLIP_MISSING = _extras.missing("flip_evaluator")
 
 
 def _pair(reference: Array, test: Array) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Both pictures as `pictures.checked` returns them; raises unless they are floats and of one size."""
+    """Both pictures as `pictures.checked` returns them; raises unless they are floats
+    and of one size."""
     a = checked("reference", reference)
     b = checked("test", test)
     for name, dtype in (("reference", a.dtype), ("test", b.dtype)):
-        check(name, dtype.kind == "f", f"floats in [0, 1], got {dtype}; divide 8-bit pictures by 255")
+        check(
+            name, dtype.kind == "f", f"floats in [0, 1], got {dtype}; divide 8-bit pictures by 255"
+        )
     check("test", a.shape == b.shape, f"the reference's shape {a.shape}, got {b.shape}")
     return cast(NDArray[np.floating], a), cast(NDArray[np.floating], b)
 
 
 def psnr(reference: Array, test: Array) -> float:
-    """Compute the peak signal-to-noise ratio in dB, for a peak of 1; infinite for equal pictures.
+    """Compute the peak signal-to-noise ratio in dB, for a peak of 1; infinite for equal
+    pictures.
 
-    Values are compared as they are: clip both to [0,1] first to compare what a screen shows.
+    Values are compared as they are: clip both to [0,1] first to compare what a screen
+    shows.
     """
     a, b = _pair(reference, test)
     difference = a.astype(np.float64) - b
@@ -55,13 +62,15 @@ def psnr(reference: Array, test: Array) -> float:
 def ssim(reference: Array, test: Array) -> float:
     """Compute the structural similarity, 1 for equal pictures.
 
-    Convention (others differ in the third digit): Gaussian window of 11×11 px with sigma 1.5 px, population
-    variances, mirrored border, mean over all pixels and channels, values in [0,1] and not clipped.
+    Convention (others differ in the third digit): Gaussian window of 11×11 px with
+    sigma 1.5 px, population variances, mirrored border, mean over all pixels and
+    channels, values in [0,1] and not clipped.
 
     Raises:
         ValueError: A side is shorter than 6 px, less than half a window.
 
-    Source: Wang et al., Image quality assessment: from error visibility to structural similarity, 2004.
+    Source: Wang et al., Image quality assessment: from error visibility to structural
+    similarity, 2004.
     """
     a, b = _pair(reference, test)
     check("reference", min(a.shape[:2]) >= 6, f"at least 6 px a side, got {a.shape}")
@@ -78,22 +87,25 @@ def has_flip() -> bool:
 def _flip(reference: Array, test: Array, *, magma: bool) -> NDArray[np.float32]:
     flip_evaluator = _extras.load("flip_evaluator")
     # These are new arrays, because the evaluator may write into its arguments.
-    a, b = (np.clip(picture, 0, 1).astype(np.float32, order="C") for picture in _pair(reference, test))
+    a, b = (
+        np.clip(picture, 0, 1).astype(np.float32, order="C") for picture in _pair(reference, test)
+    )
     parameters = {"ppd": FLIP_PIXELS_PER_DEGREE}
     error, _, _ = flip_evaluator.evaluate(a, b, "LDR", applyMagma=magma, parameters=parameters)
     return np.asarray(error, dtype=np.float32)
 
 
 def flip_map(reference: Array, test: Array) -> NDArray[np.float32]:
-    """Compute LDR-FLIP per pixel at 67 pixels per degree: (H,W), 0 where no difference is seen, at most 1.
+    """Compute LDR-FLIP per pixel at 67 pixels per degree: (H,W), 0 where no difference
+    is seen, at most 1.
 
     Pictures are clipped to [0,1] first.
 
     Raises:
         ImportError: The extra `flip` is not installed.
 
-    Source: Andersson et al., FLIP: a difference evaluator for alternating images, HPG 2020; by its authors'
-    package.
+    Source: Andersson et al., FLIP: a difference evaluator for alternating images, HPG
+    2020; by its authors' package.
     """
     return _flip(reference, test, magma=False).reshape(reference.shape[0], reference.shape[1])
 
@@ -104,25 +116,33 @@ def flip(reference: Array, test: Array) -> float:
 
 
 def error_image(reference: Array, test: Array) -> NDArray[np.float32]:
-    """Draw `flip_map` in the magma colours that FLIP is usually shown in, (H,W,3): black is no difference."""
+    """Draw `flip_map` in the magma colours that FLIP is usually shown in, (H,W,3):
+    black is no difference."""
     return _flip(reference, test, magma=True)
 
 
 def box_downsample(image: Array, factor: int) -> Array:
-    """Average ``factor`` × ``factor`` blocks: (H,W,...) to (H/factor,W/factor,...), of the same array kind.
+    """Average ``factor`` × ``factor`` blocks: (H,W,...) to (H/factor,W/factor,...), of
+    the same array kind.
 
     Raises:
-        ValueError: ``factor`` is not positive, or does not divide the height and the width.
+        ValueError: ``factor`` is not positive, or does not divide the height and the
+            width.
     """
     check("factor", factor >= 1, f"at least 1, got {factor}")
     height, width = image.shape[:2]
     is_divisible = height % factor == 0 == width % factor
-    check("image", is_divisible, f"a height and width divisible by {factor}, got {height} x {width}")
-    return image.reshape(height // factor, factor, width // factor, factor, *image.shape[2:]).mean((1, 3))
+    check(
+        "image", is_divisible, f"a height and width divisible by {factor}, got {height} x {width}"
+    )
+    return image.reshape(height // factor, factor, width // factor, factor, *image.shape[2:]).mean(
+        (1, 3)
+    )
 
 
 def errors_of(reference: Picture, test: Picture) -> dict[str, float | None]:
-    """FLIP (None without its extra), PSNR (None for equal pictures) and SSIM of pictures in 8 bits."""
+    """FLIP (None without its extra), PSNR (None for equal pictures) and SSIM of
+    pictures in 8 bits."""
     a, b = (picture.astype(np.float32) / np.float32(255) for picture in (reference, test))
     errors: dict[str, float | None] = {"flip": None, "psnr": None, "ssim": ssim(a, b)}
     if has_flip():
@@ -141,8 +161,8 @@ def draw_truth(
 ) -> Picture:
     """Draw the picture that others are compared with, in 8 bits, from all gaussians.
 
-    A pixel has ``supersampling`` × ``supersampling`` samples.
-    Each sample is clipped to [0,1] as a screen does, before it is averaged over its pixel.
+    A pixel has ``supersampling`` × ``supersampling`` samples. Each sample is clipped to
+    [0,1] as a screen does, before it is averaged over its pixel.
     """
     image = render(
         subject,

@@ -19,10 +19,11 @@ File: TypeAlias = str | os.PathLike[str]
 
 
 def open(path: str | os.PathLike[str]) -> Subject:
-    """Open a file by its name: a scene (.json), a bundle (.v3dg) or an asset, as `read_asset` does.
+    """Open a file by its name: a scene (.json), a bundle (.v3dg) or an asset, as
+    `read_asset` does.
 
-    `read_scene` gives the cameras of a scene, too. A file of OpenUSD with instances is a scene, as
-    `read_usd_scene` reads it.
+    `read_scene` gives the cameras of a scene, too. A file of OpenUSD with instances is
+    a scene, as `read_usd_scene` reads it.
 
     Raises:
         ValueError: The file is not what its name says, or has another name.
@@ -57,25 +58,30 @@ def open_with_cameras(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
 def read_usd_scene(
     path: str | os.PathLike[str], *, config: BuildConfig | None = None, device: str = "auto"
 ) -> Scene:
-    """Read a world of OpenUSD: a bundle is built of each thing in it, and stands where its instances do.
+    """Read a world of OpenUSD: a bundle is built of each thing in it, and stands where
+    its instances do.
 
-    Instances are those of PointInstancers, also of each other, and prims that refer to the same gaussians;
-    a prim alone has one. The finest of their levels is read. Needs the extra `usd`.
+    Instances are those of PointInstancers, also of each other, and prims that refer to
+    the same gaussians; a prim alone has one. The finest of their levels is read. Needs
+    the extra `usd`.
 
     Args:
-        config: How bundles are built; if None, without fitting the levels, which takes seconds.
+        config: How bundles are built; if None, without fitting the levels, which takes
+            seconds.
         device: Where, as in `build_bundle`.
 
     Raises:
         ImportError: usd-core is not installed.
-        ValueError: The file is not OpenUSD with gaussians, or something is placed otherwise than by rotation,
-            translation and one scale.
+        ValueError: The file is not OpenUSD with gaussians, or something is placed
+            otherwise than by rotation, translation and one scale.
         OSError: It cannot be read.
     """
     with reading(path) as local:
         assets, asset_from_instance, poses, up = usd.read_world(local)
     config = config or BuildConfig(steps=0)
-    bundles = [build_bundle(asset, config=config, device=device, progress=False) for asset in assets]
+    bundles = [
+        build_bundle(asset, config=config, device=device, progress=False) for asset in assets
+    ]
     scene = Scene()
     quaternions, positions, scales = zip(*poses, strict=True)
     bundle_from_instance = [bundles[asset] for asset in asset_from_instance]

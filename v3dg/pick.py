@@ -28,7 +28,8 @@ class Pick:
         level: The cluster's level.
         weight: Its share of the pixel, 0 to 1.
         depth: Its depth along the camera's axis, world units.
-        position: (3,) float64, the point of the pixel's ray at that depth, in the world.
+        position: (3,) float64, the point of the pixel's ray at that depth, in the
+            world.
     """
 
     instance: int
@@ -50,7 +51,8 @@ def pick(
     min_level: int = 0,
     renderer: Renderer | None = None,
 ) -> Pick | None:
-    """Return what pixel (x, y) of the picture that `v3dg.render` draws shows most of; None where it is empty.
+    """Return what pixel (x, y) of the picture that `v3dg.render` draws shows most of;
+    None where it is empty.
 
     Looks at nothing but the pixel, on the CPU; the cut is the same on every device.
 
@@ -59,10 +61,12 @@ def pick(
         x: Column, from 0 at the left.
         y: Row, from 0 at the top.
         tolerance: As for the picture; so are `budget` and `min_level`.
-        renderer: With a pool on the CPU, of the same scene: look at what is resident there, and read nothing.
+        renderer: With a pool on the CPU, of the same scene: look at what is resident
+            there, and read nothing.
 
     Raises:
-        ValueError: The pixel is not in the image, or another argument is not as in `v3dg.render`.
+        ValueError: The pixel is not in the image, or another argument is not as in
+            `v3dg.render`.
     """
     check_type("camera", camera, Camera, "a Camera")
     x = whole(x, "x", "a column", 0)
@@ -71,7 +75,9 @@ def pick(
     check("x, y", is_inside, f"a pixel of {camera.width} x {camera.height}, got ({x}, {y})")
     scene = copy.copy(Scene.of(opened(subject)))  # another thread may change the scene meanwhile
     if budget is not None:  # the budget is that of the whole picture
-        cut = select(scene, camera, tolerance=tolerance, budget=budget, min_level=min_level, device=CPU)
+        cut = select(
+            scene, camera, tolerance=tolerance, budget=budget, min_level=min_level, device=CPU
+        )
         tolerance = cut.tolerance
     rule = rule_of(tolerance, None, min_level, "solid_angle", True)
     pixel = camera.core.window(x, y, x + 1, y + 1)
@@ -91,7 +97,8 @@ def pick(
 def _pick_from_scene(
     scene: Scene, pixel: _core.Camera, rule: _core.Rule
 ) -> tuple[int, int, float, float] | None:
-    """Instance, cluster, weight and depth of what a pixel shows most of, from all gaussians."""
+    """Instance, cluster, weight and depth of what a pixel shows most of, from all
+    gaussians."""
     resident = residency.scene(scene, CPU)
     pairs = resident.core.select(pixel, rule)
     frame = _core.SceneFrame(CPU.number)
@@ -118,7 +125,8 @@ def _pick_from_pool(
 
 
 def _draws(renderer: Renderer, scene: Scene) -> bool:
-    """Whether a renderer draws the instances of this scene, from the same bundles or the same files."""
+    """Whether a renderer draws the instances of this scene, from the same bundles or
+    the same files."""
     if isinstance(renderer.subject, Gaussians):
         return False
     drawn = Scene.of(renderer.subject)

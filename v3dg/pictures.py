@@ -1,4 +1,5 @@
-"""Pictures of 8 bits: from colours, on contact sheets, in files that are written whole or not at all."""
+"""Pictures of 8 bits: from colours, on contact sheets, in files that are written whole
+or not at all."""
 
 import io
 import os
@@ -32,7 +33,8 @@ _INK = (238, 240, 243)
 
 
 def to_8bit(image: Array) -> Picture:
-    """Round display values in [0,1] to 0..255, where the array is; what lies outside is clipped."""
+    """Round display values in [0,1] to 0..255, where the array is; what lies outside is
+    clipped."""
     if hasattr(image, "detach"):
         import torch
 
@@ -42,11 +44,14 @@ def to_8bit(image: Array) -> Picture:
 
 
 def checked(name: str, image: Array) -> NDArray[np.generic]:
-    """A picture as a NumPy array (H,W,3), on the host, without gradient; TypeError or ValueError if none."""
+    """A picture as a NumPy array (H,W,3), on the host, without gradient; TypeError or
+    ValueError if none."""
     if hasattr(image, "detach"):
         image = image.detach().cpu().numpy()
     if not isinstance(image, np.ndarray):
-        raise TypeError(f"{name}: expected a NumPy array or a torch tensor, got {type(image).__name__}")
+        raise TypeError(
+            f"{name}: expected a NumPy array or a torch tensor, got {type(image).__name__}"
+        )
     fits = image.ndim == 3 and image.shape[2] == 3 and 0 not in image.shape
     check(name, fits, f"shape (H, W, 3) with at least one pixel, got {image.shape}")
     return image
@@ -90,7 +95,8 @@ def check_size(name: str, width: int, height: int, most_pixels: int = MOST_PIXEL
     """Refuse, before anything is decoded or drawn, a picture that is too large.
 
     Raises:
-        ValueError: A side has more than ``MOST_SIDE`` px, or the picture more than ``most_pixels``.
+        ValueError: A side has more than ``MOST_SIDE`` px, or the picture more than
+            ``most_pixels``.
     """
     expected = f"a picture of at most {MOST_SIDE:,} px a side and {most_pixels:,} px in all"
     fits = max(width, height) <= MOST_SIDE and width * height <= most_pixels
@@ -98,10 +104,12 @@ def check_size(name: str, width: int, height: int, most_pixels: int = MOST_PIXEL
 
 
 def read_picture(path: str | os.PathLike[str]) -> Picture:
-    """Read a PNG or a JPEG to compare it, whatever its name says; transparency is left out.
+    """Read a PNG or a JPEG to compare it, whatever its name says; transparency is left
+    out.
 
     Raises:
-        ValueError: It is none, is damaged or too large, or has more than 8 bits a channel.
+        ValueError: It is none, is damaged or too large, or has more than 8 bits a
+            channel.
         OSError: It cannot be read.
     """
     from PIL import Image
@@ -129,7 +137,8 @@ def encode_png(image: Array) -> bytes:
 
 
 def write_picture(path: str | os.PathLike[str], image: Array) -> None:
-    """Write (H,W,3) floats in [0,1] or 8-bit values as PNG or JPEG; the file appears when it is complete."""
+    """Write (H,W,3) floats in [0,1] or 8-bit values as PNG or JPEG; the file appears
+    when it is complete."""
     from PIL import Image
 
     path = check_picture_path(path)

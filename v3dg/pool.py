@@ -33,7 +33,8 @@ def free_on(device: Device) -> int:
 
 
 def chosen_bytes(bundles: Sequence[Bundle], device: Device) -> int | None:
-    """Half of the free bytes of the device, for a pool, if not everything fits there; None if it does."""
+    """Half of the free bytes of the device, for a pool, if not everything fits there;
+    None if it does."""
     for memory, num_bytes in residency.bytes_to_add(bundles, device).items():
         free = free_on(memory)
         if num_bytes > free - min(free // 4, _RESERVE_BYTES):
@@ -43,13 +44,16 @@ def chosen_bytes(bundles: Sequence[Bundle], device: Device) -> int | None:
 
 @dataclass(frozen=True)
 class PoolLook:
-    """What a picture of a pool shows, and of which cut; anything but "appearance" is for the CPU alone.
+    """What a picture of a pool shows, and of which cut; anything but "appearance" is
+    for the CPU alone.
 
     Attributes:
-        shows: Colours as in `v3dg.render`; "error" shows the share of the tolerance that metrics take, as
-            grey, and "count" the number of gaussians that a pixel is blended of, in place of depth.
+        shows: Colours as in `v3dg.render`; "error" shows the share of the tolerance
+            that metrics take, as grey, and "count" the number of gaussians that a pixel
+            is blended of, in place of depth.
         chooser: The camera whose cut is drawn; None for the camera of the picture.
-        aside: Draw what was resident for the last picture, and neither bring pages in nor ask for any.
+        aside: Draw what was resident for the last picture, and neither bring pages in
+            nor ask for any.
     """
 
     shows: ColorBy | Literal["error", "count"] = "appearance"
@@ -64,7 +68,8 @@ class PoolLook:
         return self.chooser.core
 
     def palettes(self, bundles: Sequence[Bundle]) -> list[NDArray[np.float32]]:
-        """The colours of each bundle's clusters; none where the bundles have no colours of their own."""
+        """The colours of each bundle's clusters; none where the bundles have no colours
+        of their own."""
         if self.shows not in ("level", "cluster"):
             return []
         palettes = []
@@ -76,17 +81,22 @@ class PoolLook:
 
 
 class Pool:
-    """Pages of bundles in a fixed amount of memory of one device, which come and go as views need them.
+    """Pages of bundles in a fixed amount of memory of one device, which come and go as
+    views need them.
 
     Attributes:
         tables: The tables of its bundles.
         num_bytes: The size of its memory.
-        lease: Held by a thread from `settle` until its picture is drawn, so that no other thread's view takes
-            the place of what it has settled.
+        lease: Held by a thread from `settle` until its picture is drawn, so that no
+            other thread's view takes the place of what it has settled.
     """
 
     def __init__(
-        self, bundles: tuple[Bundle, ...], tables: list[_core.ClusterTable], device: Device, num_bytes: int
+        self,
+        bundles: tuple[Bundle, ...],
+        tables: list[_core.ClusterTable],
+        device: Device,
+        num_bytes: int,
     ) -> None:
         self.tables = tables
         self.num_bytes = num_bytes
@@ -102,11 +112,13 @@ class Pool:
         timeout: float,
         seconds: float,
     ) -> None:
-        """Bring in the pages that a view needs, or as many of them as arrive within ``seconds``.
+        """Bring in the pages that a view needs, or as many of them as arrive within
+        ``seconds``.
 
         Raises:
             ValueError: A page is damaged.
-            OSError: A page cannot be read; TimeoutError when none came in for `timeout` seconds.
+            OSError: A page cannot be read; TimeoutError when none came in for `timeout`
+                seconds.
         """
         core = self.core
         start = time.monotonic()
@@ -133,14 +145,15 @@ class Pool:
                 last_arrival = time_of_step
             elif time_of_step - last_arrival > timeout:
                 raise TimeoutError(
-                    f"settle: {step.num_absent} pages are missing and none came in for {timeout:g} s; "
-                    "is the disk or the server at work?"
+                    f"settle: {step.num_absent} pages are missing and none came in for {timeout:g} "
+                    "s; is the disk or the server at work?"
                 )
             core.wait(_WAIT_SECONDS)
 
 
 class PoolSlot:
-    """The pool that stills of one subject share on one device: the last one that was asked for."""
+    """The pool that stills of one subject share on one device: the last one that was
+    asked for."""
 
     def __init__(self) -> None:
         self._pool: Pool | None = None
@@ -159,7 +172,8 @@ class PoolSlot:
         device: Device,
         num_bytes: int,
     ) -> Pool:
-        """A pool of these bundles and of this size. Another one is given up first, for its memory is needed.
+        """A pool of these bundles and of this size. Another one is given up first, for
+        its memory is needed.
 
         Requires the lock of `residency`.
         """

@@ -30,29 +30,33 @@ def rasterize(
     antialiased: bool = False,
     background: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Image:
-    """Draw gaussians with the meaning of 3D Gaussian Splatting, as gsplat 1.5 defines it.
+    """Draw gaussians with the meaning of 3D Gaussian Splatting, as gsplat 1.5 defines
+    it.
 
-    Alpha is cut at 0.999, contributions below 1/255 are skipped, a pixel stops before its transmittance would
-    fall to 1e-4, and gaussians are blended in the order of their depth, equal depths by index.
+    Alpha is cut at 0.999, contributions below 1/255 are skipped, a pixel stops before
+    its transmittance would fall to 1e-4, and gaussians are blended in the order of
+    their depth, equal depths by index.
 
-    On torch tensors the picture is differentiable with respect to the gaussians' means, quats, scales,
-    opacities and sh, and to `background` when that is a tensor; float64 tensors on the CPU are computed in
-    float64. Tensors on a CUDA device are drawn there, on its current stream. Pictures and gradients are the
-    same on every run.
+    On torch tensors the picture is differentiable with respect to the gaussians' means,
+    quats, scales, opacities and sh, and to `background` when that is a tensor; float64
+    tensors on the CPU are computed in float64. Tensors on a CUDA device are drawn
+    there, on its current stream. Pictures and gradients are the same on every run.
 
     Args:
         gaussians: N gaussians in world space; or the file of an asset.
         camera: Pinhole camera.
-        filter_px2: Variance of the low-pass filter in screen space, px²; 0.3 draws assets that were trained
-            with the original 3DGS code as they were trained.
-        antialiased: Scale opacities by sqrt(det before / det after the filter) (Mip-Splatting, eq. 9), so
-            that the filter spreads a gaussian without adding to it.
+        filter_px2: Variance of the low-pass filter in screen space, px²; 0.3 draws
+            assets that were trained with the original 3DGS code as they were trained.
+        antialiased: Scale opacities by sqrt(det before / det after the filter)
+            (Mip-Splatting, eq. 9), so that the filter spreads a gaussian without adding
+            to it.
         background: Three numbers, or a tensor of them.
 
     Raises:
-        ValueError: The filter is negative, the background is not three numbers, or the gaussians are float64
-            on a CUDA device.
-        RuntimeError: The gaussians are on a CUDA device, and v3dg was built without CUDA.
+        ValueError: The filter is negative, the background is not three numbers, or the
+            gaussians are float64 on a CUDA device.
+        RuntimeError: The gaussians are on a CUDA device, and v3dg was built without
+            CUDA.
     """
     gaussians = loaded(gaussians)
     if not hasattr(gaussians, "means"):  # any object with the arrays of Gaussians is accepted
@@ -84,7 +88,9 @@ def rasterize(
 def check_device(means: Array) -> None:
     """Raise unless tensors of this dtype can be drawn on their device."""
     if means.is_cuda and not _core.has_cuda:
-        raise RuntimeError(f"gaussians: {_device.missing_for_cuda()}; or call gaussians.torch('cpu')")
+        raise RuntimeError(
+            f"gaussians: {_device.missing_for_cuda()}; or call gaussians.torch('cpu')"
+        )
     if means.is_cuda and str(means.dtype) == "torch.float64":
         advice = "call gaussians.torch('cpu'), or use float32"
         raise ValueError(f"gaussians: float64 is computed on the CPU only; {advice}")
@@ -111,22 +117,26 @@ class DrawSettings:
 
 @dataclass(eq=False)
 class CenterGradient:
-    """The gradient with respect to centres on the images, once the backward pass has set it."""
+    """The gradient with respect to centres on the images, once the backward pass has
+    set it."""
 
     value: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class CenterProbe:
-    """Receives the gradient of pictures with respect to the centres of gaussians on the images.
+    """Receives the gradient of pictures with respect to the centres of gaussians on the
+    images.
 
     Attributes:
-        centers: The centres, (V, N, 2)[pairs]. Nothing flows through them, but autograd gives them the
-            gradient.
+        centers: The centres, (V, N, 2)[pairs]. Nothing flows through them, but autograd
+            gives them the gradient.
         pairs: The index of the rows that `centers` has.
-        with_sizes: Whether `centers.absgrad` becomes the sum of absolute values of each pixel's share.
-        gradient: Gets the gradient with respect to `centers`. It is an object of its own, because the
-            operation that made the centres keeps it: if it kept the centres, too, that were a cycle.
+        with_sizes: Whether `centers.absgrad` becomes the sum of absolute values of each
+            pixel's share.
+        gradient: Gets the gradient with respect to `centers`. It is an object of its
+            own, because the operation that made the centres keeps it: if it kept the
+            centres, too, that were a cycle.
     """
 
     centers: torch.Tensor
@@ -141,12 +151,13 @@ def draw_views(
     inputs: Sequence[Sequence[torch.Tensor]],
     probe: CenterProbe | None = None,
 ) -> tuple[torch.Tensor, ...]:
-    """Draw tensors; differentiable. Returns colour, alpha and depth (or None) of the first view, the next...
+    """Draw tensors; differentiable. Returns colour, alpha and depth (or None) of the
+    first view, the next...
 
     Args:
         cameras: V cameras.
-        inputs: Means, quats, scales, opacities, sh, backgrounds: one tensor of each, or several that views
-            use in turn.
+        inputs: Means, quats, scales, opacities, sh, backgrounds: one tensor of each, or
+            several that views use in turn.
         probe: Receives the gradient with respect to the centres on the images.
     """
     import torch
@@ -161,7 +172,8 @@ def draw_views(
 
 
 def _slots_of_view(counts: list[int], view: int) -> list[int]:
-    """For each kind of input, the number of the tensor that a view uses among all tensors."""
+    """For each kind of input, the number of the tensor that a view uses among all
+    tensors."""
     return [sum(counts[:kind]) + view % count for kind, count in enumerate(counts)]
 
 
@@ -209,7 +221,8 @@ def _add_to(sums: list[torch.Tensor | None], slot: int, gradient: torch.Tensor) 
 
 
 def _set_probe(probe: CenterProbe, gradients: list[list[torch.Tensor]]) -> torch.Tensor:
-    """Store and return the gradient by the centres, from that of each view with its sizes if wanted."""
+    """Store and return the gradient by the centres, from that of each view with its
+    sizes if wanted."""
     d_centers, *sizes = (joined(parts)[probe.pairs] for parts in zip(*gradients, strict=True))
     probe.gradient.value = d_centers
     if probe.with_sizes:
@@ -233,7 +246,9 @@ def _function() -> Callable[..., tuple[torch.Tensor, ...]]:
             probe: CenterProbe | None,
             *tensors: torch.Tensor,
         ) -> tuple[torch.Tensor | None, ...]:
-            inputs = tensors[1:]  # the first one is the centres, which only take part in the backward pass
+            inputs = tensors[
+                1:
+            ]  # the first one is the centres, which only take part in the backward pass
             ctx.set_materialize_grads(False)
             ctx.counts = counts
             ctx.probe = probe
@@ -245,7 +260,9 @@ def _function() -> Callable[..., tuple[torch.Tensor, ...]]:
                 planes, tape = _draw_view(camera, settings, inputs_of_view, keep_tape=keep_tape)
                 ctx.tapes.append(tape)
                 pictures += planes
-            if inputs[0].is_cuda:  # the backward pass reads them again, so autograd must see later writes
+            if inputs[
+                0
+            ].is_cuda:  # the backward pass reads them again, so autograd must see later writes
                 ctx.save_for_backward(*inputs[: -counts[-1]], *pictures)
             return tuple(pictures)
 
@@ -259,8 +276,12 @@ def _function() -> Callable[..., tuple[torch.Tensor, ...]]:
             center_gradients: list[list[torch.Tensor]] = []
             for view, tape in enumerate(ctx.tapes):
                 d_color, d_alpha, d_depth = map(_to_core, gradients[3 * view : 3 * view + 3])
-                parts = _core.rasterize_backward(tape, d_color, d_alpha, d_depth, wants_centers, with_sizes)
-                center_gradients.append([torch.as_tensor(part) for part in parts[6:] if part is not None])
+                parts = _core.rasterize_backward(
+                    tape, d_color, d_alpha, d_depth, wants_centers, with_sizes
+                )
+                center_gradients.append(
+                    [torch.as_tensor(part) for part in parts[6:] if part is not None]
+                )
                 for slot, part in zip(_slots_of_view(ctx.counts, view), parts, strict=False):
                     if wants_input[slot]:
                         _add_to(sums, slot, torch.as_tensor(part).to(ctx.devices[slot]))

@@ -1,4 +1,5 @@
-"""Levels of a bundle made better together: as cuts show them, next to what hides parts of them."""
+"""Levels of a bundle made better together: as cuts show them, next to what hides parts
+of them."""
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,8 +26,8 @@ _T = TypeVar("_T", covariant=True)
 _RATE = 0.2  # of the step sizes of a fit, from whose result this starts
 # The number of pictures that measure how much is seen of each gaussian.
 _NUM_WEIGHING_PICTURES = 2_000
-# A gaussian is measured if it is in the cuts of at least this many of them. Pictures show only parts of a
-# very large asset, so some gaussians are in too few.
+# A gaussian is measured if it is in the cuts of at least this many of them. Pictures
+# show only parts of a very large asset, so some gaussians are in too few.
 _LEAST_LOOKS = 8
 
 
@@ -40,23 +41,30 @@ def refine_bundle(
     device: str | Device = "auto",
     progress: Progress = True,
 ) -> Bundle:
-    """Make the levels of a bundle look more like its asset, in small pictures and large ones; a copy.
+    """Make the levels of a bundle look more like its asset, in small pictures and large
+    ones; a copy.
 
-    A build fits every group alone, seen from all sides, at the size at which it is selected. Pictures of cuts
-    show gaussians next to each other, where they hide each other. By these, this drops the least seen
-    gaussians of all levels but the first, and moves the others until such pictures are those of the asset.
-    Cuts have 0.7 of the asset's gaussians down to those of the last level, and pictures 0.18 to 9.7 times the
-    size at which they are at home, 2 px² a gaussian. docs/levels.md has what is gained.
+    A build fits every group alone, seen from all sides, at the size at which it is
+    selected. Pictures of cuts show gaussians next to each other, where they hide each
+    other. By these, this drops the least seen gaussians of all levels but the first,
+    and moves the others until such pictures are those of the asset. Cuts have 0.7 of
+    the asset's gaussians down to those of the last level, and pictures 0.18 to 9.7
+    times the size at which they are at home, 2 px² a gaussian. docs/levels.md has what
+    is gained.
 
-    The same bundle, cameras, steps, share and seed give the same bits on the same kind of device.
+    The same bundle, cameras, steps, share and seed give the same bits on the same kind
+    of device.
 
     Args:
-        bundle: What `build_bundle` made, or its file. About six times what that takes is in memory meanwhile.
-        cameras: Where the asset is seen from, also by name: for a room those of its photographs. What is
-            seen from elsewhere may get worse. Without any, pictures are taken from all around.
+        bundle: What `build_bundle` made, or its file. About six times what that takes
+            is in memory meanwhile.
+        cameras: Where the asset is seen from, also by name: for a room those of its
+            photographs. What is seen from elsewhere may get worse. Without any,
+            pictures are taken from all around.
         steps: Pictures that cuts are compared with, one after another.
-        drop: The least seen gaussians of a level are dropped, up to this share of what is seen of it: 0,
-            which keeps all, to 0.5. A bundle that was refined before loses gaussians again.
+        drop: The least seen gaussians of a level are dropped, up to this share of what
+            is seen of it: 0, which keeps all, to 0.5. A bundle that was refined before
+            loses gaussians again.
         seed: Of the pictures.
         device: Where to compute.
         progress: As for `build_bundle`.
@@ -107,10 +115,16 @@ class _CutOperation(Protocol[_T]):
 
 
 class _Cuts:
-    """Pictures of a bundle's cuts, and copies of its gaussians on a device, which they move."""
+    """Pictures of a bundle's cuts, and copies of its gaussians on a device, which they
+    move."""
 
     def __init__(
-        self, bundle: Bundle, cameras: Sequence[Camera], seed: int, device: Device, progress: Progress
+        self,
+        bundle: Bundle,
+        cameras: Sequence[Camera],
+        seed: int,
+        device: Device,
+        progress: Progress,
     ) -> None:
         self._bundle = bundle
         self._seed = seed
@@ -163,7 +177,8 @@ class _Cuts:
 
 
 def _without_least(bundle: Bundle, weight: npt.NDArray[np.float64], share: float) -> Bundle:
-    """Drop from each level but the first its gaussians of least weight, up to a share of the level's weight.
+    """Drop from each level but the first its gaussians of least weight, up to a share
+    of the level's weight.
 
     Gaussians whose weight is not a number stay, and count for nothing in the sum.
     """

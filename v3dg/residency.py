@@ -1,4 +1,5 @@
-"""Residency: which data of bundles and scenes is on which device. It is the only cache of the package.
+"""Residency: which data of bundles and scenes is on which device. It is the only cache
+of the package.
 
 Data is freed with its bundle or scene, or by `residency.clear()`.
 """
@@ -26,14 +27,15 @@ from v3dg.scene import Scene, Subject
 
 _T = TypeVar("_T")
 
-# A GPU decodes quantised bundles once, rather than in each frame and for each instance, up to so many bytes:
-# about what its second-level cache holds. Above, codes are as fast, and take a seventh of the memory.
+# A GPU decodes quantised bundles once, rather than in each frame and for each instance,
+# up to so many bytes: about what its second-level cache holds. Above, codes are as
+# fast, and take a seventh of the memory.
 MOST_DECODED_BYTES = 48 << 20
 _PACKED_BYTES = 64  # of a gaussian, which frames of a GPU read besides its rows
 _TOO_MANY_BYTES = 1 << 62  # what no memory holds, so that pages come one by one
 
-# Kinds of entries that a child of a fork makes anew, because threads that it does not have may have been at
-# work on them.
+# Kinds of entries that a child of a fork makes anew, because threads that it does not
+# have may have been at work on them.
 _NOT_INHERITED = ("frame", "pool", "scene")
 
 _NO_VALUE = object()
@@ -48,20 +50,25 @@ class _LastResult:
 
 
 class ResidentScene:
-    """The data of a scene that selection and frames read on one device. On the CPU it never changes.
+    """The data of a scene that selection and frames read on one device. On the CPU it
+    never changes.
 
     Attributes:
         core: The part of the compiled module.
-        references: Weak references to the bundles; another tuple where the bundles have changed.
+        references: Weak references to the bundles; another tuple where the bundles have
+            changed.
         revision: The revision of the scene whose data this is.
     """
 
     def __init__(self, device: Device) -> None:
         self.device = device
         self.core = _core.ResidentScene(device.number)
-        # The references are weak, because a bundle that is drawn by itself would keep itself alive otherwise.
+        # The references are weak, because a bundle that is drawn by itself would keep
+        # itself alive otherwise.
         self.references: tuple[weakref.ref[Bundle], ...] = ()
-        self._drawings: weakref.WeakSet[_core.Drawing] = weakref.WeakSet()  # drawings that may be under way
+        self._drawings: weakref.WeakSet[_core.Drawing] = (
+            weakref.WeakSet()
+        )  # drawings that may be under way
         self._lock = threading.Lock()  # guards that set
         self.revision = (-1, -1, -1)
 
@@ -71,7 +78,8 @@ class ResidentScene:
         return tuple(bundle for reference in self.references if (bundle := reference()) is not None)
 
     def is_of(self, subject: Subject) -> bool:
-        """Whether this is the data of the subject's current revision; a bundle never changes."""
+        """Whether this is the data of the subject's current revision; a bundle never
+        changes."""
         if isinstance(subject, Scene):
             return self.revision == subject.revision
         return self.revision[0] >= 0
@@ -79,7 +87,8 @@ class ResidentScene:
     def update(self, scene: Scene, tables: list[_core.ClusterTable]) -> None:
         """Update what has changed since the last time: the poses, or all instances.
 
-        Frames under way are finished first: one that found a buffer too small will be drawn again.
+        Frames under way are finished first: one that found a buffer too small will be
+        drawn again.
 
         Raises:
             RuntimeError: A CUDA graph is being captured.
@@ -115,7 +124,8 @@ class ResidentScene:
                 self._drawings.add(drawing)
 
     def _on_device(self, rows: Array) -> Array:
-        """The rows on this device if they are on another CUDA device, else as they are."""
+        """The rows on this device if they are on another CUDA device, else as they
+        are."""
         if getattr(rows, "is_cuda", False) and rows.device.index != self.device.number:
             return rows.to(str(self.device))
         return rows
@@ -124,8 +134,9 @@ class ResidentScene:
 class Residency:
     """The data of bundles and scenes on devices, as long as the bundle or scene lives.
 
-    Data that is asked for and does not exist yet is made; several devices may hold the same bundle at once.
-    Adding a bundle to a scene leaves the gaussians of the others where they are.
+    Data that is asked for and does not exist yet is made; several devices may hold the
+    same bundle at once. Adding a bundle to a scene leaves the gaussians of the others
+    where they are.
     """
 
     def __init__(self) -> None:
@@ -155,20 +166,27 @@ class Residency:
         return self.once(bundle, "table", make)
 
     def turn(self, device: Device) -> AbstractContextManager[object]:
-        """Keep scenes that are on the device unchanged inside the context; on CUDA, other threads wait."""
+        """Keep scenes that are on the device unchanged inside the context; on CUDA,
+        other threads wait."""
         if device.is_cuda:
             return self.lock
         return nullcontext()
 
-    def scene(self, subject: Subject, device: Device, last: ResidentScene | None = None) -> ResidentScene:
-        """The data of the current scene on a device; a bundle is a scene of one instance.
+    def scene(
+        self, subject: Subject, device: Device, last: ResidentScene | None = None
+    ) -> ResidentScene:
+        """The data of the current scene on a device; a bundle is a scene of one
+        instance.
 
-        It is mostly the same as the last time, so passing that as ``last`` saves the search.
+        It is mostly the same as the last time, so passing that as ``last`` saves the
+        search.
         """
         if last is not None and last.is_of(subject):
             return last
         if isinstance(subject, Gaussians):
-            raise TypeError("subject: expected a Scene or a Bundle, got Gaussians; build a bundle of them")
+            raise TypeError(
+                "subject: expected a Scene or a Bundle, got Gaussians; build a bundle of them"
+            )
         with self.lock:
             resident = self.once(subject, ("scene", device), lambda: ResidentScene(device))
             if resident.is_of(subject):
@@ -183,7 +201,8 @@ class Residency:
     def rows(
         self, bundle: Bundle, clusters: NDArray[np.int32], device: Device
     ) -> tuple[_core.Rows, NDArray[np.int64]]:
-        """Gaussians of the bundle on a device, and the first row of each of S clusters among them, (S,)."""
+        """Gaussians of the bundle on a device, and the first row of each of S clusters
+        among them, (S,)."""
         if not self._draws_codes(bundle, device):
             return self.gaussians(bundle, device).rows, bundle.clusters.offset[clusters]
         ids, place = np.unique(clusters, return_inverse=True)
@@ -210,7 +229,8 @@ class Residency:
     def set_models(
         self, frame: _core.SceneFrame, bundles: Sequence[Bundle], device: Device, color_by: ColorBy
     ) -> None:
-        """Have a frame of a device draw these bundles, their gaussians or clusters in these colours."""
+        """Have a frame of a device draw these bundles, their gaussians or clusters in
+        these colours."""
         palettes = [
             _core.Palette(self.table(bundle), sh, device.number)
             for bundle in bundles
@@ -223,9 +243,11 @@ class Residency:
         return self.once(bundle, ("palette", color_by), lambda: palette_of(bundle, color_by))
 
     def bytes_to_add(self, bundles: Sequence[Bundle], device: Device) -> dict[Device, int]:
-        """Bytes, by device and host, that the gaussians need which are not on the device yet.
+        """Bytes, by device and host, that the gaussians need which are not on the
+        device yet.
 
-        Bundles at URLs count as more than any memory holds: their pages are fetched as pictures need them.
+        Bundles at URLs count as more than any memory holds: their pages are fetched as
+        pictures need them.
         """
         add = {device: 0, CPU: 0}
         for bundle in bundles:
@@ -243,7 +265,8 @@ class Residency:
         return add
 
     def num_bytes(self, device: Device) -> int:
-        """Memory that gaussians and tables of all bundles take on a device beside the bundles themselves."""
+        """Memory that gaussians and tables of all bundles take on a device beside the
+        bundles themselves."""
         with self.lock:
             all_entries = list(self._entries.values())
         num_bytes = 0
@@ -278,7 +301,8 @@ class Residency:
         return self.once(bundle, ("decoded", device), decoded_bytes) == 0
 
     def once(self, owner: Scene | Bundle, key: Hashable, make: Callable[[], _T]) -> _T:
-        """The entry of a bundle or scene with this key, which is made if there is none."""
+        """The entry of a bundle or scene with this key, which is made if there is
+        none."""
         with self.lock:
             if not isinstance(owner, Bundle):
                 owner = Scene.of(owner)  # raises for what is no scene
@@ -287,8 +311,11 @@ class Residency:
                 entries[key] = make()
             return cast(_T, entries[key])
 
-    def last(self, owner: Scene | Bundle, key: Hashable, value: Hashable, make: Callable[[], _T]) -> _T:
-        """The result of ``make`` for this value. The result for another value is given up first."""
+    def last(
+        self, owner: Scene | Bundle, key: Hashable, value: Hashable, make: Callable[[], _T]
+    ) -> _T:
+        """The result of ``make`` for this value. The result for another value is given
+        up first."""
         with self.lock:
             last = self.once(owner, key, _LastResult)
             if last.value != value:
@@ -299,11 +326,15 @@ class Residency:
             return cast(_T, last.result)
 
     def _after_fork(self) -> None:
-        """In the child of a fork: another thread of the parent may have held a lock, or been at work."""
+        """In the child of a fork: another thread of the parent may have held a lock, or
+        been at work."""
         self.lock = threading.RLock()
         for entries in self._entries.values():
-            for key in [key for key in entries if isinstance(key, tuple) and key[0] in _NOT_INHERITED]:
-                # They are not destroyed: that would wait for threads that the child does not have.
+            for key in [
+                key for key in entries if isinstance(key, tuple) and key[0] in _NOT_INHERITED
+            ]:
+                # They are not destroyed: that would wait for threads that the child
+                # does not have.
                 self._abandoned.append(entries.pop(key))
 
 

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from v3dg.cameras import Floats
 
-# The squares of components beyond these overflow a double, or lose digits to denormal numbers.
+# The squares of components beyond these overflow a double, or lose digits to denormal
+# numbers.
 _LEAST = 1e-140
 _MOST = 1e140
 
@@ -15,8 +16,8 @@ _MOST = 1e140
 def in_range(quaternions: NDArray[np.floating[Any]]) -> Floats:
     """Return quaternions (..., 4) as doubles whose squares neither vanish nor overflow.
 
-    The shortest and the longest are multiplied by a power of two, which rounds nothing. Others stay, and so
-    do zero quaternions and those that are not finite.
+    The shortest and the longest are multiplied by a power of two, which rounds nothing.
+    Others stay, and so do zero quaternions and those that are not finite.
     """
     scaled = np.array(quaternions, np.float64)
     largest = np.abs(scaled).max(axis=-1)
@@ -30,7 +31,8 @@ def in_range(quaternions: NDArray[np.floating[Any]]) -> Floats:
 def normalised(quaternions: NDArray[np.floating[Any]]) -> Floats:
     """Return quaternions (..., 4) of length one, in double precision.
 
-    Those of length zero stay, and those that are not finite contain NaN. No length is too short or too long.
+    Those of length zero stay, and those that are not finite contain NaN. No length is
+    too short or too long.
     """
     unit = in_range(quaternions)
     length = np.linalg.norm(unit, axis=-1, keepdims=True)
@@ -52,7 +54,8 @@ def rotation_from_quaternion(quaternions: Floats) -> Floats:
 
 def quaternion_from_rotation(rotation: Floats) -> tuple[float, float, float, float]:
     """Unit quaternion w x y z with w >= 0 of a (3, 3) rotation."""
-    # The eigenvector of Bar-Itzhack's symmetric matrix: no case distinctions, stable for any angle.
+    # The eigenvector of Bar-Itzhack's symmetric matrix: no case distinctions, stable
+    # for any angle.
     r = np.asarray(rotation, np.float64)
     symmetric = np.full((4, 4), np.trace(r))
     symmetric[1:, 0] = [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]

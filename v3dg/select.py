@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 _Value = TypeVar("_Value", bound=np.generic)
 Footprint: TypeAlias = Literal["solid_angle", "paper"]
 
-# px² of screen that one gaussian of a coarser cluster may stand for; docs/levels.md has the error it gives.
+# px² of screen that one gaussian of a coarser cluster may stand for; docs/levels.md has
+# the error it gives.
 DEFAULT_TOLERANCE = 3.0
 
 # Fade for pictures of a sequence; docs/fades.md has its cost and its gain.
@@ -41,8 +42,9 @@ class Selection:
     """Clusters that one view needs, in ascending order of instance, then cluster.
 
     Attributes:
-        scene: The scene that was selected from. It may have moved and grown since; once instances of it were
-            removed, the cut is invalid, and drawing it is a ValueError.
+        scene: The scene that was selected from. It may have moved and grown since; once
+            instances of it were removed, the cut is invalid, and drawing it is a
+            ValueError.
         instance_ids: (S,) int32, read-only.
         cluster_ids: (S,) int32, within the instance's bundle, read-only.
         num_gaussians: Gaussians in all selected clusters.
@@ -80,7 +82,8 @@ class Selection:
         return Selection, tuple(getattr(self, field.name) for field in fields(self))
 
     def check(self, revision: tuple[int, int, int]) -> None:
-        """Raise ValueError unless a scene of this revision still has the instances of the cut."""
+        """Raise ValueError unless a scene of this revision still has the instances of
+        the cut."""
         assert self.revision is not None
         if revision[2] != self.revision[2]:
             problem = "instances were removed from the scene after this selection"
@@ -89,18 +92,22 @@ class Selection:
     def __len__(self) -> int:
         return len(self.instance_ids)
 
-    def gaussians(self, origin: VectorLike = (0.0, 0.0, 0.0), *, device: str | Device = "auto") -> Gaussians:
-        """Return the selected gaussians in the world, N in the order of the selection, for any rasterizer.
+    def gaussians(
+        self, origin: VectorLike = (0.0, 0.0, 0.0), *, device: str | Device = "auto"
+    ) -> Gaussians:
+        """Return the selected gaussians in the world, N in the order of the selection,
+        for any rasterizer.
 
-        Spherical harmonics are rotated into the world's frame, which is exact. The degree is the highest of
-        the bundles that are selected from. Opacities are multiplied by the weights of their clusters, so that
-        every rasterizer fades.
+        Spherical harmonics are rotated into the world's frame, which is exact. The
+        degree is the highest of the bundles that are selected from. Opacities are
+        multiplied by the weights of their clusters, so that every rasterizer fades.
 
         Args:
-            origin: (3,) point in the world that means are relative to; use the camera's position if the
-                scene is so far from zero that float32 is not precise enough.
-            device: ``"cpu"`` for NumPy arrays, ``"cuda"`` for torch tensors there, ``"auto"`` for the latter
-                if CUDA works. Both hold the same numbers.
+            origin: (3,) point in the world that means are relative to; use the camera's
+                position if the scene is so far from zero that float32 is not precise
+                enough.
+            device: ``"cpu"`` for NumPy arrays, ``"cuda"`` for torch tensors there,
+                ``"auto"`` for the latter if CUDA works. Both hold the same numbers.
         """
         target = _device.resolve(device)
         shift = vector(origin, "origin")
@@ -114,7 +121,9 @@ class Selection:
             for number, bundle_id in enumerate(bundle_ids):
                 is_in_bundle = bundle[instance] == number
                 cluster_ids = self.cluster_ids[is_in_bundle]
-                bundle_rows, first_rows = residency.rows(scene.bundles[bundle_id], cluster_ids, target)
+                bundle_rows, first_rows = residency.rows(
+                    scene.bundles[bundle_id], cluster_ids, target
+                )
                 first_row[is_in_bundle] = first_rows
                 rows.append(bundle_rows)
             world = _core.gather(
@@ -145,8 +154,9 @@ class Selection:
     def filters_px2(self) -> npt.NDArray[np.float32]:
         """(N,) variance of the screen-space filter that each gaussian is drawn with.
 
-        With a fade, a level 0 that has none is drawn with 0.05 px², and with `antialiased`. `render` limits
-        that to four times a gaussian's own variance, so that very many tiny ones stay opaque.
+        With a fade, a level 0 that has none is drawn with 0.05 px², and with
+        `antialiased`. `render` limits that to four times a gaussian's own variance, so
+        that very many tiny ones stay opaque.
         """
 
         def filter_px2(clusters: Clusters) -> npt.NDArray[np.float32]:
@@ -171,10 +181,13 @@ class Selection:
 
     def _first(self) -> npt.NDArray[np.int64]:
         """(S + 1,) first gaussian of each selected cluster, and the number of all."""
-        return np.concatenate([[0], np.cumsum(self._per_pair(lambda clusters: np.diff(clusters.offset)))])
+        return np.concatenate(
+            [[0], np.cumsum(self._per_pair(lambda clusters: np.diff(clusters.offset)))]
+        )
 
     def _per_pair(self, column: Callable[[Clusters], npt.NDArray[_Value]]) -> npt.NDArray[_Value]:
-        """(S,) values of the selected clusters from a column (C,) of the tables of their bundles."""
+        """(S,) values of the selected clusters from a column (C,) of the tables of
+        their bundles."""
         scene = copy.copy(self.scene)
         self.check(scene.revision)
         columns = [column(bundle.clusters) for bundle in scene.bundles]
@@ -227,39 +240,47 @@ def select(
     fade: float | None = None,
     device: str | Device = "auto",
 ) -> Selection | list[Selection]:
-    """Choose the clusters that are just detailed enough for one view, or for each of several.
+    """Choose the clusters that are just detailed enough for one view, or for each of
+    several.
 
-    Exactly one cluster is chosen on every path from a leaf of an instance to its root, and those that lie
-    outside the frustum are then left out. Turning the camera or moving it together with the scene changes
-    only what is left out.
+    Exactly one cluster is chosen on every path from a leaf of an instance to its root,
+    and those that lie outside the frustum are then left out. Turning the camera or
+    moving it together with the scene changes only what is left out.
 
     Args:
-        subject: What to choose from, or the file of it, which is then opened anew by every call.
-        camera: Pinhole camera. For a stereo camera, what is chosen is detailed enough for the nearer eye, and
-            what either may see is left in; not with the paper's footprint.
-        tolerance: Screen area in px² that one gaussian of a coarser cluster may stand for; 0 chooses the
-            full detail wherever it covers anything, infinity the coarsest clusters. `DEFAULT_TOLERANCE` if
-            None; with a budget, 0.
-        budget: Most gaussians that one view may have. The tolerance is raised, alike for all instances, until
-            they fit: to the least of 2,048 values an octave from which on no cut has more.
-        min_level: No cluster of a finer level is chosen, except where an asset has no coarser one.
-        footprint: ``"solid_angle"``, or ``"paper"`` for the published formula, with which a path can
-            have more than one cluster.
+        subject: What to choose from, or the file of it, which is then opened anew by
+            every call.
+        camera: Pinhole camera. For a stereo camera, what is chosen is detailed enough
+            for the nearer eye, and what either may see is left in; not with the paper's
+            footprint.
+        tolerance: Screen area in px² that one gaussian of a coarser cluster may stand
+            for; 0 chooses the full detail wherever it covers anything, infinity the
+            coarsest clusters. `DEFAULT_TOLERANCE` if None; with a budget, 0.
+        budget: Most gaussians that one view may have. The tolerance is raised, alike
+            for all instances, until they fit: to the least of 2,048 values an octave
+            from which on no cut has more.
+        min_level: No cluster of a finer level is chosen, except where an asset has no
+            coarser one.
+        footprint: ``"solid_angle"``, or ``"paper"`` for the published formula, with
+            which a path can have more than one cluster.
         cull: False keeps what lies outside the frustum.
-        fade: What is within this factor of the tolerance is drawn on two levels, or more, with weights that
-            add up to exactly 1 on every path and depend on the view alone: a level comes as the other goes,
-            so that nothing pops while the camera moves. A level 0 without a filter of its own is drawn with
-            a low-pass of 0.05 px², so that it does not flicker. `DEFAULT_FADE` is meant for that, and for
-            nothing else; 1 and None choose one cluster on every path. Not with the paper's footprint.
-        device: Where to choose: ``"cpu"``, ``"cuda"``, or ``"auto"``, which is CUDA where that works; all
-            choose the same.
+        fade: What is within this factor of the tolerance is drawn on two levels, or
+            more, with weights that add up to exactly 1 on every path and depend on the
+            view alone: a level comes as the other goes, so that nothing pops while the
+            camera moves. A level 0 without a filter of its own is drawn with a low-pass
+            of 0.05 px², so that it does not flicker. `DEFAULT_FADE` is meant for that,
+            and for nothing else; 1 and None choose one cluster on every path. Not with
+            the paper's footprint.
+        device: Where to choose: ``"cpu"``, ``"cuda"``, or ``"auto"``, which is CUDA
+            where that works; all choose the same.
 
     Raises:
-        ValueError: The coarsest cut has more gaussians than the budget, ``tolerance`` is negative or not a
-            number, or another argument is not one of the above.
+        ValueError: The coarsest cut has more gaussians than the budget, ``tolerance``
+            is negative or not a number, or another argument is not one of the above.
         RuntimeError: ``device`` is ``"cuda"`` and something is missing for it.
 
-    Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the budget is ours.
+    Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the
+    budget is ours.
     """
     rule = rule_of(tolerance, budget, min_level, footprint, cull, fade)
     target = _device.resolve(device)
@@ -275,7 +296,8 @@ def select_by(
     device: Device,
     steps: _core.BudgetSteps | None = None,
 ) -> Selection:
-    """Select for one view; with `steps`, which holds the state of the budget, for the next of a sequence."""
+    """Select for one view; with `steps`, which holds the state of the budget, for the
+    next of a sequence."""
     check_camera(camera)
     start = time.perf_counter()
     with residency.turn(device):
@@ -308,7 +330,8 @@ def rule_of(
     cull: bool = True,
     fade: float | None = None,
 ) -> _core.Rule:
-    """The rule of a selection for the core; ValueError for a number that `select` does not accept."""
+    """The rule of a selection for the core; ValueError for a number that `select` does
+    not accept."""
     if tolerance is None:
         tolerance = 0.0
         if budget is None:
@@ -324,7 +347,8 @@ def rule_of(
         factor = real(fade, "fade", "None or a factor of 1 to 1000", 1, 1000)
     if factor != 1 and footprint == "paper":
         refuse(
-            "fade", f"None with the paper's footprint, which can decrease towards the root, got {factor:g}"
+            "fade",
+            f"None with the paper's footprint, which can decrease towards the root, got {factor:g}",
         )
     return _core.Rule(
         tolerance_px2=tolerance,
@@ -337,6 +361,7 @@ def rule_of(
 
 
 def over_budget(budget: int, least: int) -> ValueError:
-    """The error for a budget that the coarsest cut exceeds; ``least`` is the size of that cut."""
+    """The error for a budget that the coarsest cut exceeds; ``least`` is the size of
+    that cut."""
     expected = f"at least {least} gaussians, which the coarsest cut of this view has"
     return ValueError(f"budget: expected {expected}, got {budget}")

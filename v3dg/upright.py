@@ -1,4 +1,5 @@
-"""The axis that is up: from a file, or guessed from cameras, from a ground plane, or by convention."""
+"""The axis that is up: from a file, or guessed from cameras, from a ground plane, or by
+convention."""
 
 import os
 from collections.abc import Mapping
@@ -17,9 +18,11 @@ ASSUMED = "as most trained assets have it"
 
 # With fewer cameras, all of them may be tilted.
 _MIN_CAMERAS = 3
-# Cosine of the largest angle, 26 degrees, between an axis and a direction that is taken for it.
+# Cosine of the largest angle, 26 degrees, between an axis and a direction that is taken
+# for it.
 _NEAR_AN_AXIS = 0.9
-# Largest ratio of the thickness of a ground to its smaller extent, as standard deviations.
+# Largest ratio of the thickness of a ground to its smaller extent, as standard
+# deviations.
 _FLAT = 0.55
 
 
@@ -37,9 +40,10 @@ def up_of(
 ) -> tuple[Axis, str]:
     """Return the axis that is up in a subject, and the reason, as a phrase.
 
-    The first of these that applies: the axis in the file of a scene or a bundle; the direction in which the
-    tops of three or more cameras point; z for other scenes; y for glTF; the normal of the plane in which the
-    gaussians of level 0 mostly lie, if it is along y or z, as -y or z; else -y, as in most trained assets.
+    The first of these that applies: the axis in the file of a scene or a bundle; the
+    direction in which the tops of three or more cameras point; z for other scenes; y
+    for glTF; the normal of the plane in which the gaussians of level 0 mostly lie, if
+    it is along y or z, as -y or z; else -y, as in most trained assets.
 
     Args:
         cameras: Cameras that look at the subject, by name.
@@ -69,7 +73,8 @@ def up_of(
 
 
 def _middles(subject: Bundle | Gaussians) -> Floats:
-    """(N, 3) centres of gaussians of level 0, or of the clusters of a bundle, for which no page is read."""
+    """(N, 3) centres of gaussians of level 0, or of the clusters of a bundle, for which
+    no page is read."""
     if isinstance(subject, Gaussians):
         return np.asarray(subject.means[:: max(len(subject) // 100_000, 1)], np.float64)
     if not subject.num_levels:
@@ -78,7 +83,8 @@ def _middles(subject: Bundle | Gaussians) -> Floats:
 
 
 def _flat_axis(points: Floats) -> Axis | None:
-    """The axis along the normal of the plane that the points lie in, ignoring outliers; None without one."""
+    """The axis along the normal of the plane that the points lie in, ignoring outliers;
+    None without one."""
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 16:
         return None

@@ -1,4 +1,5 @@
-"""Videos: pictures in a row in one file, written whole or not at all. Needs the extra `video`."""
+"""Videos: pictures in a row in one file, written whole or not at all. Needs the extra
+`video`."""
 
 import os
 from collections.abc import Iterable
@@ -12,20 +13,23 @@ from v3dg.pictures import to_8bit
 def write_video(
     path: str | os.PathLike[str], pictures: Iterable[Array], *, fps: int = 30, quality: int = 18
 ) -> int:
-    """Encode pictures as H.264 in an .mp4 file, each as it comes; the file appears when all are in it.
+    """Encode pictures as H.264 in an .mp4 file, each as it comes; the file appears when
+    all are in it.
 
     Args:
-        pictures: (H, W, 3) floats in [0, 1], NumPy arrays or torch tensors, all of one size; height and width
-            are even.
+        pictures: (H, W, 3) floats in [0, 1], NumPy arrays or torch tensors, all of one
+            size; height and width are even.
         fps: Pictures a second.
-        quality: Constant rate factor, 0 to 51; smaller is better and larger, 18 shows no difference.
+        quality: Constant rate factor, 0 to 51; smaller is better and larger, 18 shows
+            no difference.
 
     Returns:
         How many pictures the video has.
 
     Raises:
         ImportError: The extra is not installed.
-        ValueError: Another suffix, no pictures, or pictures of an odd or a changing size.
+        ValueError: Another suffix, no pictures, or pictures of an odd or a changing
+            size.
     """
     av = _extras.load("av")
     check(path, os.fspath(path).endswith(".mp4"), "a file name ending in .mp4")

@@ -42,17 +42,19 @@ def view(
     up: Axis | VectorLike | None = None,
     **options: Unpack[_SiteOptions],
 ) -> Site:
-    """Show a scene, a bundle or an asset, or the file of one, in a web browser (docs/viewer.md).
+    """Show a scene, a bundle or an asset, or the file of one, in a web browser
+    (docs/viewer.md).
 
-    The viewer's server runs on threads of this process. Its address is printed, and is the `url` of what is
-    returned; `close()` of that ends it.
+    The viewer's server runs on threads of this process. Its address is printed, and is
+    the `url` of what is returned; `close()` of that ends it.
 
     Args:
         device: As in `v3dg.render`.
         memory: As in `v3dg.Renderer`.
-        up: What is up at first, an axis or a direction; as `v3dg.upright.up_of` takes it if None.
-        options: As `v3dg.viewer.server.Site` takes them, such as `cameras`, by name, `port`, `tolerance` and
-            `budget`. A scene's file brings its own cameras.
+        up: What is up at first, an axis or a direction; as `v3dg.upright.up_of` takes
+            it if None.
+        options: As `v3dg.viewer.server.Site` takes them, such as `cameras`, by name,
+            `port`, `tolerance` and `budget`. A scene's file brings its own cameras.
 
     Raises:
         ImportError: The extra `viewer` is not installed.

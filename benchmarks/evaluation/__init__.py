@@ -1,4 +1,5 @@
-"""The evaluation: speed against error, and peers in the same run; `python -m benchmarks evaluate`."""
+"""The evaluation: speed against error, and peers in the same run; `python -m benchmarks
+evaluate`."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ __all__ = ["NAMES", "PRESETS", "Evaluation", "part", "run"]
 def run(
     evaluation: Evaluation, preset: str, names: Sequence[str], *, quiet: bool = False
 ) -> dict[str, dict[str, Any]]:
-    """Run parts, each of which writes <part>.json as it ends; returns what they measured.
+    """Run parts, each of which writes <part>.json as it ends; returns what they
+    measured.
 
     Raises:
         ValueError: A name is not of a part.
@@ -35,7 +37,12 @@ def run(
             for result in [found] if isinstance(found, dict) else found:
                 seconds = time.perf_counter() - start
                 results[name] = {
-                    **{"part": name, "preset": preset, "device": evaluation.device, "seed": evaluation.seed},
+                    **{
+                        "part": name,
+                        "preset": preset,
+                        "device": evaluation.device,
+                        "seed": evaluation.seed,
+                    },
                     **{"asset": evaluation.asset_name, "asset_gaussians": len(evaluation.asset)},
                     **{"seconds": round(seconds, 1), "pictures": evaluation.pictures},
                     **result,

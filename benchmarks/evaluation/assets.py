@@ -1,4 +1,5 @@
-"""Assets to measure with: many copies of a small one, and random gaussians that look trained."""
+"""Assets to measure with: many copies of a small one, and random gaussians that look
+trained."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ def read_layout(path: str | Path, bundle: v3dg.Bundle) -> tuple[v3dg.Scene, dict
 
 
 def many_copies(asset: v3dg.Gaussians, num_copies: int, *, seed: int = 0) -> v3dg.Gaussians:
-    """Copies of an asset as one: turned at random, half to twice as large, side by side on a square.
+    """Copies of an asset as one: turned at random, half to twice as large, side by side
+    on a square.
 
     What of the colour depends on the view is not turned with them.
     """
@@ -30,13 +32,17 @@ def many_copies(asset: v3dg.Gaussians, num_copies: int, *, seed: int = 0) -> v3d
     pitch = float(np.linalg.norm(np.ptp(asset.means, axis=0)))
     copies = []
     for i in range(num_copies):
-        place = pitch * np.array([i % side + rng.uniform(-0.3, 0.3), i // side + rng.uniform(-0.3, 0.3), 0])
+        place = pitch * np.array(
+            [i % side + rng.uniform(-0.3, 0.3), i // side + rng.uniform(-0.3, 0.3), 0]
+        )
         turn = rng.normal(size=4)
         turn /= np.linalg.norm(turn)
         scale = np.float32(2 ** rng.uniform(-1, 1))
         rotation = np.float32(scale * rotation_from_quaternion(turn))
         w, x, y, z = turn
-        product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], np.float32)
+        product = np.array(
+            [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], np.float32
+        )
         copies.append(
             v3dg.Gaussians(
                 means=asset.means @ rotation.T + np.float32(place),
@@ -50,7 +56,8 @@ def many_copies(asset: v3dg.Gaussians, num_copies: int, *, seed: int = 0) -> v3d
 
 
 class _Random:
-    """Seeded float32 numbers where they are needed: NumPy's on the CPU, torch's on another device."""
+    """Seeded float32 numbers where they are needed: NumPy's on the CPU, torch's on
+    another device."""
 
     def __init__(self, device: str, seed: int) -> None:
         self._device = device
@@ -82,13 +89,16 @@ class _Random:
 def like_trained(
     count: int, camera: v3dg.Camera, device: str, *, sh_degree: int = 0, seed: int = 0
 ) -> v3dg.Gaussians:
-    """Random gaussians before a camera with the sizes, shapes and opacities that training leaves.
+    """Random gaussians before a camera with the sizes, shapes and opacities that
+    training leaves.
 
-    The distributions are fitted to a trained asset: logs of sizes are normal with deviation 1, logs of the
-    ratios of neighbouring axes are gamma of shape 3 (median ratios 3 and 4), logits of opacities are normal.
-    Training spends gaussians where they show, so sizes on screen do not depend on depth: the longest axis has
-    a median of 2 px (the middle one 0.7 px), and one in a thousand passes 40 px. Depths are log-uniform over
-    a factor of 20, places uniform on the image and a little beyond it. NumPy arrays on the CPU, else tensors.
+    The distributions are fitted to a trained asset: logs of sizes are normal with
+    deviation 1, logs of the ratios of neighbouring axes are gamma of shape 3 (median
+    ratios 3 and 4), logits of opacities are normal. Training spends gaussians where
+    they show, so sizes on screen do not depend on depth: the longest axis has a median
+    of 2 px (the middle one 0.7 px), and one in a thousand passes 40 px. Depths are
+    log-uniform over a factor of 20, places uniform on the image and a little beyond it.
+    NumPy arrays on the CPU, else tensors.
     """
     random = _Random(device, seed)
     uniform, normal, array = random.uniform, random.normal, random.array
@@ -103,7 +113,9 @@ def like_trained(
     # A uniform number may be 0, one less never is.
     ratios = exp(array([0.4, 0.5]) * random.library.log(1 - uniform(count, 3, 2)).sum(1))
     middle = longest * ratios[:, :1]
-    sh = join([uniform(count, 1, 3) * 3.4 - 1.7, 0.2 * normal(count, (sh_degree + 1) ** 2 - 1, 3)], 1)
+    sh = join(
+        [uniform(count, 1, 3) * 3.4 - 1.7, 0.2 * normal(count, (sh_degree + 1) ** 2 - 1, 3)], 1
+    )
     return v3dg.Gaussians(
         means=means,
         quats=normal(count, 4),
@@ -114,7 +126,8 @@ def like_trained(
 
 
 def hair_lines(count: int, *, seed: int = 0) -> v3dg.Gaussians:
-    """Bent wires within a ball of radius 1, a 3,000th of it thick: what falls between pixels."""
+    """Bent wires within a ball of radius 1, a 3,000th of it thick: what falls between
+    pixels."""
     rng = np.random.default_rng(seed)
     wires = max(4, count // 100)
     wire = np.arange(count) % wires
@@ -135,7 +148,8 @@ def hair_lines(count: int, *, seed: int = 0) -> v3dg.Gaussians:
 
 
 def sky_dome(count: int, *, seed: int = 0) -> v3dg.Gaussians:
-    """Huge soft gaussians on half a sphere of radius 1: blue above, haze at the horizon, clouds."""
+    """Huge soft gaussians on half a sphere of radius 1: blue above, haze at the
+    horizon, clouds."""
     rng = np.random.default_rng(seed)
     z = (np.arange(count) + 0.5) / count
     turn = np.arange(count) * math.pi * (3 - math.sqrt(5))
@@ -146,14 +160,19 @@ def sky_dome(count: int, *, seed: int = 0) -> v3dg.Gaussians:
         1, keepdims=True
     )
     cloud = np.clip(3 * waves, 0, 1)
-    blue = np.array([0.75, 0.82, 0.9]) * (1 - z[:, None]) + np.array([0.15, 0.35, 0.75]) * z[:, None]
+    blue = (
+        np.array([0.75, 0.82, 0.9]) * (1 - z[:, None]) + np.array([0.15, 0.35, 0.75]) * z[:, None]
+    )
     scales = spacing * np.array([0.05, 1.2, 1.2]) * np.exp(rng.normal(scale=0.2, size=(count, 3)))
     opacities = rng.uniform(0.3, 0.8, count)
-    return _gaussians(outwards, _quats_from_x(outwards), scales, opacities, blue * (1 - cloud) + cloud)
+    return _gaussians(
+        outwards, _quats_from_x(outwards), scales, opacities, blue * (1 - cloud) + cloud
+    )
 
 
 def _quats_from_x(x: Any) -> Any:
-    """Rotations that take the x axis to unit vectors: half a turn about the middle between the two."""
+    """Rotations that take the x axis to unit vectors: half a turn about the middle
+    between the two."""
     middle = x + np.array([1.0, 0.0, 0.0])
     middle[np.linalg.norm(middle, axis=1) < 1e-6] = [0.0, 1.0, 0.0]
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)
@@ -162,4 +181,6 @@ def _quats_from_x(x: Any) -> Any:
 
 def _gaussians(means: Any, quats: Any, scales: Any, opacities: Any, color: Any) -> v3dg.Gaussians:
     sh = (color[:, None] - 0.5) / _core.sh_base0
-    return v3dg.Gaussians(*(np.asarray(a, np.float32) for a in (means, quats, scales, opacities, sh)))
+    return v3dg.Gaussians(
+        *(np.asarray(a, np.float32) for a in (means, quats, scales, opacities, sh))
+    )

@@ -1,4 +1,5 @@
-"""Rows of tables in which each is a build, drawn over the camera sweep: the means over the distances."""
+"""Rows of tables in which each is a build, drawn over the camera sweep: the means over
+the distances."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ def build_row(evaluation: Evaluation, name: str, config: BuildConfig, tolerance:
 
 
 def as_many_row(evaluation: Evaluation, name: str, config: BuildConfig, rival: Row) -> Row:
-    """What this build gives with at most as many gaussians as another row has, view by view."""
+    """What this build gives with at most as many gaussians as another row has, view by
+    view."""
     built = evaluation.build(config)
     scene = evaluation.place(built.bundle)
     shots = [
@@ -35,8 +37,12 @@ def as_many_row(evaluation: Evaluation, name: str, config: BuildConfig, rival: R
 
 
 def sweep_row(evaluation: Evaluation, name: str, tolerance: float | None, sweep: list[Row]) -> Row:
-    means = mean_of(sweep, "drawn_selected", "drawn_in_frustum", "drawn_ms", "drawn_flip", "drawn_psnr")
-    full = mean_of([shot.row("drawn") for shot in evaluation.full_sweep], "drawn_in_frustum", "drawn_ms")
+    means = mean_of(
+        sweep, "drawn_selected", "drawn_in_frustum", "drawn_ms", "drawn_flip", "drawn_psnr"
+    )
+    full = mean_of(
+        [shot.row("drawn") for shot in evaluation.full_sweep], "drawn_in_frustum", "drawn_ms"
+    )
     return {
         "levels": name,
         "tolerance": tolerance,

@@ -13,7 +13,8 @@ from v3dg.cli._common import Flag, Threads, UsageError, option, print_result, re
 
 @dataclass
 class Evaluate:
-    """Measure speed against error, beside peers, and write JSON, tables and pictures (docs/results.md)."""
+    """Measure speed against error, beside peers, and write JSON, tables and pictures
+    (docs/results.md)."""
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("evaluation")
     """Folder for the results; made if it is not there."""
@@ -28,9 +29,11 @@ class Evaluate:
     layout: Annotated[Path | None, option("PATH")] = None
     """Published layout (.json) of the instances of that asset and of cameras."""
     peers: Annotated[Path | None, option("FOLDER")] = None
-    """What other tools made of that asset (benchmarks/evaluation/parts/merging.py says how)."""
+    """What other tools made of that asset (benchmarks/evaluation/parts/merging.py says
+    how)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to build and draw; auto is a CUDA device where there is one and torch can use it."""
+    """Where to build and draw; auto is a CUDA device where there is one and torch can
+    use it."""
     seed: int = 0
     """Seed of assets, layouts and builds."""
     threads: Threads = None
@@ -71,6 +74,8 @@ def run(options: Evaluate) -> None:
             f"## {evaluation.part(name).TITLE}\n\n{evaluation.part(name).tables(result)}"
             for name, result in results.items()
         ]
-        return "\n\n".join([*sections, f"Plots and a page: python -m benchmarks report {options.output}"])
+        return "\n\n".join(
+            [*sections, f"Plots and a page: python -m benchmarks report {options.output}"]
+        )
 
     print_result(options.json, results, text().splitlines())

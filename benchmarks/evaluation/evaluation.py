@@ -1,4 +1,5 @@
-"""What parts of the evaluation share: assets, bundles, the main scene with its views and true pictures."""
+"""What parts of the evaluation share: assets, bundles, the main scene with its views
+and true pictures."""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ PAPER_CLUSTER_SIZE = BuildConfig.paper().cluster_size
 
 
 def paper_tolerance(tau_px2: float) -> float:
-    """Our tolerance, px² a gaussian, for the paper's: px² of a group that is drawn as one cluster."""
+    """Our tolerance, px² a gaussian, for the paper's: px² of a group that is drawn as
+    one cluster."""
     return tau_px2 / PAPER_CLUSTER_SIZE
 
 
@@ -47,7 +49,8 @@ PAPER_TOLERANCE = paper_tolerance(2048)
 
 @dataclass(frozen=True)
 class View:
-    """A camera that looks at the origin, and from where: degrees, degrees, world units."""
+    """A camera that looks at the origin, and from where: degrees, degrees, world
+    units."""
 
     azimuth: float
     elevation: float
@@ -77,7 +80,9 @@ def orbit_view(azimuth: float, elevation: float, distance: float, size: tuple[in
     """Look at the origin from there; degrees and world units."""
     a, e = math.radians(azimuth), math.radians(elevation)
     eye = distance * np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
-    camera = Camera.look_at(eye, (0, 0, 0), fov_x=FOV_X, width=size[0], height=size[1], near=1e-3 * distance)
+    camera = Camera.look_at(
+        eye, (0, 0, 0), fov_x=FOV_X, width=size[0], height=size[1], near=1e-3 * distance
+    )
     return View(azimuth, elevation, distance, camera)
 
 
@@ -88,7 +93,8 @@ def resized(camera: Camera, size: tuple[int, int]) -> Camera:
 
 
 def close_distance(asset: Gaussians) -> tuple[Any, float]:
-    """The middle of an asset and how far from it a square picture is filled; without its few outliers."""
+    """The middle of an asset and how far from it a square picture is filled; without
+    its few outliers."""
     center, radius = ball_of_most(_device.to_host(asset.means))
     return center, radius / math.tan(FOV_X / 2)
 
@@ -97,7 +103,9 @@ def close_view(asset: Gaussians, size: tuple[int, int]) -> Camera:
     """The asset fills the picture, from above its front."""
     center, distance = close_distance(asset)
     eye = center + distance * np.array([0.0, -0.8, 0.6])
-    return Camera.look_at(eye, center, fov_x=FOV_X, width=size[0], height=size[1], near=1e-3 * distance)
+    return Camera.look_at(
+        eye, center, fov_x=FOV_X, width=size[0], height=size[1], near=1e-3 * distance
+    )
 
 
 @dataclass(frozen=True)
@@ -108,7 +116,8 @@ class Built:
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture that was drawn twice to the same bytes, what it shows, and how long it took in between."""
+    """A picture that was drawn twice to the same bytes, what it shows, and how long it
+    took in between."""
 
     view: View
     picture: Picture
@@ -137,7 +146,8 @@ class Evaluation:
     asset_path: Path | None = None
     layout_path: Path | None = None
     peers: Path | None = None
-    """Folder with what other tools made of the asset: <asset>_<percent>.ply and so on, see part "merging"."""
+    """Folder with what other tools made of the asset: <asset>_<percent>.ply and so on,
+    see part "merging"."""
     pictures: list[str] = field(default_factory=list)
     """File names of what the part at hand has saved."""
     judge: Judge = field(default_factory=Judge)
@@ -155,9 +165,12 @@ class Evaluation:
         return "made_donut" if self.asset_path is None else self.asset_path.stem
 
     def warm_up(self) -> None:
-        """Load what the first build and the first picture load, so that no part pays for it."""
+        """Load what the first build and the first picture load, so that no part pays
+        for it."""
         tiny = make_asset(1000)
-        bundle = build_bundle(tiny, config=BuildConfig(steps=2), progress=False, device=self._device)
+        bundle = build_bundle(
+            tiny, config=BuildConfig(steps=2), progress=False, device=self._device
+        )
         render(bundle, orbit_view(0, 45, 5, (64, 64)).camera, device=self.device).stats  # noqa: B018
 
     @property
@@ -184,11 +197,14 @@ class Evaluation:
         return built
 
     def place(self, bundle: Bundle, instances: int | None = None) -> Scene:
-        """The main scene, made of this bundle; the first few instances if so many are wanted."""
+        """The main scene, made of this bundle; the first few instances if so many are
+        wanted."""
         scene = Scene()
         positions, quaternions, scales = self._layout[0]
         few = slice(instances)
-        scene.add(bundle, positions=positions[few], quaternions=quaternions[few], scales=scales[few])
+        scene.add(
+            bundle, positions=positions[few], quaternions=quaternions[few], scales=scales[few]
+        )
         return scene
 
     @cached_property
@@ -219,7 +235,8 @@ class Evaluation:
         return self._some_of(self._layout[1])
 
     def _some_of(self, views: Sequence[View]) -> list[View]:
-        """Of the paper's 400 views those of the settings' directions, elevations and distances."""
+        """Of the paper's 400 views those of the settings' directions, elevations and
+        distances."""
         azimuths = sorted({round(v.azimuth) for v in views})[: self.settings.directions]
         lines: dict[tuple[int, int], list[View]] = {}
         for view in views:
@@ -235,31 +252,45 @@ class Evaluation:
         """The views of one direction and the middle elevation, from near to far."""
         middle = sorted(self.settings.elevations)[len(self.settings.elevations) // 2]
         first = self.all_views[0].azimuth
-        line = [v for v in self.all_views if abs(v.azimuth - first) < 0.5 and abs(v.elevation - middle) < 0.5]
+        line = [
+            v
+            for v in self.all_views
+            if abs(v.azimuth - first) < 0.5 and abs(v.elevation - middle) < 0.5
+        ]
         return every(line, self.settings.sweep_distances)
 
     def truth(self, index: int) -> Picture:
         """The true picture of the camera sweep's view."""
         if index not in self._truths:
-            self._truths[index] = draw_truth(self.full_scene, self.camera_sweep[index].camera, self.device)
+            self._truths[index] = draw_truth(
+                self.full_scene, self.camera_sweep[index].camera, self.device
+            )
         return self._truths[index]
 
     def shoot(
-        self, subject: Any, view: View, tolerance: float = DEFAULT_TOLERANCE, repeats: int | None = None
+        self,
+        subject: Any,
+        view: View,
+        tolerance: float = DEFAULT_TOLERANCE,
+        repeats: int | None = None,
     ) -> Shot:
-        """Draw, time, and draw again: a time counts only if the pictures are the same."""
+        """Draw, time, and draw again: a time counts only if the pictures are the
+        same."""
 
         def draw() -> Any:
             return render(subject, view.camera, tolerance=tolerance, device=self.device)
 
         picture = to_8bit(draw().color)
         if not picture.any():
-            raise RuntimeError(f"picture at distance {view.distance:g}: expected something in it, got black")
+            raise RuntimeError(
+                f"picture at distance {view.distance:g}: expected something in it, got black"
+            )
         timed = time_ms(lambda: draw().stats, self.device, repeats or self.settings.repeats)
         last = draw()
         if not np.array_equal(picture, to_8bit(last.color)):
             raise RuntimeError(
-                f"picture at distance {view.distance:g}: expected the same on every run, got another"
+                f"picture at distance {view.distance:g}: expected the same on every run, got "
+                "another"
             )
         return Shot(view, picture, last.stats, timed)
 
@@ -268,7 +299,8 @@ class Evaluation:
 
     @cached_property
     def full_sweep(self) -> list[Shot]:
-        """The camera sweep with all gaussians, one sample a pixel: what level of detail has to beat."""
+        """The camera sweep with all gaussians, one sample a pixel: what level of detail
+        has to beat."""
         return self.shoot_sweep(self.full_scene, 0.0)
 
     def judge_sweep(self, shots: Sequence[Shot]) -> list[Row]:
@@ -276,10 +308,15 @@ class Evaluation:
         return self.judge.errors((self.truth(i), shot.picture) for i, shot in enumerate(shots))
 
     def sweep_rows(self, shots: Sequence[Shot], name: str) -> list[Row]:
-        """A row a view: where from, what was drawn, how long it took, how far off it is."""
+        """A row a view: where from, what was drawn, how long it took, how far off it
+        is."""
         errors = self.judge_sweep(shots)
         return [
-            {**shot.view.row(), **shot.row(name), **{f"{name}_{key}": value for key, value in error.items()}}
+            {
+                **shot.view.row(),
+                **shot.row(name),
+                **{f"{name}_{key}": value for key, value in error.items()},
+            }
             for shot, error in zip(shots, errors, strict=True)
         ]
 

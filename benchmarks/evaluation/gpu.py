@@ -1,4 +1,5 @@
-"""What benchmarks on a GPU share: memory, errors, and gsplat as the peer to compare with."""
+"""What benchmarks on a GPU share: memory, errors, and gsplat as the peer to compare
+with."""
 
 from __future__ import annotations
 
@@ -18,9 +19,11 @@ DEVICE = "cuda"
 
 
 class PeakMemory:
-    """The most memory of the GPU in use within a `with` block, beyond an idle process's: `.gigabytes`.
+    """The most memory of the GPU in use within a `with` block, beyond an idle
+    process's: `.gigabytes`.
 
-    Sampled every few milliseconds, from the driver: it sees everybody's allocations, and what a pool keeps.
+    Sampled every few milliseconds, from the driver: it sees everybody's allocations,
+    and what a pool keeps.
     """
 
     _idle = 0
@@ -40,7 +43,10 @@ class PeakMemory:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._done.set()
         self._thread.join()
@@ -67,7 +73,8 @@ def picture_error(picture: Any, truth: Any) -> dict[str, float]:
 
 
 def placed_gaussians(scene: Scene, device: str = DEVICE) -> v3dg.Gaussians:
-    """All instances of a scene of one bundle, in full detail, in the world, as tensors; SH degree 0."""
+    """All instances of a scene of one bundle, in full detail, in the world, as tensors;
+    SH degree 0."""
     import torch
 
     asset = scene.bundles[0].level_gaussians(0).torch(device)
@@ -101,7 +108,8 @@ def _left_products(quaternions: Any) -> Any:
 
 
 def has_gsplat() -> bool:
-    """Whether there is a peer to measure; results name its version, or do not have it."""
+    """Whether there is a peer to measure; results name its version, or do not have
+    it."""
     return importlib.util.find_spec("gsplat") is not None
 
 
@@ -129,7 +137,8 @@ def gsplat_frame(
 ) -> Callable[[], tuple[Any, Any]]:
     """A call that draws `gsplat_picture`, with all that it needs on the GPU.
 
-    Colours without a view dependence are handed over as they are, which spares gsplat a pass.
+    Colours without a view dependence are handed over as they are, which spares gsplat a
+    pass.
     """
     import gsplat
     import torch
@@ -139,7 +148,9 @@ def gsplat_frame(
     else:
         colors, degree = gaussians.sh, gaussians.sh_degree
     device = gaussians.means.device
-    viewmat, K = (torch.as_tensor(m, dtype=torch.float32, device=device) for m in (camera.viewmat, camera.K))
+    viewmat, K = (
+        torch.as_tensor(m, dtype=torch.float32, device=device) for m in (camera.viewmat, camera.K)
+    )
 
     def draw() -> tuple[Any, Any]:
         color, alpha, _ = gsplat.rasterization(

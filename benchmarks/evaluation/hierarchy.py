@@ -1,9 +1,11 @@
-"""A hierarchy of single gaussians as a baseline: Kerbl et al., A Hierarchical 3D Gaussian Representation.
+"""A hierarchy of single gaussians as a baseline: Kerbl et al., A Hierarchical 3D
+Gaussian Representation.
 
-Written from the paper (SIGGRAPH 2024), without its optimisation against photographs, which assets without any
-cannot have. A binary tree by median splits, down to single gaussians; an inner node merges its two children
-by their moments, weighted by opacity times surface; a node is drawn where its size on screen is at most the
-target and its parent's is not, interpolated towards its parent, so that nothing jumps.
+Written from the paper (SIGGRAPH 2024), without its optimisation against photographs,
+which assets without any cannot have. A binary tree by median splits, down to single
+gaussians; an inner node merges its two children by their moments, weighted by opacity
+times surface; a node is drawn where its size on screen is at most the target and its
+parent's is not, interpolated towards its parent, so that nothing jumps.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ class Hierarchy:
     """M nodes, level by level from the root, on the host.
 
     Attributes:
-        gaussians: What each node draws; opacities of inner nodes may exceed 1, as in the paper.
+        gaussians: What each node draws; opacities of inner nodes may exceed 1, as in
+            the paper.
         parent: (M,) the node above; the root is its own.
         num_siblings: (M,) children of the parent, the node itself included.
         box: (M, 2, 3) around what the leaves below draw.
@@ -51,19 +54,24 @@ class Hierarchy:
 def build_hierarchy(asset: Gaussians) -> Hierarchy:
     """Build the tree of one asset, given as NumPy arrays."""
     count = len(asset)
-    order, offset = _core.median_split(asset.means, np.array([0, count]), _core.num_halvings(count, 1))
+    order, offset = _core.median_split(
+        asset.means, np.array([0, count]), _core.num_halvings(count, 1)
+    )
     depth = (len(offset) - 1).bit_length() - 1
     leaves = asset.subset(order)
     levels = [leaves]
     boxes = [_core.bound_by_boxes(leaves.rows, np.arange(len(leaves) + 1))]
-    # Of the segments that the last split leaves, some are empty; above it, every node has two children.
+    # Of the segments that the last split leaves, some are empty; above it, every node
+    # has two children.
     parents = [np.repeat(np.arange(len(offset) - 1), np.diff(offset)) // 2]
     for k in range(depth - 1, -1, -1):
         first_child = offset[::2].copy() if k == depth - 1 else 2 * np.arange(2**k + 1)
         levels.append(_merge(levels[-1], first_child))
         low, high = boxes[-1].swapaxes(0, 1)
         starts = first_child[:-1]
-        boxes.append(np.stack([np.minimum.reduceat(low, starts), np.maximum.reduceat(high, starts)], 1))
+        boxes.append(
+            np.stack([np.minimum.reduceat(low, starts), np.maximum.reduceat(high, starts)], 1)
+        )
         parents.append(np.arange(2**k) // 2)
     first = np.concatenate([[0], np.cumsum([len(level) for level in reversed(levels)])])
     parent = np.concatenate(
@@ -73,11 +81,14 @@ def build_hierarchy(asset: Gaussians) -> Hierarchy:
     for k in range(1, depth + 1):
         _match_axes(nodes, slice(int(first[k]), int(first[k + 1])), parent)
     siblings = np.bincount(parent[1:], minlength=len(parent))[parent]
-    return Hierarchy(nodes, parent, np.maximum(siblings, 1), np.concatenate(boxes[::-1]), len(leaves))
+    return Hierarchy(
+        nodes, parent, np.maximum(siblings, 1), np.concatenate(boxes[::-1]), len(leaves)
+    )
 
 
 def _merge(children: Gaussians, first_child: Ids) -> Gaussians:
-    """Join segments of one or two by their moments; opacity times surface is kept, also beyond 1."""
+    """Join segments of one or two by their moments; opacity times surface is kept, also
+    beyond 1."""
     merged = Gaussians(*_core.merge(children.rows, first_child, np.arange(len(first_child))))
     weight = np.add.reduceat(children.opacities * _surface(children.scales), first_child[:-1])
     opacities = weight / np.maximum(_surface(merged.scales), np.float32(1e-30))
@@ -91,7 +102,8 @@ def _surface(scales: Any) -> Any:
     return ((x * y + x * z + y * z) / 3) ** (1 / p)
 
 
-# The 24 rotations that take axes to axes, as quaternions, and which axis each puts in which place.
+# The 24 rotations that take axes to axes, as quaternions, and which axis each puts in
+# which place.
 _TURNS = np.array(
     [
         np.array(q) / np.linalg.norm(q)
@@ -103,7 +115,8 @@ _AXIS_AT = np.abs(rotation_from_quaternion(_TURNS)).argmax(axis=1)  # (24, 3)
 
 
 def _match_axes(nodes: Gaussians, level: slice, parent: Ids) -> None:
-    """Name the axes of a level's gaussians so that they are turned least from their parents'."""
+    """Name the axes of a level's gaussians so that they are turned least from their
+    parents'."""
     child = nodes.quats[level] / np.linalg.norm(nodes.quats[level], axis=1, keepdims=True)
     above = nodes.quats[parent[level]]
     back = child * [1, -1, -1, -1]
@@ -147,7 +160,8 @@ class HierarchyScene:
         return like(values, self._nodes.means)
 
     def cut(self, camera: Camera, target_px: float) -> tuple[Any, Any, Any]:
-        """Instances, nodes and how far each is on its way to its parent, for nodes at most so large."""
+        """Instances, nodes and how far each is on its way to its parent, for nodes at
+        most so large."""
         scene = self.scene
         eyes = (
             np.einsum("ij,ijk->ik", camera.position - scene.positions, scene.rotations)
@@ -161,7 +175,9 @@ class HierarchyScene:
         instance, node, way = (self._library.concatenate(p) for p in zip(*parts, strict=True))
         return instance, node, way
 
-    def _cut_some(self, eyes: Any, focal: float, target_px: float, first: int) -> tuple[Any, Any, Any]:
+    def _cut_some(
+        self, eyes: Any, focal: float, target_px: float, first: int
+    ) -> tuple[Any, Any, Any]:
         low, high = self._box[:, 0], self._box[:, 1]
         square = 0.0
         for axis in range(3):
@@ -183,7 +199,8 @@ class HierarchyScene:
         """The nodes of a cut in the world, interpolated towards their parents."""
         instance, node, way = cut
         own, above = self._gather(instance, node), self._gather(instance, self._parent[node])
-        # So many siblings, drawn over each other as their parent, together cover what it covers.
+        # So many siblings, drawn over each other as their parent, together cover what
+        # it covers.
         shared = 1 - (1 - above.opacities.clip(0, _MOST_ALPHA)) ** (1 / self._siblings[node])
         to = way[:, None]
         return Gaussians(

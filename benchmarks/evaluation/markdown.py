@@ -11,7 +11,8 @@ from benchmarks.evaluation.measure import Row
 
 @dataclass(frozen=True)
 class Column:
-    """What of a row is shown, under which title and how: a format such as ".3f", or "count"."""
+    """What of a row is shown, under which title and how: a format such as ".3f", or
+    "count"."""
 
     title: str
     key: str

@@ -1,4 +1,5 @@
-"""What is measured: times of calls, errors of pictures, tolerances at equal counts, who a clip leaves out."""
+"""What is measured: times of calls, errors of pictures, tolerances at equal counts, who
+a clip leaves out."""
 
 from __future__ import annotations
 
@@ -22,11 +23,13 @@ from v3dg.select import select
 Row = dict[str, Any]
 
 COARSEST = 1e9
-"""Tolerance in px² of the coarsest cut that there is, as a number that JSON can hold."""
+"""Tolerance in px² of the coarsest cut that there is, as a number that JSON can hold.
+"""
 
 _WARM_UPS = 1
 _HALVINGS = 30
-# gsplat 1.5: a gaussian ends where it falls below 1/255, and at 3.33 standard deviations.
+# gsplat 1.5: a gaussian ends where it falls below 1/255, and at 3.33 standard
+# deviations.
 _MIN_ALPHA, _REACH_SIGMAS = 1 / 255, 3.33
 _FRUSTUM_MARGIN = 0.15  # of half the picture, to either side, on which the projection is linearised
 
@@ -47,7 +50,8 @@ class Time:
 
 
 def time_ms(call: Callable[[], Any], device: str, repeats: int) -> Time:
-    """Time single calls from an idle device to an idle device, after a warm-up; Python's share counts."""
+    """Time single calls from an idle device to an idle device, after a warm-up;
+    Python's share counts."""
     for _ in range(_WARM_UPS):
         call()
     times = times_ms(call, device, repeats)
@@ -92,10 +96,12 @@ def _flip_and_psnr(pair: tuple[Picture, Picture]) -> tuple[float, float]:
 
 
 class Judge(Judges):
-    """FLIP and PSNR of many pairs of pictures, on all cores; never while something is timed."""
+    """FLIP and PSNR of many pairs of pictures, on all cores; never while something is
+    timed."""
 
     def errors(self, pairs: Iterable[tuple[Picture, Picture]]) -> list[Row]:
-        """{"flip", "psnr"} of each (truth, picture); PSNR is None for equal pictures."""
+        """{"flip", "psnr"} of each (truth, picture); PSNR is None for equal
+        pictures."""
         return [
             {"flip": round(flip, 5), "psnr": round(psnr, 2) if math.isfinite(psnr) else None}
             for _, (flip, psnr) in self.measured(pairs, _flip_and_psnr)
@@ -103,7 +109,8 @@ class Judge(Judges):
 
 
 def tolerance_for(scene: Scene, camera: Camera, count: int) -> float:
-    """The tolerance at which at most `count` gaussians are selected; `COARSEST` where that is not enough."""
+    """The tolerance at which at most `count` gaussians are selected; `COARSEST` where
+    that is not enough."""
     if select(scene, camera, tolerance=COARSEST, device="cpu").num_gaussians > count:
         return COARSEST
     return select(scene, camera, budget=count, device="cpu").tolerance
@@ -127,10 +134,11 @@ def like(values: Any, array: Any) -> Any:
 
 
 def screen_radii(gaussians: Gaussians, camera: Camera) -> Any:
-    """(N,) px: half the larger side of the box in which gsplat 1.5 draws each gaussian; 0 outside of it.
+    """(N,) px: half the larger side of the box in which gsplat 1.5 draws each gaussian;
+    0 outside of it.
 
-    Its `radius_clip` leaves out what is not larger. It rounds radii up first; unrounded ones leave room for
-    any count, and to choose among what is of one size.
+    Its `radius_clip` leaves out what is not larger. It rounds radii up first; unrounded
+    ones leave room for any count, and to choose among what is of one size.
     """
     library = _device.library_of(gaussians.means)
     viewmat = like(camera.viewmat, gaussians.means)
@@ -144,17 +152,21 @@ def screen_radii(gaussians: Gaussians, camera: Camera) -> Any:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     axes = library.stack([library.stack(row, -1) for row in rows], -2)
-    halves = world_to_view @ (axes * gaussians.scales[:, None, :])  # covariance in the view: halves halvesᵀ
+    halves = world_to_view @ (
+        axes * gaussians.scales[:, None, :]
+    )  # covariance in the view: halves halvesᵀ
     centers, variances = [], []
     for axis, size, focal, principal in (
         (0, camera.width, camera.fx, camera.cx),
         (1, camera.height, camera.fy, camera.cy),
     ):
         margin = _FRUSTUM_MARGIN * size / focal
-        slope = (view[:, axis] / depth).clip(-principal / focal - margin, (size - principal) / focal + margin)
-        variance = (((halves[:, axis] - slope[:, None] * halves[:, 2]) * (focal / depth)[:, None]) ** 2).sum(
-            -1
+        slope = (view[:, axis] / depth).clip(
+            -principal / focal - margin, (size - principal) / focal + margin
         )
+        variance = (
+            ((halves[:, axis] - slope[:, None] * halves[:, 2]) * (focal / depth)[:, None]) ** 2
+        ).sum(-1)
         variances.append(variance)
         centers.append(focal * view[:, axis] / depth + principal)
     sigmas = (2 * library.log((gaussians.opacities / _MIN_ALPHA).clip(1))) ** 0.5

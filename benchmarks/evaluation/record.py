@@ -17,7 +17,8 @@ _LIBRARIES = ("numpy", "torch", "gsplat", "flip-evaluator")
 
 
 def provenance(device: str = "cpu") -> dict[str, Any]:
-    """Commit, command, processor, threads, instruction set, versions, and the GPU if that is the device."""
+    """Commit, command, processor, threads, instruction set, versions, and the GPU if
+    that is the device."""
     names = []
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -48,7 +49,8 @@ def _command() -> str:
 
 
 def _commit() -> str:
-    """Of the checkout that this file is in, "-dirty" if that was changed; elsewhere what V3DG_COMMIT says."""
+    """Of the checkout that this file is in, "-dirty" if that was changed; elsewhere
+    what V3DG_COMMIT says."""
     done = subprocess.run(
         ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"],
         capture_output=True,
@@ -66,10 +68,13 @@ def _version(library: str) -> str | None:
 
 
 def write(path: str | Path | None, result: dict[str, Any], device: str = "cpu") -> None:
-    """Write a result with its provenance as JSON, whole or not at all; to nowhere if `path` is None."""
+    """Write a result with its provenance as JSON, whole or not at all; to nowhere if
+    `path` is None."""
     if path is None:
         return
     path = Path(path)
     temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(json.dumps({**provenance(device), **result}, indent=1) + "\n", encoding="utf-8")
+    temporary.write_text(
+        json.dumps({**provenance(device), **result}, indent=1) + "\n", encoding="utf-8"
+    )
     temporary.replace(path)

@@ -1,4 +1,5 @@
-"""`python -m benchmarks report`: from recorded results to a short page, a page of all tables, and plots."""
+"""`python -m benchmarks report`: from recorded results to a short page, a page of all
+tables, and plots."""
 
 from __future__ import annotations
 
@@ -17,10 +18,12 @@ from v3dg.cli._common import Flag
 
 @dataclass
 class Report:
-    """Make two pages with plots of what `evaluate` has recorded: what it comes to, and all tables."""
+    """Make two pages with plots of what `evaluate` has recorded: what it comes to, and
+    all tables."""
 
     folders: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders with results of `evaluate`; the first one is what the pages begin with."""
+    """Folders with results of `evaluate`; the first one is what the pages begin with.
+    """
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("results.md")
     """Page to write: an overview, and where we win and lose."""
     tables: Annotated[Path, tyro.conf.arg(metavar="PATH")] = Path("evaluation.md")
@@ -30,10 +33,10 @@ class Report:
 
 
 HOW = (
-    "Error is FLIP (67 pixels per degree) and PSNR to the full scene at twice the resolution, box-averaged. "
-    "Times are medians of single frames after a warm-up, selection included, from an idle device to an idle "
-    "device; a picture is checked before its time counts. The JSON that a run writes has the spread and "
-    "every view."
+    "Error is FLIP (67 pixels per degree) and PSNR to the full scene at twice the resolution, "
+    "box-averaged. Times are medians of single frames after a warm-up, selection included, from an "
+    "idle device to an idle device; a picture is checked before its time counts. The JSON that a "
+    "run writes has the spread and every view."
 )
 
 
@@ -45,11 +48,14 @@ def read_results(folder: Path) -> dict[str, dict[str, Any]]:
     """
     paths = {name: folder / f"{name}.json" for name in NAMES}
     results = {
-        name: json.loads(path.read_text(encoding="utf-8")) for name, path in paths.items() if path.exists()
+        name: json.loads(path.read_text(encoding="utf-8"))
+        for name, path in paths.items()
+        if path.exists()
     }
     if not results:
         raise ValueError(
-            f"{folder}: expected results such as {NAMES[0]}.json; run `python -m benchmarks evaluate` first"
+            f"{folder}: expected results such as {NAMES[0]}.json; run `python -m benchmarks "
+            "evaluate` first"
         )
     return results
 
@@ -61,7 +67,9 @@ def page(folders: Sequence[Path], output: Path, tables: Path) -> str:
     """
     sections = [(folder, read_results(folder)) for folder in folders]
     # The first folder counts; the others for parts that it does not have.
-    measured = {name: (folder, r) for folder, results in reversed(sections) for name, r in results.items()}
+    measured = {
+        name: (folder, r) for folder, results in reversed(sections) for name, r in results.items()
+    }
     wins, losses = _sentences(measured, place(next(iter(sections[0][1].values()))))
     machines = [machine(list(results.values())) for _, results in sections]
     lines = [
@@ -83,8 +91,8 @@ def page(folders: Sequence[Path], output: Path, tables: Path) -> str:
         "",
         HOW,
         "",
-        "This page is written by `python -m benchmarks report` from recorded JSON, never by hand. It was "
-        f"measured on {'. What was not measured there was measured on '.join(machines)}.",
+        "This page is written by `python -m benchmarks report` from recorded JSON, never by hand. "
+        f"It was measured on {'. What was not measured there was measured on '.join(machines)}.",
     ]
     return "\n".join(lines) + "\n"
 
@@ -95,17 +103,26 @@ def _overview(measured: dict[str, tuple[Path, dict[str, Any]]], output: Path) ->
     if "composed" in measured:
         _, result = measured["composed"]
         composed = part("composed")
-        lines += ["", composed.overview(result), "", f"Drawn on {place(result)}. {composed.OVERVIEW}"]
+        lines += [
+            "",
+            composed.overview(result),
+            "",
+            f"Drawn on {place(result)}. {composed.OVERVIEW}",
+        ]
     if "tolerance" in measured:
         folder, result = measured["tolerance"]
         if (folder / "tolerance.png").exists():
             picture = Path(os.path.relpath(folder, output.parent), "tolerance.png").as_posix()
-            caption = f"Milliseconds a frame against FLIP on {place(result)}, a point for each tolerance."
+            caption = (
+                f"Milliseconds a frame against FLIP on {place(result)}, a point for each tolerance."
+            )
             lines += ["", f"![{part('tolerance').TITLE}]({picture})", "", caption]
     return lines
 
 
-def _sentences(measured: dict[str, tuple[Path, dict[str, Any]]], home: str) -> tuple[list[str], list[str]]:
+def _sentences(
+    measured: dict[str, tuple[Path, dict[str, Any]]], home: str
+) -> tuple[list[str], list[str]]:
     """Lists in Markdown of where we win and where we do not, in the order of parts."""
     wins: list[str] = []
     losses: list[str] = []
@@ -123,8 +140,8 @@ def tables_page(folders: Sequence[Path], output: Path) -> str:
     lines = [
         "# The evaluation",
         "",
-        "All tables of the evaluation, written by `python -m benchmarks report` from recorded JSON, never by "
-        "hand.",
+        "All tables of the evaluation, written by `python -m benchmarks report` from recorded "
+        "JSON, never by hand.",
         "",
         HOW,
     ]

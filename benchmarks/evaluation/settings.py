@@ -10,24 +10,30 @@ class Settings:
     """Sizes of an evaluation.
 
     Attributes:
-        asset_gaussians: Of the asset that the main scene is made of, where none is given.
+        asset_gaussians: Of the asset that the main scene is made of, where none is
+            given.
         instances: Of it in the main scene.
-        worlds: Instances and gaussians of an asset of the composed worlds beside the main scene.
+        worlds: Instances and gaussians of an asset of the composed worlds beside the
+            main scene.
         world_steps: Of the fit of their assets.
         size: Width and height of pictures in px.
-        elevations: Degrees above the horizon of the cameras of "composed"; other parts take the middle.
+        elevations: Degrees above the horizon of the cameras of "composed"; other parts
+            take the middle.
         directions: How many of the paper's four directions "composed" looks from.
         distances: Cameras a direction in "composed", and in "large".
         sweep_distances: Cameras of the one sweep on which the other parts compare.
-        judged_directions: Of how many directions FLIP is taken, which needs a second a picture.
+        judged_directions: Of how many directions FLIP is taken, which needs a second a
+            picture.
         repeats: Timed calls, of which the median counts ...
         composed_repeats: ... and in "composed", which has by far the most views.
-        steps: Of the fit, in "fit" and "levels"; the paper's \\*0 (nothing grown, nothing fitted) is added.
+        steps: Of the fit, in "fit" and "levels"; the paper's \\*0 (nothing grown,
+            nothing fitted) is added.
         tree_steps: Of the fit in "tree".
         large_copies: Of the asset that make the one large asset.
         large_steps: Of its fit.
         motion_frames: Of the zoom.
-        hierarchy_instances: In the scene that is compared with single gaussians in a hierarchy.
+        hierarchy_instances: In the scene that is compared with single gaussians in a
+            hierarchy.
         hard_gaussians: Of each hard asset.
         counts: Gaussians of which the operations are measured alone.
         close_views: From how many sides an asset is seen from near ...

@@ -1,9 +1,11 @@
-"""How steady pictures of a moving camera are: paths, and what changes between frames that should not.
+"""How steady pictures of a moving camera are: paths, and what changes between frames
+that should not.
 
-What a frame is off, less what the frame before it was off, is what an eye sees beside the motion: flicker,
-and levels that are replaced at once. A whole picture hides that, for what pops is small; so the worst tile
-counts. Of quicker motion the same is found along the motion: the last error is brought to where its place is
-seen now, by the depth of the picture. What pops, and nothing else, is the difference of two pictures from the
+What a frame is off, less what the frame before it was off, is what an eye sees beside
+the motion: flicker, and levels that are replaced at once. A whole picture hides that,
+for what pops is small; so the worst tile counts. Of quicker motion the same is found
+along the motion: the last error is brought to where its place is seen now, by the depth
+of the picture. What pops, and nothing else, is the difference of two pictures from the
 same place: with the cut of the frame, and with that of the frame before.
 """
 
@@ -30,7 +32,8 @@ _DRIFT = 5e-4  # of the distance, a frame: nothing else is seen to move
 _ZOOM = 5e-3
 _TURN = 5e-4  # rad a frame
 _SHAKE = 2e-3  # of the distance, to either side
-# Frames a wave of each of the two that make up a shaking hand, so that they do not meet.
+# Frames a wave of each of the two that make up a shaking hand, so that they do not
+# meet.
 _WAVES = (7.3, 11.9)
 _BOB, _STEP_FRAMES = 2e-3, 30.0  # of who walks: of the distance, up and down, and frames a step
 _COVERED = 0.9  # alpha from which on a pixel has a depth
@@ -65,7 +68,8 @@ class Path:
 def paths_from(first: Camera, target: Any, frames: int) -> list[Path]:
     """Ways to go from a camera that sees the target: so many frames each.
 
-    It stays where it is in the picture, but where the camera turns; that need not be the middle.
+    It stays where it is in the picture, but where the camera turns; that need not be
+    the middle.
     """
     away = first.position - target
     right, down = first.viewmat[0, :3], first.viewmat[1, :3]
@@ -99,10 +103,13 @@ def paths_from(first: Camera, target: Any, frames: int) -> list[Path]:
         "drift out": [moved(target + away * (1 + _DRIFT) ** k) for k in steps],
         "strafe": [moved(first.position + k * step, target + k * step) for k in steps],
         "orbit": [
-            moved(target + np.cos(_TURN * k) * away + np.sin(_TURN * k) * distance * right) for k in steps
+            moved(target + np.cos(_TURN * k) * away + np.sin(_TURN * k) * distance * right)
+            for k in steps
         ],
         "hand shake": [shaken(k) for k in steps],
-        "turn in place": [moved(first.position, target + k * _TURN * distance * right) for k in steps],
+        "turn in place": [
+            moved(first.position, target + k * _TURN * distance * right) for k in steps
+        ],
         "zoom": [moved(target + away * (1 - _ZOOM) ** k) for k in steps],
         "walk": [walked(k) for k in steps],
     }
@@ -112,20 +119,24 @@ def paths_from(first: Camera, target: Any, frames: int) -> list[Path]:
 
 
 def true_picture(subject: Any, camera: Camera, device: str, samples: int = SUPERSAMPLING) -> Any:
-    """(H, W, 3) of all gaussians, floats in [0, 1], of so many samples a side that it hardly flickers."""
+    """(H, W, 3) of all gaussians, floats in [0, 1], of so many samples a side that it
+    hardly flickers."""
     color = render(subject, camera.scaled(samples), tolerance=0.0, device=device).color
     return box_downsample(_device.to_host(color).clip(0, 1), samples)
 
 
 class Warp:
-    """Brings values of one picture to where their places are seen in another, by the depths of both."""
+    """Brings values of one picture to where their places are seen in another, by the
+    depths of both."""
 
     def __init__(self, before: Camera, after: Camera, images: tuple[Any, Any]) -> None:
         (depth_before, alpha_before), (depth, alpha) = (
             (_device.to_host(image.depth), _device.to_host(image.alpha)) for image in images
         )
         row, column = np.indices(depth.shape)
-        ray = np.stack([(column + 0.5 - after.cx) / after.fx, (row + 0.5 - after.cy) / after.fy], -1)
+        ray = np.stack(
+            [(column + 0.5 - after.cx) / after.fx, (row + 0.5 - after.cy) / after.fy], -1
+        )
         seen = depth[..., None] * np.concatenate([ray, np.ones((*depth.shape, 1))], -1)
         rotation, shift = after.viewmat[:3, :3], after.viewmat[:3, 3]
         place = (seen - shift) @ rotation
@@ -140,7 +151,8 @@ class Warp:
         self.is_valid &= np.abs(self(depth_before) - z) < _SAME_DEPTH * deep
 
     def __call__(self, values: Any) -> Any:
-        """(H, W, ...) values between those of the four nearest pixels; of no use where it is not valid."""
+        """(H, W, ...) values between those of the four nearest pixels; of no use where
+        it is not valid."""
         height, width = values.shape[:2]
         x, y = np.clip(self._x, 0, width - 1), np.clip(self._y, 0, height - 1)
         left, top = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
@@ -163,7 +175,8 @@ class Steadiness:
         self._mse: list[float] = []
 
     def add(self, picture: Any, truth: Any, warp: Warp | None = None) -> None:
-        """Take the next frame: (H, W, 3) floats in [0, 1], and how the last one comes to it."""
+        """Take the next frame: (H, W, 3) floats in [0, 1], and how the last one comes
+        to it."""
         error = _device.to_host(picture).clip(0, 1) - truth
         self._mse.append(float(np.square(error).mean()))
         if self._last is not None:
@@ -176,7 +189,8 @@ class Steadiness:
         self._last = error
 
     def row(self) -> Row:
-        """Root mean squares in 255ths: of whole pictures, and of the worst tile of each; PSNR in dB."""
+        """Root mean squares in 255ths: of whole pictures, and of the worst tile of
+        each; PSNR in dB."""
         row = {
             "rms": round(float(np.mean(self._whole)), 4),
             "tile_mean": round(float(np.mean(self._worst_tile)), 4),
@@ -192,7 +206,8 @@ class Steadiness:
 
 
 def tile_means(values: Any) -> Any:
-    """Means of (H, W) values over the tiles of a picture; those at its right and bottom may be smaller."""
+    """Means of (H, W) values over the tiles of a picture; those at its right and bottom
+    may be smaller."""
     starts = [np.arange(0, side, TILE_PX) for side in values.shape]
     sums = np.add.reduceat(np.add.reduceat(values, starts[0], axis=0), starts[1], axis=1)
     height, width = (
@@ -202,7 +217,8 @@ def tile_means(values: Any) -> Any:
 
 
 def worst_tile(change: Any) -> float:
-    """Of (H, W, 3) differences of colours in [0, 1]: root mean square of the worst tile, in 255ths."""
+    """Of (H, W, 3) differences of colours in [0, 1]: root mean square of the worst
+    tile, in 255ths."""
     return float(np.sqrt(tile_means(np.square(255.0 * change).mean(-1)).max()))
 
 
@@ -212,7 +228,9 @@ def changed_items(before: Selection, after: Selection) -> int:
         before.cluster_ids, after.cluster_ids
     ):
         return int((before.weights != after.weights).sum())
-    mine, other = ((cut.instance_ids.astype(np.int64) << 32) + cut.cluster_ids for cut in (before, after))
+    mine, other = (
+        (cut.instance_ids.astype(np.int64) << 32) + cut.cluster_ids for cut in (before, after)
+    )
     common, first, second = np.intersect1d(mine, other, assume_unique=True, return_indices=True)
     other_weights = int((before.weights[first] != after.weights[second]).sum())
     return len(before) + len(after) - 2 * len(common) + other_weights
@@ -275,10 +293,12 @@ def compare(
     along_motion: bool = True,
     samples: int = SUPERSAMPLING,
 ) -> list[Row]:
-    """Draw the frames of a path with several options of `render`: how steady they are, gaussians a frame.
+    """Draw the frames of a path with several options of `render`: how steady they are,
+    gaussians a frame.
 
     Args:
-        along_motion: Whether errors are followed, too, which draws all gaussians once more.
+        along_motion: Whether errors are followed, too, which draws all gaussians once
+            more.
         samples: Of the true pictures, a pixel's side.
     """
     scene = copy.copy(Scene.of(subject))

@@ -1,6 +1,8 @@
-"""Forward and backward on CUDA beside gsplat's, in one run: time, ratio, distance of the gradients.
+"""Forward and backward on CUDA beside gsplat's, in one run: time, ratio, distance of
+the gradients.
 
-With fewer gaussians in a smaller picture, both are also measured against float64 on the CPU.
+With fewer gaussians in a smaller picture, both are also measured against float64 on the
+CPU.
 """
 
 from __future__ import annotations
@@ -51,7 +53,9 @@ def main(config: Config) -> None:
 
 def compare(config: Config, count: int) -> dict[str, Any]:
     camera, gaussians, weights = inputs(config, count)
-    forward_ms, total_ms, gradients = measure(ours(config, camera), gaussians, weights, config.repeats)
+    forward_ms, total_ms, gradients = measure(
+        ours(config, camera), gaussians, weights, config.repeats
+    )
     _, _, again = measure(ours(config, camera), gaussians, weights, 1)
     row: dict[str, Any] = {
         "gaussians": count,
@@ -86,11 +90,15 @@ def errors_to_float64(config: Config, count: int) -> dict[str, dict[str, float]]
     draws = {"ours": ours(config, camera)}
     if config.gsplat:
         draws["gsplat"] = gsplats(config, camera, False)
-    return {name: relative_l2(gradients_of(draw, gaussians, weights), exact) for name, draw in draws.items()}
+    return {
+        name: relative_l2(gradients_of(draw, gaussians, weights), exact)
+        for name, draw in draws.items()
+    }
 
 
 def inputs(config: Config, count: int) -> tuple[Camera, v3dg.Gaussians, tuple[Any, ...]]:
-    """A camera, gaussians, and the random weights of colour and alpha whose weighted sum is the loss."""
+    """A camera, gaussians, and the random weights of colour and alpha whose weighted
+    sum is the loss."""
     camera = Camera.look_at((0, 0, 0), (0, 1, 0), width=config.width, height=config.height)
     gaussians = like_trained(count, camera, gpu.DEVICE, sh_degree=config.sh_degree)
     generator = torch.Generator(gpu.DEVICE).manual_seed(1)
@@ -108,7 +116,9 @@ def ours(config: Config, camera: Camera) -> Draw:
 
 
 def gsplats(config: Config, camera: Camera, packed: bool) -> Draw:
-    return lambda gaussians: gpu.gsplat_picture(gaussians, camera, packed=packed, eps2d=config.filter_px2)
+    return lambda gaussians: gpu.gsplat_picture(
+        gaussians, camera, packed=packed, eps2d=config.filter_px2
+    )
 
 
 def measure(

@@ -1,8 +1,10 @@
-"""Build bundles: seconds and GPU memory on each device, beside the error of the picture that they give.
+"""Build bundles: seconds and GPU memory on each device, beside the error of the picture
+that they give.
 
-Parts: "default" and "paper" build the asset with our settings and the paper's; "split" orders the points of
-many copies of it, and "large" builds them as one asset. With a layout of instances and its true picture, the
-first two are also drawn at several numbers of gaussians in the frustum.
+Parts: "default" and "paper" build the asset with our settings and the paper's; "split"
+orders the points of many copies of it, and "large" builds them as one asset. With a
+layout of instances and its true picture, the first two are also drawn at several
+numbers of gaussians in the frustum.
 """
 
 from __future__ import annotations
@@ -47,7 +49,8 @@ class Config:
     """The true picture of its camera."""
     camera: int = 59
     in_frustum: tuple[float, ...] = (2.9e6, 5.7e6, 11.5e6, 22.9e6)
-    """How many gaussians to draw, as far as the bundle goes down; the tolerance is searched."""
+    """How many gaussians to draw, as far as the bundle goes down; the tolerance is
+    searched."""
     repeats: int = 3
     output: str | None = None
 
@@ -74,7 +77,8 @@ def main(config: Config) -> None:
 def build(
     asset: v3dg.Gaussians, settings: BuildConfig, device: str, repeats: int
 ) -> tuple[dict[str, Any], Bundle]:
-    """Median over the repeats; the first run of a process also loads the kernels, so there is one more."""
+    """Median over the repeats; the first run of a process also loads the kernels, so
+    there is one more."""
     seconds = []
     with gpu.PeakMemory() as peak:
         for _ in range(repeats + (repeats > 1)):
@@ -93,7 +97,10 @@ def build(
 
 
 def split(means: Any, device: str, repeats: int) -> dict[str, Any]:
-    ends, depth = np.array([0, len(means)]), _core.num_halvings(len(means), BuildConfig().cluster_size)
+    ends, depth = (
+        np.array([0, len(means)]),
+        _core.num_halvings(len(means), BuildConfig().cluster_size),
+    )
     points = torch.from_numpy(means).to(gpu.DEVICE) if device == "cuda" else means
     seconds = []
     with gpu.PeakMemory() as peak:
@@ -116,7 +123,8 @@ def split(means: Any, device: str, repeats: int) -> dict[str, Any]:
 
 
 def pictures(bundle: Bundle, config: Config) -> list[dict[str, Any]]:
-    """FLIP and PSNR of the layout from this bundle, by the number of gaussians in the frustum."""
+    """FLIP and PSNR of the layout from this bundle, by the number of gaussians in the
+    frustum."""
     if config.layout is None or config.truth is None:
         return []
     scene, cameras = read_layout(config.layout, bundle)

@@ -1,4 +1,5 @@
-"""How fast assets are cut into clusters, bounded, halved for a coarser level, and gathered from instances."""
+"""How fast assets are cut into clusters, bounded, halved for a coarser level, and
+gathered from instances."""
 
 from __future__ import annotations
 
@@ -68,7 +69,8 @@ def placements(leaf_offset: np.ndarray, config: Config) -> dict[str, Any]:
 def operations(
     gaussians: v3dg.Gaussians, config: Config
 ) -> dict[str, tuple[int, Callable[[], tuple[Any, ...]]]]:
-    """What is timed, by name: how many gaussians go in, and a call that returns arrays."""
+    """What is timed, by name: how many gaussians go in, and a call that returns
+    arrays."""
     num = len(gaussians)
     ends, depth = np.array([0, num]), _core.num_halvings(num, config.cluster_size)
     order, leaf_offset = _core.median_split(gaussians.means, ends, depth)
@@ -77,7 +79,9 @@ def operations(
     halved = np.concatenate([[0], np.cumsum((np.diff(offset) + 1) // 2)])
     one = gaussians.subset(slice(0, min(num, config.group_size)))
     if config.device == "cpu":
-        spheres = np.concatenate([gaussians.means, gaussians.scales.max(axis=1, keepdims=True)], axis=1)
+        spheres = np.concatenate(
+            [gaussians.means, gaussians.scales.max(axis=1, keepdims=True)], axis=1
+        )
     else:
         import torch
 

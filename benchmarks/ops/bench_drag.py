@@ -1,8 +1,9 @@
-"""The viewer under a mouse in Chromium on the same cores: milliseconds from a drag's move to its answer.
+"""The viewer under a mouse in Chromium on the same cores: milliseconds from a drag's
+move to its answer.
 
-That is the frame that shows the first picture of the new camera. The server is a process of its own, `v3dg
-view`. Drags begin while the picture at rest is being refined, or has just come. Needs playwright, and
-Chromium where PATH finds it.
+That is the frame that shows the first picture of the new camera. The server is a
+process of its own, `v3dg view`. Drags begin while the picture at rest is being refined,
+or has just come. Needs playwright, and Chromium where PATH finds it.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ class Config:
     drags: int = 8
     """From each camera."""
     webgl: bool = False
-    """Have Chromium compose the page with WebGL in software; else it does so without."""
+    """Have Chromium compose the page with WebGL in software; else it does so without.
+    """
     output: str | None = None
     """JSON file for the result."""
 
@@ -54,13 +56,27 @@ def main(config: Config) -> None:
     from playwright.sync_api import sync_playwright
 
     without = ["--disable-gpu", *(flag for flag in chromium.ARGUMENTS if "swiftshader" not in flag)]
-    command = [sys.executable, "-m", "v3dg", "view", str(config.scene), "--no-browser", "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server, sync_playwright() as play:
+    command = [
+        sys.executable,
+        "-m",
+        "v3dg",
+        "view",
+        str(config.scene),
+        "--no-browser",
+        "--port",
+        "0",
+    ]
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server,
+        sync_playwright() as play,
+    ):
         try:
             arguments = chromium.ARGUMENTS if config.webgl else without
             browser = play.chromium.launch(executable_path=chromium.PROGRAM, args=arguments)
             page = browser.new_context(viewport={"width": 1600, "height": 900}).new_page()
-            told = next(found for line in server.stdout or [] if (found := re.search(r"http://\S+", line)))
+            told = next(
+                found for line in server.stdout or [] if (found := re.search(r"http://\S+", line))
+            )
             page.goto(told[0])
             page.wait_for_selector("body[data-state=ready]", timeout=60_000)
             page.evaluate(_NOTE)
@@ -75,7 +91,8 @@ def main(config: Config) -> None:
 
 
 def drags_from(page: Any, camera: int, drags: int) -> dict[str, Any]:
-    """Answers to drags from a camera of the file, gaps between later pictures, widths of the first ones."""
+    """Answers to drags from a camera of the file, gaps between later pictures, widths
+    of the first ones."""
     page.evaluate(f"viewer.lookThrough({camera})")
     page.wait_for_timeout(2500)
     answers, gaps, widths = [], [], []

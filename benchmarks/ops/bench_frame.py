@@ -1,7 +1,9 @@
-"""Our CUDA frame beside gsplat's, in one run: time, ratio, and how far the two pictures are apart.
+"""Our CUDA frame beside gsplat's, in one run: time, ratio, and how far the two pictures
+are apart.
 
-Scenes: a layout of instances in full detail (gsplat gets all of them in the world), random gaussians of the
-sizes that training leaves, and one asset that fills the picture.
+Scenes: a layout of instances in full detail (gsplat gets all of them in the world),
+random gaussians of the sizes that training leaves, and one asset that fills the
+picture.
 """
 
 from __future__ import annotations
@@ -60,14 +62,18 @@ def main(config: Config) -> None:
         row["gaussians_in_frustum"] = ours().stats.gaussians_in_frustum
         row["frame_ms"] = round(time_ms(ours, gpu.DEVICE, config.repeats).median, 3)
         if config.gsplat:
-            row.update(beside_gsplat(row["frame_ms"], ours().color, gaussians, camera, config.repeats))
+            row.update(
+                beside_gsplat(row["frame_ms"], ours().color, gaussians, camera, config.repeats)
+            )
         print(row, flush=True)
         rows.append(row)
 
     asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
     if config.layout is not None:
         # One level is all that is drawn.
-        bundle = build_bundle(asset, config=BuildConfig(min_clusters=1 << 30), progress=False, device="cpu")
+        bundle = build_bundle(
+            asset, config=BuildConfig(min_clusters=1 << 30), progress=False, device="cpu"
+        )
         scene, cameras = read_layout(config.layout, bundle)
         placed = gpu.placed_gaussians(scene)
         for index in config.cameras:
@@ -97,7 +103,9 @@ def beside_gsplat(
     def peer(packed: bool) -> Callable[[], Any]:
         return lambda: gpu.gsplat_picture(gaussians, camera, packed=packed)
 
-    packed_ms, unpacked_ms = (time_ms(peer(packed), gpu.DEVICE, repeats).median for packed in (True, False))
+    packed_ms, unpacked_ms = (
+        time_ms(peer(packed), gpu.DEVICE, repeats).median for packed in (True, False)
+    )
     error = gpu.picture_error(color, peer(True)()[0])
     torch.cuda.empty_cache()
     return {

@@ -1,7 +1,9 @@
-"""Scenes of many instances on a GPU: frames beside gsplat's, error, memory, movement, budgets.
+"""Scenes of many instances on a GPU: frames beside gsplat's, error, memory, movement,
+budgets.
 
-Two parts: a layout of instances of one asset, with a range of its cameras, and fields of very many instances
-in view at once, whose error is measured on crops, since nothing draws all of them in full.
+Two parts: a layout of instances of one asset, with a range of its cameras, and fields
+of very many instances in view at once, whose error is measured on crops, since nothing
+draws all of them in full.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ from v3dg.render import Renderer
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
 
-# An instance of a field can be smaller than a pixel, and its gaussians are not filtered.
+# An instance of a field can be smaller than a pixel, and its gaussians are not
+# filtered.
 _CROP_SUPERSAMPLING = 16
 _STEP = 0.005
 
@@ -51,7 +54,8 @@ class Config:
     fields: tuple[int, ...] = (100_000, 2_000_000)
     """Instances of each field."""
     crops: int = 4
-    """Crops of a field, each of 64 x 36 px, on which it is compared with all of its gaussians."""
+    """Crops of a field, each of 64 x 36 px, on which it is compared with all of its
+    gaussians."""
     repeats: int = 11
     refine: int = 0
     """Steps by which the levels are refined together, too."""
@@ -83,7 +87,9 @@ def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge
     runs.append(frames(scene, cameras, {"budget": config.budget}, config.repeats))
     moving = movement(scene, cameras[-1], config)
     flown = [flight(scene, cameras, {"tolerance": t}, config.repeats) for t in config.tolerances]
-    for (row, _), gigabytes in zip(runs[:-1], gigabytes_alone(scene.bundles[0], config), strict=True):
+    for (row, _), gigabytes in zip(
+        runs[:-1], gigabytes_alone(scene.bundles[0], config), strict=True
+    ):
         row["gigabytes_alone"] = gigabytes
     truths = [draw_truth(scene, camera, gpu.DEVICE) for camera in cameras]
     peer_ms, peer_pictures = gsplat(scene, cameras, config) if config.gsplat else ([], [])
@@ -93,10 +99,18 @@ def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge
         row |= mean_of(errors, "flip", "psnr")
         row["flip_of_each"] = [e["flip"] for e in errors]
         if peer_ms:
-            ratios = [ours / peer for ours, peer in zip(row["frame_ms_of_each"], peer_ms, strict=True)]
+            ratios = [
+                ours / peer for ours, peer in zip(row["frame_ms_of_each"], peer_ms, strict=True)
+            ]
             row["worst_ratio_to_gsplat"] = round(max(ratios), 4)
         print({k: v for k, v in row.items() if not k.endswith("of_each")}, flush=True)
-        print("  farthest:", row["frame_ms_of_each"][-1], "ms, FLIP", row["flip_of_each"][-1], flush=True)
+        print(
+            "  farthest:",
+            row["frame_ms_of_each"][-1],
+            "ms, FLIP",
+            row["flip_of_each"][-1],
+            flush=True,
+        )
         rows.append(row)
     about: Row = {"instances": len(scene), "cameras": config.cameras}
     result: Row = {**about, "frames": rows, "moving": moving, "flights": flown}
@@ -116,7 +130,8 @@ def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge
 def frames(
     scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], repeats: int
 ) -> tuple[Row, list[Picture]]:
-    """Every camera, near to far, with one renderer: as a flight through the scene finds it."""
+    """Every camera, near to far, with one renderer: as a flight through the scene finds
+    it."""
     ms, device_ms, select_ms, counts = [], [], [], []
     renderer, gigabytes = drawn_before(scene, cameras, options, repeats)
     for camera in cameras:
@@ -131,7 +146,8 @@ def frames(
         device_ms.append(statistics.median(s.select_ms + s.draw_ms for s in stats))
         select_ms.append(statistics.median(s.select_ms for s in stats))
         counts.append(stats[-1].gaussians_in_frustum)
-    # Not before, for what a picture takes beside its frame is not the renderer's memory.
+    # Not before, for what a picture takes beside its frame is not the renderer's
+    # memory.
     pictures = [to_8bit(renderer.render(camera, **options).color) for camera in cameras]
     row = {
         **options,
@@ -150,7 +166,8 @@ def frames(
 def drawn_before(
     scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], repeats: int
 ) -> tuple[Renderer, float]:
-    """A renderer that has drawn from every camera, and the most memory that took; no frame is timed then."""
+    """A renderer that has drawn from every camera, and the most memory that took; no
+    frame is timed then."""
     with gpu.PeakMemory() as peak:
         renderer = Renderer(scene, device=gpu.DEVICE)
         for camera in cameras:
@@ -160,7 +177,8 @@ def drawn_before(
 
 
 def gigabytes_alone(bundle: v3dg.Bundle, config: Config) -> list[float]:
-    """Of each tolerance, what a process takes on the device that draws the layout and has built nothing."""
+    """Of each tolerance, what a process takes on the device that draws the layout and
+    has built nothing."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "levels.v3dg"
         bundle.write(path)
@@ -177,12 +195,14 @@ def _drawing_gigabytes(path: Path, config: Config, tolerance: float) -> float:
 
 
 def flight(scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], repeats: int) -> Row:
-    """Each camera on its way to the side, by 0.5 % of its distance to the middle of the scene a frame."""
+    """Each camera on its way to the side, by 0.5 % of its distance to the middle of the
+    scene a frame."""
     renderer, middle = Renderer(scene, device=gpu.DEVICE), scene.positions.mean(axis=0)
     ms = []
     for camera in cameras:
         step = _STEP * float(np.linalg.norm(camera.position - middle))
-        # Made before, as all cameras are: a frame goes from the call to the finished picture.
+        # Made before, as all cameras are: a frame goes from the call to the finished
+        # picture.
         views = iter([_aside(camera, step * k) for k in range(3 + repeats)])
 
         def frame(views: Iterator[Camera] = views) -> None:
@@ -199,7 +219,8 @@ def _aside(camera: Camera, distance: float) -> Camera:
 
 
 def movement(scene: Scene, camera: Camera, config: Config) -> Row:
-    """What it costs that every instance has another place and rotation in every frame."""
+    """What it costs that every instance has another place and rotation in every
+    frame."""
     renderer = Renderer(scene, device=gpu.DEVICE)
     tolerance = config.tolerances[-1]
     host = tuple(np.array(a) for a in (scene.positions, scene.quaternions, scene.scales))
@@ -226,7 +247,9 @@ def movement(scene: Scene, camera: Camera, config: Config) -> Row:
     return row
 
 
-def gsplat(scene: Scene, cameras: Sequence[Camera], config: Config) -> tuple[list[float], list[Picture]]:
+def gsplat(
+    scene: Scene, cameras: Sequence[Camera], config: Config
+) -> tuple[list[float], list[Picture]]:
     placed = gpu.placed_gaussians(scene)
     ms, pictures = [], []
     with torch.no_grad():

@@ -76,9 +76,15 @@ def main(config: Config) -> None:
         report["save_peak_over_file"] = save_bytes / file_bytes
         report["load_peak_over_file"] = load_bytes / file_bytes
         back = v3dg.read_asset(path)
-        report["largest_relative_scale_error"] = float(np.max(np.abs(back.scales / gaussians.scales - 1)))
-        report["largest_opacity_error"] = float(np.max(np.abs(back.opacities - gaussians.opacities)))
-        if not np.array_equal(back.sh, gaussians.sh) or not np.array_equal(back.means, gaussians.means):
+        report["largest_relative_scale_error"] = float(
+            np.max(np.abs(back.scales / gaussians.scales - 1))
+        )
+        report["largest_opacity_error"] = float(
+            np.max(np.abs(back.opacities - gaussians.opacities))
+        )
+        if not np.array_equal(back.sh, gaussians.sh) or not np.array_equal(
+            back.means, gaussians.means
+        ):
             raise SystemExit("what was read is not what was written")
         del back
         for name, run in (

@@ -1,4 +1,5 @@
-"""One asset that fills the picture: frames a second, stages of a frame, and its error to double precision."""
+"""One asset that fills the picture: frames a second, stages of a frame, and its error
+to double precision."""
 
 from __future__ import annotations
 
@@ -40,7 +41,9 @@ def main(config: Config) -> None:
     look = {"filter_px2": 0.0, "antialiased": False, "background": [0.0] * 3}
     options = {**look, "with_depth": False, "keep_tape": False}
     rows = gaussians.rows
-    in_double = _core.Rows(*(getattr(gaussians, f.name).astype(np.float64) for f in fields(gaussians)))
+    in_double = _core.Rows(
+        *(getattr(gaussians, f.name).astype(np.float64) for f in fields(gaussians))
+    )
     times, stages = [], []
     for _ in range(config.repeats + 3):
         start = time.perf_counter()
@@ -57,7 +60,9 @@ def main(config: Config) -> None:
         "frame_ms_fastest": round(1e3 * min(times), 2),
         "frames_per_second": round(1 / median, 1),
         **{
-            f"{stage}_ms": round(1e3 * statistics.median(s[f"{stage}_seconds"] for s in stages[3:]), 2)
+            f"{stage}_ms": round(
+                1e3 * statistics.median(s[f"{stage}_seconds"] for s in stages[3:]), 2
+            )
             for stage in ("project", "bin", "rasterize")
         },
         "records": counts["records"],

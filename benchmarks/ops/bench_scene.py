@@ -1,6 +1,8 @@
-"""A layout of many instances from a bundle: Gaussians, time and error of a frame, for several tolerances.
+"""A layout of many instances from a bundle: Gaussians, time and error of a frame, for
+several tolerances.
 
-Truth is a picture given by path, or the full asset drawn at twice the size and box-averaged.
+Truth is a picture given by path, or the full asset drawn at twice the size and
+box-averaged.
 """
 
 from __future__ import annotations
@@ -48,7 +50,10 @@ def main(config: Config) -> None:
         )
     rows = []
     for tolerance in config.tolerances:
-        frames = [render(scene, camera, tolerance=tolerance, device="cpu") for _ in range(config.repeats + 1)]
+        frames = [
+            render(scene, camera, tolerance=tolerance, device="cpu")
+            for _ in range(config.repeats + 1)
+        ]
         stats = [frame.stats for frame in frames[1:]]
         color = np.round(np.clip(frames[-1].color, 0, 1) * 255) / np.float32(255)
         row = {

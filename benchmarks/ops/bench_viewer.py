@@ -1,7 +1,9 @@
-"""The viewer under a mouse: milliseconds from a camera's move to the picture that answers it.
+"""The viewer under a mouse: milliseconds from a camera's move to the picture that
+answers it.
 
-A client of our own speaks the browser's protocol over a socket of this machine, so all but the browser's own
-work is measured. Each drag orbits the scene, and begins while the picture at rest is being refined.
+A client of our own speaks the browser's protocol over a socket of this machine, so all
+but the browser's own work is measured. Each drag orbits the scene, and begins while the
+picture at rest is being refined.
 """
 
 from __future__ import annotations
@@ -56,7 +58,9 @@ def main(config: Config) -> None:
             for place in config.cameras:
                 name, camera = list(cameras.items())[place]
                 view = View.of_camera(camera)
-                rows.append({"camera": name, **drag_around(browser, view, scene_view.center, config, rng)})
+                rows.append(
+                    {"camera": name, **drag_around(browser, view, scene_view.center, config, rng)}
+                )
                 print(rows[-1], flush=True)
     finally:
         site.close()
@@ -72,7 +76,9 @@ def drag_around(
     browser.look(view, config.size)
     settle(browser, config.size)
     for _ in range(config.drags):
-        browser.look(turned(eye, target, angle, view), config.size)  # whose refinement the drag interrupts
+        browser.look(
+            turned(eye, target, angle, view), config.size
+        )  # whose refinement the drag interrupts
         until = time.perf_counter() + rng.uniform(0.3, 1.5)
         browser.pictures(until)
         begin = last = time.perf_counter()
@@ -112,7 +118,9 @@ def turned(eye: np.ndarray, target: np.ndarray, angle: float, view: View) -> Vie
 
 
 def settle(browser: Tab, size: tuple[int, int]) -> None:
-    while not any(picture.width == size[0] for _, picture in browser.pictures(time.perf_counter() + 1.0)):
+    while not any(
+        picture.width == size[0] for _, picture in browser.pictures(time.perf_counter() + 1.0)
+    ):
         pass
 
 

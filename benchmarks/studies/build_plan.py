@@ -1,7 +1,9 @@
-"""What a build of so many gaussians needs, computed from its plan: nothing is built, and no time is told.
+"""What a build of so many gaussians needs, computed from its plan: nothing is built,
+and no time is told.
 
-Sizes are in bytes. `disk` is what is on it at once; `read` and `written` is all of it, without what a build
-that is gone on with reads again. `host` is without the interpreter and its libraries, about 0.1 GB.
+Sizes are in bytes. `disk` is what is on it at once; `read` and `written` is all of it,
+without what a build that is gone on with reads again. `host` is without the interpreter
+and its libraries, about 0.1 GB.
 """
 
 from __future__ import annotations
@@ -48,7 +50,9 @@ def needs(num_gaussians: int, sh_degree: int, memory: str) -> dict[str, Any]:
     gaussian, num_low = gaussian_bytes(sh_degree), len(units[0].levels)
     records = [record_bytes(level.num_clusters, level.num_groups) for level in plan.levels]
     num_pages = plan.first_page[-1]
-    journal = sum(records) + 16 * num_pages + 24 * (len(units) * num_low + len(plan.levels) - num_low)
+    journal = (
+        sum(records) + 16 * num_pages + 24 * (len(units) * num_low + len(plan.levels) - num_low)
+    )
     kept = range(config.target_of(num_low) if num_low < len(plan.levels) else num_low - 1, num_low)
     top = sum(plan.levels[number].num_gaussians for number in kept) * gaussian
     pages = int(np.diff(file.run(0, num_pages).places).sum())
@@ -71,8 +75,12 @@ def needs(num_gaussians: int, sh_degree: int, memory: str) -> dict[str, Any]:
         "scratch": scratch_bytes(num_gaussians, sh_degree) if is_sorted else 0,
         "disk": file.num_bytes + journal + (input_bytes if is_sorted else 0),
         "sorting_passes": passes if is_sorted else 0,
-        "written": file.num_bytes + journal + is_sorted * num_gaussians * (gaussian + 20 + 16 * passes),
-        "read": input_bytes + top + is_sorted * (2 * input_bytes + num_gaussians * (24 + 64 * passes)),
+        "written": file.num_bytes
+        + journal
+        + is_sorted * num_gaussians * (gaussian + 20 + 16 * passes),
+        "read": input_bytes
+        + top
+        + is_sorted * (2 * input_bytes + num_gaussians * (24 + 64 * passes)),
         "a_unit": a_unit,
         "a_task": len(pickle.dumps(units[0])),
         "a_result": (sum(records[:num_low]) + 16 * plan.first_page[num_low]) // len(units),

@@ -1,10 +1,12 @@
-"""Frames drawn from codes beside frames drawn from float32 rows, on a GPU; docs/notes/codecs.md has results.
+"""Frames drawn from codes beside frames drawn from float32 rows, on a GPU;
+docs/notes/codecs.md has results.
 
     python -m benchmarks.studies.code_frames donut.ply donutsea.json NAME=OTHER.ply
 
-For the scene and, alone, for each asset: bytes on the GPU for each stored gaussian, frame times by turns (of
-the device and of the wall clock), times of the project stage, whether pictures from codes have the bits of
-pictures of a float32 bundle that holds the decoded rows, and how far they are from those of what was built.
+For the scene and, alone, for each asset: bytes on the GPU for each stored gaussian,
+frame times by turns (of the device and of the wall clock), times of the project stage,
+whether pictures from codes have the bits of pictures of a float32 bundle that holds the
+decoded rows, and how far they are from those of what was built.
 """
 
 from __future__ import annotations
@@ -94,7 +96,9 @@ def project_ms(renderer, camera, options):
             renderer.render(camera, **options).stats  # noqa: B018
         torch.cuda.synchronize()
     total = sum(
-        e.time_range.elapsed_us() for e in trace.events() if "project" in e.name and "kernel" in e.name
+        e.time_range.elapsed_us()
+        for e in trace.events()
+        if "project" in e.name and "kernel" in e.name
     )
     return total / frames / 1e3
 
@@ -128,7 +132,9 @@ def compared(subjects, cameras, options, rounds):
                 "device_ms": {name: float(np.median(t)) for name, t in device.items()},
                 "wall_ms": {name: float(np.median(t)) for name, t in wall.items()},
                 "ratio": float(np.median(device["quantized"] / device["float32"])),
-                "project_ms": {name: project_ms(renderers[name], camera, options) for name in times},
+                "project_ms": {
+                    name: project_ms(renderers[name], camera, options) for name in times
+                },
                 "psnr_to_float32": None if mse == 0 else -10 * np.log10(mse),
                 "most_difference": float((color["quantized"] - color["float32"]).abs().max()),
                 "same_bits_as_decoded": equal,
@@ -138,13 +144,19 @@ def compared(subjects, cameras, options, rounds):
 
 
 def views_of(gaussians):
-    """Cameras around an asset, at 1, 2.5 and 8 of the radii that hold 9 of 10 gaussians."""
+    """Cameras around an asset, at 1, 2.5 and 8 of the radii that hold 9 of 10
+    gaussians."""
     means = np.asarray(gaussians.means, np.float64)
     centre = np.median(means, axis=0)
     radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.9))
     return [
         v3dg.Camera.look_at(
-            centre + d * radius * np.array([0.3, -1, 0.4]), centre, (0, 0, 1), 0.9, width=1920, height=1080
+            centre + d * radius * np.array([0.3, -1, 0.4]),
+            centre,
+            (0, 0, 1),
+            0.9,
+            width=1920,
+            height=1080,
         )
         for d in (1, 2.5, 8)
     ]
@@ -185,7 +197,9 @@ def main(config):
             "ratio": float(np.median([r["ratio"] for r in rows])),
             "views": rows,
         }
-    report["scene"]["all leaves"] = compared(scene_of, views[-1:], {"tolerance": 1e-6}, config.rounds)
+    report["scene"]["all leaves"] = compared(
+        scene_of, views[-1:], {"tolerance": 1e-6}, config.rounds
+    )
     one = Scene()
     one.add(kinds["float32"], positions=(0.0, 0, 0))
     one.add(kinds["quantized"], positions=(0.5, 0, 0))

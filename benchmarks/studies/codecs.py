@@ -1,11 +1,14 @@
-"""What a bundle's codec costs in bytes and in pictures; docs/notes/codecs.md has results.
+"""What a bundle's codec costs in bytes and in pictures; docs/notes/codecs.md has
+results.
 
     python -m benchmarks.studies.codecs --up 0 -1 0 --assets angel.sog st-peter.sog
 
-Each asset, or the part of it that is nearest to its middle, is built with each codec. Pictures of bundles are
-drawn at the default tolerance from four sides at four distances. `psnr` compares the float32 bundle,
-converted, with itself: the codec's error alone. `flip` is that to the whole asset, drawn with several samples
-a pixel, of pictures of 8 bits: of the bundle that was built with each codec, and of the converted one.
+Each asset, or the part of it that is nearest to its middle, is built with each codec.
+Pictures of bundles are drawn at the default tolerance from four sides at four
+distances. `psnr` compares the float32 bundle, converted, with itself: the codec's error
+alone. `flip` is that to the whole asset, drawn with several samples a pixel, of
+pictures of 8 bits: of the bundle that was built with each codec, and of the converted
+one.
 """
 
 from __future__ import annotations
@@ -59,7 +62,8 @@ def cameras_of(
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     side /= np.linalg.norm(side)
     eyes = (
-        centre + distance * radius * (np.cos(a) * side + np.sin(a) * np.cross(axis, side) + 0.3 * axis)
+        centre
+        + distance * radius * (np.cos(a) * side + np.sin(a) * np.cross(axis, side) + 0.3 * axis)
         for a in np.pi / 2 * (np.arange(4) + 0.2)
     )
     size = {"width": WIDTH * samples, "height": HEIGHT * samples}
@@ -88,7 +92,10 @@ def measure(asset: v3dg.Gaussians, options: Config, folder: Path) -> dict[str, A
         bundle = v3dg.build_bundle(asset, config=config, progress=False, codec=codec)
         bundle.write(folder / codec)
         leaves = len(bundle.level_gaussians(0))
-        bundles[codec], bytes_a_leaf[codec] = bundle, round((folder / codec).stat().st_size / leaves, 2)
+        bundles[codec], bytes_a_leaf[codec] = (
+            bundle,
+            round((folder / codec).stat().st_size / leaves, 2),
+        )
     kept = bundles["float32"]
     result: dict[str, Any] = {"leaves": leaves, "sh_degree": asset.sh_degree, "bytes": bytes_a_leaf}
     for distance in DISTANCES:
@@ -102,7 +109,9 @@ def measure(asset: v3dg.Gaussians, options: Config, folder: Path) -> dict[str, A
             drawn[f"{codec}, converted"] = pictures(same, cameras)
             told["psnr"][codec] = mean_psnr(drawn[kept.codec], drawn[f"{codec}, converted"])
         told["flip"] = {how: mean_flip(truths, tests) for how, tests in drawn.items()}
-        result[f"{distance:g} radii"] = told | {"drawn": v3dg.select(kept, cameras[0]).num_gaussians}
+        result[f"{distance:g} radii"] = told | {
+            "drawn": v3dg.select(kept, cameras[0]).num_gaussians
+        }
     return result
 
 

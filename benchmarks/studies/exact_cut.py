@@ -1,4 +1,5 @@
-"""Count how often a path from a leaf to a root has not exactly one selected cluster: it must be never.
+"""Count how often a path from a leaf to a root has not exactly one selected cluster: it
+must be never.
 
 What a trial is, and how it is counted, is in tests/support/exact_cut.py.
 """
@@ -23,9 +24,13 @@ def main(arguments=None):
     parser.add_argument("--trials", type=int, default=10_000_000)
     parser.add_argument("--bundle", type=Path, help="a .v3dg file; random trees if not given")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--partial", action="store_true", help="of random pages, closed towards the root")
+    parser.add_argument(
+        "--partial", action="store_true", help="of random pages, closed towards the root"
+    )
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
-    parser.add_argument("--fades", action="store_true", help="weights of random fades have to add up to 1")
+    parser.add_argument(
+        "--fades", action="store_true", help="weights of random fades have to add up to 1"
+    )
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args(arguments)
 

@@ -1,8 +1,10 @@
-"""Does a fade between levels remove pops? Bundles on slow paths, beside the hard cut and all gaussians.
+"""Does a fade between levels remove pops? Bundles on slow paths, beside the hard cut
+and all gaussians.
 
-The hard cut is drawn twice: at the same tolerance, and at the lower one at which it has as many gaussians as
-the fade. So is a cut that stays as it is in the middle of the path: what it flickers is no pop, and no fade
-can be steadier. docs/fades.md is about the result.
+The hard cut is drawn twice: at the same tolerance, and at the lower one at which it has
+as many gaussians as the fade. So is a cut that stays as it is in the middle of the
+path: what it flickers is no pop, and no fade can be steadier. docs/fades.md is about
+the result.
 """
 
 from __future__ import annotations
@@ -33,16 +35,24 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("bundles", nargs="+", type=Path, help=".v3dg files, each as PATH or PATH:UP (-y, z)")
+    parser.add_argument(
+        "bundles", nargs="+", type=Path, help=".v3dg files, each as PATH or PATH:UP (-y, z)"
+    )
     parser.add_argument("--frames", type=int, default=60, help="of each path")
     parser.add_argument("--side", type=int, default=1, help="of a field of copies; 1: a single one")
     parser.add_argument("--size", type=int, default=160, help="sides of the pictures, px")
-    parser.add_argument("--distances", type=float, nargs="+", default=[1.0, 2.0], help="where paths begin")
+    parser.add_argument(
+        "--distances", type=float, nargs="+", default=[1.0, 2.0], help="where paths begin"
+    )
     parser.add_argument("--fades", type=float, nargs="+", default=[DEFAULT_FADE])
     parser.add_argument("--tolerance", type=float, default=DEFAULT_TOLERANCE)
     parser.add_argument("--paths", nargs="+", help="only these")
-    parser.add_argument("--samples", type=int, default=SUPERSAMPLING, help="of the true pictures, a side")
-    parser.add_argument("--level-0-filter", type=float, default=0.0, help="px2, with compensated opacities")
+    parser.add_argument(
+        "--samples", type=int, default=SUPERSAMPLING, help="of the true pictures, a side"
+    )
+    parser.add_argument(
+        "--level-0-filter", type=float, default=0.0, help="px2, with compensated opacities"
+    )
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
     parser.add_argument("--json", type=Path, help="write the result there")
     options = parser.parse_args(arguments)
@@ -60,7 +70,12 @@ def main(arguments: list[str] | None = None) -> int:
                     continue
                 rows += measure(scene, camera_path, options, {**of, "distance": distance})
                 print(*(line(row) for row in rows[-4 - len(options.fades) :]), sep="\n", flush=True)
-    result = {"frames": options.frames, "size": options.size, "tolerance": options.tolerance, "rows": rows}
+    result = {
+        "frames": options.frames,
+        "size": options.size,
+        "tolerance": options.tolerance,
+        "rows": rows,
+    }
     result |= {"level_0_filter": options.level_0_filter, "samples": options.samples}
     result["verdict"] = [verdict(rows, fade) for fade in options.fades]
     print(*result["verdict"], sep="\n")
@@ -69,7 +84,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def filtered(bundle: Bundle, filter_px2: float) -> Bundle:
-    """The bundle whose level 0 is drawn with a filter and compensated opacities, as coarser levels are."""
+    """The bundle whose level 0 is drawn with a filter and compensated opacities, as
+    coarser levels are."""
     if filter_px2 == 0.0:
         return bundle
     clusters = bundle.clusters
@@ -83,7 +99,8 @@ def filtered(bundle: Bundle, filter_px2: float) -> Bundle:
 
 
 def field_of(bundle: Bundle, side: int, up: str) -> Scene:
-    """So many times so many of the bundle, each turned about its upright middle at random; one stays."""
+    """So many times so many of the bundle, each turned about its upright middle at
+    random; one stays."""
     if side == 1:
         return Scene.of(bundle)
     center, radius = ball_of_most(bundle.level_gaussians(0).means)
@@ -106,7 +123,8 @@ def axes(up: str) -> tuple[Any, Any]:
 
 
 def first_camera(bundle: Bundle, up: str, distance: float, size: int) -> tuple[Camera, Any]:
-    """From where the bundle fills a picture, or so many times as far away; and its middle."""
+    """From where the bundle fills a picture, or so many times as far away; and its
+    middle."""
     center, radius = ball_of_most(bundle.level_gaussians(0).means)
     axis, aside = axes(up)
     direction = math.cos(0.45) * aside + math.sin(0.45) * axis
@@ -115,7 +133,8 @@ def first_camera(bundle: Bundle, up: str, distance: float, size: int) -> tuple[C
 
 
 class Stays:
-    """The hard cut of one camera, whatever the frame, drawn as a fade draws: with a filter at level 0."""
+    """The hard cut of one camera, whatever the frame, drawn as a fade draws: with a
+    filter at level 0."""
 
     def __init__(self, camera: Camera, tolerance: float) -> None:
         self.camera, self.tolerance = camera, tolerance
@@ -128,16 +147,23 @@ class Stays:
         return {"cut": self.cut}
 
 
-def measure(scene: Scene, path: CameraPath, options: Any, of: Row, *, along_motion: bool = True) -> list[Row]:
-    """Rows of one path: all gaussians, the hard cut, fades, the hard cut with as many, and one that stays."""
+def measure(
+    scene: Scene, path: CameraPath, options: Any, of: Row, *, along_motion: bool = True
+) -> list[Row]:
+    """Rows of one path: all gaussians, the hard cut, fades, the hard cut with as many,
+    and one that stays."""
     tolerance = options.tolerance
     cuts: dict[str, Cut] = {"all": {"tolerance": 0.0}, "hard": {"tolerance": tolerance}}
     cuts |= {f"fade {fade:g}": {"tolerance": tolerance, "fade": fade} for fade in options.fades}
-    cameras = [path.seen_from(k) for k in range(0, len(path.cameras), max(1, len(path.cameras) // 8))]
+    cameras = [
+        path.seen_from(k) for k in range(0, len(path.cameras), max(1, len(path.cameras) // 8))
+    ]
     count = _mean_count(scene, cameras, tolerance=tolerance, fade=options.fades[0])
     cuts["hard, equal count"] = {"tolerance": _tolerance_of_count(scene, cameras, count, tolerance)}
     cuts["stays"] = Stays(path.seen_from(len(path.cameras) // 2), tolerance)
-    rows = compare(scene, path, cuts, options.device, along_motion=along_motion, samples=options.samples)
+    rows = compare(
+        scene, path, cuts, options.device, along_motion=along_motion, samples=options.samples
+    )
     return [{**of, "path": path.name, "is_drift": path.is_drift, **row} for row in rows]
 
 
@@ -147,7 +173,8 @@ def _mean_count(scene: Scene, cameras: list[Camera], **how: Any) -> float:
 
 
 def _tolerance_of_count(scene: Scene, cameras: list[Camera], count: float, most: float) -> float:
-    """The least tolerance, up to one, at which the hard cut has at most so many gaussians a frame."""
+    """The least tolerance, up to one, at which the hard cut has at most so many
+    gaussians a frame."""
     low, high = most / 4, most
     for _ in range(_HALVINGS):
         middle = math.sqrt(low * high)
@@ -159,7 +186,8 @@ def _tolerance_of_count(scene: Scene, cameras: list[Camera], count: float, most:
 
 
 def verdict(rows: list[Row], fade: float, keys: tuple[str, ...] = ("asset", "distance")) -> Row:
-    """What a fade comes to, for each start: ratios to the hard cut and to all gaussians, of what is worst.
+    """What a fade comes to, for each start: ratios to the hard cut and to all
+    gaussians, of what is worst.
 
     Starts differ in the keys. The worst is that of drifts, if there are any.
     """
@@ -172,7 +200,10 @@ def verdict(rows: list[Row], fade: float, keys: tuple[str, ...] = ("asset", "dis
         cuts = {short: [r for r in mine if r["cut"] == name] for short, name in names.items()}
         cuts["fade"] = [r for r in mine if r.get("fade") == fade]
         worst, pop = (
-            {name: max(r[of] for r in cut if r["is_drift"] or not has_drifts) for name, cut in cuts.items()}
+            {
+                name: max(r[of] for r in cut if r["is_drift"] or not has_drifts)
+                for name, cut in cuts.items()
+            }
             for of in ("tile_worst", "pop_worst")
         )
         pairs = list(zip(cuts["fade"], cuts["hard"], cuts["equal"], strict=True))
@@ -185,10 +216,16 @@ def verdict(rows: list[Row], fade: float, keys: tuple[str, ...] = ("asset", "dis
                 "of_hard": round(worst["fade"] / worst["hard"], 3),
                 "of_all": round(worst["fade"] / worst["all"], 3),
                 "of_stays": round(worst["fade"] / worst["stays"], 3),
-                "pop_of_hard_at_equal_count": round(pop["fade"] / pop["equal"], 3) if pop["equal"] else None,
+                "pop_of_hard_at_equal_count": round(pop["fade"] / pop["equal"], 3)
+                if pop["equal"]
+                else None,
                 "least_psnr_gain": round(min(f["psnr"] - h["psnr"] for f, h, _ in pairs), 3),
-                "mean_psnr_gain": round(float(np.mean([f["psnr"] - h["psnr"] for f, h, _ in pairs])), 3),
-                "gaussians": round(float(np.mean([f["gaussians"] / h["gaussians"] for f, h, _ in pairs])), 3),
+                "mean_psnr_gain": round(
+                    float(np.mean([f["psnr"] - h["psnr"] for f, h, _ in pairs])), 3
+                ),
+                "gaussians": round(
+                    float(np.mean([f["gaussians"] / h["gaussians"] for f, h, _ in pairs])), 3
+                ),
             }
         )
     return {"fade": fade, "starts": found}
@@ -197,12 +234,17 @@ def verdict(rows: list[Row], fade: float, keys: tuple[str, ...] = ("asset", "dis
 def line(row: Row) -> str:
     """What a row says, in one line."""
     start = f"{row['asset']:>10} {row['distance']:4g} " if "distance" in row else ""
-    warped = f"warped {row['warped_mean']:.3f} {row['warped_worst']:.3f}  " if "warped_mean" in row else ""
+    warped = (
+        f"warped {row['warped_mean']:.3f} {row['warped_worst']:.3f}  "
+        if "warped_mean" in row
+        else ""
+    )
     return (
         f"{start}{row['path']:14} {row['cut']:18} "
-        f"{row['gaussians']:9,.0f}  rms {row['rms']:.3f}  tile {row['tile_mean']:.3f} {row['tile_p99']:.3f} "
-        f"{row['tile_worst']:.3f}  pop {row['pop_mean']:.3f} {row['pop_worst']:.3f}  {warped}"
-        f"changed {row['changed_items']:.0f}  PSNR {row['psnr']:.2f}"
+        f"{row['gaussians']:9,.0f}  rms {row['rms']:.3f}  tile {row['tile_mean']:.3f} "
+        f"{row['tile_p99']:.3f} {row['tile_worst']:.3f}  pop {row['pop_mean']:.3f} "
+        f"{row['pop_worst']:.3f}  {warped}changed {row['changed_items']:.0f}  PSNR "
+        f"{row['psnr']:.2f}"
     )
 
 

@@ -1,14 +1,17 @@
-"""Does a fade remove pops in scenes? Instances by the thousand, crowds of captured assets, rooms from within.
+"""Does a fade remove pops in scenes? Instances by the thousand, crowds of captured
+assets, rooms from within.
 
-A picture is looked at in windows of some pixels, each of which drifts towards and away from what is in its
-own middle: what moves slowly there hides nothing. All windows together are the picture. The cuts are those of
-`fades`. docs/notes/steadiness.md is about the result.
+A picture is looked at in windows of some pixels, each of which drifts towards and away
+from what is in its own middle: what moves slowly there hides nothing. All windows
+together are the picture. The cuts are those of `fades`. docs/notes/steadiness.md is
+about the result.
 
 A subject is one of
 
-    SCENE.json@CAMERA@CAMERA            a scene file, or a published layout, seen by cameras of its own
-    BUNDLE.v3dg+CAMERAS.json@CAMERA     a bundle, seen by cameras of a file
-    BUNDLE.v3dg:UP,BUNDLE.v3dg:UP       a crowd of these, as large as each other; from within and above
+    SCENE.json@CAMERA@CAMERA a scene file, or a published layout, seen by cameras of its
+    own BUNDLE.v3dg+CAMERAS.json@CAMERA a bundle, seen by cameras of a file
+    BUNDLE.v3dg:UP,BUNDLE.v3dg:UP a crowd of these, as large as each other; from within
+    and above
 """
 
 from __future__ import annotations
@@ -27,12 +30,24 @@ from benchmarks.evaluation.measure import Row
 from benchmarks.evaluation.record import write
 from benchmarks.evaluation.steadiness import SUPERSAMPLING, paths_from
 from benchmarks.studies.fades import axes, filtered, line, measure, verdict
-from v3dg import DEFAULT_FADE, DEFAULT_TOLERANCE, Bundle, Camera, Scene, read_cameras, read_scene, render
+from v3dg import (
+    DEFAULT_FADE,
+    DEFAULT_TOLERANCE,
+    Bundle,
+    Camera,
+    Scene,
+    read_cameras,
+    read_scene,
+    render,
+)
 from v3dg._device import to_host
 from v3dg.cleaning import ball_of_most
 
 _PITCH = 2.2  # of a crowd, in radii of the ball of most gaussians
-_COVERED, _SEEN = 0.9, 0.25  # alpha from which on a pixel is of something, and the least share of such pixels
+_COVERED, _SEEN = (
+    0.9,
+    0.25,
+)  # alpha from which on a pixel is of something, and the least share of such pixels
 
 
 @dataclass
@@ -43,7 +58,8 @@ class Config:
     picture: tuple[int, int] = (1920, 1080)
     window: tuple[int, int] = (320, 180)
     windows: int = 0
-    """Of each camera: those evenly apart among all that tile the picture and show something; 0: all."""
+    """Of each camera: those evenly apart among all that tile the picture and show
+    something; 0: all."""
     side: int = 10
     """Of crowds."""
     fades: tuple[float, ...] = (DEFAULT_FADE,)
@@ -89,12 +105,15 @@ def with_filter(scene: Scene, filter_px2: float) -> Scene:
 
 
 def crowd_of(members: list[str], side: int) -> Subject:
-    """A square of so many assets to a side, brought to one size and turned upright, each as often as any."""
+    """A square of so many assets to a side, brought to one size and turned upright,
+    each as often as any."""
     random = np.random.default_rng(0)
     who = np.resize(np.arange(len(members)), side * side)
     random.shuffle(who)
     steps = np.arange(side) - 0.5 * (side - 1)
-    places = _PITCH * np.stack([*np.meshgrid(steps, steps), np.zeros((side, side))], -1).reshape(-1, 3)
+    places = _PITCH * np.stack([*np.meshgrid(steps, steps), np.zeros((side, side))], -1).reshape(
+        -1, 3
+    )
     scene = Scene()
     for k, member in enumerate(members):
         path, _, up = member.partition(":")
@@ -144,7 +163,8 @@ def _quaternion(turn: Any) -> Any:
 
 
 def windows_of(scene: Scene, camera: Camera, config: Config) -> Iterator[tuple[str, Camera, Any]]:
-    """Parts of a camera's picture, and what each looks at: names, cameras, and places in the world."""
+    """Parts of a camera's picture, and what each looks at: names, cameras, and places
+    in the world."""
     camera = resized(camera, config.picture)
     width, height = config.window
     image = render(scene, resized(camera, (480, 270)), depth=True, device=config.device)
@@ -166,7 +186,9 @@ def windows_of(scene: Scene, camera: Camera, config: Config) -> Iterator[tuple[s
             found.append((f"{left},{top}", part, place))
     chosen = range(len(found))
     if config.windows and config.windows < len(found):
-        chosen = [round((k + 0.5) * len(found) / config.windows - 0.5) for k in range(config.windows)]
+        chosen = [
+            round((k + 0.5) * len(found) / config.windows - 0.5) for k in range(config.windows)
+        ]
     yield from (found[k] for k in chosen)
 
 
@@ -174,7 +196,10 @@ def main(config: Config) -> None:
     rows: list[Row] = []
     for text in config.subjects:
         subject = subject_of(text, config)
-        print(f"{subject.name}: {len(subject.scene)} instances of {len(subject.scene.bundles)} bundles")
+        print(
+            f"{subject.name}: {len(subject.scene)} instances of {len(subject.scene.bundles)} "
+            "bundles"
+        )
         for camera_name, camera in subject.cameras.items():
             for window, first, place in windows_of(subject.scene, camera, config):
                 of = {"asset": subject.name, "camera": camera_name, "window": window}

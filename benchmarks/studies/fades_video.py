@@ -1,9 +1,11 @@
-"""What an eye makes of a slow drift: ColorVideoVDP of the hard cut and of a fade, beside all gaussians.
+"""What an eye makes of a slow drift: ColorVideoVDP of the hard cut and of a fade,
+beside all gaussians.
 
-Frames at 30 a second, as on a screen of 1920 x 1080 px, against two references: frames of 4 x 4 samples of
-all gaussians, from which a cut differs everywhere and always, and the same path drawn from the cut of its
-middle frame, from which it differs by what levels do while the camera moves. Needs the package `cvvdp`, and a
-GPU for large pictures; docs/fades.md is about the result.
+Frames at 30 a second, as on a screen of 1920 x 1080 px, against two references: frames
+of 4 x 4 samples of all gaussians, from which a cut differs everywhere and always, and
+the same path drawn from the cut of its middle frame, from which it differs by what
+levels do while the camera moves. Needs the package `cvvdp`, and a GPU for large
+pictures; docs/fades.md is about the result.
 """
 
 from __future__ import annotations
@@ -32,12 +34,20 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--bundle", type=Path, required=True, help=".v3dg file of the layout's asset")
-    parser.add_argument("--layout", type=Path, required=True, help="scene file of instances and cameras")
+    parser.add_argument(
+        "--bundle", type=Path, required=True, help=".v3dg file of the layout's asset"
+    )
+    parser.add_argument(
+        "--layout", type=Path, required=True, help="scene file of instances and cameras"
+    )
     parser.add_argument("--cameras", nargs="+", help="names of those from which paths begin")
     parser.add_argument("--frames", type=int, default=60, help="of each path")
-    parser.add_argument("--size", type=int, nargs=2, default=[1920, 1080], help="of the pictures, px")
-    parser.add_argument("--references", nargs="+", default=["truth", "frozen"], choices=["truth", "frozen"])
+    parser.add_argument(
+        "--size", type=int, nargs=2, default=[1920, 1080], help="of the pictures, px"
+    )
+    parser.add_argument(
+        "--references", nargs="+", default=["truth", "frozen"], choices=["truth", "frozen"]
+    )
     parser.add_argument("--device", default="cuda", choices=["cpu", "cuda"])
     parser.add_argument("--tolerances", type=float, nargs="+", default=[3.0, 9.4])
     parser.add_argument("--paths", nargs="+", default=["drift in", "drift out"])
@@ -48,9 +58,14 @@ def main(arguments: list[str] | None = None) -> int:
     scene, cameras = read_scene(options.layout, bundles={asset: Bundle.open(options.bundle)})
     rows = []
     for name in options.cameras:
-        first, middle = resized(cameras[name], tuple(options.size)), np.mean(scene.positions, axis=0)
+        first, middle = (
+            resized(cameras[name], tuple(options.size)),
+            np.mean(scene.positions, axis=0),
+        )
         upwards = -first.viewmat[1, :3]
-        aimed = Camera.look_at(first.position, middle, upwards, width=first.width, height=first.height)
+        aimed = Camera.look_at(
+            first.position, middle, upwards, width=first.width, height=first.height
+        )
         for path in paths_from(replace(first, viewmat=aimed.viewmat), middle, options.frames):
             if path.name in options.paths:
                 of = {"camera": name, "path": path.name}
@@ -60,8 +75,11 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def measure(scene: Scene, cameras: list[Camera], options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Rows of one path: just objectionable differences, 10 where there is none, and gaussians a frame."""
+def measure(
+    scene: Scene, cameras: list[Camera], options: argparse.Namespace
+) -> list[dict[str, Any]]:
+    """Rows of one path: just objectionable differences, 10 where there is none, and
+    gaussians a frame."""
     import pycvvdp
 
     metric = pycvvdp.cvvdp(display_name=_DISPLAY, device=torch.device(options.device), quiet=True)
@@ -85,14 +103,17 @@ def measure(scene: Scene, cameras: list[Camera], options: argparse.Namespace) ->
             for name, reference in references.items():
                 if reference is not None:
                     order = {"dim_order": "FHWC", "frames_per_second": _FRAMES_A_SECOND}
-                    row[f"jod_{name}"] = round(float(metric.predict(frames, reference, **order)[0]), 4)
+                    row[f"jod_{name}"] = round(
+                        float(metric.predict(frames, reference, **order)[0]), 4
+                    )
             rows.append(row)
             print(row, flush=True)
     return rows
 
 
 def video(renderer: Renderer, cameras: list[Camera], samples: int, **cut: Any) -> tuple[Any, float]:
-    """(F, H, W, 3) bytes of the frames, each pixel the mean of so many samples squared; gaussians a frame."""
+    """(F, H, W, 3) bytes of the frames, each pixel the mean of so many samples squared;
+    gaussians a frame."""
     frames, gaussians = [], 0
     for camera in cameras:
         image = renderer.render(camera.scaled(samples), **cut)

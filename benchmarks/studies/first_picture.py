@@ -1,9 +1,10 @@
 """How long it takes from the name of files to the first, coarsest picture with a pool.
 
-Two kinds of 10 GB are made of one bundle: a set of copies, and one file with the clusters of as many copies
-side by side, whose tables are as large as those of a bundle of that size. Those stand where the first does.
-Processes of their own open them and draw, in turn with those of another checkout if there is one, with what
-the system keeps of the files dropped before (`cold`) or not.
+Two kinds of 10 GB are made of one bundle: a set of copies, and one file with the
+clusters of as many copies side by side, whose tables are as large as those of a bundle
+of that size. Those stand where the first does. Processes of their own open them and
+draw, in turn with those of another checkout if there is one, with what the system keeps
+of the files dropped before (`cold`) or not.
 """
 
 from __future__ import annotations
@@ -57,7 +58,8 @@ def write_set(config: Config) -> list[Path]:
 
 
 def write_joined(config: Config) -> Path:
-    """One bundle with the clusters of all copies: by level, and in each level copy by copy."""
+    """One bundle with the clusters of all copies: by level, and in each level copy by
+    copy."""
     path = config.folder / f"joined_{config.copies}.v3dg"
     if path.exists():
         return path
@@ -72,7 +74,10 @@ def write_joined(config: Config) -> Path:
     new_group = np.full((count, len(g) + 1), -1, np.int32)
     new_group[group_copy, old_group] = np.arange(len(old_group))
     sizes = np.diff(c.offset)[old_cluster]
-    columns = {name: getattr(c, name)[old_cluster] for name in ("level", "box", "filter_px2", "antialiased")}
+    columns = {
+        name: getattr(c, name)[old_cluster]
+        for name in ("level", "box", "filter_px2", "antialiased")
+    }
     made = v3dg.Clusters(
         offset=np.concatenate([[0], np.cumsum(sizes)]),
         own_group=new_group[copy, c.own_group[old_cluster]],
@@ -158,7 +163,10 @@ def main(config: Config) -> None:
             paths = sets[name]
             if temperature == "cold":
                 drop_cached(paths)
-            environment = {"PYTHONPATH": str(checkouts[checkout]), PATHS: json.dumps(list(map(str, paths)))}
+            environment = {
+                "PYTHONPATH": str(checkouts[checkout]),
+                PATHS: json.dumps(list(map(str, paths))),
+            }
             done = subprocess.run(
                 [sys.executable, __file__, *sys.argv[1:]],
                 env=os.environ | environment,
@@ -167,9 +175,17 @@ def main(config: Config) -> None:
                 text=True,
             )
             rows.append(
-                {"files": name, "cache": temperature, "checkout": checkout, **json.loads(done.stdout)}
+                {
+                    "files": name,
+                    "cache": temperature,
+                    "checkout": checkout,
+                    **json.loads(done.stdout),
+                }
             )
-            print({k: round(v, 1) if isinstance(v, float) else v for k, v in rows[-1].items()}, flush=True)
+            print(
+                {k: round(v, 1) if isinstance(v, float) else v for k, v in rows[-1].items()},
+                flush=True,
+            )
     sizes = {name: sum(path.stat().st_size for path in paths) for name, paths in sets.items()}
     result = {"config": {k: str(v) for k, v in vars(config).items()}, "bytes": sizes, "rows": rows}
     record.write(config.output, {"device": config.device, **result}, config.device)
@@ -178,6 +194,10 @@ def main(config: Config) -> None:
 if __name__ == "__main__":
     chosen = tyro.cli(Config)
     if PATHS in os.environ:
-        print(json.dumps(open_and_draw(chosen, [Path(path) for path in json.loads(os.environ[PATHS])])))
+        print(
+            json.dumps(
+                open_and_draw(chosen, [Path(path) for path in json.loads(os.environ[PATHS])])
+            )
+        )
     else:
         main(chosen)

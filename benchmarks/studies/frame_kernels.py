@@ -1,13 +1,16 @@
-"""Where a frame's time goes on a GPU: each kernel of it, beside the frame and a digest of its picture.
+"""Where a frame's time goes on a GPU: each kernel of it, beside the frame and a digest
+of its picture.
 
-    python -m benchmarks.studies.frame_kernels --layout donutsea.json --asset donut.ply \\
+    python -m benchmarks.studies.frame_kernels --layout donutsea.json --asset donut.ply
+    \\
         --captured ASSETS --names Fungi -o frame_kernels_h200
 
-ASSETS is a folder as `pairs` has it. A captured asset is drawn whole, and with levels at the default
-tolerance, random gaussians whole, instances of a layout with levels at two tolerances, and whole. A frame is
-counted from an idle device to an idle device, Python included, the median of 25; kernels are the means of a
-dozen frames under torch's profiler. To compare two versions, run it with each in turn on one machine: digests
-tell whether they draw the same bits.
+ASSETS is a folder as `pairs` has it. A captured asset is drawn whole, and with levels
+at the default tolerance, random gaussians whole, instances of a layout with levels at
+two tolerances, and whole. A frame is counted from an idle device to an idle device,
+Python included, the median of 25; kernels are the means of a dozen frames under torch's
+profiler. To compare two versions, run it with each in turn on one machine: digests tell
+whether they draw the same bits.
 """
 
 from __future__ import annotations
@@ -33,7 +36,8 @@ from v3dg.cameras import Camera
 
 Row = dict[str, Any]
 Frame = tuple[str, Any, Camera, float | None]
-"""Its name, what draws it, from where, and a tolerance, or None where there are no levels."""
+"""Its name, what draws it, from where, and a tolerance, or None where there are no
+levels."""
 
 _WARM_UPS, _FRAMES, _PROFILED = 4, 25, 12
 _TOLERANCES = 9.4, 3.0
@@ -68,14 +72,22 @@ def frames(config: Config) -> Iterator[Frame]:
             )
             bundle = v3dg.build_bundle(subject.gaussians.numpy(), device="cuda", progress=False)
             yield from _sized(
-                config, f"{name}, levels", v3dg.Renderer(bundle, device="cuda"), subject.cameras, 3.0
+                config,
+                f"{name}, levels",
+                v3dg.Renderer(bundle, device="cuda"),
+                subject.cameras,
+                3.0,
             )
     for count in config.counts:
         subject = scenes.random(count, 3, "cuda")
-        yield from _sized(config, subject.name, v3dg.Renderer(subject.gaussians), subject.cameras, None)
+        yield from _sized(
+            config, subject.name, v3dg.Renderer(subject.gaussians), subject.cameras, None
+        )
     if config.layout is not None:
         asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
-        scene, views = read_layout(config.layout, v3dg.build_bundle(asset, device="cuda", progress=False))
+        scene, views = read_layout(
+            config.layout, v3dg.build_bundle(asset, device="cuda", progress=False)
+        )
         renderer = v3dg.Renderer(scene, device="cuda")
         for tolerance in (*_TOLERANCES, 0.0):
             for number in config.cameras:
@@ -143,7 +155,9 @@ def main(config: Config) -> None:
     for frame in frames(config):
         rows.append(measure(frame))
         record.write(config.output, {"rows": rows}, "cuda")
-        kernels = " ".join(f"{kernel} {ms:.3f}" for kernel, ms in list(rows[-1]["kernels"].items())[:8])
+        kernels = " ".join(
+            f"{kernel} {ms:.3f}" for kernel, ms in list(rows[-1]["kernels"].items())[:8]
+        )
         print(f"{rows[-1]['frame']}: {rows[-1]['milliseconds']:.3f} ms; {kernels}", flush=True)
 
 

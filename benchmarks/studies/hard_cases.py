@@ -1,8 +1,10 @@
-"""How far float32 is from float64 in tests/support/hard_cases.py: histograms of errors, and docs/numerics.md.
+"""How far float32 is from float64 in tests/support/hard_cases.py: histograms of errors,
+and docs/numerics.md.
 
-    python -m benchmarks.studies.hard_cases --device cpu --output benchmarks/results/hard_cases_cpu.json
-    python -m benchmarks.studies.hard_cases --device cuda --output benchmarks/results/hard_cases_h200.json
-    python -m benchmarks.studies.hard_cases --docs    # write the table again, from those two
+    python -m benchmarks.studies.hard_cases --device cpu --output
+    benchmarks/results/hard_cases_cpu.json python -m benchmarks.studies.hard_cases
+    --device cuda --output benchmarks/results/hard_cases_h200.json python -m
+    benchmarks.studies.hard_cases --docs # write the table again, from those two
 
 The last one measures nothing.
 """
@@ -29,7 +31,10 @@ import hard_cases as cases  # noqa: E402  (of the tests)
 DECADES = (1e-7, 1e-6, 1e-5, 1e-4)
 DOCS = ROOT / "docs" / "numerics.md"
 RESULTS = {"CPU": "hard_cases_cpu.json", "H200": "hard_cases_h200.json"}
-BEGIN, END = "<!-- hard cases: benchmarks/studies/hard_cases.py -->\n", "<!-- end of hard cases -->\n"
+BEGIN, END = (
+    "<!-- hard cases: benchmarks/studies/hard_cases.py -->\n",
+    "<!-- end of hard cases -->\n",
+)
 
 
 @dataclass
@@ -41,14 +46,16 @@ class Config:
 
 
 def histogram(errors: np.ndarray) -> dict[str, Any]:
-    """Shares of the errors up to each decade and beyond the last, in per cent, and the largest."""
+    """Shares of the errors up to each decade and beyond the last, in per cent, and the
+    largest."""
     counts = np.bincount(np.searchsorted(DECADES, errors.ravel()), minlength=len(DECADES) + 1)
     shares = 100 * counts / max(errors.size, 1)
     return {"percent": shares.round(2).tolist(), "largest": float(f"{errors.max(initial=0.0):.1e}")}
 
 
 def gradient_histogram(case: cases.HardCase, device: str) -> dict[str, Any]:
-    """Of the drawn gaussians' gradients by relative changes, in units of each input's root mean square."""
+    """Of the drawn gaussians' gradients by relative changes, in units of each input's
+    root mean square."""
     import torch
 
     single = cases.gradients(case, cases.draw_core, torch.float32, device)
@@ -86,7 +93,8 @@ def table(results: dict[str, dict[str, Any]]) -> str:
             measured = result["cases"].get(name)
             for part in ("picture", "gradients"):
                 errors = (
-                    measured and f"{text_of(measured[part]['percent'])} ({measured[part]['largest']:.0e})"
+                    measured
+                    and f"{text_of(measured[part]['percent'])} ({measured[part]['largest']:.0e})"
                 )
                 cells.append(errors or "not measured")
         bound = f"{case.picture.absolute:.0e}" if case.gradient else "finite"
@@ -96,7 +104,9 @@ def table(results: dict[str, dict[str, Any]]) -> str:
 
 def write_docs() -> None:
     paths = {device: ROOT / "benchmarks" / "results" / name for device, name in RESULTS.items()}
-    results = {device: json.loads(path.read_text()) for device, path in paths.items() if path.exists()}
+    results = {
+        device: json.loads(path.read_text()) for device, path in paths.items() if path.exists()
+    }
     before, rest = DOCS.read_text().split(BEGIN)
     _, after = rest.split(END)
     DOCS.write_text(before + BEGIN + "\n" + table(results) + "\n" + END + after)
@@ -109,7 +119,9 @@ def main(config: Config) -> None:
     measured = {}
     for name, case in cases.hard_cases().items():
         measured[name] = measure(case, config.device)
-        print(f"{name:36}", *(f"{m['percent']} {m['largest']:.0e}" for m in measured[name].values()))
+        print(
+            f"{name:36}", *(f"{m['percent']} {m['largest']:.0e}" for m in measured[name].values())
+        )
     record.write(config.output, {"decades": DECADES, "cases": measured}, config.device)
 
 

@@ -1,8 +1,9 @@
-"""What large builds take: many copies of an asset as one, built by `v3dg build` in processes of their own.
+"""What large builds take: many copies of an asset as one, built by `v3dg build` in
+processes of their own.
 
-Time with reading and writing, the most memory of the host and of the GPU, for each number of gaussians and
-amount of memory given. Copies stand in a grid and are moved a little, gaussian by gaussian, so that none are
-alike.
+Time with reading and writing, the most memory of the host and of the GPU, for each
+number of gaussians and amount of memory given. Copies stand in a grid and are moved a
+little, gaussian by gaussian, so that none are alike.
 """
 
 from __future__ import annotations
@@ -45,7 +46,16 @@ def main(config: Config) -> None:
             asset, bundle = Path(folder, "asset.ply"), Path(folder, "bundle.v3dg")
             count = write_copies(asset, base, int(1e6 * millions))
             row = {"gaussians": count, "memory": memory, "asset_bytes": asset.stat().st_size}
-            command = [sys.executable, "-m", "v3dg", "build", str(asset), "-o", str(bundle), "--quiet"]
+            command = [
+                sys.executable,
+                "-m",
+                "v3dg",
+                "build",
+                str(asset),
+                "-o",
+                str(bundle),
+                "--quiet",
+            ]
             row |= watched([*command, "--memory", memory, "--device", config.device])
             row["bundle_bytes"] = bundle.stat().st_size
         row["us_a_gaussian"] = round(1e6 * row["seconds"] / count, 3)
@@ -55,7 +65,8 @@ def main(config: Config) -> None:
 
 
 def write_copies(path: Path, base: v3dg.Gaussians, at_least: int) -> int:
-    """Write copies of an asset, one after the other, as a .ply file; how many gaussians there are."""
+    """Write copies of an asset, one after the other, as a .ply file; how many gaussians
+    there are."""
     copies = -(-at_least // len(base))
     side = int(np.ceil(np.sqrt(copies)))
     rng = np.random.default_rng(5)
@@ -77,7 +88,8 @@ def write_copies(path: Path, base: v3dg.Gaussians, at_least: int) -> int:
 
 
 def watched(command: list[str]) -> dict[str, Any]:
-    """Run a command; its seconds, and the most memory in GB that it, and the first GPU, had."""
+    """Run a command; its seconds, and the most memory in GB that it, and the first GPU,
+    had."""
     start = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     most = {"host_gb": 0.0, "gpu_gb": 0.0}

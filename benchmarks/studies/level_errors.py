@@ -1,10 +1,11 @@
 """Would a metric made of measured error be better than footprint over gaussians?
 
-Each group of a bundle is drawn alone, at several sizes, beside its clusters one level finer and the leaves
-under it (4 x 4 samples). What is gained per gaussian by going one level finer, at the size at which each
-group is seen, then decides a cut: the pruning of the tree with the least sum of error and lambda x gaussians
-(Chou, Lookabaugh and Gray 1989). It is compared with the metric at equal numbers of gaussians, from outside
-of an object; docs/notes/levels.md has the table.
+Each group of a bundle is drawn alone, at several sizes, beside its clusters one level
+finer and the leaves under it (4 x 4 samples). What is gained per gaussian by going one
+level finer, at the size at which each group is seen, then decides a cut: the pruning of
+the tree with the least sum of error and lambda x gaussians (Chou, Lookabaugh and Gray
+1989). It is compared with the metric at equal numbers of gaussians, from outside of an
+object; docs/notes/levels.md has the table.
 """
 
 from __future__ import annotations
@@ -22,9 +23,12 @@ from benchmarks.evaluation import record
 from v3dg import _core, metrics
 
 SIZES = {0.5: 4, 1.0: 4, 2.0: 2, 4.0: 2, 8.0: 1}
-"""In units of 2 px² a gaussian, as a side; the samples of a pixel's side that the leaves are drawn with."""
+"""In units of 2 px² a gaussian, as a side; the samples of a pixel's side that the
+leaves are drawn with."""
 _MOST_SAMPLES = 12_000_000  # of one picture
-_WEIGHTS = np.array([1, 1, 1, 1.5], np.float32) / 3  # mean |colour| and half of |alpha|, as the fit has it
+_WEIGHTS = (
+    np.array([1, 1, 1, 1.5], np.float32) / 3
+)  # mean |colour| and half of |alpha|, as the fit has it
 _FOV = 0.3
 
 
@@ -40,7 +44,8 @@ class Config:
 
 
 class Groups:
-    """What is known of the groups of a bundle: their gaussians, smallest balls, and gains."""
+    """What is known of the groups of a bundle: their gaussians, smallest balls, and
+    gains."""
 
     def __init__(self, bundle: v3dg.Bundle) -> None:
         self.bundle, self.table, clusters = bundle, bundle.groups, bundle.clusters
@@ -67,7 +72,8 @@ class Groups:
         self.all = bundle.gaussians
 
     def _runs(self, links: Any, clusters: Any, offset: Any) -> Any:
-        """(G, 2) first and end of the gaussians of the clusters that are linked to each group."""
+        """(G, 2) first and end of the gaussians of the clusters that are linked to each
+        group."""
         runs = np.tile(np.array([1 << 60, 0]), (len(self.table), 1))
         linked = clusters[links >= 0]
         np.minimum.at(runs[:, 0], links[linked], offset[linked])
@@ -75,7 +81,8 @@ class Groups:
         return runs
 
     def measure(self, num_views: int) -> None:
-        """Find gain (G, S), of error per gaussian, and cover (G,), alpha px at twice its size."""
+        """Find gain (G, S), of error per gaussian, and cover (G,), alpha px at twice
+        its size."""
         self.gain, self.cover = np.zeros((len(self.table), len(SIZES))), np.zeros(len(self.table))
         rng = np.random.default_rng(1)
         turns = [np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(num_views)]
@@ -94,8 +101,11 @@ class Groups:
                         if size == 2:
                             self.cover[some] += covered / num_views
 
-    def _compare(self, groups: Any, level: int, turn: Any, radius_px: float, cell: int, samples: int) -> Any:
-        """What one view of groups side by side gains by one level more, and alpha, in px each."""
+    def _compare(
+        self, groups: Any, level: int, turn: Any, radius_px: float, cell: int, samples: int
+    ) -> Any:
+        """What one view of groups side by side gains by one level more, and alpha, in
+        px each."""
         across = math.ceil(math.sqrt(len(groups)))
         spacing = cell / radius_px
         depth = 12 * across * spacing + 20
@@ -108,7 +118,9 @@ class Groups:
             grid = np.stack([place % across, place // across], 1) - (across - 1) / 2
             means = (part.means - ball[:, :3]) / ball[:, 3:] + spacing * grid @ turn[:2]
             part = replace(
-                part, means=means.astype(np.float32), scales=(part.scales / ball[:, 3:]).astype(np.float32)
+                part,
+                means=means.astype(np.float32),
+                scales=(part.scales / ball[:, 3:]).astype(np.float32),
             )
             viewmat = np.eye(4)
             viewmat[:3, :3], viewmat[2, 3] = turn, depth
@@ -127,7 +139,8 @@ class Groups:
         return errors[0] - errors[1], sums(truth[..., 3])
 
     def see(self, cameras: list[v3dg.Camera]) -> None:
-        """Find how much of each group is seen among all, from these cameras: (G,), 1 if nothing hides it."""
+        """Find how much of each group is seen among all, from these cameras: (G,), 1 if
+        nothing hides it."""
         import torch
 
         asset = self.bundle.level_gaussians(0).torch("cpu")
@@ -136,7 +149,9 @@ class Groups:
             sh = torch.zeros(len(asset), 1, 3, requires_grad=True)
             v3dg.rasterize(replace(asset, sh=sh), camera).color.sum().backward()
             assert sh.grad is not None
-            weight = np.append(0, np.cumsum(sh.grad[:, 0].mean(1).double().numpy() / _core.sh_base0))
+            weight = np.append(
+                0, np.cumsum(sh.grad[:, 0].mean(1).double().numpy() / _core.sh_base0)
+            )
             seen += weight[self.leaf[:, 1]] - weight[self.leaf[:, 0]]
             alone += self.cover * (self._size(camera) / 2) ** 2
         self.visibility = seen / alone
@@ -164,7 +179,9 @@ class Groups:
                 here = np.flatnonzero(self.table.level == level)
                 refined[here] &= refined[self.table.parent[here]]
         own, parent = self.bundle.clusters.own_group, self.bundle.clusters.parent_group
-        return np.flatnonzero(((own < 0) | ~refined[own]) & ((parent < 0) | refined[parent])).astype(np.int32)
+        return np.flatnonzero(
+            ((own < 0) | ~refined[own]) & ((parent < 0) | refined[parent])
+        ).astype(np.int32)
 
     def _to_parents(self, join: Any, values: Any) -> Any:
         values = values.copy()
@@ -174,7 +191,8 @@ class Groups:
         return values
 
     def _gain_at(self, camera: v3dg.Camera) -> Any:
-        """(G,) gain at the size seen: between two in proportion of logs, past the last as the area."""
+        """(G,) gain at the size seen: between two in proportion of logs, past the last
+        as the area."""
         size, known = np.log2(self._size(camera)), np.log2(list(SIZES))
         inside = np.clip(size, known[0], known[-1])
         step = np.minimum((inside - known[0]).astype(int), len(known) - 2)
@@ -204,7 +222,9 @@ def main(config: Config) -> None:
     groups.see([look(2.4 * i, 1.2 - 0.1 * i, 350) for i in range(24)])
     rows = []
     for width in config.widths:
-        cameras = [look(*place, width) for place in ((0.3, 0.4), (1.9, 0.1), (3.3, 0.6), (5.0, 0.3))]
+        cameras = [
+            look(*place, width) for place in ((0.3, 0.4), (1.9, 0.1), (3.3, 0.6), (5.0, 0.3))
+        ]
         truths = [metrics.draw_truth(groups.bundle, camera, "cpu", 4) for camera in cameras]
         for part in (0.5, 0.25, 0.125, 0.06, 0.03):
             target = min(part * math.pi / 8 * width**2, 0.9 * len(asset))
@@ -228,7 +248,9 @@ def _mean_flip(groups: Groups, rule: str, cameras: Any, truths: Any, target: flo
             fits = sizes[groups.cut(rule, camera, tolerance)].sum() <= target
             low, high = (low, tolerance) if fits else (tolerance, high)
         ids = groups.cut(rule, camera, high)
-        chosen = v3dg.Selection(scene, np.zeros(len(ids), np.int32), ids, int(sizes[ids].sum()), high, 0.0)
+        chosen = v3dg.Selection(
+            scene, np.zeros(len(ids), np.int32), ids, int(sizes[ids].sum()), high, 0.0
+        )
         image = v3dg.render(groups.bundle, camera, cut=chosen, device="cpu").color.clip(0, 1)
         flips.append(metrics.flip(truth.astype(np.float32) / 255, image))
     return float(np.mean(flips))

@@ -1,7 +1,8 @@
-"""What each choice of the build gives: one change at a time, drawn in a layout of many instances.
+"""What each choice of the build gives: one change at a time, drawn in a layout of many
+instances.
 
-The table of docs/notes/levels.md: Gaussians in the frustum, FLIP and PSNR against a given picture at three
-tolerances, and the processor seconds of the build.
+The table of docs/notes/levels.md: Gaussians in the frustum, FLIP and PSNR against a
+given picture at three tolerances, and the processor seconds of the build.
 """
 
 from __future__ import annotations
@@ -64,7 +65,10 @@ def main(config: Config) -> None:
         bundle = v3dg.build_bundle(
             asset, config=replace(v3dg.BuildConfig(), **CHANGES[change]), progress=False
         )
-        row: dict[str, Any] = {"change": change, "build_cpu_seconds": round(time.process_time() - start, 1)}
+        row: dict[str, Any] = {
+            "change": change,
+            "build_cpu_seconds": round(time.process_time() - start, 1),
+        }
         scene, cameras = read_layout(config.layout, bundle)
         camera = list(cameras.values())[config.camera]
         row["frames"] = []

@@ -1,4 +1,5 @@
-"""How even are the frames of a moving flight? Percentiles of 5,000, and which of them were drawn twice."""
+"""How even are the frames of a moving flight? Percentiles of 5,000, and which of them
+were drawn twice."""
 
 from __future__ import annotations
 
@@ -23,15 +24,25 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--bundle", type=Path, required=True, help=".v3dg file of the layout's asset")
-    parser.add_argument("--layout", type=Path, required=True, help="scene file of instances and cameras")
     parser.add_argument(
-        "--cameras", type=int, nargs=2, default=(40, 60), help="whose distances the flight goes through"
+        "--bundle", type=Path, required=True, help=".v3dg file of the layout's asset"
+    )
+    parser.add_argument(
+        "--layout", type=Path, required=True, help="scene file of instances and cameras"
+    )
+    parser.add_argument(
+        "--cameras",
+        type=int,
+        nargs=2,
+        default=(40, 60),
+        help="whose distances the flight goes through",
     )
     parser.add_argument("--frames", type=int, default=5000)
     parser.add_argument("--tolerances", type=float, nargs="+", default=[3.0, 9.4])
     parser.add_argument("--fade", type=float, default=1.02)
-    parser.add_argument("--memory", nargs="+", default=["none"], help='sizes of pools; "none": all resident')
+    parser.add_argument(
+        "--memory", nargs="+", default=["none"], help='sizes of pools; "none": all resident'
+    )
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--json", type=Path, help="write the result there")
     options = parser.parse_args(arguments)
@@ -52,7 +63,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def flight(scene: Scene, cameras: list[Camera], count: int) -> list[Camera]:
-    """Two turns around the middle of the scene, from the farthest of the cameras to the nearest and back."""
+    """Two turns around the middle of the scene, from the farthest of the cameras to the
+    nearest and back."""
     middle = scene.positions.mean(axis=0)
     offsets = np.array([camera.position - middle for camera in cameras])
     distances = np.linalg.norm(offsets, axis=1)
@@ -87,7 +99,8 @@ def flight(scene: Scene, cameras: list[Camera], count: int) -> list[Camera]:
 
 
 def measure(renderer: Renderer, views: list[Camera], options: dict[str, float]) -> dict[str, Any]:
-    """Milliseconds from the call to the finished picture, and how often frames were drawn again."""
+    """Milliseconds from the call to the finished picture, and how often frames were
+    drawn again."""
     milliseconds = np.empty(len(views))
     draws = np.empty(len(views), np.int64)
     bytes_in = np.empty(len(views), np.int64)
@@ -103,7 +116,9 @@ def measure(renderer: Renderer, views: list[Camera], options: dict[str, float]) 
     return {
         **percentiles(milliseconds[later]),
         "drawn_again": int((draws[later] > 1).sum()),
-        "drawn_again_ms": [round(float(ms), 3) for ms in milliseconds[later][draws[later] > 1]][:_NUM_WORST],
+        "drawn_again_ms": [round(float(ms), 3) for ms in milliseconds[later][draws[later] > 1]][
+            :_NUM_WORST
+        ],
         "first_frames_ms": [round(float(ms), 3) for ms in milliseconds[:3]],
         "first_frames_drawn_again": int((draws[:_FIRST_FRAMES] > 1).sum()),
         "worst": [

@@ -1,12 +1,15 @@
-"""Levels at equal counts and several sizes: ours, merging alone, and what other tools and makers left.
+"""Levels at equal counts and several sizes: ours, merging alone, and what other tools
+and makers left.
 
-    python -m benchmarks.studies.pairs measure ASSETS -o pairs --device cuda
-    python -m benchmarks.studies.pairs report pairs/pairs.json -o docs/notes/pairs.md --plots docs/images
+    python -m benchmarks.studies.pairs measure ASSETS -o pairs --device cuda python -m
+    benchmarks.studies.pairs report pairs/pairs.json -o docs/notes/pairs.md --plots
+    docs/images
 
-ASSETS is a folder with assets.json: for each asset by its name a `file` that v3dg reads; `up` for an object,
-which is drawn from four sides, or for a scene `cameras`, a transforms.json, `views`, names of some of them,
-and `refined_from`, cameras of another file by which it is refined; and `published`, by their names the
-`file` and number of `gaussians` of the levels that its makers gave it. Levels of other tools are
+ASSETS is a folder with assets.json: for each asset by its name a `file` that v3dg
+reads; `up` for an object, which is drawn from four sides, or for a scene `cameras`, a
+transforms.json, `views`, names of some of them, and `refined_from`, cameras of another
+file by which it is refined; and `published`, by their names the `file` and number of
+`gaussians` of the levels that its makers gave it. Levels of other tools are
 ASSETS/peers/NAME/TOOL_PERCENT.npz, which `pairs_subject.pack_level` makes of what
 
     splat-transform -g cpu -w NAME.ply -d 50% d_50.ply
@@ -14,17 +17,20 @@ ASSETS/peers/NAME/TOOL_PERCENT.npz, which `pairs_subject.pack_level` makes of wh
 
 wrote, or of any format that v3dg reads.
 
-A pair is a count and a size. The size at which a level is at home is 2 px² for each of its gaussians: of the
-footprint of the object's ball, or of a scene's picture, for as large a share of the level as is in it of the
-asset. Every level is drawn at `factors` times that, measured along a side. Ours and merging alone are the
-finest cut with at most as many gaussians as the other level has, drawn with the filter that the bundle asks
-for, and so are ours refined, with `--refine` and as many steps; others are drawn whole and plain. Of a scene
-those gaussians count whose means are in the picture, in each picture anew: others' levels have more of them
-in one place than in another, so there each of them is a pair alone. Cuts are of whole groups: where one has
-fewer than 97 % of the count, its error and that of the next finer one are interpolated in the logarithm of
-the count. Where the eye is inside of groups, those are refined at any tolerance; a count below what is left
-is met with the least `min_level` that does. The truth is every gaussian at four by four samples a pixel. Of
-a picture wider than `widest` a window is compared, around a gaussian drawn at random from those that are
+A pair is a count and a size. The size at which a level is at home is 2 px² for each of
+its gaussians: of the footprint of the object's ball, or of a scene's picture, for as
+large a share of the level as is in it of the asset. Every level is drawn at `factors`
+times that, measured along a side. Ours and merging alone are the finest cut with at
+most as many gaussians as the other level has, drawn with the filter that the bundle
+asks for, and so are ours refined, with `--refine` and as many steps; others are drawn
+whole and plain. Of a scene those gaussians count whose means are in the picture, in
+each picture anew: others' levels have more of them in one place than in another, so
+there each of them is a pair alone. Cuts are of whole groups: where one has fewer than
+97 % of the count, its error and that of the next finer one are interpolated in the
+logarithm of the count. Where the eye is inside of groups, those are refined at any
+tolerance; a count below what is left is met with the least `min_level` that does. The
+truth is every gaussian at four by four samples a pixel. Of a picture wider than
+`widest` a window is compared, around a gaussian drawn at random from those that are
 large and opaque.
 """
 
@@ -97,7 +103,8 @@ class Measure:
 
 @dataclass(frozen=True)
 class Shown:
-    """What is drawn: gaussians whole, or a cut of a bundle; what they weigh in the error of their method."""
+    """What is drawn: gaussians whole, or a cut of a bundle; what they weigh in the
+    error of their method."""
 
     method: str
     subject: v3dg.Gaussians | v3dg.Bundle
@@ -144,31 +151,41 @@ class Study:
         """Means over the views of each method, count and size."""
         views: dict[tuple[Any, ...], list[Row]] = {}
         for (about, _, _), found in judges.measured(self._drawn(subject), errors):
-            key = tuple(about[name] for name in ("asset", "method", "level", "count", "factor", "width"))
+            key = tuple(
+                about[name] for name in ("asset", "method", "level", "count", "factor", "width")
+            )
             views.setdefault(key, []).append({**about, **found})
         names = ("asset", "method", "level", "count", "factor", "width")
         return [dict(zip(names, key, strict=True)) | weighted(rows) for key, rows in views.items()]
 
     def _drawn(self, subject: Subject) -> Iterator[tuple[Row, Picture, Picture]]:
         """What is to be compared: what it is, the truth, the picture."""
-        wanted_of_ours = set[str](self._config.methods) - ({"refined"} if self._config.refine == 0 else set())
+        wanted_of_ours = set[str](self._config.methods) - (
+            {"refined"} if self._config.refine == 0 else set()
+        )
         bundles: dict[str, v3dg.Bundle] = {}
         for name in _OURS:
             if name in wanted_of_ours:
                 bundles[name] = self._built(subject, name, bundles.get("ours"))
         self._asset = Level("all", self._placed(subject.asset), subject.counts(subject.asset))
         places = subject.cameras if subject.is_scene else [None] * len(subject.cameras)
-        sizes = {name: [cluster_sizes(bundle, place) for place in places] for name, bundle in bundles.items()}
+        sizes = {
+            name: [cluster_sizes(bundle, place) for place in places]
+            for name, bundle in bundles.items()
+        }
         for target in self._targets(subject):
             for factor in self._config.factors:
                 yield from self._compared(subject, target, factor, bundles, sizes)
 
     def _targets(self, subject: Subject) -> list[Target]:
-        """Objects at each percent; of a scene each other level, which have different counts in a picture."""
+        """Objects at each percent; of a scene each other level, which have different
+        counts in a picture."""
         targets: dict[float | str, Target] = {}
         for percent in self._config.percents:
             counts = [round(count * percent / 100) for count in self._asset.counts]
-            targets[percent] = Target(percent, round(len(subject.asset) * percent / 100), counts, [])
+            targets[percent] = Target(
+                percent, round(len(subject.asset) * percent / 100), counts, []
+            )
         if not subject.is_scene:
             for label, count in subject.published_counts.items():
                 targets[f"published {label}"] = Target(
@@ -182,7 +199,9 @@ class Study:
             level = Level(method, self._placed(gaussians), subject.counts(gaussians))
             if subject.is_scene:
                 label = wanted if isinstance(wanted, str) else f"{wanted:g} %, {method}"
-                of_scene.append(Target(label, len(gaussians), level.counts, [level] if is_drawn else []))
+                of_scene.append(
+                    Target(label, len(gaussians), level.counts, [level] if is_drawn else [])
+                )
             else:
                 targets[wanted].levels.append(level)
         return of_scene or list(targets.values())
@@ -197,7 +216,9 @@ class Study:
         if name == "refined" and ours is not None:
             bundle = ours
         else:
-            bundle = v3dg.build_bundle(subject.asset, config=config, device=self.device, progress=False)
+            bundle = v3dg.build_bundle(
+                subject.asset, config=config, device=self.device, progress=False
+            )
         if name == "refined":
             options: Row = {"steps": self._config.refine, "device": self.device, "progress": False}
             bundle = refine_bundle(bundle, cameras=subject.refined_from, **options)
@@ -226,20 +247,28 @@ class Study:
         for view, size in enumerate(sizes):
             truth = draw_truth(self._asset.gaussians, size.window, self.device, _SAMPLES)
             about["width"] = size.camera.width
-            shown = [Shown(level.method, level.gaussians, level.counts[view], {}) for level in levels]
+            shown = [
+                Shown(level.method, level.gaussians, level.counts[view], {}) for level in levels
+            ]
             for name, bundle in bundles.items():
                 count = max(target.counts[view], 1)
                 shown += cuts_of(name, bundle, size.camera, count, cluster_sizes_of[name][view])
             for one in shown:
                 image = v3dg.render(one.subject, size.window, device=self.device, **one.cut)
-                row = {**about, "method": one.method, "gaussians": one.gaussians, "weight": one.weight}
+                row = {
+                    **about,
+                    "method": one.method,
+                    "gaussians": one.gaussians,
+                    "weight": one.weight,
+                }
                 tolerance = one.cut.get("tolerance", _COARSEST_PX2)
                 row["tolerance"] = tolerance if tolerance < _COARSEST_PX2 else None
                 yield row, truth, to_8bit(image.color)
 
 
 def cluster_sizes(bundle: v3dg.Bundle, camera: v3dg.Camera | None = None) -> Any:
-    """(C,) gaussians of each cluster; with a camera, those whose means are in its picture."""
+    """(C,) gaussians of each cluster; with a camera, those whose means are in its
+    picture."""
     offset = bundle.clusters.offset
     if camera is None:
         return np.diff(offset)
@@ -250,7 +279,8 @@ def cluster_sizes(bundle: v3dg.Bundle, camera: v3dg.Camera | None = None) -> Any
 def cuts_of(
     name: str, bundle: v3dg.Bundle, camera: v3dg.Camera, count: int, sizes: Any = None
 ) -> list[Shown]:
-    """The finest cut with at most so many gaussians, and the next finer one if it has far fewer.
+    """The finest cut with at most so many gaussians, and the next finer one if it has
+    far fewer.
 
     `sizes`: how many gaussians of each cluster count; all by default.
     """
@@ -296,7 +326,9 @@ def weighted(rows: list[Row]) -> Row:
         known = [row for row in rows if row[name] is not None]
         values, weights = [row[name] for row in known], [row["weight"] for row in known]
         if name == "gaussians":  # errors are interpolated in its logarithm
-            means[name] = round(math.exp(np.average(np.log(np.maximum(values, 1)), weights=weights)))
+            means[name] = round(
+                math.exp(np.average(np.log(np.maximum(values, 1)), weights=weights))
+            )
         else:
             means[name] = float(f"{np.average(values, weights=weights):.6g}") if known else None
     return means
@@ -319,7 +351,10 @@ def measure(config: Measure) -> None:
             start = time.perf_counter()
             subject = Subject(config.assets, name, about[name], config.views)
             rows = rows | by_key(study.rows(subject, judges))
-            print(f"{name}: {len(subject.asset)} gaussians, {time.perf_counter() - start:.0f} s", flush=True)
+            print(
+                f"{name}: {len(subject.asset)} gaussians, {time.perf_counter() - start:.0f} s",
+                flush=True,
+            )
             result: Row = {"settings": settings, "changes": changes, "builds": study.builds}
             result |= {"rows": list(rows.values())}
             record.write(config.output / "pairs.json", result, study.device)
@@ -335,7 +370,8 @@ def by_key(rows: list[Row]) -> dict[tuple[Any, ...], Row]:
 def known_results(
     paths: tuple[Path, ...], settings: Row, changes: Row
 ) -> tuple[dict[tuple[Any, ...], Row], dict[str, Row], Row]:
-    """Rows and builds of recorded results, which must have been made alike, and all changes."""
+    """Rows and builds of recorded results, which must have been made alike, and all
+    changes."""
     rows: dict[tuple[Any, ...], Row] = {}
     builds: dict[str, Row] = {}
     for path in paths:

@@ -1,4 +1,5 @@
-"""The page of `pairs`: tables of our error by the best other tool's at equal counts, and plots."""
+"""The page of `pairs`: tables of our error by the best other tool's at equal counts,
+and plots."""
 
 from __future__ import annotations
 
@@ -59,7 +60,8 @@ class Report:
 
 
 def best_others(rows: Sequence[Row], which: str = "ours") -> list[Row]:
-    """One row for each pair of a count and a size that others have, too: which of ours, the best other."""
+    """One row for each pair of a count and a size that others have, too: which of ours,
+    the best other."""
     pairs: dict[tuple[Any, ...], dict[str, Row]] = {}
     for row in rows:
         pairs.setdefault((row["asset"], row["level"], row["factor"]), {})[row["method"]] = row
@@ -92,7 +94,8 @@ def _ratio(ours: float, theirs: float) -> float:
 
 
 def overview(rows: Sequence[Row], which: str = "ours") -> str:
-    """A line for each asset, and of all of them one, one from half the size on, and one for each size."""
+    """A line for each asset, and of all of them one, one from half the size on, and one
+    for each size."""
     pairs = best_others(rows, which)
     names = list(dict.fromkeys(row["asset"] for row in pairs))
     lines = [_line(name, [row for row in pairs if row["asset"] == name]) for name in names]
@@ -101,7 +104,9 @@ def overview(rows: Sequence[Row], which: str = "ours") -> str:
         larger = [row for row in pairs if row["factor"] >= 0.5]
         lines += [_line("all, from x0.5 on", larger)] if larger else []
         for factor in sorted({row["factor"] for row in pairs}):
-            lines.append(_line(f"all, x{factor:g}", [row for row in pairs if row["factor"] == factor]))
+            lines.append(
+                _line(f"all, x{factor:g}", [row for row in pairs if row["factor"] == factor])
+            )
     return markdown(_OVERVIEW, lines)
 
 
@@ -134,7 +139,9 @@ def _line(name: str, pairs: Sequence[Row]) -> Row:
         line[key] = sum(row["ratio"] <= most for row in pairs) / len(pairs)
     for key in ("psnr", "ssim"):
         both = [(row[f"ours_{key}"], row[f"best_{key}"]) for row in pairs]
-        line[key] = mean([ours - theirs for ours, theirs in both if ours is not None and theirs is not None])
+        line[key] = mean(
+            [ours - theirs for ours, theirs in both if ours is not None and theirs is not None]
+        )
     return line
 
 
@@ -143,19 +150,24 @@ def _level(row: Row) -> str:
 
 
 def table(pairs: Sequence[Row]) -> str:
-    """Of one asset: counts down, sizes across, FLIP of ours and of the best other, and their ratio."""
+    """Of one asset: counts down, sizes across, FLIP of ours and of the best other, and
+    their ratio."""
     factors = sorted({row["factor"] for row in pairs})
     lines: dict[Any, Row] = {}
     for row in sorted(pairs, key=lambda row: -row["count"]):
         line = lines.setdefault(row["level"], {"level": _level(row), "others": row["others"]})
         line["gaussians"] = row["gaussians"]
-        line[f"{row['factor']:g}"] = f"{row['ours_flip']:.4f} / {row['best_flip']:.4f} = {row['ratio']:.2f}"
+        line[f"{row['factor']:g}"] = (
+            f"{row['ours_flip']:.4f} / {row['best_flip']:.4f} = {row['ratio']:.2f}"
+        )
     columns = [
         Column("kept", "level"),
         Column("theirs", "others", "count"),
         Column("ours", "gaussians", "count"),
     ]
-    return markdown([*columns, *(Column(f"x{f:g}", f"{f:g}") for f in factors)], list(lines.values()))
+    return markdown(
+        [*columns, *(Column(f"x{f:g}", f"{f:g}") for f in factors)], list(lines.values())
+    )
 
 
 def report(options: Report) -> None:
@@ -190,7 +202,8 @@ def report(options: Report) -> None:
 
 
 def plot(rows: Sequence[Row], path: Path) -> None:
-    """Count against FLIP, and below it PSNR, for each size: three sizes side by side, as wide as a page."""
+    """Count against FLIP, and below it PSNR, for each size: three sizes side by side,
+    as wide as a page."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -229,14 +242,19 @@ def plot(rows: Sequence[Row], path: Path) -> None:
         panel.xaxis.set_major_formatter(lambda x, _: count_text(int(x)))
     total = max((row["gaussians"] for row in rows if row["method"] == "all"), default=0)
     figure.suptitle(f"{rows[0]['asset']}, {count_text(total)} gaussians in a picture", fontsize=12)
-    figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=10)
+    figure.legend(
+        *axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=10
+    )
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
 
 
 def _draw(panel: Any, rows: Sequence[Row], key: str) -> None:
-    """The points of each method, at one size, where others' levels of as many gaussians are."""
-    counts = {row["level"]: row["gaussians"] for row in rows if row["method"] not in (*_OURS, "all")}
+    """The points of each method, at one size, where others' levels of as many gaussians
+    are."""
+    counts = {
+        row["level"]: row["gaussians"] for row in rows if row["method"] not in (*_OURS, "all")
+    }
     for method, (style, color, label) in _STYLES.items():
         points = sorted(
             (counts[row["level"]], row[key])
@@ -244,6 +262,8 @@ def _draw(panel: Any, rows: Sequence[Row], key: str) -> None:
             if row["method"] == method and row["level"] in counts and row[key] is not None
         )
         if points:
-            panel.plot(*zip(*points, strict=True), style, color=color, label=label, markersize=4, lw=1.3)
+            panel.plot(
+                *zip(*points, strict=True), style, color=color, label=label, markersize=4, lw=1.3
+            )
     panel.set_xscale("log")
     panel.grid(alpha=0.3, which="both", lw=0.5)

@@ -1,4 +1,5 @@
-"""What `pairs` looks at: assets from all sides or from cameras, how large, and others' levels of them."""
+"""What `pairs` looks at: assets from all sides or from cameras, how large, and others'
+levels of them."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ _DISTANCE = 2.5  # of the camera from an object's centre, in radii
 
 @dataclass(frozen=True)
 class Size:
-    """How large a view of a subject is drawn: the camera of the whole picture, and of the part compared."""
+    """How large a view of a subject is drawn: the camera of the whole picture, and of
+    the part compared."""
 
     camera: v3dg.Camera
     window: v3dg.Camera
@@ -45,7 +47,9 @@ class Subject:
         center = np.quantile(means, [0.01, 0.99], axis=0).mean(axis=0)
         radius = float(np.quantile(np.linalg.norm(means - center, axis=1), _BALL_SHARE))
         fov, up = 2 * math.asin(1 / _DISTANCE), self._about["up"]
-        return v3dg.turntable(center, _DISTANCE * radius, views, up=up, fov_x=fov, width=1024, height=1024)
+        return v3dg.turntable(
+            center, _DISTANCE * radius, views, up=up, fov_x=fov, width=1024, height=1024
+        )
 
     @property
     def is_scene(self) -> bool:
@@ -53,12 +57,14 @@ class Subject:
 
     @property
     def refined_from(self) -> list[v3dg.Camera]:
-        """Cameras by which a scene is refined; none of an object, which is seen from all around."""
+        """Cameras by which a scene is refined; none of an object, which is seen from
+        all around."""
         name = self._about.get("refined_from")
         return [] if name is None else list(v3dg.read_cameras(self._folder / name).values())
 
     def counts(self, gaussians: v3dg.Gaussians) -> list[int]:
-        """Of gaussians that count, in each view: all of an object, of a scene those in the picture."""
+        """Of gaussians that count, in each view: all of an object, of a scene those in
+        the picture."""
         if not self.is_scene:
             return [len(gaussians)] * len(self.cameras)
         return [int(places(gaussians.means, camera)[1].sum()) for camera in self.cameras]
@@ -69,7 +75,8 @@ class Subject:
         return float(np.mean(self.counts(self.asset))) / len(self.asset)
 
     def sizes(self, count: int, factor: float, widest: int) -> list[Size]:
-        """Each view, at a factor times the size at which a level of so many gaussians is at home."""
+        """Each view, at a factor times the size at which a level of so many gaussians
+        is at home."""
         if self.is_scene:
             wanted = HOME_PX2 * count * self._share_seen
             scales = [math.sqrt(wanted / (c.width * c.height)) for c in self.cameras]
@@ -78,7 +85,8 @@ class Subject:
             scales = [math.sqrt(HOME_PX2 * count / solid_angle) / c.fx for c in self.cameras]
         rng = np.random.default_rng([zlib.crc32(self.name.encode()), count, round(64 * factor)])
         return [
-            self._size(scaled(c, factor * s), widest, rng) for c, s in zip(self.cameras, scales, strict=True)
+            self._size(scaled(c, factor * s), widest, rng)
+            for c, s in zip(self.cameras, scales, strict=True)
         ]
 
     def _size(self, camera: v3dg.Camera, widest: int, rng: np.random.Generator) -> Size:
@@ -87,11 +95,14 @@ class Subject:
         px, is_seen = places(self.asset.means, camera)
         ids = np.flatnonzero(is_seen)
         largest = np.sort(self.asset.scales[ids].astype(np.float64), axis=1)[:, 1:].prod(axis=1)
-        # Of a scene the sky would always be taken: what is twice as large counts twice, whatever the rest.
+        # Of a scene the sky would always be taken: what is twice as large counts twice,
+        # whatever the rest.
         weights = self.asset.opacities[ids] * np.sqrt(largest)
         target = px[rng.choice(ids, p=weights / weights.sum())]
         size = np.minimum([camera.width, camera.height], widest)
-        corner = np.clip(np.round(target - size / 2), 0, np.array([camera.width, camera.height]) - size)
+        corner = np.clip(
+            np.round(target - size / 2), 0, np.array([camera.width, camera.height]) - size
+        )
         K = camera.K.copy()
         K[:2, 2] -= corner
         return Size(camera, replace(camera, K=K, width=int(size[0]), height=int(size[1])))
@@ -99,10 +110,15 @@ class Subject:
     @property
     def published_counts(self) -> dict[str, int]:
         """Gaussians of the levels of the asset's makers."""
-        return {label: level["gaussians"] for label, level in self._about.get("published", {}).items()}
+        return {
+            label: level["gaussians"] for label, level in self._about.get("published", {}).items()
+        }
 
-    def peers(self, percents: tuple[float, ...]) -> Iterator[tuple[float | str, str, v3dg.Gaussians]]:
-        """Levels of others: at which percent, or which published one, made by whom, and its gaussians."""
+    def peers(
+        self, percents: tuple[float, ...]
+    ) -> Iterator[tuple[float | str, str, v3dg.Gaussians]]:
+        """Levels of others: at which percent, or which published one, made by whom, and
+        its gaussians."""
         for path in sorted((self._folder / "peers" / self.name).glob("*_*")):
             tool, _, percent = path.name.removesuffix(path.suffix).rpartition("_")
             if float(percent) in percents:
@@ -116,12 +132,15 @@ def places(means: Any, camera: v3dg.Camera) -> tuple[Any, Any]:
     seen = means.astype(np.float64) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     is_before = seen[:, 2] > camera.near
     depth = np.where(is_before, seen[:, 2], 1)
-    px = np.stack([camera.fx * seen[:, 0] / depth + camera.cx, camera.fy * seen[:, 1] / depth + camera.cy], 1)
+    px = np.stack(
+        [camera.fx * seen[:, 0] / depth + camera.cx, camera.fy * seen[:, 1] / depth + camera.cy], 1
+    )
     return px, is_before & ((px >= 0) & (px < [camera.width, camera.height])).all(axis=1)
 
 
 def scaled(camera: v3dg.Camera, scale: float) -> v3dg.Camera:
-    """The camera with that many times the resolution, its sides rounded up to whole px."""
+    """The camera with that many times the resolution, its sides rounded up to whole
+    px."""
     width, height = (math.ceil(scale * side) for side in (camera.width, camera.height))
     K = camera.K * np.array([[scale], [scale], [1.0]])
     K[:2, 2] += (np.array([width, height]) - scale * np.array([camera.width, camera.height])) / 2
@@ -129,10 +148,12 @@ def scaled(camera: v3dg.Camera, scale: float) -> v3dg.Camera:
 
 
 def pack_level(path: Path, gaussians: v3dg.Gaussians) -> None:
-    """Write gaussians in about 27 bytes each and half a byte for each coefficient of higher degree or more.
+    """Write gaussians in about 27 bytes each and half a byte for each coefficient of
+    higher degree or more.
 
-    Means have 17 bits of mantissa, and coefficients of higher degrees a byte of their square root, so that
-    small ones are kept: pictures differ from the gaussians' by far less than levels do from the asset.
+    Means have 17 bits of mantissa, and coefficients of higher degrees a byte of their
+    square root, so that small ones are kept: pictures differ from the gaussians' by far
+    less than levels do from the asset.
     """
     sh = gaussians.sh.reshape(len(gaussians), -1)
     base, rest = sh[:, :3], sh[:, 3:]
@@ -158,7 +179,9 @@ def read_level(path: Path) -> v3dg.Gaussians:
     with np.load(path) as file:
         parts = {name: file[name] for name in file.files}
     root = parts["rest_root"].astype(np.float32) / 127
-    sh = np.concatenate([parts["sh0"].astype(np.float32), parts["rest_top"] * root * np.abs(root)], axis=1)
+    sh = np.concatenate(
+        [parts["sh0"].astype(np.float32), parts["rest_top"] * root * np.abs(root)], axis=1
+    )
     quats = parts["quats"].astype(np.float32)
     return v3dg.Gaussians(
         means=parts["means"],

@@ -1,21 +1,25 @@
-"""Our frames and gradients beside those of other rasterizers, in one run: times, memory and errors.
+"""Our frames and gradients beside those of other rasterizers, in one run: times, memory
+and errors.
 
     python -m benchmarks.studies.peers --layout donutsea.json --asset donut.ply \\
         --captured ASSETS --names Fungi --modules PEERS -o peers.json
 
-Measured is what can be imported: gsplat 1.5, the inference renderer of its main branch ("HiGS"), Faster-GS,
-FlashGS. PEERS has a folder for each that is put in front of Python's path: `gsplat`, `higs`, and, because the
-latter two have the filter compiled in, `fastergs_0`, `fastergs_0.3`, `flashgs_0` and `flashgs_0.3`. Every
-one is measured in a process of its own, so that one that fails leaves the others alone; what failed is in the
-result with what it said.
+Measured is what can be imported: gsplat 1.5, the inference renderer of its main branch
+("HiGS"), Faster-GS, FlashGS. PEERS has a folder for each that is put in front of
+Python's path: `gsplat`, `higs`, and, because the latter two have the filter compiled
+in, `fastergs_0`, `fastergs_0.3`, `flashgs_0` and `flashgs_0.3`. Every one is measured
+in a process of its own, so that one that fails leaves the others alone; what failed is
+in the result with what it said.
 
-ASSETS is a folder as `pairs` has it. Instances are drawn without a filter, assets and random gaussians with
-0.3 px², as assets are trained, and, at the first size, without one. Times are of CUDA events around single
-calls that start on an idle device and end with it, so what Python costs is in them. Errors are to float64, in
-eight windows of each picture. Memory is what the process has on the device while it draws, without those
-inputs of which the renderer has a copy of its own. A training step starts from logarithms of scales and
-logits of opacities, as optimisers hold them, and its loss is a weighted sum of the picture's colours.
-Gradients of few gaussians are compared with float64's.
+ASSETS is a folder as `pairs` has it. Instances are drawn without a filter, assets and
+random gaussians with 0.3 px², as assets are trained, and, at the first size, without
+one. Times are of CUDA events around single calls that start on an idle device and end
+with it, so what Python costs is in them. Errors are to float64, in eight windows of
+each picture. Memory is what the process has on the device while it draws, without those
+inputs of which the renderer has a copy of its own. A training step starts from
+logarithms of scales and logits of opacities, as optimisers hold them, and its loss is a
+weighted sum of the picture's colours. Gradients of few gaussians are compared with
+float64's.
 """
 
 from __future__ import annotations
@@ -87,7 +91,8 @@ class Config:
 
 
 def subjects(config: Config) -> Iterator[tuple[str, Callable[[], Subject]]]:
-    """Names of scenes, and what makes each; the largest last, for a pool keeps what was taken once."""
+    """Names of scenes, and what makes each; the largest last, for a pool keeps what was
+    taken once."""
     device = config.device
     for name in config.names:
         yield name, partial(scenes.captured, config.captured or Path(), name, device)
@@ -109,7 +114,8 @@ def views(config: Config, subject: Subject, filter_px2: float) -> Iterator[tuple
 
 
 class Book:
-    """Rows as they are measured, a line of JSON each, so that a process that ends leaves what it had."""
+    """Rows as they are measured, a line of JSON each, so that a process that ends
+    leaves what it had."""
 
     def __init__(self, folder: Path, job: str) -> None:
         self._path, self._folder, self._job = folder / f"{job}.jsonl", folder, job
@@ -125,7 +131,9 @@ class Book:
 
     def failure(self, about: Row, error: BaseException) -> None:
         said = f"{type(error).__name__}: {error}"
-        self.write("failure", {**about, "error": said[-600:], "trace": traceback.format_exc()[-1500:]})
+        self.write(
+            "failure", {**about, "error": said[-600:], "trace": traceback.format_exc()[-1500:]}
+        )
 
     def truth_path(self, about: Row) -> Path:
         parts = (str(about[name]) for name in ("scene", "view", "width", "filter_px2"))
@@ -198,7 +206,9 @@ def frames(config: Config, peer: Peer, subject: Subject, filter_px2: float, book
             about = {**view, "renderer": peer.name, "gaussians": len(subject.gaussians)}
             try:
                 row, shown = measured(config, of(camera), spare)
-                errors = errors_of(peer.picture(shown), camera, book.truth_path(view), config.window)
+                errors = errors_of(
+                    peer.picture(shown), camera, book.truth_path(view), config.window
+                )
                 book.write("frame", {**about, **row, **errors})
             except Exception as error:
                 book.failure(about, error)
@@ -236,8 +246,16 @@ def measured(config: Config, draw: Draw, spare: float = 0.0) -> tuple[Row, Any]:
     first = statistics.median(times_ms(draw, config.device, 3))
     repeats = int(min(max(1e3 * config.seconds / max(first, 1e-3), _LEAST_REPEATS), _MOST_REPEATS))
     times = times_ms(draw, config.device, repeats)
-    row = {"ms": statistics.median(times), "p95_ms": float(np.quantile(times, 0.95)), "least_ms": min(times)}
-    return {**{k: round(v, 3) for k, v in row.items()}, "repeats": repeats, "gigabytes": gigabytes}, draw()
+    row = {
+        "ms": statistics.median(times),
+        "p95_ms": float(np.quantile(times, 0.95)),
+        "least_ms": min(times),
+    }
+    return {
+        **{k: round(v, 3) for k, v in row.items()},
+        "repeats": repeats,
+        "gigabytes": gigabytes,
+    }, draw()
 
 
 def errors_of(picture: Any, camera: Camera, path: Path, side: int) -> Row:
@@ -262,7 +280,8 @@ def errors_of(picture: Any, camera: Camera, path: Path, side: int) -> Row:
 
 
 def compare_gradients(config: Config, job: Job, book: Book) -> None:
-    """Relative L2 distances of gradients to those of float64, of few gaussians in a small picture."""
+    """Relative L2 distances of gradients to those of float64, of few gaussians in a
+    small picture."""
     trainable = [peer for peer in job.peers if peer.train and job.filter_px2 in (None, TRAINED_PX2)]
     if not trainable:
         return
@@ -290,7 +309,9 @@ def compare_gradients(config: Config, job: Job, book: Book) -> None:
 
 def distances(values: dict[str, Any], truths: dict[str, Any]) -> dict[str, float]:
     """Relative to the truths' lengths."""
-    found = {name: float((values[name] - truths[name]).norm() / truths[name].norm()) for name in ROWS}
+    found = {
+        name: float((values[name] - truths[name]).norm() / truths[name].norm()) for name in ROWS
+    }
     return {name: float(f"{distance:.2e}") for name, distance in found.items()}
 
 
@@ -339,13 +360,18 @@ def version_of(config: Config, job: str) -> str | None:
 
 
 def print_table(rows: list[Row]) -> None:
-    """Of each picture ours over the fastest peer, and everyone's times, PSNR to float64, and memory."""
+    """Of each picture ours over the fastest peer, and everyone's times, PSNR to
+    float64, and memory."""
     pictures: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         key = tuple(row[name] for name in ("scene", "view", "width", "filter_px2"))
         pictures.setdefault(key, []).append(row)
     for key, found in pictures.items():
-        ours = [row["ms"] for row in found if row["job"] == _OURS and not row["renderer"].endswith("1e-4")]
+        ours = [
+            row["ms"]
+            for row in found
+            if row["job"] == _OURS and not row["renderer"].endswith("1e-4")
+        ]
         peers = [row["ms"] for row in found if not row["job"].startswith(_OURS)]
         ratio = f"ours / fastest peer {min(ours) / min(peers):.2f}" if ours and peers else ""
         print("{}, {}, {} px, filter {}: ".format(*key) + ratio)
@@ -353,7 +379,9 @@ def print_table(rows: list[Row]) -> None:
             name = row["renderer"] + (" again" if row["job"].endswith("again") else "")
             psnr = f"{row['psnr']:.1f} dB" if "psnr" in row else ""
             memory = f"{row['gigabytes']} GB" if row["gigabytes"] is not None else ""
-            print(f"    {name:24} {row['ms']:9.3f} ms, p95 {row['p95_ms']:9.3f}  {psnr:>9}  {memory}")
+            print(
+                f"    {name:24} {row['ms']:9.3f} ms, p95 {row['p95_ms']:9.3f}  {psnr:>9}  {memory}"
+            )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""The renderers that `peers` compares: how each is given a scene, draws it, and is trained with.
+"""The renderers that `peers` compares: how each is given a scene, draws it, and is
+trained with.
 
-Each is driven as its authors' example or renderer drives it. What needs no camera is prepared before the time
-is taken, and so is what a camera needs of tensors.
+Each is driven as its authors' example or renderer drives it. What needs no camera is
+prepared before the time is taken, and so is what a camera needs of tensors.
 """
 
 from __future__ import annotations
@@ -48,7 +49,9 @@ class Raw:
         return Raw(*(getattr(self, name).detach().clone().requires_grad_() for name in ROWS))
 
     def gaussians(self) -> v3dg.Gaussians:
-        return v3dg.Gaussians(self.means, self.quats, self.log_scales.exp(), self.logits.sigmoid(), self.sh)
+        return v3dg.Gaussians(
+            self.means, self.quats, self.log_scales.exp(), self.logits.sigmoid(), self.sh
+        )
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,8 @@ class Peer:
     """(H, W, 3) of what was drawn, on black; a float is 0 to 1."""
     train: Step | None = None
     keeps: Callable[[Subject, float], tuple[str, ...]] = lambda subject, filter_px2: INPUTS
-    """What of the subject's gaussians it draws from; of the rest it has copies of its own."""
+    """What of the subject's gaussians it draws from; of the rest it has copies of its
+    own."""
     sh_degrees: tuple[int, ...] = (0, 1, 2, 3)
     differs: str = ""
     """What it does otherwise than gsplat 1.5 does, as far as that shows in errors."""
@@ -115,7 +119,8 @@ def differentiate(draw: Callable[[Raw, Camera, float], Any]) -> Step:
 
 
 def v3dg_renderer(min_transmittance: float | None) -> Prepare:
-    """With None scenes and bundles stop where they do by default, and assets where gsplat does."""
+    """With None scenes and bundles stop where they do by default, and assets where
+    gsplat does."""
 
     def prepare(subject: Subject, filter_px2: float) -> Callable[[Camera], Draw]:
         whole, device = subject.whole(filter_px2), subject.gaussians.means.device.type
@@ -138,7 +143,8 @@ def v3dg_renderer(min_transmittance: float | None) -> Prepare:
 
 
 def v3dg_keeps(subject: Subject, filter_px2: float) -> tuple[str, ...]:
-    """An asset is drawn from where it is, a scene and a bundle from what is resident."""
+    """An asset is drawn from where it is, a scene and a bundle from what is
+    resident."""
     return INPUTS if subject.layout is None and filter_px2 == 0 else ()
 
 
@@ -181,7 +187,14 @@ def higs(sh_compression: str) -> Prepare:
         compression = sh_compression if g.sh_degree == 3 else "none"
         colors, degree = (base_color(g), None) if g.sh_degree == 0 else (g.sh, g.sh_degree)
         scene = GaussianInferenceScene.from_gaussian_tensors(
-            g.means, g.quats, g.scales, g.opacities.clamp(0, 1), colors, degree, compression, id="scene"
+            g.means,
+            g.quats,
+            g.scales,
+            g.opacities.clamp(0, 1),
+            colors,
+            degree,
+            compression,
+            id="scene",
         )
         renderer = GaussianInferenceRenderer(scene)
 
@@ -206,7 +219,14 @@ def higs_picture(done: Any) -> Any:
 def fastergs_inputs(raw: Raw) -> tuple[Any, ...]:
     """In the order in which its functions take them."""
     rest = raw.sh[:, 1:].contiguous()
-    return raw.means, raw.log_scales, raw.quats, raw.logits[:, None], raw.sh[:, :1].contiguous(), rest
+    return (
+        raw.means,
+        raw.log_scales,
+        raw.quats,
+        raw.logits[:, None],
+        raw.sh[:, :1].contiguous(),
+        rest,
+    )
 
 
 def fastergs_settings(camera: Camera, like: Any, sh_bases: int) -> Any:
@@ -285,9 +305,14 @@ def flashgs(subject: Subject, filter_px2: float) -> Callable[[Camera], Draw]:
 
     def of(camera: Camera) -> Draw:
         if (camera.K[0, 2], camera.K[1, 2]) != (camera.width / 2, camera.height / 2):
-            raise ValueError("camera: expected the principal point in the middle, FlashGS has no other")
+            raise ValueError(
+                "camera: expected the principal point in the middle, FlashGS has no other"
+            )
         size = camera.width, camera.height, 16, 16
-        place = (t.float() for t in map(torch.as_tensor, (camera.position, camera.viewmat[:3, :3].T.copy())))
+        place = (
+            t.float()
+            for t in map(torch.as_tensor, (camera.position, camera.viewmat[:3, :3].T.copy()))
+        )
         view = *size, *place, camera.fx, camera.fy, _FLASHGS_FAR, camera.near
         ranges = zeros(_MOST_TILES, 2, dtype=torch.int32)
 
@@ -300,7 +325,15 @@ def flashgs(subject: Subject, filter_px2: float) -> Callable[[Camera], Draw]:
             ops.sort_gaussian(pairs, *size, space, keys[0], values[0], keys[1], values[1])
             color = zeros(camera.height, camera.width, 3, dtype=torch.int8)
             ops.render_16x16(
-                pairs, camera.width, camera.height, *projected, keys[1], values[1], ranges, black, color
+                pairs,
+                camera.width,
+                camera.height,
+                *projected,
+                keys[1],
+                values[1],
+                ranges,
+                black,
+                color,
             )
             return color
 
@@ -331,7 +364,9 @@ def covariances(gaussians: v3dg.Gaussians) -> Any:
     ]
     squares = gaussians.scales.square()
     upper = [(i, j) for i in range(3) for j in range(i, 3)]
-    return torch.stack([sum(rows[i][k] * rows[j][k] * squares[:, k] for k in range(3)) for i, j in upper], 1)
+    return torch.stack(
+        [sum(rows[i][k] * rows[j][k] * squares[:, k] for k in range(3)) for i, j in upper], 1
+    )
 
 
 def tensor(array: Any, like: Any) -> Any:
@@ -349,12 +384,20 @@ def keeps(*names: str) -> Callable[[Subject, float], tuple[str, ...]]:
 
 
 def jobs() -> tuple[Job, ...]:
-    """What there is to measure, v3dg first and again at the end: a clock that has changed shows."""
+    """What there is to measure, v3dg first and again at the end: a clock that has
+    changed shows."""
     stop = "pixels of scenes and bundles stop behind what leaves a thousandth of the light"
     ours = (
-        Peer("v3dg.Renderer", v3dg_renderer(None), lambda f: f.color, keeps=v3dg_keeps, differs=stop),
+        Peer(
+            "v3dg.Renderer", v3dg_renderer(None), lambda f: f.color, keeps=v3dg_keeps, differs=stop
+        ),
         Peer("v3dg.Renderer, 1e-4", v3dg_renderer(1e-4), lambda f: f.color, keeps=v3dg_keeps),
-        Peer("v3dg.rasterize", v3dg_rasterize, lambda image: image.color, differentiate(v3dg_training)),
+        Peer(
+            "v3dg.rasterize",
+            v3dg_rasterize,
+            lambda image: image.color,
+            differentiate(v3dg_training),
+        ),
     )
     no_clamp = "alpha is not held below 0.999"
     gsplats = tuple(
@@ -364,7 +407,15 @@ def jobs() -> tuple[Job, ...]:
     half = "half floats, of the picture too; " + no_clamp + "; pixels do not stop one by one"
     inference = (
         Peer("HiGS", higs("none"), higs_picture, None, keeps(), differs=half),
-        Peer("HiGS, 32 bytes", higs("32b"), higs_picture, None, keeps(), (3,), half + "; SH compressed"),
+        Peer(
+            "HiGS, 32 bytes",
+            higs("32b"),
+            higs_picture,
+            None,
+            keeps(),
+            (3,),
+            half + "; SH compressed",
+        ),
     )
     faster = (
         Peer(
@@ -376,13 +427,17 @@ def jobs() -> tuple[Job, ...]:
         ),
     )
     near = "nothing nearer than 0.2; 8 bits, rounded down; 16 SH coefficients always; " + no_clamp
-    flash = (Peer("FlashGS", flashgs, flashgs_picture, keeps=keeps("means", "opacities"), differs=near),)
+    flash = (
+        Peer("FlashGS", flashgs, flashgs_picture, keeps=keeps("means", "opacities"), differs=near),
+    )
     return (
         Job("v3dg", "v3dg", ours),
         Job("gsplat", "gsplat", gsplats),
         Job("higs", "gsplat.experimental.render", inference),
         *(
-            Job(f"fastergs_{px2:g}", "FasterGSCudaBackend.torch_bindings.rasterization", faster, px2)
+            Job(
+                f"fastergs_{px2:g}", "FasterGSCudaBackend.torch_bindings.rasterization", faster, px2
+            )
             for px2 in (0.3, 0.0)
         ),
         *(Job(f"flashgs_{px2:g}", "flash_gaussian_splatting", flash, px2) for px2 in (0.3, 0.0)),

@@ -1,8 +1,10 @@
-"""The page of `peers`: tables of everyone's times, errors and memory, from one or more recorded results.
+"""The page of `peers`: tables of everyone's times, errors and memory, from one or more
+recorded results.
 
     python -m benchmarks.studies.peers_report peers.json -o docs/notes/peers.md
 
-Ours is the quicker of `v3dg.Renderer` and `v3dg.rasterize` in the same row, where both were measured.
+Ours is the quicker of `v3dg.Renderer` and `v3dg.rasterize` in the same row, where both
+were measured.
 """
 
 from __future__ import annotations
@@ -117,7 +119,10 @@ def training_table(rows: list[Row], gradients: list[Row]) -> str:
 
 
 def page(results: list[Row]) -> str:
-    rows = {kind: [row for r in results for row in r[kind]] for kind in ("frame", "training", "gradients")}
+    rows = {
+        kind: [row for r in results for row in r[kind]]
+        for kind in ("frame", "training", "gradients")
+    }
     about = results[-1]
     differs = {name: said for result in results for name, said in result["differs"].items()}
     versions = {job: said for result in results for job, said in result["versions"].items()}
@@ -132,8 +137,9 @@ def page(results: list[Row]) -> str:
         *(f"- `{result['command']}`" for result in results),
         *frame_tables(latest(rows["frame"])),
         "\n## Training\n",
-        "A step starts from logarithms of scales and logits of opacities; the filter is 0.3 px². Gradients\n"
-        "are those of few gaussians in a small picture; of the five inputs the one farthest off counts.\n",
+        "A step starts from logarithms of scales and logits of opacities; the filter is 0.3 px². "
+        "Gradients\nare those of few gaussians in a small picture; of the five inputs the one "
+        "farthest off counts.\n",
         training_table(latest(rows["training"]), rows["gradients"]),
     ]
     failures = [row for result in results for row in result["failure"]]
@@ -149,7 +155,9 @@ def latest(rows: list[Row]) -> list[Row]:
 
 
 def failure_text(row: Row) -> str:
-    place = [str(row[name]) for name in ("renderer", "scene", "view", "width", "part") if name in row]
+    place = [
+        str(row[name]) for name in ("renderer", "scene", "view", "width", "part") if name in row
+    ]
     return f"{row['job']}{': ' if place else ''}{', '.join(place)}: {row['error'].splitlines()[0][:200]}"
 
 

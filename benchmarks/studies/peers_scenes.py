@@ -1,4 +1,5 @@
-"""What `peers` draws: scenes with their cameras, and what float64 says of windows of the pictures."""
+"""What `peers` draws: scenes with their cameras, and what float64 says of windows of
+the pictures."""
 
 from __future__ import annotations
 
@@ -59,7 +60,9 @@ class Subject:
         if filter_px2 == 0:
             return self.gaussians
         if len(self.gaussians) > _MOST_IN_A_BUNDLE:
-            raise ValueError(f"gaussians: expected at most {_MOST_IN_A_BUNDLE}, got {len(self.gaussians)}")
+            raise ValueError(
+                f"gaussians: expected at most {_MOST_IN_A_BUNDLE}, got {len(self.gaussians)}"
+            )
         return one_level(self.gaussians.numpy(), filter_px2)
 
 
@@ -69,12 +72,15 @@ def one_level(asset: v3dg.Gaussians, filter_px2: float) -> v3dg.Bundle:
     return build_bundle(asset, config=config, progress=False, device="cpu")
 
 
-def _placed(layout: Path, asset: v3dg.Gaussians, filter_px2: float) -> tuple[v3dg.Scene, dict[str, Camera]]:
+def _placed(
+    layout: Path, asset: v3dg.Gaussians, filter_px2: float
+) -> tuple[v3dg.Scene, dict[str, Camera]]:
     return read_layout(layout, one_level(asset, filter_px2))
 
 
 def at_size(camera: Camera, width: int, height: int) -> Camera:
-    """The same view on more or fewer pixels; another aspect ratio shows more or less above and below."""
+    """The same view on more or fewer pixels; another aspect ratio shows more or less
+    above and below."""
     scale = width / camera.width
     K = camera.K * np.array([[scale], [scale], [1.0]])
     K[:2, 2] = width / 2, height / 2
@@ -114,7 +120,9 @@ def captured(folder: Path, name: str, device: str) -> Subject:
                 strict=True,
             )
         )
-        above = Camera.look_at(eye, target, up, 2 * math.atan(0.5 * eye_level.width / eye_level.fx), **_SIZE)
+        above = Camera.look_at(
+            eye, target, up, 2 * math.atan(0.5 * eye_level.width / eye_level.fx), **_SIZE
+        )
     else:
         up = np.asarray(about["up"], np.float64)
         eye_level, above = (_from(means, up, slope) for slope in (0.15, 6.0))
@@ -127,8 +135,11 @@ def captured(folder: Path, name: str, device: str) -> Subject:
 
 
 def _from(means: Any, up: Any, slope: float) -> Camera:
-    """A camera that sees nine tenths of an object from a height of `slope` times its distance."""
-    aside = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.7 * np.linalg.norm(up) else [0.0, 1.0, 0.0])
+    """A camera that sees nine tenths of an object from a height of `slope` times its
+    distance."""
+    aside = np.cross(
+        up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.7 * np.linalg.norm(up) else [0.0, 1.0, 0.0]
+    )
     up, aside = (np.asarray(v) / np.linalg.norm(v) for v in (up, aside))
     low, high = np.quantile(means, [0.05, 0.95], axis=0)
     direction = (aside + slope * up) / math.hypot(1, slope)
@@ -166,9 +177,13 @@ def truths(subject: Subject, camera: Camera, filter_px2: float, side: int) -> li
 
 
 def _touching(
-    gaussians: v3dg.Gaussians, camera: Camera, filter_px2: float, boxes: list[tuple[int, int, int, int]]
+    gaussians: v3dg.Gaussians,
+    camera: Camera,
+    filter_px2: float,
+    boxes: list[tuple[int, int, int, int]],
 ) -> v3dg.Gaussians:
-    """Those that may reach a window, and some that do not: the ball of the largest axis decides."""
+    """Those that may reach a window, and some that do not: the ball of the largest axis
+    decides."""
     import torch
 
     def tensor(array: Any) -> Any:

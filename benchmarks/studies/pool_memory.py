@@ -1,8 +1,10 @@
-"""What a process holds on the host while it flies over a field of copies, with pools and without.
+"""What a process holds on the host while it flies over a field of copies, with pools
+and without.
 
-The copies are those of `residency.py`. Each flight has a process of its own, in turn: how long frames take,
-the largest part of memory that the process had (RSS), and hashes of some settled pictures, which have to be
-the same for all. `--degree` gives the copies coefficients of spherical harmonics that the bundle lacks.
+The copies are those of `residency.py`. Each flight has a process of its own, in turn:
+how long frames take, the largest part of memory that the process had (RSS), and hashes
+of some settled pictures, which have to be the same for all. `--degree` gives the copies
+coefficients of spherical harmonics that the bundle lacks.
 """
 
 from __future__ import annotations
@@ -99,7 +101,9 @@ def fly(config: Config, pool: str) -> dict[str, Any]:
         image = renderer.render(camera, tolerance=config.tolerance)
         missing = image.stats.missing
         milliseconds = 1e3 * (time.perf_counter() - begin)
-        frames.append((milliseconds, missing, image.stats.gaussians_selected, image.stats.tolerance))
+        frames.append(
+            (milliseconds, missing, image.stats.gaussians_selected, image.stats.tolerance)
+        )
     result["flown"] = memory_of_process()
     hashes = []
     for camera in cameras[:: max(1, len(cameras) // 8)]:

@@ -1,9 +1,11 @@
-"""Pools that keep rows and pools that keep codes, of the same quantised bundles: frames of a flight by turns.
+"""Pools that keep rows and pools that keep codes, of the same quantised bundles: frames
+of a flight by turns.
 
-A pool keeps rows where a bundle of the scene is float32. So one of the two scenes has a tiny one more, behind
-the camera.
+A pool keeps rows where a bundle of the scene is float32. So one of the two scenes has a
+tiny one more, behind the camera.
 
-    python -m benchmarks.studies.pool_slots --bundle quantized.v3dg --side 13 --size 1920 1080 --device cuda
+    python -m benchmarks.studies.pool_slots --bundle quantized.v3dg --side 13 --size
+    1920 1080 --device cuda
 """
 
 from __future__ import annotations

@@ -1,14 +1,16 @@
 """Cuts of levels as they are built, and refined together.
 
-    python -m benchmarks.studies.refined --asset donut.ply --layout donutsea.json -o refined
-    python -m benchmarks.studies.refined --asset donut.ply --picture refined.png --device cpu
-    python -m benchmarks.studies.refined --asset room.ply --eyes transforms.json -o refined
+    python -m benchmarks.studies.refined --asset donut.ply --layout donutsea.json -o
+    refined python -m benchmarks.studies.refined --asset donut.ply --picture refined.png
+    --device cpu python -m benchmarks.studies.refined --asset room.ply --eyes
+    transforms.json -o refined
 
-With a layout of instances, FLIP, PSNR and SSIM of the same cuts from some of its cameras, to all gaussians at
-3 x 3 samples a pixel. With a picture, the asset, and a cut of a sixth of its gaussians three times as large
-as it is at home, built and refined. With eyes, cameras in a scene: errors of cuts of some shares of the
-gaussians in the frustum from these eyes, built, refined from all around, and refined from other cameras that
-stand beside them.
+With a layout of instances, FLIP, PSNR and SSIM of the same cuts from some of its
+cameras, to all gaussians at 3 x 3 samples a pixel. With a picture, the asset, and a cut
+of a sixth of its gaussians three times as large as it is at home, built and refined.
+With eyes, cameras in a scene: errors of cuts of some shares of the gaussians in the
+frustum from these eyes, built, refined from all around, and refined from other cameras
+that stand beside them.
 """
 
 from __future__ import annotations
@@ -54,7 +56,9 @@ class Config:
     output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
 
 
-def pictures(config: Config, bundles: dict[str, v3dg.Bundle]) -> Iterator[tuple[Row, Picture, Picture]]:
+def pictures(
+    config: Config, bundles: dict[str, v3dg.Bundle]
+) -> Iterator[tuple[Row, Picture, Picture]]:
     for number in config.cameras:
         truth = None
         for name, bundle in bundles.items():
@@ -108,7 +112,9 @@ def main(config: Config) -> None:
     bundles = {"built": built, "refined": refined}
     eyes = [] if config.eyes is None else list(v3dg.read_cameras(config.eyes).values())
     if eyes:
-        beside = others_of(unseen.Config(config.asset, others=96, turn=0.5, width=eyes[0].width), eyes)
+        beside = others_of(
+            unseen.Config(config.asset, others=96, turn=0.5, width=eyes[0].width), eyes
+        )
         how: Row = {"steps": config.steps, "device": config.device, "progress": False}
         bundles["refined from beside"] = v3dg.refine_bundle(built, cameras=beside, **how)
     if config.picture is not None:

@@ -1,12 +1,15 @@
-"""The composed worlds with levels as they are built, and refined together: what fewer gaussians are enough.
+"""The composed worlds with levels as they are built, and refined together: what fewer
+gaussians are enough.
 
-    python -m benchmarks.studies.refined_worlds --steps 10000 --persons 3 --device cuda -o refined_worlds
-    python -m benchmarks.studies.refined_worlds --report refined_worlds.json
+    python -m benchmarks.studies.refined_worlds --steps 10000 --persons 3 --device cuda
+    -o refined_worlds python -m benchmarks.studies.refined_worlds --report
+    refined_worlds.json
 
-Cuts of several tolerances, from cameras near to far, are compared with all gaussians at 2 x 2 samples a
-pixel. The report has, for each camera and each FLIP that a cut of the levels as they are built has, how many
-gaussians are enough for it with refined levels, by how many are with those; and FLIP at the default tolerance
-by that of all gaussians at one sample.
+Cuts of several tolerances, from cameras near to far, are compared with all gaussians at
+2 x 2 samples a pixel. The report has, for each camera and each FLIP that a cut of the
+levels as they are built has, how many gaussians are enough for it with refined levels,
+by how many are with those; and FLIP at the default tolerance by that of all gaussians
+at one sample.
 """
 
 from __future__ import annotations
@@ -70,16 +73,26 @@ def make_asset(asset: worlds.Asset) -> v3dg.Gaussians:
 
 
 def pictures(config: Config, about: Row) -> Iterator[tuple[Row, Picture, Picture]]:
-    """What is drawn of each world, the truth and the picture; tells what it made in `about`."""
+    """What is drawn of each world, the truth and the picture; tells what it made in
+    `about`."""
     how: Row = {"device": config.device, "progress": False}
     for name in config.names:
         world, start = world_of(config, name), time.perf_counter()
-        with multiprocessing.get_context("spawn").Pool(min(len(world.assets), os.cpu_count() or 1)) as pool:
-            assets = dict(zip(world.assets, pool.map(make_asset, world.assets.values(), 1), strict=True))
-        built = {key: v3dg.build_bundle(asset, config=config.build, **how) for key, asset in assets.items()}
+        with multiprocessing.get_context("spawn").Pool(
+            min(len(world.assets), os.cpu_count() or 1)
+        ) as pool:
+            assets = dict(
+                zip(world.assets, pool.map(make_asset, world.assets.values(), 1), strict=True)
+            )
+        built = {
+            key: v3dg.build_bundle(asset, config=config.build, **how)
+            for key, asset in assets.items()
+        }
         scenes = {"built": (worlds.scene_of(world, built), (0.0, *config.built))}
         if config.steps > 0:
-            refined = {key: v3dg.refine_bundle(b, steps=config.steps, **how) for key, b in built.items()}
+            refined = {
+                key: v3dg.refine_bundle(b, steps=config.steps, **how) for key, b in built.items()
+            }
             scenes["refined"] = worlds.scene_of(world, refined), config.refined
         seconds = round(time.perf_counter() - start, 1)
         about[name] = {"assets": len(assets), "instances": world.num_instances, "seconds": seconds}
@@ -96,7 +109,8 @@ def pictures(config: Config, about: Row) -> Iterator[tuple[Row, Picture, Picture
 
 
 def count_at(flip: float, rows: Sequence[Row]) -> float:
-    """The fewest gaussians of these cuts that have at most this FLIP, between two by the logarithm."""
+    """The fewest gaussians of these cuts that have at most this FLIP, between two by
+    the logarithm."""
     fewest = math.inf
     finest_first = sorted(rows, key=lambda row: -row["gaussians"])
     for row, coarser in zip(finest_first, [*finest_first[1:], None], strict=True):
@@ -110,10 +124,11 @@ def count_at(flip: float, rows: Sequence[Row]) -> float:
 
 
 def share_at(tolerance: float, built: Sequence[Row], refined: Sequence[Row]) -> float | None:
-    """Gaussians with refined levels by those with levels as they are built, at the FLIP of one of these cuts.
+    """Gaussians with refined levels by those with levels as they are built, at the FLIP
+    of one of these cuts.
 
-    None where the coarsest cut is nearer than that: then fewer than are known may be enough. Where no refined
-    cut is as near, nothing is gained.
+    None where the coarsest cut is nearer than that: then fewer than are known may be
+    enough. Where no refined cut is as near, nothing is gained.
     """
     flip = next(row["flip"] for row in built if row["tolerance"] == tolerance)
     coarsest = max(built, key=lambda row: row["tolerance"])
@@ -131,19 +146,31 @@ def report(rows: Sequence[Row]) -> None:
         cameras = dict.fromkeys(row["camera"] for row in rows if row["world"] == world)
         sets = [(of(world, camera, "built"), of(world, camera, "refined")) for camera in cameras]
         print(world, *cameras)
-        kinds = range(1 + any(cuts[1] for cuts in sets))  # without refined ones there is nothing to share
-        for tolerance in sorted({row["tolerance"] for row in sets[0][0]} - {0.0} if len(kinds) > 1 else ()):
+        kinds = range(
+            1 + any(cuts[1] for cuts in sets)
+        )  # without refined ones there is nothing to share
+        for tolerance in sorted(
+            {row["tolerance"] for row in sets[0][0]} - {0.0} if len(kinds) > 1 else ()
+        ):
             shares = [share_at(tolerance, *cuts) for cuts in sets]
             known = [share for share in shares if share is not None]
             text = " ".join("  -  " if share is None else f"{share:.3f}" for share in shares)
             print(f"  {tolerance}: {text} mean {statistics.fmean(known):.3f}")
         for levels in kinds:
             at_default = [
-                next(row["flip"] for row in found[levels] if row["tolerance"] == v3dg.DEFAULT_TOLERANCE)
+                next(
+                    row["flip"]
+                    for row in found[levels]
+                    if row["tolerance"] == v3dg.DEFAULT_TOLERANCE
+                )
                 / next(row["flip"] for row in found[0] if row["tolerance"] == 0)
                 for found in sets
             ]
-            print("  FLIP by that of all,", ("built:", "refined:")[levels], *(f"{x:.3f}" for x in at_default))
+            print(
+                "  FLIP by that of all,",
+                ("built:", "refined:")[levels],
+                *(f"{x:.3f}" for x in at_default),
+            )
 
 
 def main(config: Config) -> None:
@@ -152,8 +179,12 @@ def main(config: Config) -> None:
         return
     about: Row = {}
     with contextlib.closing(Judges()) as judges:
-        rows = [row | found for (row, _, _), found in judges.measured(pictures(config, about), errors)]
-    record.write(config.output, {"steps": config.steps, "worlds": about, "rows": rows}, config.device)
+        rows = [
+            row | found for (row, _, _), found in judges.measured(pictures(config, about), errors)
+        ]
+    record.write(
+        config.output, {"steps": config.steps, "worlds": about, "rows": rows}, config.device
+    )
     report(rows)
 
 

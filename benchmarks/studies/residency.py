@@ -1,11 +1,13 @@
-"""What a pool of pages does to frames: flights and teleports over a field of many different copies.
+"""What a pool of pages does to frames: flights and teleports over a field of many
+different copies.
 
-Copies of a bundle are written with the colours of all gaussians changed a little, so that no two share a
-page, and stand in a grid. For pools of several sizes, as shares of what a view needs, with the files in the
-system's cache and without: how long frames take, how many bytes come in and how many pages are missing, and
-how far the picture is from the settled one; after a teleport, also how far both are from all gaussians at
-4 x 4 samples. The size of a pool is a choice here: whether all would fit is said by the row without a pool.
-On a GPU, rows say what the process has on it.
+Copies of a bundle are written with the colours of all gaussians changed a little, so
+that no two share a page, and stand in a grid. For pools of several sizes, as shares of
+what a view needs, with the files in the system's cache and without: how long frames
+take, how many bytes come in and how many pages are missing, and how far the picture is
+from the settled one; after a teleport, also how far both are from all gaussians at 4 x
+4 samples. The size of a pool is a choice here: whether all would fit is said by the row
+without a pool. On a GPU, rows say what the process has on it.
 """
 
 from __future__ import annotations
@@ -43,7 +45,8 @@ class Config:
     frames: int = 120
     """Of a flight across the field."""
     hz: float = 0.0
-    """Frames a second that flights and teleports are paced to; as many as there can be if 0."""
+    """Frames a second that flights and teleports are paced to; as many as there can be
+    if 0."""
     shares: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
     """Slots of each pool, over those that the neediest view of the flight takes."""
     pools: tuple[str, ...] = ()
@@ -134,7 +137,8 @@ class Field:
 def timed(
     config: Config, renderer: v3dg.Renderer, cameras: list[v3dg.Camera], kept: Collection[int] = ()
 ) -> list[dict[str, Any]]:
-    """Draw one picture after the other; what each took, and its stats. Some of the pictures are kept."""
+    """Draw one picture after the other; what each took, and its stats. Some of the
+    pictures are kept."""
     frames, start = [], time.perf_counter()
     for number, camera in enumerate(cameras):
         if config.hz:
@@ -150,7 +154,9 @@ def timed(
 
 def summary(frames: list[dict[str, Any]]) -> dict[str, Any]:
     ms = np.array([frame["ms"] for frame in frames])
-    result = {f"p{q}_ms": float(np.percentile(ms, q)) for q in (50, 95, 99)} | {"worst_ms": float(ms.max())}
+    result = {f"p{q}_ms": float(np.percentile(ms, q)) for q in (50, 95, 99)} | {
+        "worst_ms": float(ms.max())
+    }
     for name in ("missing", "bytes_in", "gaussians_selected"):
         values = np.array([frame[name] for frame in frames])
         result |= {f"mean_{name}": float(values.mean()), f"most_{name}": int(values.max())}
@@ -158,7 +164,8 @@ def summary(frames: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def errors(frames: list[dict[str, Any]], truth: dict[int, np.ndarray]) -> dict[str, Any]:
-    """PSNR of some pictures against the settled ones; equal pictures count as 100 dB."""
+    """PSNR of some pictures against the settled ones; equal pictures count as 100
+    dB."""
     values = [min(100.0, float(psnr(truth[number], frames[number]["picture"]))) for number in truth]
     return {"mean_psnr": float(np.mean(values)), "least_psnr": float(np.min(values))}
 
@@ -177,7 +184,9 @@ def pixels(image: v3dg.Image) -> np.ndarray:
     return np.clip(_device.to_host(image.color), 0, 1)
 
 
-def teleport(config: Config, field: Field, memory: int, truth: np.ndarray, *, cold: bool) -> dict[str, Any]:
+def teleport(
+    config: Config, field: Field, memory: int, truth: np.ndarray, *, cold: bool
+) -> dict[str, Any]:
     """From one end of the field to the other: pictures until nothing is missing."""
     renderer = v3dg.Renderer(field.scene, device=config.device, memory=memory)
     renderer.settle(field.camera(0), tolerance=config.tolerance)
@@ -230,9 +239,13 @@ def main(config: Config) -> None:
             truth[number] = pixels(roomy.render(cameras[number], tolerance=config.tolerance))
         del roomy
         result: dict[str, Any] = {
-            "config": {k: str(getattr(v, "name", v)) for k, v in vars(config).items()},  # without folders
+            "config": {
+                k: str(getattr(v, "name", v)) for k, v in vars(config).items()
+            },  # without folders
             "gaussians": sum(bundle.num_gaussians for bundle in field.scene.bundles),
-            "leaves": sum(int(b.clusters.offset[b.level_range(0).stop]) for b in field.scene.bundles),
+            "leaves": sum(
+                int(b.clusters.offset[b.level_range(0).stop]) for b in field.scene.bundles
+            ),
             "file_bytes": sum(path.stat().st_size for path in field.paths),
             "first_picture_ms": first_ms,
             "most_needed_slots": most_needed,
@@ -255,7 +268,13 @@ def main(config: Config) -> None:
             if cold:
                 field.drop_cached_pages()
             frames = timed(config, renderer, cameras, truth)
-            row = {"share": share, "memory": memory, "cold": cold, **summary(frames), **errors(frames, truth)}
+            row = {
+                "share": share,
+                "memory": memory,
+                "cold": cold,
+                **summary(frames),
+                **errors(frames, truth),
+            }
             if idle is not None:
                 row["bytes_of_process"] = (bytes_on_device(config) or 0) - idle
             result["flights"].append(row)

@@ -1,9 +1,11 @@
-"""What makes motion steadier beside a fade? A budget in steps, hysteresis, pages that fade in, other ramps.
+"""What makes motion steadier beside a fade? A budget in steps, hysteresis, pages that
+fade in, other ramps.
 
-The first is beside the tolerance that each view would have alone, also in the frames after the camera has
-stopped where steps are farthest behind. Hysteresis is a trial, and so are pages beside what a pool does: cuts
-with a state, made of the metrics that selection has. So are ramps, which have none.
-docs/notes/steadiness.md is about the results.
+The first is beside the tolerance that each view would have alone, also in the frames
+after the camera has stopped where steps are farthest behind. Hysteresis is a trial, and
+so are pages beside what a pool does: cuts with a state, made of the metrics that
+selection has. So are ramps, which have none. docs/notes/steadiness.md is about the
+results.
 """
 
 from __future__ import annotations
@@ -20,11 +22,23 @@ from benchmarks.evaluation.record import write
 from benchmarks.evaluation.steadiness import Cut, Options, compare, paths_from
 from benchmarks.evaluation.steadiness import Path as CameraPath
 from benchmarks.studies.fades import Stays, field_of, first_camera
-from v3dg import DEFAULT_FADE, DEFAULT_TOLERANCE, Bundle, Camera, Renderer, Scene, Selection, _core, select
+from v3dg import (
+    DEFAULT_FADE,
+    DEFAULT_TOLERANCE,
+    Bundle,
+    Camera,
+    Renderer,
+    Scene,
+    Selection,
+    _core,
+    select,
+)
 from v3dg.residency import residency
 from v3dg.select import rule_of
 
-_FAR = 1.15  # how much farther away hysteresis begins to look, so that it is in its stride at the first frame
+# how much farther away hysteresis begins to look, so that it is in its stride at the
+# first frame
+_FAR = 1.15
 _FAR_FRAMES = 30
 _SWAY = 12  # frames to one side
 _ARRIVAL_FRAMES = 8  # as csrc/residency/page_table.h has them
@@ -49,7 +63,8 @@ class Config:
     rests: tuple[int, ...] = (1, 4, 16, 64)
     """Over how many frames the tolerance of a budget arrives at rest."""
     bands: tuple[float, ...] = (1.005, 1.01, 1.03, 1.05)
-    """Fades beside the one above, of linear ramps; smooth ones have that and half as much again."""
+    """Fades beside the one above, of linear ramps; smooth ones have that and half as
+    much again."""
     trials: tuple[str, ...] = ("budget", "rest", "hysteresis", "pages", "ramps")
     paths: tuple[str, ...] = ()
     """Only these."""
@@ -69,7 +84,8 @@ class AtOnce:
 
 
 class Rests:
-    """A budget in steps along a path, and after its end, over so many frames, to where it would be at once.
+    """A budget in steps along a path, and after its end, over so many frames, to where
+    it would be at once.
 
     As a `Renderer` does if no number of frames is given.
     """
@@ -117,13 +133,16 @@ def metrics_of(scene: Scene, camera: Camera) -> tuple[Any, Any]:
 
 
 def cut_of(scene: Scene, refinement: Any, offset: Any) -> Selection:
-    """The cut of groups that are refined by 0 to 1, none further than the group above it."""
+    """The cut of groups that are refined by 0 to 1, none further than the group above
+    it."""
     instance_ids, cluster_ids, weights, count = [], [], [], 0
     for i, b in enumerate(scene.instance_bundle):
         clusters = scene.bundles[b].clusters
         mine = refinement[offset[i] : offset[i + 1]]
         # -1 is no group, and the last value is what stands for it.
-        weight = np.append(mine, 1.0)[clusters.parent_group] - np.append(mine, 0.0)[clusters.own_group]
+        weight = (
+            np.append(mine, 1.0)[clusters.parent_group] - np.append(mine, 0.0)[clusters.own_group]
+        )
         assert weight.min() >= 0, "a path would have no cluster, or two"
         chosen = np.flatnonzero(weight > 0).astype(np.int32)
         instance_ids.append(np.full(len(chosen), i, np.int32))
@@ -135,7 +154,8 @@ def cut_of(scene: Scene, refinement: Any, offset: Any) -> Selection:
 
 
 class Sticks:
-    """A cut that refines a group above the tolerance times a factor and coarsens it below the quotient."""
+    """A cut that refines a group above the tolerance times a factor and coarsens it
+    below the quotient."""
 
     def __init__(self, tolerance: float, factor: float) -> None:
         self.tolerance, self.factor = tolerance, factor
@@ -167,7 +187,8 @@ class Smooth:
 
 
 class Arrives:
-    """A cut with a fade whose pages all come in after the first frame, and fade in over so many frames.
+    """A cut with a fade whose pages all come in after the first frame, and fade in over
+    so many frames.
 
     All of them together, or those of a level once those above it are there.
     """
@@ -192,7 +213,8 @@ class Arrives:
 
 
 class ArrivesInPool(Arrives):
-    """The same as a renderer with a pool has it, which reads pages while true pictures are drawn."""
+    """The same as a renderer with a pool has it, which reads pages while true pictures
+    are drawn."""
 
     def __init__(self, scene: Scene, tolerance: float, fade: float) -> None:
         super().__init__(tolerance, fade, 0, by_level=True)
@@ -220,7 +242,11 @@ def main(config: Config) -> None:
                 if config.paths and camera_path.name not in config.paths:
                     continue
                 for trial in config.trials:
-                    shown = up_to_the_rest(subject, camera_path, config) if trial == "rest" else camera_path
+                    shown = (
+                        up_to_the_rest(subject, camera_path, config)
+                        if trial == "rest"
+                        else camera_path
+                    )
                     cuts = TRIALS[trial](subject, shown, config)
                     of = {"asset": Path(path).stem, "side": config.side, "distance": distance}
                     of |= {"trial": trial, "path": camera_path.name}
@@ -235,9 +261,12 @@ def main(config: Config) -> None:
 
 
 def to_and_fro(path: CameraPath) -> CameraPath:
-    """A path of which a few frames are gone again and again, so that the same groups come and go."""
+    """A path of which a few frames are gone again and again, so that the same groups
+    come and go."""
     frames = [abs((k + _SWAY) % (2 * _SWAY) - _SWAY) for k in range(len(path.cameras))]
-    return replace(path, name="to and fro", cameras=[path.cameras[min(k, len(frames) - 1)] for k in frames])
+    return replace(
+        path, name="to and fro", cameras=[path.cameras[min(k, len(frames) - 1)] for k in frames]
+    )
 
 
 def up_to_the_rest(scene: Scene, path: CameraPath, config: Config) -> CameraPath:
@@ -332,11 +361,12 @@ TRIALS = {
 def line(row: Row) -> str:
     low, high = row["tolerances"]
     return (
-        f"{row['asset']:>8} {row['distance']:4g} {row['path']:15} {row['cut']:16} {row['gaussians']:9,.0f} "
-        f"rms {row['rms']:.3f}  tile {row['tile_mean']:.3f} {row['tile_p99']:.3f} {row['tile_worst']:.3f}  "
-        f"pop {row['pop_mean']:.3f} {row['pop_worst']:.3f}  "
-        f"warped {row['warped_mean']:.3f} {row['warped_worst']:.3f}  changed {row['changed_items']:.0f}  "
-        f"PSNR {row['psnr']:.2f}  tolerance {low:.3f} to {high:.3f}"
+        f"{row['asset']:>8} {row['distance']:4g} {row['path']:15} {row['cut']:16} "
+        f"{row['gaussians']:9,.0f} rms {row['rms']:.3f}  tile {row['tile_mean']:.3f} "
+        f"{row['tile_p99']:.3f} {row['tile_worst']:.3f}  pop {row['pop_mean']:.3f} "
+        f"{row['pop_worst']:.3f}  warped {row['warped_mean']:.3f} {row['warped_worst']:.3f}  "
+        f"changed {row['changed_items']:.0f}  PSNR {row['psnr']:.2f}  tolerance {low:.3f} to "
+        f"{high:.3f}"
     )
 
 

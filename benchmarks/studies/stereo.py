@@ -1,4 +1,5 @@
-"""How long do both eyes of a headset take? One frame of two pictures that share a cut, beside two frames."""
+"""How long do both eyes of a headset take? One frame of two pictures that share a cut,
+beside two frames."""
 
 from __future__ import annotations
 
@@ -20,8 +21,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--bundle", type=Path, required=True, help=".v3dg file of the layout's asset")
-    parser.add_argument("--layout", type=Path, required=True, help="scene file of instances and cameras")
+    parser.add_argument(
+        "--bundle", type=Path, required=True, help=".v3dg file of the layout's asset"
+    )
+    parser.add_argument(
+        "--layout", type=Path, required=True, help="scene file of instances and cameras"
+    )
     parser.add_argument(
         "--cameras", type=int, nargs=2, default=(40, 60), help="the first, and that after the last"
     )
@@ -48,12 +53,17 @@ def main(arguments: list[str] | None = None) -> int:
 def headset(camera: Camera, side: int) -> StereoCamera:
     """Eyes where a camera is, that look where it looks."""
     ahead, top = camera.viewmat[2, :3], -camera.viewmat[1, :3]
-    middle = Camera.look_at(camera.position, camera.position + ahead, top, _FOV, width=side, height=side)
+    middle = Camera.look_at(
+        camera.position, camera.position + ahead, top, _FOV, width=side, height=side
+    )
     return StereoCamera.of(middle, _EYE_DISTANCE)
 
 
-def measure(renderer: Renderer, stereo: StereoCamera, tolerance: float, repeats: int) -> dict[str, Any]:
-    """Milliseconds from the call to both pictures, of one frame and of two; gaussians of the shared cut."""
+def measure(
+    renderer: Renderer, stereo: StereoCamera, tolerance: float, repeats: int
+) -> dict[str, Any]:
+    """Milliseconds from the call to both pictures, of one frame and of two; gaussians
+    of the shared cut."""
 
     def one_frame() -> list[Any]:
         return [picture.color for picture in renderer.render(stereo, tolerance=tolerance)]

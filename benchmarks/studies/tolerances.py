@@ -1,11 +1,14 @@
-"""What error a tolerance stands for: cuts of each asset at several sizes, beside all its gaussians.
+"""What error a tolerance stands for: cuts of each asset at several sizes, beside all
+its gaussians.
 
     python -m benchmarks.studies.tolerances ASSETS -o tolerances_cpu
 
-ASSETS is a folder as `benchmarks.studies.pairs` describes it. An object is drawn so wide that its ball fills
-the picture, a scene from its cameras at the same widths. Cuts and every gaussian at one sample a pixel are
-compared with every gaussian at four by four samples, or eight by eight where there are few pixels. The table
-has FLIP of the cut by that of all gaussians, PSNR less theirs, and the share of the gaussians in the frustum.
+ASSETS is a folder as `benchmarks.studies.pairs` describes it. An object is drawn so
+wide that its ball fills the picture, a scene from its cameras at the same widths. Cuts
+and every gaussian at one sample a pixel are compared with every gaussian at four by
+four samples, or eight by eight where there are few pixels. The table has FLIP of the
+cut by that of all gaussians, PSNR less theirs, and the share of the gaussians in the
+frustum.
 """
 
 from __future__ import annotations
@@ -51,7 +54,8 @@ class Config:
 
 
 def measure(config: Config, subject: Subject, judges: Judges) -> list[Row]:
-    """Means over the views, for each width and tolerance; tolerance 0 is every gaussian."""
+    """Means over the views, for each width and tolerance; tolerance 0 is every
+    gaussian."""
     found: dict[tuple[int, float], list[Row]] = {}
     for (about, _, _), errors in judges.measured(_drawn(config, subject), _errors):
         found.setdefault((about["width"], about["tolerance"]), []).append({**about, **errors})
@@ -78,7 +82,11 @@ def _drawn(config: Config, subject: Subject) -> Iterator[tuple[Row, Picture, Pic
                 if tolerance == 0:
                     whole = image.stats.gaussians_in_frustum
                 share = image.stats.gaussians_in_frustum / max(whole, 1)
-                yield {"width": width, "tolerance": tolerance, "share": share}, truth, to_8bit(image.color)
+                yield (
+                    {"width": width, "tolerance": tolerance, "share": share},
+                    truth,
+                    to_8bit(image.color),
+                )
 
 
 def _errors(item: tuple[Row, Picture, Picture]) -> Row:
@@ -86,17 +94,23 @@ def _errors(item: tuple[Row, Picture, Picture]) -> Row:
 
 
 def summary(rows: list[Row]) -> str:
-    """A row for each tolerance: means over the assets and widths, and where it is worst."""
+    """A row for each tolerance: means over the assets and widths, and where it is
+    worst."""
     whole = {(row["asset"], row["width"]): row for row in rows if row["tolerance"] == 0}
     lines = []
     for tolerance in sorted({row["tolerance"] for row in rows} - {0.0}):
         here = [row for row in rows if row["tolerance"] == tolerance]
-        ratio = {(r["asset"], r["width"]): r["flip"] / whole[r["asset"], r["width"]]["flip"] for r in here}
+        ratio = {
+            (r["asset"], r["width"]): r["flip"] / whole[r["asset"], r["width"]]["flip"]
+            for r in here
+        }
         worst = max(ratio, key=lambda key: ratio[key])
         line: Row = {"tolerance": tolerance, "mean": statistics.geometric_mean(ratio.values())}
         line["held"] = statistics.fmean(value <= 1 for value in ratio.values())
         line |= {"worst": ratio[worst], "where": f"{worst[0]}, {worst[1]} px"}
-        line["psnr"] = statistics.fmean(r["psnr"] - whole[r["asset"], r["width"]]["psnr"] for r in here)
+        line["psnr"] = statistics.fmean(
+            r["psnr"] - whole[r["asset"], r["width"]]["psnr"] for r in here
+        )
         line |= {name: statistics.fmean(row[name] for row in here) for name in ("flip", "share")}
         lines.append(line)
     return markdown(_SUMMARY, lines)

@@ -1,7 +1,9 @@
-"""Does training with v3dg in place of gsplat come to the same, and how long does a step take?
+"""Does training with v3dg in place of gsplat come to the same, and how long does a step
+take?
 
-Gaussians are trained from nothing on pictures of an asset with gsplat's own strategies, drawn by either of
-the two, and compared on pictures that were held out. Needs a GPU, and gsplat 1.5.3 compiled.
+Gaussians are trained from nothing on pictures of an asset with gsplat's own strategies,
+drawn by either of the two, and compared on pictures that were held out. Needs a GPU,
+and gsplat 1.5.3 compiled.
 """
 
 from __future__ import annotations
@@ -27,7 +29,14 @@ from v3dg.compat.gsplat import rasterization
 _DRAWN_BY: dict[str, Callable[..., Any]] = {"v3dg": rasterization, "gsplat": gsplat.rasterization}
 _REPEATS = 31  # of a step that is timed
 _SIDE = 512  # px of a training picture
-_STEP = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
+_STEP = {
+    "means": 1.6e-4,
+    "quats": 1e-3,
+    "scales": 5e-3,
+    "opacities": 5e-2,
+    "sh0": 2.5e-3,
+    "shN": 1.25e-4,
+}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -37,7 +46,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("asset", type=Path)
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--gaussians", type=int, default=1_000_000, help="of the steps that are timed")
+    parser.add_argument(
+        "--gaussians", type=int, default=1_000_000, help="of the steps that are timed"
+    )
     parser.add_argument("--json", type=Path, help="write the result there")
     options = parser.parse_args(arguments)
 
@@ -50,14 +61,17 @@ def main(arguments: list[str] | None = None) -> int:
         for seed in range(options.seeds):
             for name in _DRAWN_BY:
                 row = {"strategy": strategy, "seed": seed, "drawn_by": name}
-                result["training"].append(row | train(views, strategy, seed, options.steps, _DRAWN_BY[name]))
+                result["training"].append(
+                    row | train(views, strategy, seed, options.steps, _DRAWN_BY[name])
+                )
                 print(result["training"][-1], flush=True)
     write(options.json, result, "cuda")
     return 0
 
 
 def times(count: int, num_cameras: int) -> list[dict[str, Any]]:
-    """Milliseconds of a picture, and of one with its gradients, of random gaussians of SH degree 3."""
+    """Milliseconds of a picture, and of one with its gradients, of random gaussians of
+    SH degree 3."""
     scene = random_scene(count, 3, "cuda")
     camera, gaussians = next(iter(scene.cameras.values())), scene.gaussians
     shifted = [v3dg.StereoCamera.of(camera, 0.01 * (k + 1)).left for k in range(num_cameras)]
@@ -85,7 +99,12 @@ def times(count: int, num_cameras: int) -> list[dict[str, Any]]:
 
         with torch.no_grad():
             forward = time_ms(picture, "cuda", _REPEATS).median
-        row = {"gaussians": count, "cameras": num_cameras, "drawn_by": name, "forward_ms": round(forward, 3)}
+        row = {
+            "gaussians": count,
+            "cameras": num_cameras,
+            "drawn_by": name,
+            "forward_ms": round(forward, 3),
+        }
         rows.append(row | {"both_ms": round(time_ms(gradients, "cuda", _REPEATS).median, 3)})
     return rows
 
@@ -120,7 +139,9 @@ class Views:
 
     def start(self, count: int) -> dict[str, torch.nn.Parameter]:
         """Grey gaussians anywhere in the box of the asset."""
-        low, high = (torch.tensor(a, dtype=torch.float32, device="cuda") for a in (self.low, self.high))
+        low, high = (
+            torch.tensor(a, dtype=torch.float32, device="cuda") for a in (self.low, self.high)
+        )
         start = {
             "means": low + torch.rand(count, 3, device="cuda") * (high - low),
             "quats": torch.randn(count, 4, device="cuda"),
@@ -143,7 +164,9 @@ def strategy_of(name: str, steps: int, size: float) -> tuple[Any, dict[str, Any]
     return strategy, strategy.initialize_state(scene_scale=size / 2)
 
 
-def train(views: Views, name: str, seed: int, steps: int, draw: Callable[..., Any]) -> dict[str, Any]:
+def train(
+    views: Views, name: str, seed: int, steps: int, draw: Callable[..., Any]
+) -> dict[str, Any]:
     """PSNR on the pictures that were held out, gaussians, seconds."""
     torch.manual_seed(seed)
     order = torch.Generator().manual_seed(seed)
@@ -180,7 +203,9 @@ def train(views: Views, name: str, seed: int, steps: int, draw: Callable[..., An
         target = views.pictures[number]
         loss = 0.8 * (color - target).abs().mean() + 0.2 * (1 - structure(color, target))
         if name == "mcmc":
-            loss = loss + 0.01 * (params["opacities"].sigmoid().mean() + params["scales"].exp().mean())
+            loss = loss + 0.01 * (
+                params["opacities"].sigmoid().mean() + params["scales"].exp().mean()
+            )
         loss.backward()
         for optimizer in optimizers.values():
             optimizer.step()
@@ -195,7 +220,11 @@ def train(views: Views, name: str, seed: int, steps: int, draw: Callable[..., An
             for number in views.held_out
         ]
     decibels = float(-10 * torch.stack(errors).log10().mean())
-    return {"psnr": round(decibels, 3), "gaussians": len(params["means"]), "seconds": round(seconds, 2)}
+    return {
+        "psnr": round(decibels, 3),
+        "gaussians": len(params["means"]),
+        "seconds": round(seconds, 2),
+    }
 
 
 def structure(first: Any, second: Any) -> Any:
@@ -212,7 +241,9 @@ def structure(first: Any, second: Any) -> Any:
     variances = mean(x * x) - mx**2 + mean(y * y) - my**2
     covariance = mean(x * y) - mx * my
     return (
-        (2 * mx * my + 1e-4) * (2 * covariance + 9e-4) / ((mx**2 + my**2 + 1e-4) * (variances + 9e-4))
+        (2 * mx * my + 1e-4)
+        * (2 * covariance + 9e-4)
+        / ((mx**2 + my**2 + 1e-4) * (variances + 9e-4))
     ).mean()
 
 

@@ -1,12 +1,15 @@
-"""What one version of v3dg computes, as digests, and how long it takes, to be compared with another.
+"""What one version of v3dg computes, as digests, and how long it takes, to be compared
+with another.
 
-Run it once or more with each version in turn, on one machine, then compare what they wrote:
+Run it once or more with each version in turn, on one machine, then compare what they
+wrote:
 
     PYTHONPATH=old python -m benchmarks.studies.two_versions --output old.json ...
     PYTHONPATH=new python -m benchmarks.studies.two_versions --output new.json ...
     python -m benchmarks.studies.two_versions --compare old.json new.json
 
-It calls nothing but the public interface, so that a version that lays its modules out otherwise runs it, too.
+It calls nothing but the public interface, so that a version that lays its modules out
+otherwise runs it, too.
 """
 
 from __future__ import annotations
@@ -86,7 +89,9 @@ class Run:
             (3, v3dg.BuildConfig.paper(cluster_size=512, steps=10)),
         ):
             asset = random_gaussians(6000, sh_degree, seed=sh_degree)
-            bundle = v3dg.build_bundle(asset, config=config, seed=5, device=self.device, progress=False)
+            bundle = v3dg.build_bundle(
+                asset, config=config, seed=5, device=self.device, progress=False
+            )
             self.digests[f"build sh {sh_degree}"] = self.digest_of(bundle)
         asset = random_gaussians(40_000, 1)
         config = v3dg.BuildConfig(steps=100 if self.device == "cpu" else 800)
@@ -113,7 +118,9 @@ class Run:
                     continue
                 image = self.time(f"frame, {label}", partial(v3dg.render, scene, camera, **options))
                 self.digests[f"picture, {label}"] = digest(image.color, image.alpha)
-            budget = v3dg.select(scene, camera, tolerance=3.0, device=self.device).num_gaussians // 2
+            budget = (
+                v3dg.select(scene, camera, tolerance=3.0, device=self.device).num_gaussians // 2
+            )
             cut = v3dg.select(scene, camera, budget=budget, device=self.device)
             self.digests[f"budget, {name} {key}"] = digest(cut.instance_ids, cut.cluster_ids)
             world = cut.gaussians(origin=camera.position, device=self.device)
@@ -153,21 +160,28 @@ class Run:
         def both() -> Any:
             for leaf in leaves:
                 leaf.grad = None
-            picture = v3dg.rasterize(v3dg.Gaussians(*leaves), camera, filter_px2=0.3, antialiased=True)
+            picture = v3dg.rasterize(
+                v3dg.Gaussians(*leaves), camera, filter_px2=0.3, antialiased=True
+            )
             ((picture.color * weights).mean() + 0.1 * picture.alpha.mean()).backward()
             return leaves
 
         self.time(f"forward + backward {count}", both)
-        # The sign of a gradient of 0 may differ from run to run of one version; 0 is added to take it away.
+        # The sign of a gradient of 0 may differ from run to run of one version; 0 is
+        # added to take it away.
         self.digests[f"gradients {count}"] = digest(*(leaf.grad + 0.0 for leaf in leaves))
 
 
 def compare(old_path: Path, new_path: Path, output: Path | None) -> int:
-    """Print what differs, and write it where that is asked for; the number of digests that differ."""
+    """Print what differs, and write it where that is asked for; the number of digests
+    that differ."""
     old, new = (json.loads(path.read_text()) for path in (old_path, new_path))
     names = sorted(old["digests"].keys() | new["digests"].keys())
     differ = [name for name in names if old["digests"].get(name) != new["digests"].get(name)]
-    print(f"{len(names) - len(differ)} of {len(names)} digests are the same; others: {differ or 'none'}")
+    print(
+        f"{len(names) - len(differ)} of {len(names)} digests are the same; others: "
+        f"{differ or 'none'}"
+    )
     times = {}
     print(f"{'':58} {'old ms':>9} {'new ms':>9} {'ratio':>6} {'least':>6}")
     for name, before in old["ms"].items():
@@ -191,7 +205,11 @@ def compare(old_path: Path, new_path: Path, output: Path | None) -> int:
 
 
 def machine(device: str, commit: str) -> dict[str, Any]:
-    names = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
+    names = [
+        line
+        for line in Path("/proc/cpuinfo").read_text().splitlines()
+        if line.startswith("model name")
+    ]
     about = {
         "commit": commit,
         "command": " ".join(Path(word).name if os.sep in word else word for word in sys.argv),
@@ -211,7 +229,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
-    parser.add_argument("--layout", type=Path, help="a layout of instances, for frames of a whole scene")
+    parser.add_argument(
+        "--layout", type=Path, help="a layout of instances, for frames of a whole scene"
+    )
     parser.add_argument("--cameras", type=int, nargs="*", default=[40, 46, 50, 59])
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--count", type=int, default=100_000, help="gaussians that are rasterized")
@@ -226,21 +246,26 @@ def main() -> None:
         run.ms = json.loads(arguments.output.read_text())["ms"]
     bundle = run.builds()
     ring = {
-        f"ring {k}": c for k, c in enumerate(v3dg.cameras.turntable((0, 0, 0), 4.0, 2, width=640, height=480))
+        f"ring {k}": c
+        for k, c in enumerate(v3dg.cameras.turntable((0, 0, 0), 4.0, 2, width=640, height=480))
     }
     run.frames("random", bundle, ring)
     if arguments.layout:
         from v3dg import read_scene
 
         read_asset = getattr(v3dg, "read_asset", None) or v3dg.load  # as an older version calls it
-        asset = read_asset(arguments.layout.parent / json.loads(arguments.layout.read_text())["asset"])
+        asset = read_asset(
+            arguments.layout.parent / json.loads(arguments.layout.read_text())["asset"]
+        )
         config = v3dg.BuildConfig(steps=20)
         name = json.loads(arguments.layout.read_text())["asset"]
         donut = v3dg.build_bundle(asset, config=config, device=arguments.device, progress=False)
         scene, cameras = read_scene(arguments.layout, bundles={name: donut})
         some = [list(cameras.items())[k] for k in arguments.cameras]
         run.frames(
-            "layout", scene, {f"camera {k}": c for k, (_, c) in zip(arguments.cameras, some, strict=True)}
+            "layout",
+            scene,
+            {f"camera {k}": c for k, (_, c) in zip(arguments.cameras, some, strict=True)},
         )
     run.rasterize(arguments.count, 3 if arguments.device == "cuda" else 1, 1280, 720)
     if arguments.output:

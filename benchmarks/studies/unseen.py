@@ -1,12 +1,15 @@
-"""What a scene loses when gaussians that are hardly seen are dropped, and what a refit brings back.
+"""What a scene loses when gaussians that are hardly seen are dropped, and what a refit
+brings back.
 
     python -m benchmarks.studies.unseen ASSETS --only Paljassaare -o unseen_cpu
 
-ASSETS is a folder as `benchmarks.studies.pairs` describes it; its scenes are measured from their own
-cameras. What other cameras, which stand beside those and look elsewhere, see least of is dropped, as by
-`examples/drop_unseen.py`. What is left may be refitted to pictures of all gaussians from the same other
-cameras, 3 x 3 samples a pixel, or be drawn with levels. Errors are to all gaussians at 4 x 4 samples a pixel.
-The table has the share of the gaussians in the frustum, and FLIP by that of all gaussians at one sample.
+ASSETS is a folder as `benchmarks.studies.pairs` describes it; its scenes are measured
+from their own cameras. What other cameras, which stand beside those and look elsewhere,
+see least of is dropped, as by `examples/drop_unseen.py`. What is left may be refitted
+to pictures of all gaussians from the same other cameras, 3 x 3 samples a pixel, or be
+drawn with levels. Errors are to all gaussians at 4 x 4 samples a pixel. The table has
+the share of the gaussians in the frustum, and FLIP by that of all gaussians at one
+sample.
 """
 
 from __future__ import annotations
@@ -37,8 +40,16 @@ Row = dict[str, Any]
 _NARROWEST, _WIDEST = 0.9, 1.25  # of the pictures' tangent, in that of the scene's own cameras
 _PITCH = 0.4  # radians, at most
 _EXAMPLE = Path(__file__).parents[2] / "examples" / "drop_unseen.py"
-# Of a refit, Adam's first step sizes: means in median scales, scales as logarithms, opacities as logits.
-_SIZES = {"means": 3e-3, "quats": 1.5e-4, "scales": 6e-4, "opacities": 2e-3, "sh0": 4.5e-4, "rest": 6e-5}
+# Of a refit, Adam's first step sizes: means in median scales, scales as logarithms,
+# opacities as logits.
+_SIZES = {
+    "means": 3e-3,
+    "quats": 1.5e-4,
+    "scales": 6e-4,
+    "opacities": 2e-3,
+    "sh0": 4.5e-4,
+    "rest": 6e-5,
+}
 _LAST_STEP = 0.01  # of the first
 _SAMPLES = 3
 
@@ -101,7 +112,8 @@ def others_of(config: Config, cameras: Sequence[v3dg.Camera]) -> list[v3dg.Camer
 def refitted(
     kept: v3dg.Gaussians, asset: v3dg.Gaussians, cameras: Sequence[v3dg.Camera], config: Config
 ) -> v3dg.Gaussians:
-    """What is kept, moved by Adam until pictures of it are those of the asset: a step a picture."""
+    """What is kept, moved by Adam until pictures of it are those of the asset: a step a
+    picture."""
     import torch
 
     device, steps = config.device, config.steps
@@ -145,13 +157,19 @@ def measure(config: Config, subject: Subject) -> list[Row]:
     weights = np.sum([weights_in(asset, camera, config.device) for camera in others], axis=0)
     seen = np.flatnonzero(weights > 0)
     seen = seen[np.argsort(weights[seen], kind="stable")]
-    shown = [(width, scaled(view, width / view.width)) for width in config.widths for view in subject.cameras]
+    shown = [
+        (width, scaled(view, width / view.width))
+        for width in config.widths
+        for view in subject.cameras
+    ]
     whole_asset = asset.torch(config.device)
     truths = [draw_truth(whole_asset, camera, config.device, 4) for _, camera in shown]
     rows: list[Row] = []
     whole: list[Row] = []
 
-    def add(kept: v3dg.Gaussians | v3dg.Bundle, part: float, steps: int, tolerance: float = 0.0) -> None:
+    def add(
+        kept: v3dg.Gaussians | v3dg.Bundle, part: float, steps: int, tolerance: float = 0.0
+    ) -> None:
         found = []
         options: Row = {"tolerance": tolerance} if isinstance(kept, v3dg.Bundle) else {}
         renderer = v3dg.Renderer(kept, device=config.device)
@@ -165,7 +183,12 @@ def measure(config: Config, subject: Subject) -> list[Row]:
         pairs = list(zip(found, whole, strict=True))
         for width in config.widths:
             here = [(mine, all_) for mine, all_ in pairs if mine["width"] == width]
-            row = {"asset": subject.name, "width": width, "seen": len(seen) / len(asset), "part": part}
+            row = {
+                "asset": subject.name,
+                "width": width,
+                "seen": len(seen) / len(asset),
+                "part": part,
+            }
             row |= {"steps": steps, "tolerance": tolerance}
             row["all"] = statistics.fmean(all_["flip"] for _, all_ in here)
             row["share"] = statistics.fmean(mine["count"] / all_["count"] for mine, all_ in here)

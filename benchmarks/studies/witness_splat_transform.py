@@ -1,14 +1,16 @@
-"""One asset drawn by us and by splat-transform, a renderer that shares no code with this one.
+"""One asset drawn by us and by splat-transform, a renderer that shares no code with
+this one.
 
-It needs Node 22 or newer, `npm install @playcanvas/splat-transform@3.7.0`, and a Vulkan device; without a GPU
-the software device that comes with Chromium does (SwiftShader: `VK_ICD_FILENAMES` names its
-vk_swiftshader_icd.json, `XDG_RUNTIME_DIR` a directory).
+It needs Node 22 or newer, `npm install @playcanvas/splat-transform@3.7.0`, and a Vulkan
+device; without a GPU the software device that comes with Chromium does (SwiftShader:
+`VK_ICD_FILENAMES` names its vk_swiftshader_icd.json, `XDG_RUNTIME_DIR` a directory).
 
-Both add the 0.3 px² of the original 3DGS code, but splat-transform cuts alpha at 0.99 and ends each gaussian
-at three standard deviations, bringing the falloff to 0 there. So a third picture is made: the float64
-reference of the tests, which the core is held to, with splat-transform's falloff in place of ours. It must be
-theirs but for the rounding to 8 bits (58.9 dB); then projection, colour, order and blending are the same, and
-the rest of the difference is the falloff's.
+Both add the 0.3 px² of the original 3DGS code, but splat-transform cuts alpha at 0.99
+and ends each gaussian at three standard deviations, bringing the falloff to 0 there. So
+a third picture is made: the float64 reference of the tests, which the core is held to,
+with splat-transform's falloff in place of ours. It must be theirs but for the rounding
+to 8 bits (58.9 dB); then projection, colour, order and blending are the same, and the
+rest of the difference is the falloff's.
 """
 
 from __future__ import annotations
@@ -50,7 +52,8 @@ class Config:
     """Vertical and horizontal field of view in degrees."""
     views: int = 4
     distance: float = 2.0
-    """From the centre of the asset, in radii of the ball that holds nearly all of it."""
+    """From the centre of the asset, in radii of the ball that holds nearly all of it.
+    """
     background: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))
     keep: Path | None = None
     """Directory to keep the pictures in."""
@@ -67,7 +70,11 @@ def witness(config: Config, camera: v3dg.Camera, target: np.ndarray, path: Path)
     command = [
         *shlex.split(config.splat_transform),
         *("--quiet", "--overwrite", str(config.asset)),
-        *(f"--camera-pos={point(camera.position)}", f"--camera-target={point(target)}", "--camera-up=0,0,1"),
+        *(
+            f"--camera-pos={point(camera.position)}",
+            f"--camera-target={point(target)}",
+            "--camera-up=0,0,1",
+        ),
         *(f"--camera-fov={config.fov}", f"--camera-near={camera.near}"),
         *(
             f"--resolution={config.size}x{config.size}",
@@ -77,14 +84,18 @@ def witness(config: Config, camera: v3dg.Camera, target: np.ndarray, path: Path)
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0 or not path.exists():
-        sys.exit(f"splat-transform: failed with {done.returncode}: {(done.stderr or done.stdout).strip()}")
+        sys.exit(
+            f"splat-transform: failed with {done.returncode}: "
+            f"{(done.stderr or done.stdout).strip()}"
+        )
     return np.asarray(Image.open(path).convert("RGB"), np.float32) / 255
 
 
 def with_their_falloff(
     asset: v3dg.Gaussians, camera: v3dg.Camera, background: tuple[float, ...]
 ) -> np.ndarray:
-    """The tests' reference picture (H,W,3), each gaussian falling off as in splat-transform."""
+    """The tests' reference picture (H,W,3), each gaussian falling off as in
+    splat-transform."""
     projection = project(asset, camera, filter_px2=FILTER_PX2)
     colors = reference_sh.color(asset.sh, asset.means - camera.position)
     largest = np.linalg.eigvalsh(
@@ -104,7 +115,9 @@ def with_their_falloff(
         conic = np.linalg.inv(projection.covariance_px2[i])
         dx = np.arange(x0, x1) + 0.5 - projection.mean_px[i, 0]
         dy = (np.arange(y0, y1) + 0.5 - projection.mean_px[i, 1])[:, None]
-        falloff = np.exp(-0.5 * (conic[0, 0] * dx * dx + 2 * conic[0, 1] * dx * dy + conic[1, 1] * dy * dy))
+        falloff = np.exp(
+            -0.5 * (conic[0, 0] * dx * dx + 2 * conic[0, 1] * dx * dy + conic[1, 1] * dy * dy)
+        )
         alpha = np.minimum(THEIR_MAX_ALPHA, asset.opacities[i] * np.maximum(0, falloff - floor))
         left = transmittance[y0:y1, x0:x1]
         alpha[(alpha < 1 / 255) | (left < 1e-4)] = 0
@@ -130,11 +143,15 @@ def main(config: Config) -> None:
         folder = config.keep or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         for i, camera in enumerate(cameras):
-            raster = v3dg.rasterize(asset, camera, filter_px2=FILTER_PX2, background=config.background)
+            raster = v3dg.rasterize(
+                asset, camera, filter_px2=FILTER_PX2, background=config.background
+            )
             ours = np.clip(raster.color, 0, 1)
             theirs = witness(config, camera, center, folder / f"theirs_{i}.webp")
             if config.keep:
-                Image.fromarray(np.round(ours * 255).astype(np.uint8)).save(folder / f"ours_{i}.png")
+                Image.fromarray(np.round(ours * 255).astype(np.uint8)).save(
+                    folder / f"ours_{i}.png"
+                )
             same_falloff = with_their_falloff(asset, camera, config.background)
             rows.append(
                 {
@@ -144,7 +161,9 @@ def main(config: Config) -> None:
                     "ssim": ssim(theirs, ours),
                     "flip": flip(theirs, ours),
                     "same_falloff_psnr_db": psnr(theirs, same_falloff),
-                    "same_falloff_largest_difference": float(np.abs(theirs - same_falloff).max() * 255),
+                    "same_falloff_largest_difference": float(
+                        np.abs(theirs - same_falloff).max() * 255
+                    ),
                 }
             )
     if config.json:
@@ -154,8 +173,9 @@ def main(config: Config) -> None:
     print("view  covered  PSNR dB    SSIM    FLIP  | their falloff: PSNR dB  largest difference")
     for r in rows:
         print(
-            f"{r['view']:4d}  {r['covered']:7.1%}  {r['psnr_db']:7.2f}  {r['ssim']:.4f}  {r['flip']:.4f}  | "
-            f"{r['same_falloff_psnr_db']:22.2f}  {r['same_falloff_largest_difference']:14.2f}/255"
+            f"{r['view']:4d}  {r['covered']:7.1%}  {r['psnr_db']:7.2f}  {r['ssim']:.4f}  "
+            f"{r['flip']:.4f}  | {r['same_falloff_psnr_db']:22.2f}  "
+            f"{r['same_falloff_largest_difference']:14.2f}/255"
         )
 
 

@@ -1,12 +1,13 @@
-"""Worlds of about 100 million gaussians, like the four of the V3DG paper, from assets made here.
+"""Worlds of about 100 million gaussians, like the four of the V3DG paper, from assets
+made here.
 
-A world says which assets stand where. Making the assets, building their bundles and putting them into a scene
-are steps of their own:
+A world says which assets stand where. Making the assets, building their bundles and
+putting them into a scene are steps of their own:
 
-    world = worlds.forest(instances=60, num_gaussians=20_000)
-    bundles = {name: v3dg.build_bundle(asset.make()) for name, asset in world.assets.items()}
-    scene = worlds.scene_of(world, bundles)
-    image = v3dg.render(scene, world.cameras()["000_camera_0"])
+    world = worlds.forest(instances=60, num_gaussians=20_000) bundles = {name:
+    v3dg.build_bundle(asset.make()) for name, asset in world.assets.items()} scene =
+    worlds.scene_of(world, bundles) image = v3dg.render(scene,
+    world.cameras()["000_camera_0"])
 """
 
 from __future__ import annotations
@@ -80,7 +81,9 @@ class World:
     @property
     def num_gaussians(self) -> int:
         """Gaussians of all instances at full detail."""
-        return sum(len(self.placements[name]) * asset.num_gaussians for name, asset in self.assets.items())
+        return sum(
+            len(self.placements[name]) * asset.num_gaussians for name, asset in self.assets.items()
+        )
 
     def cameras(self, *, width: int = 1920, height: int = 1080) -> dict[str, Camera]:
         """The paper's 400 cameras around the origin, up to the world's extent."""
@@ -98,7 +101,9 @@ def scene_of(world: World, bundles: Mapping[str, Bundle]) -> Scene:
     """
     missing = [name for name in world.placements if name not in bundles]
     if missing:
-        raise ValueError(f"bundles: expected one for each asset of {world.name}, got none for {missing[0]}")
+        raise ValueError(
+            f"bundles: expected one for each asset of {world.name}, got none for {missing[0]}"
+        )
     scene = Scene()
     for name, placement in world.placements.items():
         scene.add(bundles[name], placement.positions, placement.quaternions, placement.scales)
@@ -129,7 +134,8 @@ _FALL_STEPS = 50  # sixtieths of a second: the highest have fallen and the pile 
 
 
 def donut_shower(instances: int, *, seed: int = 0, layers: float = 4.0, gap: float = 0.03) -> Pile:
-    """Hang donuts in the air, about that many above each other, ready to fall; none touches another.
+    """Hang donuts in the air, about that many above each other, ready to fall; none
+    touches another.
 
     Args:
         gap: Free space between donuts of full size, however they are turned.
@@ -140,11 +146,14 @@ def donut_shower(instances: int, *, seed: int = 0, layers: float = 4.0, gap: flo
     pitch = 2 * (RING + TUBE) + gap
     a_layer = max(1, round(instances / layers))
     reach = int(np.ceil(np.sqrt(a_layer))) + 2
-    i, j = (x.ravel() for x in np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1)))
+    i, j = (
+        x.ravel() for x in np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1))
+    )
     plane = pitch * np.stack([i + 0.5 * j, np.sqrt(0.75) * j], -1)
     plane = plane[np.argsort(np.hypot(*plane.T), kind="stable")[:a_layer]]
     layer, cell = np.divmod(np.arange(instances), a_layer)
-    # Layers lie over the gaps of those below, as in a close packing, and are turned a little.
+    # Layers lie over the gaps of those below, as in a close packing, and are turned a
+    # little.
     shift = pitch * np.array([0.5, np.sqrt(1 / 12)]) * (layer % 2)[:, None]
     jitter = rng.uniform(-0.4, 0.4, (instances, 3)) * gap / np.sqrt(3)
     height = RING + TUBE + gap + layer * pitch
@@ -155,10 +164,12 @@ def donut_shower(instances: int, *, seed: int = 0, layers: float = 4.0, gap: flo
 
 
 def forest(instances: int = 400, num_gaussians: int = 315_630, *, seed: int = 0) -> World:
-    """Make a forest of eight kinds of trees, turned and sized at random, whose crowns hardly meet.
+    """Make a forest of eight kinds of trees, turned and sized at random, whose crowns
+    hardly meet.
 
     Args:
-        num_gaussians: Of each of the eight assets, on average: kinds have from 0.6 to 1.4 times as many.
+        num_gaussians: Of each of the eight assets, on average: kinds have from 0.6 to
+            1.4 times as many.
     """
     shares = np.linspace(0.6, 1.4, len(TREE_KINDS))[
         np.random.default_rng([seed, 1]).permutation(len(TREE_KINDS))
@@ -173,7 +184,8 @@ def forest(instances: int = 400, num_gaussians: int = 315_630, *, seed: int = 0)
 
 
 def temples(instances: int = 100, num_gaussians: int = 1_350_487, *, seed: int = 0) -> World:
-    """Make a plain of temples, turned and sized at random, that stand clear of each other.
+    """Make a plain of temples, turned and sized at random, that stand clear of each
+    other.
 
     Args:
         num_gaussians: Of the one asset.
@@ -182,8 +194,11 @@ def temples(instances: int = 100, num_gaussians: int = 1_350_487, *, seed: int =
     return _scattered("temples", {"temple": asset}, {"temple": 15.8}, instances, (0.7, 1.2), seed)
 
 
-def crowd(instances: int = 400, num_gaussians: int = 343_274, *, persons: int = 16, seed: int = 0) -> World:
-    """Make a crowd that stands in a square grid and looks one way, its feet at z = -0.85.
+def crowd(
+    instances: int = 400, num_gaussians: int = 343_274, *, persons: int = 16, seed: int = 0
+) -> World:
+    """Make a crowd that stands in a square grid and looks one way, its feet at z =
+    -0.85.
 
     Args:
         num_gaussians: Of each asset.
@@ -199,19 +214,27 @@ def crowd(instances: int = 400, num_gaussians: int = 343_274, *, persons: int = 
     pitch, side = 1.2, int(np.ceil(np.sqrt(instances)))
     row, column = np.divmod(np.arange(instances), side)
     half = 0.5 * (side - 1)
-    # Cameras look at the origin: halfway up, for between the persons' feet there is nothing.
+    # Cameras look at the origin: halfway up, for between the persons' feet there is
+    # nothing.
     heights = np.full(instances, -0.85)
     positions = np.stack([pitch * (column - half), pitch * (row - half), heights], -1)
     # Each person as often as any other, and neighbours differ.
     who = np.concatenate(
-        [np.random.default_rng([seed, i]).permutation(persons) for i in range(-(-instances // persons))]
+        [
+            np.random.default_rng([seed, i]).permutation(persons)
+            for i in range(-(-instances // persons))
+        ]
     )
     assets, placements = {}, {}
     for person in range(persons):
         name = f"person_{person:02}"
         at = positions[who[:instances] == person]
-        assets[name] = Asset(partial(make_person, num_gaussians, seed=1000 * seed + person), num_gaussians)
-        placements[name] = Placement(at, np.tile([1.0, 0.0, 0.0, 0.0], (len(at), 1)), np.ones(len(at)))
+        assets[name] = Asset(
+            partial(make_person, num_gaussians, seed=1000 * seed + person), num_gaussians
+        )
+        placements[name] = Placement(
+            at, np.tile([1.0, 0.0, 0.0, 0.0], (len(at), 1)), np.ones(len(at))
+        )
     return World("crowd", assets, placements, 2.0 * pitch * max(half, 1.0))
 
 
@@ -223,14 +246,15 @@ def _scattered(
     scales: tuple[float, float],
     seed: int,
 ) -> World:
-    """Place one asset after the other on the plane, at random, where it is clear of all others."""
+    """Place one asset after the other on the plane, at random, where it is clear of all
+    others."""
     if instances < 1:
         raise ValueError(f"instances: expected at least 1, got {instances}")
     rng = np.random.default_rng(seed)
     names = list(assets)
-    which = np.concatenate([rng.permutation(len(names)) for _ in range(-(-instances // len(names)))])[
-        :instances
-    ]
+    which = np.concatenate(
+        [rng.permutation(len(names)) for _ in range(-(-instances // len(names)))]
+    )[:instances]
     size = rng.uniform(*scales, instances)
     room = size * np.array([radii[names[k]] for k in which])
     # Discs dropped one after the other cover about this share of the plane.
@@ -257,7 +281,8 @@ def _clear_place(
     extent: float,
     rng: np.random.Generator,
 ) -> npt.NDArray[np.float64]:
-    """A place at random where a disc touches no other; the disc of places grows where there is none."""
+    """A place at random where a disc touches no other; the disc of places grows where
+    there is none."""
     while True:
         r, a = extent * np.sqrt(rng.random(400)), rng.uniform(0, 2 * np.pi, 400)
         tried = np.stack([r * np.cos(a), r * np.sin(a)], -1)
@@ -293,10 +318,12 @@ def write_world(
     resume: bool = False,
     progress: bool = True,
 ) -> Path:
-    """Make a world's assets, build their bundles, and write all of it with a scene file and its cameras.
+    """Make a world's assets, build their bundles, and write all of it with a scene file
+    and its cameras.
 
     Args:
-        folder: Made if it is not there. It gets ASSET.ply and ASSET.v3dg for each asset, and WORLD.json.
+        folder: Made if it is not there. It gets ASSET.ply and ASSET.v3dg for each
+            asset, and WORLD.json.
         config: How bundles are built; by default as `build_bundle` does.
         seed: Of the builds.
         resume: Keep the bundles and finished levels of a call that was interrupted.
@@ -314,7 +341,9 @@ def write_world(
     folder.mkdir(parents=True, exist_ok=True)
     config = config or BuildConfig()
     bundles = {}
-    for name, asset in tqdm(world.assets.items(), desc=world.name, unit="asset", disable=not progress):
+    for name, asset in tqdm(
+        world.assets.items(), desc=world.name, unit="asset", disable=not progress
+    ):
         gaussians = asset.make()
         asset_path, bundle_path = folder / f"{name}.ply", folder / f"{name}.v3dg"
         if not (resume and asset_path.is_file() and _is_same(read_asset(asset_path), gaussians)):
@@ -336,8 +365,13 @@ def write_world(
 
 
 def _is_same(read: Gaussians, made: Gaussians) -> bool:
-    """Whether gaussians read from a file are those that were written; logarithms and logits round."""
+    """Whether gaussians read from a file are those that were written; logarithms and
+    logits round."""
     return len(read) == len(made) and all(
         np.allclose(a, b, rtol=1e-5, atol=1e-6)
-        for a, b in ((read.means, made.means), (read.scales, made.scales), (read.opacities, made.opacities))
+        for a, b in (
+            (read.means, made.means),
+            (read.scales, made.scales),
+            (read.opacities, made.opacities),
+        )
     )

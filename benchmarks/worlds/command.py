@@ -21,7 +21,8 @@ class World:
     output: Annotated[Path | None, option("FOLDER", "-o")] = None
     """Folder to write to, made if it is not there; the world's name if not given."""
     scale: Literal["small", "full"] = "small"
-    """How large: full is about 100 million gaussians, and hours of a CPU or minutes of a GPU."""
+    """How large: full is about 100 million gaussians, and hours of a CPU or minutes of
+    a GPU."""
     seed: int = 0
     """Seed of the assets, of the layout and of the builds."""
     device: Literal["auto", "cpu", "cuda"] = "auto"

@@ -20,11 +20,12 @@ def trajectories(
     height: int = 1080,
     near: float = 0.01,
 ) -> dict[str, Camera]:
-    """Make the paper's 400 cameras: from 4 directions and 5 elevations, at 20 distances, all to the centre.
+    """Make the paper's 400 cameras: from 4 directions and 5 elevations, at 20
+    distances, all to the centre.
 
-    The directions are those of +y, -x, -y and +x in this order; for each, elevations of 15 to 75 degrees; for
-    each, distances of 1/20 to 20/20 of the radius. With the origin and radius 9 they are those of the
-    published DonutSea. Up is z.
+    The directions are those of +y, -x, -y and +x in this order; for each, elevations of
+    15 to 75 degrees; for each, distances of 1/20 to 20/20 of the radius. With the
+    origin and radius 9 they are those of the published DonutSea. Up is z.
 
     Args:
         center: (3,) point in the world.
@@ -32,8 +33,8 @@ def trajectories(
         fov_x: Horizontal field of view in radians.
 
     Returns:
-        Cameras by name in that order, "000_camera_0" to "399_camera_19": the place among all, and the
-        distance's.
+        Cameras by name in that order, "000_camera_0" to "399_camera_19": the place
+        among all, and the distance's.
 
     Raises:
         ValueError: The radius is not a positive number.

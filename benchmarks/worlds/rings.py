@@ -1,8 +1,10 @@
-"""Donuts that fall into a pile: rigid rings with round tubes, on the ground and on each other.
+"""Donuts that fall into a pile: rigid rings with round tubes, on the ground and on each
+other.
 
-Position-based rigid bodies (Müller et al., Detailed Rigid Body Simulation with Extended Position Based
-Dynamics, SCA 2020), all contacts of a substep at once. A contact of two rings is where their tubes' axes,
-circles, come nearest, so rings touch as tori do and not as chains of balls.
+Position-based rigid bodies (Müller et al., Detailed Rigid Body Simulation with Extended
+Position Based Dynamics, SCA 2020), all contacts of a substep at once. A contact of two
+rings is where their tubes' axes, circles, come nearest, so rings touch as tori do and
+not as chains of balls.
 """
 
 from __future__ import annotations
@@ -52,7 +54,8 @@ class Pile:
             gravity: Length units per s².
 
         Raises:
-            ValueError: Shapes do not go together, or the tube is not thinner than the ring.
+            ValueError: Shapes do not go together, or the tube is not thinner than the
+                ring.
         """
         self.positions = np.array(positions, dtype=np.float64)
         self.quaternions = np.array(quaternions, dtype=np.float64)
@@ -68,7 +71,9 @@ class Pile:
                 f"{self.positions.shape}, {self.quaternions.shape}, {self.scales.shape}"
             )
         if not 0 < tube < ring:
-            raise ValueError(f"tube: expected a radius between 0 and the ring's {ring:g}, got {tube:g}")
+            raise ValueError(
+                f"tube: expected a radius between 0 and the ring's {ring:g}, got {tube:g}"
+            )
         self.ring, self.tube = ring * self.scales, tube * self.scales
         self._gravity = gravity
         self._velocities = np.zeros((count, 3))
@@ -101,7 +106,8 @@ class Pile:
             self._separate(contacts, rotations, self.positions.copy(), self.quaternions.copy())
 
     def deepest_overlap(self) -> float:
-        """How deep any two rings, or a ring and the ground, overlap, relative to the tubes' radius."""
+        """How deep any two rings, or a ring and the ground, overlap, relative to the
+        tubes' radius."""
         pairs = _near_pairs(self.positions, self.ring + self.tube)
         contacts = _Contacts.of(
             self.positions, rotation_from_quaternion(self.quaternions), self.ring, self.tube, pairs
@@ -111,7 +117,9 @@ class Pile:
     def _pairs_within(self, seconds: float) -> tuple[Ints, Ints]:
         """Pairs that may touch within that time."""
         reach = self.ring + self.tube
-        speed = np.sqrt((self._velocities**2).sum(axis=1)) + reach * np.sqrt((self._spins**2).sum(axis=1))
+        speed = np.sqrt((self._velocities**2).sum(axis=1)) + reach * np.sqrt(
+            (self._spins**2).sum(axis=1)
+        )
         margin = 0.05 * self.tube + (speed + self._gravity * seconds) * seconds
         a, b = _near_pairs(self.positions, reach + margin)
         on_a, on_b = _nearest_on_rings(
@@ -138,10 +146,14 @@ class Pile:
     def _separate(
         self, contacts: _Contacts, rotations: Floats, before: Floats, turned_before: Floats
     ) -> npt.NDArray[np.bool_]:
-        """Push touching bodies apart and hold back their sliding, all contacts at once; tell which touch."""
+        """Push touching bodies apart and hold back their sliding, all contacts at once;
+        tell which touch."""
         first, second, ground = contacts.first, contacts.second, contacts.second < 0
         other = np.where(ground, first, second)
-        arm_a, arm_b = contacts.point - self.positions[first], contacts.point - self.positions[other]
+        arm_a, arm_b = (
+            contacts.point - self.positions[first],
+            contacts.point - self.positions[other],
+        )
         old = rotation_from_quaternion(turned_before)
 
         def moved(body: Ints, arm: Floats) -> Floats:
@@ -155,7 +167,9 @@ class Pile:
         slip -= normal * np.sum(slip * normal, axis=1, keepdims=True)
         length = np.sqrt((slip**2).sum(axis=1))
         allowed = np.minimum(length, _FRICTION * contacts.depth)
-        push = normal * contacts.depth[:, None] - slip * (allowed / np.maximum(length, 1e-12))[:, None]
+        push = (
+            normal * contacts.depth[:, None] - slip * (allowed / np.maximum(length, 1e-12))[:, None]
+        )
 
         size = np.sqrt((push**2).sum(axis=1))
         toward = push / np.maximum(size, 1e-12)[:, None]
@@ -179,7 +193,8 @@ class Pile:
                 shift[:, axis] += np.bincount(body, self._lightness[body] * share[:, axis], count)
                 turn[:, axis] += np.bincount(body, twist[:, axis], count)
             touching += np.bincount(body, share.any(axis=1), count)
-        # Contacts that push the same way would together push too far; a mean would creep.
+        # Contacts that push the same way would together push too far; a mean would
+        # creep.
         weight = _RELAX / np.maximum(np.sqrt(touching), 1)
         self.positions += weight[:, None] * shift
         self.quaternions = _turned(self.quaternions, weight[:, None] * turn)
@@ -228,10 +243,13 @@ class _Contacts:
             away = on_a - on_b
             distance = np.sqrt((away**2).sum(axis=-1))
             depth = (tube[a] + tube[b])[:, None] - distance
-            # Two rings may touch in two places: the deepest, and the deepest of those elsewhere.
+            # Two rings may touch in two places: the deepest, and the deepest of those
+            # elsewhere.
             row = np.arange(len(a))
             deepest = depth.argmax(axis=1)
-            elsewhere = ((on_a - on_a[row, deepest][:, None]) ** 2).sum(axis=-1) > (ring[a] ** 2)[:, None]
+            elsewhere = ((on_a - on_a[row, deepest][:, None]) ** 2).sum(axis=-1) > (ring[a] ** 2)[
+                :, None
+            ]
             another = np.where(elsewhere, depth, -1.0).argmax(axis=1)
             for pick, counts in ((deepest, True), (another, elsewhere[row, another])):
                 hit = np.flatnonzero((depth[row, pick] > 0) & counts)
@@ -239,14 +257,17 @@ class _Contacts:
                 normal = away[hit, k] / np.maximum(distance[hit, k], 1e-9)[:, None]
                 point = on_b[hit, k] + normal * (tube[b[hit]] - 0.5 * depth[hit, k])[:, None]
                 parts.append(_Contacts(a[hit], b[hit], point, normal, depth[hit, k]))
-        columns = zip(*((p.first, p.second, p.point, p.normal, p.depth) for p in parts), strict=True)
+        columns = zip(
+            *((p.first, p.second, p.point, p.normal, p.depth) for p in parts), strict=True
+        )
         return _Contacts(*(np.concatenate(column) for column in columns))
 
 
 def _nearest_on_rings(
     positions: Floats, rotations: Floats, ring: Floats, a: Ints, b: Ints
 ) -> tuple[Floats, Floats]:
-    """Where the circles of pairs come nearest to each other, from several starts, (P,S,3) on each."""
+    """Where the circles of pairs come nearest to each other, from several starts,
+    (P,S,3) on each."""
 
     def onto(points: Floats, body: Ints) -> Floats:
         """The nearest points of the bodies' circles."""
@@ -258,7 +279,9 @@ def _nearest_on_rings(
 
     angle = np.arange(_PAIR_SAMPLES) * (2 * np.pi / _PAIR_SAMPLES)
     circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
-    on_a = positions[a][:, None] + ring[a][:, None, None] * np.einsum("nij,kj->nki", rotations[a], circle)
+    on_a = positions[a][:, None] + ring[a][:, None, None] * np.einsum(
+        "nij,kj->nki", rotations[a], circle
+    )
     for _ in range(3):
         on_b = onto(on_a, b)
         on_a = onto(on_b, a)
@@ -266,7 +289,8 @@ def _nearest_on_rings(
 
 
 def _near_pairs(positions: Floats, reach: Floats) -> tuple[Ints, Ints]:
-    """Pairs a < b of balls that overlap, found on a grid of cells as wide as the largest ball."""
+    """Pairs a < b of balls that overlap, found on a grid of cells as wide as the
+    largest ball."""
     if not len(positions):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     width = 2 * float(reach.max())
@@ -299,7 +323,9 @@ def _turned(quaternions: Floats, rotation_vectors: Floats) -> Floats:
     """Quaternions after small further rotations, given as vectors in the world."""
     w, v = quaternions[:, :1], quaternions[:, 1:]
     r = 0.5 * rotation_vectors
-    result = np.concatenate([w - (r * v).sum(axis=1, keepdims=True), v + w * r + np.cross(r, v)], axis=1)
+    result = np.concatenate(
+        [w - (r * v).sum(axis=1, keepdims=True), v + w * r + np.cross(r, v)], axis=1
+    )
     return np.asarray(result / np.sqrt((result**2).sum(axis=1, keepdims=True)))
 
 

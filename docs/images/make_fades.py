@@ -1,4 +1,5 @@
-"""Makes fades.webp of the donut: a slow drift with a hard cut and with a fade, and below how errors change.
+"""Makes fades.webp of the donut: a slow drift with a hard cut and with a fade, and
+below how errors change.
 
 python docs/images/make_fades.py donut.v3dg
 """

@@ -1,6 +1,8 @@
-"""Make the figures of docs/how_it_works.md and docs/choosing.md; needs the extra `bench`, takes a minute.
+"""Make the figures of docs/how_it_works.md and docs/choosing.md; needs the extra
+`bench`, takes a minute.
 
-The pictures are drawn by v3dg of an asset that is made here, the curves are those of recorded results.
+The pictures are drawn by v3dg of an asset that is made here, the curves are those of
+recorded results.
 """
 
 from __future__ import annotations
@@ -61,10 +63,18 @@ def levels(bundle: v3dg.Bundle) -> None:
         row = []
         for level in LEVELS:
             image = v3dg.render(
-                bundle, camera, tolerance=0, min_level=level, color_by=color_by, background=SKY, device="cpu"
+                bundle,
+                camera,
+                tolerance=0,
+                min_level=level,
+                color_by=color_by,
+                background=SKY,
+                device="cpu",
             )
             count = image.stats.gaussians_selected
-            row.append((f"level {level}: {count:,} gaussians" if color_by == "appearance" else "", image))
+            row.append(
+                (f"level {level}: {count:,} gaussians" if color_by == "appearance" else "", image)
+            )
         rows.append([(text, to_8bit(image.color)) for text, image in row])
     write_picture(HERE / "how_levels.jpg", contact_sheet(rows))
 
@@ -97,7 +107,12 @@ def tree() -> None:
     """Clusters of four levels over one asset, and the cut for a camera at its left."""
     figure, axes = plt.subplots(figsize=(7.6, 3.1))
     num_leaves, height = 8, 4
-    drawn = {(0, 0), (0, 1), (1, 1), (2, 1)}  # (level, place): fine near the camera, coarse away from it
+    drawn = {
+        (0, 0),
+        (0, 1),
+        (1, 1),
+        (2, 1),
+    }  # (level, place): fine near the camera, coarse away from it
     for level in range(height):
         width = 2**level
         for place in range(num_leaves // width):
@@ -115,7 +130,12 @@ def tree() -> None:
             if level + 1 < height:
                 x, up = (place + 0.5) * width, (place // 2 + 0.5) * 2 * width
                 axes.plot([x, up], [level + 0.6, level + 1.1], color=INK, linewidth=1, zorder=0)
-        axes.text(num_leaves + 0.2, level + 0.35, f"level {level}: {num_leaves // width} x 256", va="center")
+        axes.text(
+            num_leaves + 0.2,
+            level + 0.35,
+            f"level {level}: {num_leaves // width} x 256",
+            va="center",
+        )
     axes.plot(
         [-0.05, 2.0, 2.0, 4.0, 4.0, 8.05],
         [0.85, 0.85, 1.85, 1.85, 2.85, 2.85],
@@ -133,9 +153,12 @@ def tree() -> None:
 
 def tolerance() -> None:
     """Time against error on the paper's DonutSea, as recorded on a GPU."""
-    rows: list[dict[str, Any]] = json.loads((RESULTS / "full" / "tolerance.json").read_text())["rows"]
+    rows: list[dict[str, Any]] = json.loads((RESULTS / "full" / "tolerance.json").read_text())[
+        "rows"
+    ]
     figure, axes = plt.subplots(figsize=(6.4, 3.6))
-    # The curve is nearly level at its lowest point, so there the labels stand below it, elsewhere beside it.
+    # The curve is nearly level at its lowest point, so there the labels stand below it,
+    # elsewhere beside it.
     beside = {
         0.5: (12, -8),
         1: (10, -8),
@@ -160,7 +183,11 @@ def tolerance() -> None:
                 color=color,
                 xytext=beside[row["tolerance"]],
                 textcoords="offset points",
-                ha="center" if is_default else "left" if beside[row["tolerance"]][0] > 0 else "right",
+                ha="center"
+                if is_default
+                else "left"
+                if beside[row["tolerance"]][0] > 0
+                else "right",
                 fontweight="bold" if is_default else "normal",
             )
     full = next(row for row in rows if row["levels"] == "full")
@@ -172,7 +199,12 @@ def tolerance() -> None:
         linestyle="",
         label="every gaussian, 0 px²",
     )
-    axes.set(xlabel="milliseconds a frame", ylabel="FLIP, less is better", ylim=(0.03, 0.08), xlim=(1.5, 6.6))
+    axes.set(
+        xlabel="milliseconds a frame",
+        ylabel="FLIP, less is better",
+        ylim=(0.03, 0.08),
+        xlim=(1.5, 6.6),
+    )
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False)
     save(figure, "choosing_tolerance.svg")

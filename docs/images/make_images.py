@@ -1,4 +1,5 @@
-"""Make donutsea.jpg: a window of a layout as truth, with all gaussians and with our cut twice."""
+"""Make donutsea.jpg: a window of a layout as truth, with all gaussians and with our cut
+twice."""
 
 from __future__ import annotations
 
@@ -43,7 +44,9 @@ def main(config: Config) -> None:
         image = v3dg.render(scene, camera, tolerance=tolerance, device="cpu")
         color = np.clip(image.color, 0, 1)
         count = f"{image.stats.gaussians_in_frustum / 1e6:.2f} M gaussians, FLIP {flip(truth, color):.3f}"
-        panels.append((f"{'all' if tolerance == 0 else f'tolerance {tolerance:g}'}: {count}", color))
+        panels.append(
+            (f"{'all' if tolerance == 0 else f'tolerance {tolerance:g}'}: {count}", color)
+        )
 
     font = ImageFont.load_default(size=20)
     w, h, bar = width * config.zoom, height * config.zoom, 36

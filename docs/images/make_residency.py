@@ -1,9 +1,10 @@
-"""Make viewer_residency.jpg: the viewer just after a teleport, with pages that are not there yet.
+"""Make viewer_residency.jpg: the viewer just after a teleport, with pages that are not
+there yet.
 
 python docs/images/make_residency.py donut.v3dg FOLDER
 
-The scene is a field of a hundred copies of the bundle, in files of their own in FOLDER, as in
-`benchmarks.studies.residency`. Needs playwright.
+The scene is a field of a hundred copies of the bundle, in files of their own in FOLDER,
+as in `benchmarks.studies.residency`. Needs playwright.
 """
 
 import shutil
@@ -28,7 +29,8 @@ WIDTH, HEIGHT, PANEL = 1120, 640, 300
 
 
 class HeldView(SceneView):
-    """Draws the first picture from ``eye`` at full size, and none on the way there or after it."""
+    """Draws the first picture from ``eye`` at full size, and none on the way there or
+    after it."""
 
     eye: np.ndarray | None = None
     last: Frame

@@ -1,4 +1,5 @@
-"""Make viewer_*.jpg: the viewer in Chromium, in each mode, and at the size of a phone. Needs playwright.
+"""Make viewer_*.jpg: the viewer in Chromium, in each mode, and at the size of a phone.
+Needs playwright.
 
 python docs/images/make_viewer.py donutsea.json 048_camera_8
 """
@@ -16,7 +17,12 @@ from v3dg.viewer.frame import SceneView
 from v3dg.viewer.server import Site
 
 FOLDER = Path(__file__).parent
-ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"]
+ARGUMENTS = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+]
 MODES = (
     *("Colour", "Level", "Cluster", "Error", "Depth", "Alpha"),
     *("Gaussians per pixel", "Difference to all gaussians"),
@@ -65,7 +71,10 @@ def main(scene_path: str, camera: str) -> None:
         settle(page)
         save("frozen", shot(page))
         phone = browser.new_context(
-            viewport={"width": 390, "height": 700}, device_scale_factor=1, is_mobile=True, has_touch=True
+            viewport={"width": 390, "height": 700},
+            device_scale_factor=1,
+            is_mobile=True,
+            has_touch=True,
         ).new_page()
         phone.goto(site.url)
         look_through(phone, camera)
@@ -111,7 +120,14 @@ def sheet(pictures: list[Image.Image], names: list[str], columns: int) -> Image.
     for place, (picture, name) in enumerate(zip(pictures, names, strict=True)):
         corner = place % columns * (width + 6), place // columns * (height + 6)
         whole.paste(picture.convert("RGB"), corner)
-        draw.text((corner[0] + 10, corner[1] + 8), name, "white", font, stroke_width=2, stroke_fill="black")
+        draw.text(
+            (corner[0] + 10, corner[1] + 8),
+            name,
+            "white",
+            font,
+            stroke_width=2,
+            stroke_fill="black",
+        )
     return whole
 
 

@@ -1,14 +1,16 @@
 #!/usr/bin/env python3
-"""Attack v3dg with broken files, odd commands and calls, signals, threads and limits; keep what is wrong.
+"""Attack v3dg with broken files, odd commands and calls, signals, threads and limits;
+keep what is wrong.
 
     python tests/fuzz/attack.py all --seconds 3600
     python tests/fuzz/attack.py files commands --tries 500 --seed 7
     python tests/fuzz/attack.py files --seed 7 --only 123
 
-A kind is a module of attacks/, which says what it tries and what is right. Tries are numbered, and a seed and
-a number give the same try. A line of JSON is printed for each kind, with the numbers of the tries that found
-something; what these had on disk is kept in build/attack/KIND/SEED-NUMBER. The exit code is 1 where something
-was found. What is only "low", a message that could say more, is counted beside the findings.
+A kind is a module of attacks/, which says what it tries and what is right. Tries are
+numbered, and a seed and a number give the same try. A line of JSON is printed for each
+kind, with the numbers of the tries that found something; what these had on disk is kept
+in build/attack/KIND/SEED-NUMBER. The exit code is 1 where something was found. What is
+only "low", a message that could say more, is counted beside the findings.
 """
 
 import argparse
@@ -42,7 +44,9 @@ KEPT = Path(__file__).parents[2] / "build" / "attack"
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("kinds", nargs="+", choices=[*KINDS, "all"], metavar="KIND", help=", ".join(KINDS))
+    parser.add_argument(
+        "kinds", nargs="+", choices=[*KINDS, "all"], metavar="KIND", help=", ".join(KINDS)
+    )
     parser.add_argument("--seconds", type=float, default=600, help="for all kinds together")
     parser.add_argument("--tries", type=int, help="of each kind, if the time suffices")
     parser.add_argument("--seed", type=int, default=0)

@@ -3,13 +3,45 @@
 import json
 
 VALUES = (
-    *(None, True, False, 0, 1, -1, 0.5, 2, 3, 1e-300, 1e300, 1 << 20, 1 << 31, 1 << 63, 1 << 64, 10**400),
-    *("", "a", "x", "v3dg", "v3dg-scene", "OPENCV", "\ud800", "..", [], {}, [0, 0, 0], [1, 0, 0, 0], [[]]),
+    *(
+        None,
+        True,
+        False,
+        0,
+        1,
+        -1,
+        0.5,
+        2,
+        3,
+        1e-300,
+        1e300,
+        1 << 20,
+        1 << 31,
+        1 << 63,
+        1 << 64,
+        10**400,
+    ),
+    *(
+        "",
+        "a",
+        "x",
+        "v3dg",
+        "v3dg-scene",
+        "OPENCV",
+        "\ud800",
+        "..",
+        [],
+        {},
+        [0, 0, 0],
+        [1, 0, 0, 0],
+        [[]],
+    ),
 )
 
 
 def changed_json(text, rng):
-    """The document of the text with one value or key changed; the text itself where it is no document."""
+    """The document of the text with one value or key changed; the text itself where it
+    is no document."""
     try:
         document = json.loads(text)
     except (ValueError, RecursionError):
@@ -34,7 +66,13 @@ def changed_json(text, rng):
 
 def _places(value):
     """Every value in the document, as what holds it and where."""
-    keys = value.keys() if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
+    keys = (
+        value.keys()
+        if isinstance(value, dict)
+        else range(len(value))
+        if isinstance(value, list)
+        else ()
+    )
     for key in keys:
         yield value, key
         yield from _places(value[key])

@@ -1,9 +1,11 @@
-"""Fuzz the .ply reader, which is C++, for some time, and keep the inputs that reach all it reached.
+"""Fuzz the .ply reader, which is C++, for some time, and keep the inputs that reach all
+it reached.
 
     python tests/fuzz/run.py SECONDS
 
-It is guided by coverage and needs clang++ (CLANG names another one). It works in build/fuzz; what stops it is
-there as crash-*. Inputs go to tests/fuzz/corpus, which test_fuzz.py replays. What is not C++ is attack.py's.
+It is guided by coverage and needs clang++ (CLANG names another one). It works in
+build/fuzz; what stops it is there as crash-*. Inputs go to tests/fuzz/corpus, which
+test_fuzz.py replays. What is not C++ is attack.py's.
 """
 
 import os
@@ -39,7 +41,10 @@ def ply_seeds():
 
 
 def compiled(folder):
-    sources = [HERE / "fuzz_ply.cpp", *(ROOT / "csrc/io" / f"ply_{part}.cpp" for part in ("header", "read"))]
+    sources = [
+        HERE / "fuzz_ply.cpp",
+        *(ROOT / "csrc/io" / f"ply_{part}.cpp" for part in ("header", "read")),
+    ]
     checks = ["-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=undefined"]
     program = folder / "fuzz_ply"
     compiler = os.environ.get("CLANG", "clang++")
@@ -68,12 +73,24 @@ def main():
     zipfile.ZipFile(archive).extractall(found)
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     program = compiled(folder)
-    options = ["-timeout=30", "-print_final_stats=1", f"-max_len={MAX_BYTES}", f"-max_total_time={seconds}"]
+    options = [
+        "-timeout=30",
+        "-print_final_stats=1",
+        f"-max_len={MAX_BYTES}",
+        f"-max_total_time={seconds}",
+    ]
     start = [program, *options, f"-dict={HERE / 'ply.dict'}", str(found), str(seeds)]
     subprocess.run(start, cwd=folder, env=environment, check=True)
     for path in kept.iterdir():
         path.unlink()
-    merge = [program, "-set_cover_merge=1", f"-max_len={KEPT_BYTES}", str(kept), str(found), str(seeds)]
+    merge = [
+        program,
+        "-set_cover_merge=1",
+        f"-max_len={KEPT_BYTES}",
+        str(kept),
+        str(found),
+        str(seeds),
+    ]
     subprocess.run(merge, cwd=folder, env=environment, check=True)
     keep(kept, archive, KEPT_BYTES)
 

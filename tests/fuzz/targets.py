@@ -1,4 +1,5 @@
-"""Readers, and what must hold whatever they read, for inputs that were kept; and zips for all."""
+"""Readers, and what must hold whatever they read, for inputs that were kept; and zips
+for all."""
 
 import gzip
 import io
@@ -30,7 +31,8 @@ def read_ply(content, folder):
 
 
 def read_bundle(content, folder):
-    """Nearly every change of a file is found by its hashes, so it is read again with hashes that fit."""
+    """Nearly every change of a file is found by its hashes, so it is read again with
+    hashes that fit."""
     for data in (content, with_fitting_hashes(content)):
         path = put(folder / "fuzz.v3dg", data)
         with only_errors_that_name(path):
@@ -49,7 +51,8 @@ def read_json(content, folder):
 
 
 def read_format(content, folder):
-    """The first byte tells the format, and whether the rest is a file of it or what is packed in one."""
+    """The first byte tells the format, and whether the rest is a file of it or what is
+    packed in one."""
     suffix, packed = FORMATS[content[0] % len(FORMATS)] if content else FORMATS[0]
     path = put(folder / f"fuzz{suffix}", packed(content[1:]))
     with only_errors_that_name(path):
@@ -69,7 +72,8 @@ def zip_bytes(entries, compression=zipfile.ZIP_STORED):
 
 
 def small_sog():
-    """The files of a SOG, its tables cut to four values, so that most changes of it change something else."""
+    """The files of a SOG, its tables cut to four values, so that most changes of it
+    change something else."""
     files = sog.encode(random_gaussians(np.random.default_rng(0), 3, sh_degree=1))
     meta = json.loads(files["meta.json"])
     for name in ("scales", "sh0", "shN"):
@@ -96,7 +100,8 @@ def put(path, content):
 
 
 class only_errors_that_name:
-    """Lets those errors end the block that a reader may raise: of one line that begins with the name."""
+    """Lets those errors end the block that a reader may raise: of one line that begins
+    with the name."""
 
     def __init__(self, name):
         self.name = name
@@ -113,7 +118,8 @@ class only_errors_that_name:
 
 
 def parts_of(data):
-    """Header, its end, and from there the ends of pages and file's hash; None where they are not there."""
+    """Header, its end, and from there the ends of pages and file's hash; None where
+    they are not there."""
     start = 8 + int.from_bytes(data[:8], "little")
     try:
         header = json.loads(data[8:start])
@@ -125,7 +131,8 @@ def parts_of(data):
 
 
 def with_fitting_hashes(data):
-    """The file with the hashes of its pages and its own made anew, as far as its header leads to them."""
+    """The file with the hashes of its pages and its own made anew, as far as its header
+    leads to them."""
     data = bytearray(data)
     try:
         header, start, pages_end, hash_end = parts_of(data)

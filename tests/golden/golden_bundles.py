@@ -1,4 +1,5 @@
-"""Small bundles, of each version of the format; run it to write those of the newest, once and never again."""
+"""Small bundles, of each version of the format; run it to write those of the newest,
+once and never again."""
 
 from pathlib import Path
 
@@ -11,7 +12,9 @@ def path_of(version, codec):
 
 
 def bundle_of(codec):
-    return random_bundle(11, sh_degree=3, max_cluster=3, max_fan=2, config={"by": "golden"}, codec=codec)
+    return random_bundle(
+        11, sh_degree=3, max_cluster=3, max_fan=2, config={"by": "golden"}, codec=codec
+    )
 
 
 if __name__ == "__main__":

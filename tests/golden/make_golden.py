@@ -1,7 +1,8 @@
-"""Writes gsplat_projection.npz: what gsplat's pure-torch functions make of the scenes of `golden_scenes`.
+"""Writes gsplat_projection.npz: what gsplat's pure-torch functions make of the scenes
+of `golden_scenes`.
 
-Run as `python tests/golden/make_golden.py`. Needs torch and gsplat (`pip install --no-deps gsplat==1.5.3`),
-not CUDA.
+Run as `python tests/golden/make_golden.py`. Needs torch and gsplat (`pip install
+--no-deps gsplat==1.5.3`), not CUDA.
 """
 
 from __future__ import annotations
@@ -28,13 +29,16 @@ def golden_scenes():
         # Far beyond the image too, where the Jacobian is clamped.
         yield (
             name,
-            scenes.random_gaussians(100 + i, camera, NUM, sh_degree=3, size_px=(0.5, 8), margin=0.7),
+            scenes.random_gaussians(
+                100 + i, camera, NUM, sh_degree=3, size_px=(0.5, 8), margin=0.7
+            ),
             camera,
         )
 
 
 def load_gsplat():
-    """gsplat's torch functions as a module; None where gsplat is not installed. Its package needs CUDA."""
+    """gsplat's torch functions as a module; None where gsplat is not installed. Its
+    package needs CUDA."""
     spec = importlib.util.find_spec("gsplat")
     if spec is None or spec.origin is None:
         return None
@@ -46,19 +50,31 @@ def load_gsplat():
 
 
 def evaluate(gsplat, gaussians, camera) -> dict[str, np.ndarray]:
-    """Projections for both filters, colours for all degrees, gradients of a fixed weighting of them all."""
+    """Projections for both filters, colours for all degrees, gradients of a fixed
+    weighting of them all."""
     import torch
 
     def leaf(array):
         return torch.from_numpy(np.array(array, np.float64)).requires_grad_()
 
-    means, quats, scales, sh = (leaf(getattr(gaussians, n)) for n in ("means", "quats", "scales", "sh"))
+    means, quats, scales, sh = (
+        leaf(getattr(gaussians, n)) for n in ("means", "quats", "scales", "sh")
+    )
     viewmat, K = torch.from_numpy(camera.viewmat)[None], torch.from_numpy(camera.K)[None]
     covariance, _ = gsplat._quat_scale_to_covar_preci(quats, scales, True, False)
     out = {}
     for filter_px2 in FILTERS_PX2:
         _, mean_px, depth, conic, compensation = gsplat._fully_fused_projection(
-            means, covariance, viewmat, K, camera.width, camera.height, filter_px2, camera.near, 1e10, True
+            means,
+            covariance,
+            viewmat,
+            K,
+            camera.width,
+            camera.height,
+            filter_px2,
+            camera.near,
+            1e10,
+            True,
         )
         out |= {
             "mean_px": mean_px[0],
@@ -89,7 +105,8 @@ def main() -> None:
     for name, gaussians, camera in golden_scenes():
         for key, value in evaluate(gsplat, gaussians, camera).items():
             arrays[f"{name}/{key}"] = value
-        # The scene itself, so that the file stays true when the scene generator changes.
+        # The scene itself, so that the file stays true when the scene generator
+        # changes.
         for key in scenes.NAMES:
             arrays[f"{name}/{key}"] = getattr(gaussians, key)
     np.savez_compressed(PATH, **arrays)

@@ -1,4 +1,5 @@
-"""Median split of points into the leaves of a perfect binary tree, one point at a time."""
+"""Median split of points into the leaves of a perfect binary tree, one point at a
+time."""
 
 from __future__ import annotations
 
@@ -6,7 +7,8 @@ import numpy as np
 
 
 def median_split(means: np.ndarray, cluster_size: int) -> list[list[int]]:
-    """Indices of each leaf: halve at the median rank of the longest axis; ties: lower axis, lower index."""
+    """Indices of each leaf: halve at the median rank of the longest axis; ties: lower
+    axis, lower index."""
     leaves = [list(range(len(means)))]
     while max(len(leaf) for leaf in leaves) > cluster_size:
         leaves = [half for leaf in leaves for half in _halves(means, leaf)]

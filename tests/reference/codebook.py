@@ -1,4 +1,5 @@
-"""Tables of 256 numbers by Lloyd's algorithm, palettes of vectors, and the order along a Morton curve."""
+"""Tables of 256 numbers by Lloyd's algorithm, palettes of vectors, and the order along
+a Morton curve."""
 
 import numpy as np
 
@@ -10,7 +11,9 @@ def codebook_of(values):
     """256 ascending numbers near the values (N,)."""
     distinct = np.unique(values)
     if len(distinct) <= SIZE:
-        return np.pad(distinct, (0, SIZE - len(distinct)), "edge") if len(distinct) else np.zeros(SIZE)
+        return (
+            np.pad(distinct, (0, SIZE - len(distinct)), "edge") if len(distinct) else np.zeros(SIZE)
+        )
     counts, edges = np.histogram(values, BINS)
     density = np.cbrt(counts)
     share = np.cumsum([0.0, *((1 - EVEN) * density / density.sum() + EVEN / BINS)])
@@ -44,7 +47,8 @@ def palette_of(vectors, size):
 
 
 def morton_order(means):
-    """Indices that sort points (N, 3) by the interleaved bits of their cells, 2^21 a side."""
+    """Indices that sort points (N, 3) by the interleaved bits of their cells, 2^21 a
+    side."""
     if not len(means):
         return np.zeros(0, np.int64)
     low = means.min(axis=0).astype(np.float64)

@@ -13,7 +13,8 @@ def window() -> torch.Tensor:
 
 
 def dssim(picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Mean of 1 - SSIM over one channel (H, W), zeros beyond the border (Wang et al. 2004)."""
+    """Mean of 1 - SSIM over one channel (H, W), zeros beyond the border (Wang et al.
+    2004)."""
 
     def blur(image: torch.Tensor) -> torch.Tensor:
         kernel = window().to(image.dtype)[None, None]
@@ -29,9 +30,12 @@ def dssim(picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
 
 def loss(color, alpha, target_color, target_alpha, weights) -> torch.Tensor:
-    """L1 on premultiplied colour (H, W, 3), 1 - SSIM of it, L1 on alpha (H, W); `weights` in this order."""
+    """L1 on premultiplied colour (H, W, 3), 1 - SSIM of it, L1 on alpha (H, W);
+    `weights` in this order."""
     l1, ssim, on_alpha = weights
-    total = l1 * (color - target_color).abs().mean() + on_alpha * (alpha - target_alpha).abs().mean()
+    total = (
+        l1 * (color - target_color).abs().mean() + on_alpha * (alpha - target_alpha).abs().mean()
+    )
     if ssim:
         total = total + ssim * sum(dssim(color[..., c], target_color[..., c]) for c in range(3)) / 3
     return total

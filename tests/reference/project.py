@@ -1,6 +1,7 @@
 """3D gaussians to 2D ellipses in the picture, in float64.
 
-Source: Zwicker et al., EWA splatting, 2002, with gsplat 1.5's clamped Jacobian and opacity compensation.
+Source: Zwicker et al., EWA splatting, 2002, with gsplat 1.5's clamped Jacobian and
+opacity compensation.
 """
 
 from __future__ import annotations
@@ -17,13 +18,16 @@ class Projection:
     mean_px: np.ndarray  # (N,2)
     covariance_px2: np.ndarray  # (N,2,2), filter included
     determinant: np.ndarray  # (N,) of that covariance
-    compensation: np.ndarray  # (N,) factor on the opacity that keeps a gaussian's integral under the filter
+    compensation: (
+        np.ndarray
+    )  # (N,) factor on the opacity that keeps a gaussian's integral under the filter
     depth: np.ndarray  # (N,)
     is_drawable: np.ndarray  # (N,) not nearer than the near plane, finite, covers an area
 
 
 def rotation(quats: np.ndarray) -> np.ndarray:
-    """(N,3,3) of quaternions (N,4) w,x,y,z of any length: columns are q e q*. Zero stands for no rotation."""
+    """(N,3,3) of quaternions (N,4) w,x,y,z of any length: columns are q e q*. Zero
+    stands for no rotation."""
     quats = np.asarray(quats, np.float64)
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     w, v = np.split(
@@ -46,7 +50,9 @@ def covariance(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
 def project(gaussians, camera, *, filter_px2: float = 0.0) -> Projection:
     means = np.asarray(gaussians.means, np.float64)
     to_view, origin = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
-    with np.errstate(all="ignore"):  # what is behind the camera or not finite is sorted out at the end
+    with np.errstate(
+        all="ignore"
+    ):  # what is behind the camera or not finite is sorted out at the end
         view = means @ to_view.T + origin
         depth = view[:, 2]
         slope = view[:, :2] / depth[:, None]
@@ -61,7 +67,8 @@ def project(gaussians, camera, *, filter_px2: float = 0.0) -> Projection:
         axes = rotation(gaussians.quats) * np.asarray(gaussians.scales, np.float64)[:, None, :]
         rows = jacobian @ to_view @ axes  # (N,2,3): the covariance is rows rows^T
         unfiltered = rows @ rows.transpose(0, 2, 1)
-        # The determinant as a sum of squares (Cauchy-Binet): needles seen end-on keep their digits.
+        # The determinant as a sum of squares (Cauchy-Binet): needles seen end-on keep
+        # their digits.
         cross = np.cross(rows[:, 0], rows[:, 1])
         unfiltered_determinant = (cross * cross).sum(1)
         trace = unfiltered[:, 0, 0] + unfiltered[:, 1, 1]

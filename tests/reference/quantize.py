@@ -1,4 +1,5 @@
-"""Quantised pages as docs/format.md has them, gaussian by gaussian, without a thought for speed."""
+"""Quantised pages as docs/format.md has them, gaussian by gaussian, without a thought
+for speed."""
 
 import itertools
 
@@ -15,7 +16,9 @@ def sh_bits(sh_degree, band):
 
 def channels_of(rgb):
     red, green, blue = np.moveaxis(rgb, -1, 0)
-    return np.stack([(red + 2 * green + blue) / 4, (red - blue) / 2, (2 * green - red - blue) / 4], axis=-1)
+    return np.stack(
+        [(red + 2 * green + blue) / 4, (red - blue) / 2, (2 * green - red - blue) / 4], axis=-1
+    )
 
 
 def bits_of(words):
@@ -28,7 +31,8 @@ def number(bits, first, count):
 
 
 def decode(page, offset, sh_degree, *, fused):
-    """Means, quats, scales, opacities, sh; with `fused`, products are not rounded before they are added."""
+    """Means, quats, scales, opacities, sh; with `fused`, products are not rounded
+    before they are added."""
     n, num_sh = int(offset[-1]), (sh_degree + 1) ** 2
 
     def sum_of(a, code, step):
@@ -51,7 +55,9 @@ def decode(page, offset, sh_degree, *, fused):
                 means[i, k] = sum_of(mean_first[k], number(bits, first, 12), mean_step[k])
             opacities[i] = F(number(bits, 24, 8)) * (F(1) / F(255))
             for k, first in enumerate((44, 54, 64)):
-                code = (63 << 23) + (scale_first << 14) + number(bits, first, 10) * (scale_step << 4)
+                code = (
+                    (63 << 23) + (scale_first << 14) + number(bits, first, 10) * (scale_step << 4)
+                )
                 scales[i, k] = np.array(code, "<u4").view("<f4")
             xyz = [number(bits, first, 9) - 255 for first in (74, 83, 119)]
             w = np.sqrt(F(444016 - sum(x * x for x in xyz)))

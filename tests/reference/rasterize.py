@@ -21,8 +21,9 @@ class Picture:
     depth: np.ndarray  # (H,W) expected depth, 0 where nothing is drawn
     num_blended: np.ndarray  # (H,W) gaussians that contributed
     is_stopped: np.ndarray  # (H,W) whether it takes no more gaussians
-    # (H,W) smallest relative distance of an alpha to 1/255 or of a transmittance to where a pixel stops, and
-    # of an unclamped alpha to 0.999: below a band, rounding may decide otherwise than float64 does.
+    # (H,W) smallest relative distance of an alpha to 1/255 or of a transmittance to
+    # where a pixel stops, and of an unclamped alpha to 0.999: below a band, rounding
+    # may decide otherwise than float64 does.
     cutoff_distance: np.ndarray
     clamp_distance: np.ndarray
     contribution: np.ndarray  # (N,) sum of weights over all pixels
@@ -38,12 +39,14 @@ def rasterize(
     sh_degree=None,
     min_transmittance=None,
 ) -> Picture:
-    """Pixels stop before TRANSMITTANCE_MIN; behind the gaussian that leaves `min_transmittance` if given, and
-    what is left goes to what was blended.
+    """Pixels stop before TRANSMITTANCE_MIN; behind the gaussian that leaves
+    `min_transmittance` if given, and what is left goes to what was blended.
     """
     stop = TRANSMITTANCE_MIN if min_transmittance is None else min_transmittance
     projection = project(gaussians, camera, filter_px2=filter_px2)
-    colors = reference_sh.color(gaussians.sh, np.asarray(gaussians.means) - camera.position, sh_degree)
+    colors = reference_sh.color(
+        gaussians.sh, np.asarray(gaussians.means) - camera.position, sh_degree
+    )
     opacities = np.asarray(gaussians.opacities, np.float64)
     if antialiased:
         opacities = opacities * projection.compensation
@@ -66,7 +69,8 @@ def rasterize(
             break
         a, b = projection.covariance_px2[i][0]
         dx, dy = x - projection.mean_px[i, 0], y - projection.mean_px[i, 1]
-        # A sum of squares (Cholesky), so that no needle's exponent turns positive by rounding.
+        # A sum of squares (Cholesky), so that no needle's exponent turns positive by
+        # rounding.
         along = dx * dx / a
         across = (a * dy - b * dx) ** 2 / (a * projection.determinant[i])
         falloff = opacities[i] * np.exp(-0.5 * (along + across))
@@ -100,4 +104,6 @@ def rasterize(
         transmittance[filled] = 0
     alpha = 1 - transmittance
     color = color + transmittance[..., None] * np.asarray(background, np.float64)
-    return Picture(color, alpha, depth, num_blended, ~is_open, cutoff_distance, clamp_distance, contribution)
+    return Picture(
+        color, alpha, depth, num_blended, ~is_open, cutoff_distance, clamp_distance, contribution
+    )

@@ -1,4 +1,5 @@
-"""The same pictures as a chain of torch operations, so that autograd gives the gradients. All of float64."""
+"""The same pictures as a chain of torch operations, so that autograd gives the
+gradients. All of float64."""
 
 from __future__ import annotations
 
@@ -24,7 +25,13 @@ def _sh_basis(directions, degree):
     if degree >= 2:
         r15, r5 = 15**0.5 / 2, 5**0.5 / 4
         bands.append(
-            [r15 * x * y, -r15 * y * z, r5 * (3 * z * z - 1), -r15 * x * z, r15 / 2 * (x * x - y * y)]
+            [
+                r15 * x * y,
+                -r15 * y * z,
+                r5 * (3 * z * z - 1),
+                -r15 * x * z,
+                r15 / 2 * (x * x - y * y),
+            ]
         )
     if degree >= 3:
         r70, r105, r42, r7 = 70**0.5 / 8, 105**0.5 / 2, 42**0.5 / 8, 7**0.5 / 4
@@ -43,8 +50,8 @@ def _sh_basis(directions, degree):
 
 
 def project(means, quats, scales, sh, camera, filter_px2=0.0, plain_colors=False):
-    """(N,2) means in px; (N,4) covariance in px² as xx, xy, yy and its determinant; depth, compensation (N,);
-    colour (N,3)."""
+    """(N,2) means in px; (N,4) covariance in px² as xx, xy, yy and its determinant;
+    depth, compensation (N,); colour (N,3)."""
     viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float64)
     rotate, eye = viewmat[:3, :3], torch.as_tensor(camera.position, dtype=torch.float64)
     view = means @ rotate.T + viewmat[:3, 3]
@@ -59,7 +66,9 @@ def project(means, quats, scales, sh, camera, filter_px2=0.0, plain_colors=False
         image.append(focal * slope + center)
         beyond = 0.15 * size / focal
         bounded = slope.clamp(-center / focal - beyond, (size - center) / focal + beyond)
-        rows.append(focal / depth[:, None] * (toward_view[:, axis] - bounded[:, None] * toward_view[:, 2]))
+        rows.append(
+            focal / depth[:, None] * (toward_view[:, axis] - bounded[:, None] * toward_view[:, 2])
+        )
     a, b, c = ((rows[i] * rows[j]).sum(1) for i, j in ((0, 0), (0, 1), (1, 1)))
     # As sums of positive terms: needles keep their digits.
     normal = torch.linalg.cross(*rows)
@@ -71,7 +80,13 @@ def project(means, quats, scales, sh, camera, filter_px2=0.0, plain_colors=False
     if not plain_colors:
         basis = _sh_basis(means - eye, math.isqrt(sh.shape[1]) - 1)
         colors = ((basis[:, :, None] * sh).sum(1) + 0.5).clamp(min=0)
-    return torch.stack(image, dim=1), torch.stack([a, b, c, blurred], dim=1), depth, compensation, colors
+    return (
+        torch.stack(image, dim=1),
+        torch.stack([a, b, c, blurred], dim=1),
+        depth,
+        compensation,
+        colors,
+    )
 
 
 def rasterize(
@@ -87,7 +102,8 @@ def rasterize(
     antialiased=False,
     plain_colors=False,
 ):
-    """Colour (H,W,3), alpha (H,W), expected depth (H,W); differentiable in the first six."""
+    """Colour (H,W,3), alpha (H,W), expected depth (H,W); differentiable in the first
+    six."""
     image, covariance, depth, compensation, colors = project(
         means, quats, scales, sh, camera, filter_px2, plain_colors
     )
@@ -102,7 +118,10 @@ def rasterize(
     )
     transmittance = torch.ones(height, width, dtype=f64)
     is_open = torch.ones(height, width, dtype=torch.bool)
-    color, depth_sum = torch.zeros(height, width, 3, dtype=f64), torch.zeros(height, width, dtype=f64)
+    color, depth_sum = (
+        torch.zeros(height, width, 3, dtype=f64),
+        torch.zeros(height, width, dtype=f64),
+    )
     for i in torch.argsort(depth.detach(), stable=True).tolist():
         if depth[i] < camera.near:
             continue

@@ -8,16 +8,20 @@ import numpy as np
 
 
 def footprint_px2(ball: np.ndarray, eye: np.ndarray, focal_px2: float) -> float:
-    """Area on the screen of the solid angle under which a ball is seen; infinite from within."""
+    """Area on the screen of the solid angle under which a ball is seen; infinite from
+    within."""
     center, radius = np.float64(ball[:3]), float(ball[3])
     distance = float(np.linalg.norm(center - eye))
     if distance <= radius:
         return math.inf
-    # 2 pi (1 - cos a), written with sin^2 because 1 - cos loses all digits for far balls.
+    # 2 pi (1 - cos a), written with sin^2 because 1 - cos loses all digits for far
+    # balls.
     return 4 * math.pi * math.sin(0.5 * math.asin(radius / distance)) ** 2 * focal_px2
 
 
-def paper_footprint_px2(ball: np.ndarray, eye: np.ndarray, forward: np.ndarray, focal_px2: float) -> float:
+def paper_footprint_px2(
+    ball: np.ndarray, eye: np.ndarray, forward: np.ndarray, focal_px2: float
+) -> float:
     depth = float((np.float64(ball[:3]) - eye) @ forward)
     return math.pi * float(ball[3]) ** 2 * focal_px2 / depth**2 if depth != 0 else math.inf
 
@@ -42,12 +46,15 @@ def metrics(scene, i: int, camera, footprint: str = "solid_angle") -> list[float
 
 
 def cut(scene, camera, tolerance: float, footprint: str = "solid_angle") -> list[tuple[int, int]]:
-    """(instance, cluster) pairs whose own group fits and whose parent group does not."""
+    """(instance, cluster) pairs whose own group fits and whose parent group does
+    not."""
     pairs = []
     for i in range(len(scene)):
         clusters = scene.bundles[scene.instance_bundle[i]].clusters
         metric = metrics(scene, i, camera, footprint)
-        for c, (own, parent) in enumerate(zip(clusters.own_group, clusters.parent_group, strict=True)):
+        for c, (own, parent) in enumerate(
+            zip(clusters.own_group, clusters.parent_group, strict=True)
+        ):
             own_metric = -1.0 if own < 0 else metric[own]
             parent_fits = parent >= 0 and metric[parent] <= tolerance
             if own_metric <= tolerance and not parent_fits:
@@ -56,14 +63,19 @@ def cut(scene, camera, tolerance: float, footprint: str = "solid_angle") -> list
 
 
 def paths(clusters, groups) -> list[list[int]]:
-    """Every path from a leaf to a root, as clusters; it takes one of those that a group has made."""
+    """Every path from a leaf to a root, as clusters; it takes one of those that a group
+    has made."""
     made = {}
     for c, own in enumerate(clusters.own_group):
         made.setdefault(int(own), []).append(c)
 
     def upwards(c: int) -> list[list[int]]:
         parent = int(clusters.parent_group[c])
-        return [[c]] if parent < 0 else [[c, *rest] for above in made[parent] for rest in upwards(above)]
+        return (
+            [[c]]
+            if parent < 0
+            else [[c, *rest] for above in made[parent] for rest in upwards(above)]
+        )
 
     return [path for leaf in made.get(-1, []) for path in upwards(leaf)]
 
@@ -71,8 +83,9 @@ def paths(clusters, groups) -> list[list[int]]:
 def touches_image(mean: np.ndarray, covariance: np.ndarray, filter_px2: float, camera) -> bool:
     """Whether a gaussian of opacity 1 reaches alpha 1/255 somewhere in the image.
 
-    mean: (3,) and covariance: (3,3) in camera space. Projection linearised at the mean, with the slope that
-    it is linearised at kept within 0.15 image sizes of the image, as gsplat does.
+    mean: (3,) and covariance: (3,3) in camera space. Projection linearised at the mean,
+    with the slope that it is linearised at kept within 0.15 image sizes of the image,
+    as gsplat does.
     """
     x, y, z = mean
     if z < camera.near:
@@ -92,7 +105,9 @@ def touches_image(mean: np.ndarray, covariance: np.ndarray, filter_px2: float, c
             (camera.height - camera.cy) / camera.fy + 0.3 * half_y,
         )
     )
-    jacobian = np.array([[camera.fx / z, 0, -camera.fx * u / z], [0, camera.fy / z, -camera.fy * v / z]])
+    jacobian = np.array(
+        [[camera.fx / z, 0, -camera.fx * u / z], [0, camera.fy / z, -camera.fy * v / z]]
+    )
     cov = jacobian @ covariance @ jacobian.T + filter_px2 * np.eye(2)
     reach = math.sqrt(2 * math.log(255))
     px, py = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy

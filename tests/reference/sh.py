@@ -1,6 +1,8 @@
-"""Real spherical harmonics up to degree 3, from their definition by Legendre polynomials, in float64.
+"""Real spherical harmonics up to degree 3, from their definition by Legendre
+polynomials, in float64.
 
-Order and signs are those of 3DGS files: within degree l the orders m = -l..l, with the Condon-Shortley phase.
+Order and signs are those of 3DGS files: within degree l the orders m = -l..l, with the
+Condon-Shortley phase.
 """
 
 from __future__ import annotations
@@ -12,7 +14,8 @@ from numpy.polynomial.legendre import Legendre
 
 
 def basis(directions: np.ndarray, degree: int) -> np.ndarray:
-    """(N,(degree+1)²) basis values for directions (N,3) of any length; a zero direction has only degree 0."""
+    """(N,(degree+1)²) basis values for directions (N,3) of any length; a zero direction
+    has only degree 0."""
     directions = np.asarray(directions, np.float64)
     length = np.linalg.norm(directions, axis=1, keepdims=True)
     x, y, z = (directions / np.where(length == 0, 1, length)).T
@@ -21,7 +24,10 @@ def basis(directions: np.ndarray, degree: int) -> np.ndarray:
         for m in range(-order_l, order_l + 1):
             k = abs(m)
             norm = (
-                (2 * order_l + 1) / (4 * math.pi) * math.factorial(order_l - k) / math.factorial(order_l + k)
+                (2 * order_l + 1)
+                / (4 * math.pi)
+                * math.factorial(order_l - k)
+                / math.factorial(order_l + k)
             )
             along_z = Legendre.basis(order_l).deriv(k)(z) if k else Legendre.basis(order_l)(z)
             around_z = (x + 1j * y) ** k  # sin^k(theta) (cos k phi + i sin k phi)
@@ -31,7 +37,8 @@ def basis(directions: np.ndarray, degree: int) -> np.ndarray:
 
 
 def color(sh: np.ndarray, directions: np.ndarray, degree: int | None = None) -> np.ndarray:
-    """(N,3) colour: the series of sh (N,K,3) up to the degree, plus one half, clamped at 0 from below.
+    """(N,3) colour: the series of sh (N,K,3) up to the degree, plus one half, clamped
+    at 0 from below.
 
     What is not finite is 0.
     """

@@ -1,4 +1,5 @@
-"""Starts of coarser clusters in float64: which gaussians survive pruning, and what a pair merges into."""
+"""Starts of coarser clusters in float64: which gaussians survive pruning, and what a
+pair merges into."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ COLOR_WEIGHT = 6.0
 
 
 def survivors(gaussians, wanted: int) -> list[int]:
-    """V3DG, section 3.2: of each of eight median cells its share, those of highest opacity and size."""
+    """V3DG, section 3.2: of each of eight median cells its share, those of highest
+    opacity and size."""
     count = len(gaussians)
     scales = gaussians.scales.astype(np.float64)
     score = gaussians.opacities * np.prod(scales, axis=1) ** (2 / 3)
@@ -37,24 +39,30 @@ def survivors(gaussians, wanted: int) -> list[int]:
 
 
 def area(scales) -> np.ndarray:
-    """Surface of an ellipsoid over 4 pi: the mean of its shadow along 13 directions, weighted by kind."""
+    """Surface of an ellipsoid over 4 pi: the mean of its shadow along 13 directions,
+    weighted by kind."""
     directions = [d for d in itertools.product([-1, 0, 1], repeat=3) if d > (0, 0, 0)]
     weights = {1: 0.0604247, 2: 0.1013528 / 2, 3: 0.5029995 / 4}
     a, b, c = np.moveaxis(np.asarray(scales, np.float64), -1, 0)
     pairs = np.stack([b * c, a * c, a * b], axis=-1) ** 2
     return sum(
-        weights[int(np.abs(d).sum())] * np.sqrt(pairs @ np.square(d) / np.abs(d).sum()) for d in directions
+        weights[int(np.abs(d).sum())] * np.sqrt(pairs @ np.square(d) / np.abs(d).sum())
+        for d in directions
     )
 
 
 def covariances(gaussians) -> np.ndarray:
     """(N, 3, 3)."""
-    axes = reference_project.rotation(gaussians.quats) * gaussians.scales.astype(np.float64)[:, None, :]
+    axes = (
+        reference_project.rotation(gaussians.quats)
+        * gaussians.scales.astype(np.float64)[:, None, :]
+    )
     return axes @ axes.transpose(0, 2, 1)
 
 
 def moments(gaussians) -> SimpleNamespace:
-    """Sums over gaussians of 1, place, its square with the shape, and SH, weighted by opacity times area."""
+    """Sums over gaussians of 1, place, its square with the shape, and SH, weighted by
+    opacity times area."""
     weight = gaussians.opacities * area(gaussians.scales)
     means = gaussians.means.astype(np.float64)
     second = covariances(gaussians) + means[:, :, None] * means[:, None, :]
@@ -67,7 +75,8 @@ def moments(gaussians) -> SimpleNamespace:
 
 
 def merged(gaussians) -> SimpleNamespace:
-    """One gaussian with the moments of all, opaque enough to keep their area times opacity."""
+    """One gaussian with the moments of all, opaque enough to keep their area times
+    opacity."""
     m = moments(gaussians)
     mean = m.mean / m.weight
     covariance = m.second / m.weight - np.outer(mean, mean)
@@ -84,7 +93,10 @@ def cheapest_pair(gaussians) -> tuple[int, int]:
     """The pair that a merge to one gaussian less joins."""
     count = len(gaussians)
     weight = gaussians.opacities * area(gaussians.scales)
-    means, colors = gaussians.means.astype(np.float64), CONSTANT_BASIS * gaussians.sh[:, 0].astype(np.float64)
+    means, colors = (
+        gaussians.means.astype(np.float64),
+        CONSTANT_BASIS * gaussians.sh[:, 0].astype(np.float64),
+    )
     extent2 = np.sum((means.max(axis=0) - means.min(axis=0)) ** 2)
     costs = {}
     for i in range(count):

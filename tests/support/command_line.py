@@ -26,7 +26,8 @@ def run(*arguments, cwd=None):
 
 
 def fails(code, message, *arguments, cwd):
-    """Runs a command that must fail with one line on stderr, an exit code and nothing new in the folder."""
+    """Runs a command that must fail with one line on stderr, an exit code and nothing
+    new in the folder."""
     before = sorted(os.listdir(cwd))
     done = run(*arguments, cwd=cwd)
     assert done.returncode == code, done.stderr

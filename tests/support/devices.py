@@ -1,4 +1,5 @@
-"""Arrays on either device: NumPy's on the CPU, torch tensors on CUDA. For tests that run on both."""
+"""Arrays on either device: NumPy's on the CPU, torch tensors on CUDA. For tests that
+run on both."""
 
 import numpy as np
 
@@ -6,7 +7,8 @@ from v3dg import Gaussians
 
 
 def on(device, value):
-    """The array or the gaussians on `device`; a tuple or list of them becomes a tuple."""
+    """The array or the gaussians on `device`; a tuple or list of them becomes a
+    tuple."""
     if isinstance(value, (tuple, list)):
         return tuple(on(device, v) for v in value)
     if device == "cpu":

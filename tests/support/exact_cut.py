@@ -1,11 +1,14 @@
-"""Counts how often a path from a leaf to a root has not exactly one selected cluster: it must be never.
+"""Counts how often a path from a leaf to a root has not exactly one selected cluster:
+it must be never.
 
-A trial is an instance, a camera and a tolerance. Each leaf gets a random 64-bit number, each group the sum
-of the numbers below it, split at random over the clusters that it made. Then the numbers of the selected
-clusters add up to those of all leaves if every path has exactly one; if not, with a chance of 2^-64.
+A trial is an instance, a camera and a tolerance. Each leaf gets a random 64-bit number,
+each group the sum of the numbers below it, split at random over the clusters that it
+made. Then the numbers of the selected clusters add up to those of all leaves if every
+path has exactly one; if not, with a chance of 2^-64.
 
-With a fade, numbers are multiplied by weights: then what has to add up on every path are the weights, to
-exactly 1, which they are whole parts of; if they do not, the chance to miss it is 2^-49.
+With a fade, numbers are multiplied by weights: then what has to add up on every path
+are the weights, to exactly 1, which they are whole parts of; if they do not, the chance
+to miss it is 2^-49.
 """
 
 import time
@@ -26,7 +29,9 @@ def numbers_of_clusters(bundle, rng):
     clusters, groups = bundle.clusters, bundle.groups
     number = rng.integers(1 << 64, size=len(clusters), dtype=np.uint64)
     for g in range(len(groups)):  # ordered by level, so what is below is final
-        below, made = (np.flatnonzero(links == g) for links in (clusters.parent_group, clusters.own_group))
+        below, made = (
+            np.flatnonzero(links == g) for links in (clusters.parent_group, clusters.own_group)
+        )
         number[made[-1]] = 0
         number[made[-1:]] = number[below].sum(dtype=np.uint64) - number[made].sum(keepdims=True)
     return number, number[clusters.parent_group < 0].sum(dtype=np.uint64)
@@ -38,7 +43,9 @@ def random_trees(rng):
         lod_bundle(rng, blob(rng, 1500, origin=origin), 12, group_size=group_size, past_root=3)
         for group_size, origin in ((2, 0.0), (4, 0.0), (8, 10.0), (32, 1e4))
     ]
-    return bundles + [random_bundle(int(rng.integers(1 << 31)), num_levels=n, max_fan=4) for n in (2, 4, 6)]
+    return bundles + [
+        random_bundle(int(rng.integers(1 << 31)), num_levels=n, max_fan=4) for n in (2, 4, 6)
+    ]
 
 
 def log_uniform(rng, low, high, size=None):
@@ -46,7 +53,8 @@ def log_uniform(rng, low, high, size=None):
 
 
 def random_batch(bundle, rng, count):
-    """A scene of instances, a camera among or around them, and a tolerance that cuts most of them inside."""
+    """A scene of instances, a camera among or around them, and a tolerance that cuts
+    most of them inside."""
     radius = float(bundle.groups.ball[:, 3].max(initial=1.0))
     center = bundle.groups.ball[-1, :3].astype(np.float64) if len(bundle.groups) else np.zeros(3)
     origin = rng.choice([0.0, 1e3, 1e6]) * rng.normal(size=3)
@@ -78,11 +86,17 @@ def random_batch(bundle, rng, count):
     if len(metrics) == 0:
         return scene, camera, 1.0, False
     is_tie = bool(rng.random() < 0.5)
-    return scene, camera, float(rng.choice(metrics)) * (1 if is_tie else np.exp(rng.normal())), is_tie
+    return (
+        scene,
+        camera,
+        float(rng.choice(metrics)) * (1 if is_tie else np.exp(rng.normal())),
+        is_tie,
+    )
 
 
 def count_wrong(instance_ids, cluster_ids, num_instances, number, whole, parts=None):
-    """Instances whose selected clusters, of so many parts of their weight, do not add up to the whole."""
+    """Instances whose selected clusters, of so many parts of their weight, do not add
+    up to the whole."""
     bounds = np.searchsorted(instance_ids, np.arange(num_instances + 1))
     terms = number[cluster_ids]
     if parts is not None:
@@ -92,11 +106,15 @@ def count_wrong(instance_ids, cluster_ids, num_instances, number, whole, parts=N
 
 
 def check_counting(bundle, number, whole):
-    """A cut is counted as right; with a cluster taken out, doubled or replaced by its neighbour as wrong."""
+    """A cut is counted as right; with a cluster taken out, doubled or replaced by its
+    neighbour as wrong."""
     cut = np.flatnonzero(bundle.clusters.own_group < 0).astype(np.int32)
     others = [cut[1:], np.append(cut, cut[:1]), np.append(cut[1:], len(number) - 1)]
     for cluster_ids, wrong in [(cut, 0), *((other, 1) for other in others)]:
-        if count_wrong(np.zeros(len(cluster_ids), np.int32), cluster_ids, 1, number, whole) != wrong:
+        if (
+            count_wrong(np.zeros(len(cluster_ids), np.int32), cluster_ids, 1, number, whole)
+            != wrong
+        ):
             raise AssertionError("the count of violations does not count")
     ids, parts = np.zeros(len(cut), np.int32), np.full(len(cut), WHOLE)
     for change in (0, -1):
@@ -106,13 +124,19 @@ def check_counting(bundle, number, whole):
 
 
 def random_options(rng, bundle, tolerance):
-    """What else a view may ask for, that changes which clusters are drawn but not that paths add up."""
+    """What else a view may ask for, that changes which clusters are drawn but not that
+    paths add up."""
     min_level = int(rng.choice([0, 0, rng.integers(bundle.num_levels + 1)]))
-    return {"tolerance": tolerance, "min_level": min_level, "fade": float(rng.choice([1.01, 1.05, 1.3, 4.0]))}
+    return {
+        "tolerance": tolerance,
+        "min_level": min_level,
+        "fade": float(rng.choice([1.01, 1.05, 1.3, 4.0])),
+    }
 
 
 def parts_of(weights):
-    """(S,) whole parts of weights; an error where one is not drawn, or is not of whole parts."""
+    """(S,) whole parts of weights; an error where one is not drawn, or is not of whole
+    parts."""
     parts = weights.astype(np.float64) * WHOLE
     if not ((parts > 0) & (parts <= WHOLE) & (parts == np.round(parts))).all():
         raise AssertionError("weights: expected positive whole parts of at most 1")
@@ -120,7 +144,8 @@ def parts_of(weights):
 
 
 def cut_of(scene, camera, options, pages, device):
-    """The cut, of pages at places, that fade in, in a frame; or of all. And the seconds that it took."""
+    """The cut, of pages at places, that fade in, in a frame; or of all. And the seconds
+    that it took."""
     if pages is None:
         selection = select(scene, camera, **options, cull=False, device=device)
         return selection, selection.seconds
@@ -132,10 +157,12 @@ def cut_of(scene, camera, options, pages, device):
 
 
 def run_trials(num_trials, bundles=None, *, seed=0, device="cpu", partial=False, fades=False):
-    """Violations among the trials, and what was tried; random trees if no bundles are given.
+    """Violations among the trials, and what was tried; random trees if no bundles are
+    given.
 
-    With ``partial``, of pages closed towards the root, other ones for each camera. With ``fades``, views also
-    have random fades, finest levels, importances and budgets, and pages fade in.
+    With ``partial``, of pages closed towards the root, other ones for each camera. With
+    ``fades``, views also have random fades, finest levels, importances and budgets, and
+    pages fade in.
     """
     rng = np.random.default_rng(seed)
     bundles = bundles or random_trees(rng)
@@ -160,12 +187,16 @@ def run_trials(num_trials, bundles=None, *, seed=0, device="cpu", partial=False,
         if fades:
             if rng.random() < 0.5:
                 least, _ = cut_of(scene, camera, options | {"tolerance": np.inf}, None, device)
-                options["budget"] = least.num_gaussians + int(rng.integers(selection.num_gaussians + 1))
+                options["budget"] = least.num_gaussians + int(
+                    rng.integers(selection.num_gaussians + 1)
+                )
                 selection, took = cut_of(scene, camera, options, pages, device)
                 wrong += pages is None and selection.num_gaussians > options["budget"]
             parts = parts_of(selection.weights)
             between += int((parts < WHOLE).sum())
-        wrong += count_wrong(selection.instance_ids, selection.cluster_ids, count, *numbers[b], parts)
+        wrong += count_wrong(
+            selection.instance_ids, selection.cluster_ids, count, *numbers[b], parts
+        )
         seconds += took
         trials += count
         ties += is_tie

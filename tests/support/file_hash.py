@@ -12,4 +12,6 @@ def blake2b(message):
 def file_hash(message, version=3):
     if version < 3:
         return blake2b(message)
-    return blake2b(b"".join(blake2b(message[at : at + PIECE]) for at in range(0, len(message), PIECE)))
+    return blake2b(
+        b"".join(blake2b(message[at : at + PIECE]) for at in range(0, len(message), PIECE))
+    )

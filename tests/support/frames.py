@@ -1,4 +1,5 @@
-"""What tests of whole frames share: a camera, a scene, and how pictures are compared."""
+"""What tests of whole frames share: a camera, a scene, and how pictures are
+compared."""
 
 import functools
 
@@ -50,7 +51,8 @@ def assert_like_cpu(image, expected):
 
 def composed_scene(rng, sh_degree=1):
     bundles = [
-        scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, n, sh_degree=sh_degree), 64) for n in (900, 300)
+        scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, n, sh_degree=sh_degree), 64)
+        for n in (900, 300)
     ]
     scene = scenes_lod.random_scene(rng, bundles[0], 30, spread=3.0)
     scene.add(bundles[1], positions=rng.normal(size=(7, 3)), quaternions=rng.normal(size=(7, 4)))

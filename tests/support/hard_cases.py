@@ -1,7 +1,9 @@
-"""What breaks rasterizers, case by case: drawn and differentiated by both halves against float64.
+"""What breaks rasterizers, case by case: drawn and differentiated by both halves
+against float64.
 
-Tests hold each case to its bounds, forward and backward, on both devices; benchmarks/studies/hard_cases.py
-measures how the errors spread and writes the table of docs/numerics.md.
+Tests hold each case to its bounds, forward and backward, on both devices;
+benchmarks/studies/hard_cases.py measures how the errors spread and writes the table of
+docs/numerics.md.
 """
 
 from __future__ import annotations
@@ -53,24 +55,32 @@ class HardCase:
 def crowd(
     seed: int, camera: Camera = PLAIN, num: int = NUM, *, sh_degree: int = 1, **changes: Any
 ) -> Gaussians:
-    """Ordinary gaussians in front of the camera, with some arrays changed; a row may hold for all."""
+    """Ordinary gaussians in front of the camera, with some arrays changed; a row may
+    hold for all."""
     g = scenes.random_gaussians(seed, camera, num, size_px=(1, 8), aspect=4.0, sh_degree=sh_degree)
-    rows = {n: np.broadcast_to(np.asarray(v, np.float32), getattr(g, n).shape) for n, v in changes.items()}
+    rows = {
+        n: np.broadcast_to(np.asarray(v, np.float32), getattr(g, n).shape)
+        for n, v in changes.items()
+    }
     return scenes.replaced(g, **{n: np.array(v, order="C") for n, v in rows.items()})
 
 
 def zoomed(factor: float) -> tuple[Gaussians, Camera]:
-    """A scene that is `factor` times as large, its camera moved and its near plane with it."""
+    """A scene that is `factor` times as large, its camera moved and its near plane with
+    it."""
     camera = scenes.CAMERAS["posed"]
     g = crowd(2, camera)
     viewmat = camera.viewmat.copy()
     viewmat[:3, 3] *= factor
-    larger = scenes.replaced(g, means=g.means * np.float32(factor), scales=g.scales * np.float32(factor))
+    larger = scenes.replaced(
+        g, means=g.means * np.float32(factor), scales=g.scales * np.float32(factor)
+    )
     return larger, Camera(viewmat, camera.K, camera.width, camera.height, near=0.01 * factor)
 
 
 def away(distance: float) -> tuple[Gaussians, Camera]:
-    """A scene and its camera so far from zero, on no axis of the world or the camera."""
+    """A scene and its camera so far from zero, on no axis of the world or the
+    camera."""
     posed = scenes.CAMERAS["posed"]
     viewmat = posed.viewmat.copy()
     viewmat[:3, 3] -= viewmat[:3, :3] @ (distance * np.array([0.6, -0.64, 0.48]))
@@ -96,7 +106,8 @@ def shapes() -> dict[str, HardCase]:
             mode=FILTER,
         ),
         "needles of aspect 10⁶, no filter": HardCase(
-            "Thinner than what float32 resolves of a position at 10³ px, so the falloff across them is off.",
+            "Thinner than what float32 resolves of a position at 10³ px, so the falloff across "
+            "them is off.",
             crowd(1, scales=(3000.0, 3e-3, 3e-3)),
             picture=NEEDLES_FLOAT,
         ),
@@ -119,17 +130,21 @@ def shapes() -> dict[str, HardCase]:
             gradient=GRADIENT_NEEDLES,
         ),
         "scales of 0": HardCase(
-            "With a filter a point becomes the filter's own disc.", crowd(3, scales=half_flat), mode=FILTER
+            "With a filter a point becomes the filter's own disc.",
+            crowd(3, scales=half_flat),
+            mode=FILTER,
         ),
         "scales of 0, no filter": HardCase("No area: not drawn.", crowd(3, scales=half_flat)),
         "denormal scales": HardCase("As 0.", crowd(3, scales=(1e-40, 3e-41, 1e-39)), mode=FILTER),
         "denormal scales, no filter": HardCase(
-            "The determinant underflows to 0: not drawn. In float64 they are, between pixel centres.",
+            "The determinant underflows to 0: not drawn. In float64 they are, between pixel "
+            "centres.",
             crowd(3, scales=(1e-40, 3e-41, 1e-39)),
             is_drawn=False,
         ),
         "scales of 10⁶ and more": HardCase(
-            "Flat over the picture. Past a deviation of 4 x 10⁹ px the determinant overflows: not drawn.",
+            "Flat over the picture. Past a deviation of 4 x 10⁹ px the determinant overflows: not "
+            "drawn.",
             crowd(4, scales=(1e6, 2e6, 5e7), opacities=0.1),
         ),
         "quaternions of length 10¹⁵": HardCase(
@@ -143,7 +158,9 @@ def shapes() -> dict[str, HardCase]:
             mode=FILTER,
         ),
         "quaternions of 0": HardCase(
-            "No rotation, and no gradient.", crowd(5, quats=0, scales=(0.05, 0.02, 0.1)), mode=FILTER
+            "No rotation, and no gradient.",
+            crowd(5, quats=0, scales=(0.05, 0.02, 0.1)),
+            mode=FILTER,
         ),
     }
 
@@ -164,7 +181,9 @@ def values() -> dict[str, HardCase]:
             changed = scenes.replaced(usual, **{array: bad_rows(getattr(usual, array), value)})
             cases[f"{name} {array}"] = HardCase("Not drawn, and no gradient.", changed)
         colored = scenes.replaced(usual, sh=bad_rows(usual.sh, value))
-        cases[f"{name} colours"] = HardCase("The channel counts as 0, and has no gradient.", colored)
+        cases[f"{name} colours"] = HardCase(
+            "The channel counts as 0, and has no gradient.", colored
+        )
     return cases
 
 
@@ -178,7 +197,8 @@ def places() -> dict[str, HardCase]:
     stairs = 2.0 + 2.4e-7 * rng.permutation(crowded)
     return {
         "means around the near plane": HardCase(
-            "Not drawn before it. What lies behind is drawn whole, also where it reaches through the plane.",
+            "Not drawn before it. What lies behind is drawn whole, also where it reaches through "
+            "the plane.",
             crowd(
                 7,
                 means=rng.normal(0, [0.01, 0.01, 0.05], (NUM, 3)),
@@ -188,17 +208,22 @@ def places() -> dict[str, HardCase]:
         ),
         "far off the axis": HardCase(
             "The Jacobian is constant past 1.3 times the field of view, also in the backward pass.",
-            crowd(8, means=spread + ahead, scales=10 ** rng.uniform(-1, 5, (NUM, 3)), opacities=0.1),
+            crowd(
+                8, means=spread + ahead, scales=10 ** rng.uniform(-1, 5, (NUM, 3)), opacities=0.1
+            ),
         ),
         "larger than the screen": HardCase(
             "It only takes time.", crowd(9, scales=10 ** rng.uniform(0, 3, (NUM, 3)), opacities=0.1)
         ),
         "5,000 equal depths": HardCase(
-            "Blended in the order of their index.", crowd(10, num=crowded, means=disc, opacities=0.05)
+            "Blended in the order of their index.",
+            crowd(10, num=crowded, means=disc, opacities=0.05),
         ),
         "5,000 depths an ulp apart": HardCase(
             "Blended by depth.",
-            crowd(10, num=crowded, means=np.column_stack([0.2 * disc[:, :2], stairs]), opacities=0.05),
+            crowd(
+                10, num=crowded, means=np.column_stack([0.2 * disc[:, :2], stairs]), opacities=0.05
+            ),
         ),
         "5,000 at one place": HardCase(
             "Blended in the order of their index. At the threshold all of them are drawn, or none.",
@@ -215,7 +240,8 @@ def places() -> dict[str, HardCase]:
             mode=FILTER,
         ),
         "100,000 layers on a pixel": HardCase(
-            "It stops after some 2,000 of them; the transmittance is a product of as many rounded factors.",
+            "It stops after some 2,000 of them; the transmittance is a product of as many rounded "
+            "factors.",
             scenes.gaussians(
                 np.column_stack([np.zeros((100_000, 2)), np.linspace(1, 3, 100_000)]),
                 quats=(0.9, 0.1, 0.2, 0.3),
@@ -260,19 +286,27 @@ def cameras() -> dict[str, HardCase]:
     far = {power: away(10.0**power) for power in (3, 5)}
     return {
         "a scene 10⁻⁶ across": HardCase("No formula has a size of its own.", *small, mode=FILTER),
-        "a scene 10⁶ across": HardCase("As above: no formula has a size of its own.", *large, mode=FILTER),
+        "a scene 10⁶ across": HardCase(
+            "As above: no formula has a size of its own.", *large, mode=FILTER
+        ),
         "means 10³ from zero, eye beside them": HardCase(
-            "The eye is subtracted first, which takes no digit from what is near it.", *far[3], mode=FILTER
+            "The eye is subtracted first, which takes no digit from what is near it.",
+            *far[3],
+            mode=FILTER,
         ),
         "means 10⁵ from zero, eye beside them": HardCase(
-            "As above: what float32 loses is in the means before they are drawn.", *far[5], mode=FILTER
+            "As above: what float32 loses is in the means before they are drawn.",
+            *far[5],
+            mode=FILTER,
         ),
         "a camera 10⁹ away": HardCase(
             "Depths are as float32 has them: 60 units apart, or ties.",
             scenes.gaussians(distant, quats=(0.9, 0.1, 0.2, 0.3), scales=(2e7, 1e7, 3e7)),
             mode=FILTER,
         ),
-        "a field of view of 0.005°": HardCase("Nothing special.", crowd(12, telescope), telescope, FILTER),
+        "a field of view of 0.005°": HardCase(
+            "Nothing special.", crowd(12, telescope), telescope, FILTER
+        ),
         "a field of view of 178°": HardCase(
             "Past 1.3 times that, the Jacobian is constant.", crowd(13, wide), wide, FILTER
         ),
@@ -316,18 +350,25 @@ def picture_error(raster: v3dg.Image, expected: reference_rasterize.Picture) -> 
 
 
 def drawn_rows(case: HardCase) -> np.ndarray:
-    """(N,) whether the gaussian is drawn, as far as projection tells, and its colour is a number."""
+    """(N,) whether the gaussian is drawn, as far as projection tells, and its colour is
+    a number."""
     g = case.gaussians
     with np.errstate(all="ignore"):
-        projection = reference_project.project(g, case.camera, filter_px2=case.mode.get("filter_px2", 0.0))
+        projection = reference_project.project(
+            g, case.camera, filter_px2=case.mode.get("filter_px2", 0.0)
+        )
     is_number = np.isfinite(g.opacities) & np.isfinite(g.sh).all((1, 2))
     return projection.is_drawable & is_number
 
 
-def gradients(case: HardCase, draw: Callable[..., Any], dtype: Any, device: str = "cpu") -> list[np.ndarray]:
-    """Of a number that every pixel of colour, alpha and depth has a part in, by the five inputs.
+def gradients(
+    case: HardCase, draw: Callable[..., Any], dtype: Any, device: str = "cpu"
+) -> list[np.ndarray]:
+    """Of a number that every pixel of colour, alpha and depth has a part in, by the
+    five inputs.
 
-    `draw` takes the five as tensors, the camera and the mode. Depth counts in units of the nearest one.
+    `draw` takes the five as tensors, the camera and the mode. Depth counts in units of
+    the nearest one.
     """
     import torch
 
@@ -353,12 +394,16 @@ def draw_core(inputs: Sequence[Any], camera: Camera, mode: dict[str, Any]) -> tu
 
 
 def relative_changes(case: HardCase, by_inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Gradients by relative changes: of a mean by its distance, of a scale by itself, and so on.
+    """Gradients by relative changes: of a mean by its distance, of a scale by itself,
+    and so on.
 
-    So they can be compared with each other, however large a scene is. Of what is not a number: 0.
+    So they can be compared with each other, however large a scene is. Of what is not a
+    number: 0.
     """
     g = case.gaussians
-    distance = np.linalg.norm(np.asarray(g.means, np.float64) - case.camera.position, axis=1)[:, None]
+    distance = np.linalg.norm(np.asarray(g.means, np.float64) - case.camera.position, axis=1)[
+        :, None
+    ]
     units = (
         distance,
         np.linalg.norm(g.quats.astype(np.float64), axis=1)[:, None],
@@ -368,11 +413,15 @@ def relative_changes(case: HardCase, by_inputs: Sequence[np.ndarray]) -> list[np
     )
     with np.errstate(invalid="ignore"):
         relative = [d * unit for d, unit in zip(by_inputs, units, strict=True)]
-    return [np.where(np.isfinite(r) | (d != 0), r, 0.0) for r, d in zip(relative, by_inputs, strict=True)]
+    return [
+        np.where(np.isfinite(r) | (d != 0), r, 0.0)
+        for r, d in zip(relative, by_inputs, strict=True)
+    ]
 
 
 def gradient_errors(got: Sequence[np.ndarray], expected: Sequence[np.ndarray]) -> list[float]:
-    """L2 distance for each input, relative to its norm; to 1e-6 of the norm of all where that is more."""
+    """L2 distance for each input, relative to its norm; to 1e-6 of the norm of all
+    where that is more."""
     whole = np.sqrt(sum((e * e).sum() for e in expected))
     return [
         float(np.linalg.norm(g - e) / max(np.linalg.norm(e), 1e-6 * whole, 1e-300))

@@ -11,7 +11,8 @@ NEVER, LONG_AGO = np.iinfo(np.int32).max, -ARRIVAL_FRAMES
 
 
 def closed_residency(rng, bundle, share=None):
-    """(P,) whether each page is there: the last one, and others together with the pages above them."""
+    """(P,) whether each page is there: the last one, and others together with the pages
+    above them."""
     share = rng.choice([0.0, 0.5, 0.8, 0.95, 1.0]) if share is None else share
     parent = bundle.groups.parent
     there = np.append(rng.random(len(parent)) < share, True)
@@ -21,7 +22,8 @@ def closed_residency(rng, bundle, share=None):
 
 
 def page_rows(bundle):
-    """(P,) of each page the first gaussian and their number; of a bundle without clusters 0 and 0."""
+    """(P,) of each page the first gaussian and their number; of a bundle without
+    clusters 0 and 0."""
     first = [bundle.clusters.offset[bundle.page_range(p).start] for p in range(bundle.num_pages)]
     ends = [bundle.clusters.offset[bundle.page_range(p).stop] for p in range(bundle.num_pages)]
     if not first:
@@ -30,7 +32,8 @@ def page_rows(bundle):
 
 
 def random_shift(rng, bundle, there):
-    """(P,) by how many rows the pages lie behind their place, in any order, and how many rows there are."""
+    """(P,) by how many rows the pages lie behind their place, in any order, and how
+    many rows there are."""
     first, count = page_rows(bundle)
     shift = np.full(len(first), ABSENT)
     row = 0
@@ -42,7 +45,8 @@ def random_shift(rng, bundle, there):
 
 
 def random_begins(rng, bundle):
-    """(P,) after which frames pages fade in, none before the one above it, and a frame in which some do."""
+    """(P,) after which frames pages fade in, none before the one above it, and a frame
+    in which some do."""
     parent = bundle.groups.parent
     begins = np.full(len(parent) + 1, LONG_AGO, np.int32)
     for g in range(len(parent) - 1, -1, -1):  # parents come later
@@ -52,7 +56,9 @@ def random_begins(rng, bundle):
         elif above >= 0 or rng.random() < 0.3:
             begins[g] = above + ARRIVAL_FRAMES + rng.integers(0, 4)
     known = begins[(begins >= 0) & (begins < NEVER)]
-    return begins, int(rng.choice(known) if len(known) else 0) + int(rng.integers(1, ARRIVAL_FRAMES))
+    return begins, int(rng.choice(known) if len(known) else 0) + int(
+        rng.integers(1, ARRIVAL_FRAMES)
+    )
 
 
 def arrived(begins, frame):
@@ -63,7 +69,9 @@ def arrived(begins, frame):
 def table_of(bundle, shift=None, begins=None):
     """The core's table of a bundle with pages at their places."""
     groups = {name: getattr(bundle.groups, name) for name in ("ball", "weight", "level")}
-    return _core.ClusterTable(**(vars(bundle.clusters) | groups), page_shift=shift, page_begins=begins)
+    return _core.ClusterTable(
+        **(vars(bundle.clusters) | groups), page_shift=shift, page_begins=begins
+    )
 
 
 def resident_scene(scene, shifts, device="cpu", begins=None):

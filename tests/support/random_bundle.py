@@ -1,4 +1,5 @@
-"""Random small bundles with valid tables: trees and DAG-like groupings of any shape, nested balls."""
+"""Random small bundles with valid tables: trees and DAG-like groupings of any shape,
+nested balls."""
 
 import numpy as np
 
@@ -20,7 +21,8 @@ def random_gaussians(rng, count, sh_degree=0):
 
 
 def random_links(rng, num_levels, max_fan=3):
-    """Own and parent group and level of clusters, parent and level of groups, from the last level down."""
+    """Own and parent group and level of clusters, parent and level of groups, from the
+    last level down."""
     levels = [
         [(-1, -1)] * int(rng.integers(1, max_fan + 1))
     ]  # of the last level: (own, parent) to be numbered
@@ -49,7 +51,9 @@ def random_links(rng, num_levels, max_fan=3):
         for own, parent in clusters
     ]
     group_rows = [
-        (number(parent, level + 1), level) for level, made in enumerate(groups, start=1) for parent, _ in made
+        (number(parent, level + 1), level)
+        for level, made in enumerate(groups, start=1)
+        for parent, _ in made
     ]
     return np.array(rows, np.int32).reshape(-1, 3), np.array(group_rows, np.int32).reshape(-1, 2)
 
@@ -74,14 +78,17 @@ def random_groups(rng, parent, level):
 def random_bundle(
     seed=0, *, num_levels=3, sh_degree=0, max_cluster=5, max_fan=3, config=None, codec="float32"
 ):
-    """A valid bundle; clusters may be empty. ``num_levels`` 0 gives a bundle without clusters."""
+    """A valid bundle; clusters may be empty. ``num_levels`` 0 gives a bundle without
+    clusters."""
     rng = np.random.default_rng(seed)
     if num_levels:
         links, group_links = random_links(rng, num_levels, max_fan)
     else:
         links, group_links = np.empty((0, 3), np.int32), np.empty((0, 2), np.int32)
     count = len(links)
-    offset = np.concatenate([[0], np.cumsum(rng.integers(0, max_cluster + 1, count))]).astype(np.int64)
+    offset = np.concatenate([[0], np.cumsum(rng.integers(0, max_cluster + 1, count))]).astype(
+        np.int64
+    )
     gaussians = random_gaussians(rng, int(offset[-1]), sh_degree)
     box = np.zeros((count, 2, 3), np.float32)
     for c in range(count):

@@ -1,7 +1,9 @@
-"""Small scenes: by hand, random with the sizes that trained assets have, poisoned and degenerate.
+"""Small scenes: by hand, random with the sizes that trained assets have, poisoned and
+degenerate.
 
-A scene is a `Gaussians` (NumPy, float32) and a `Camera`. Random gaussians are laid out in front of their
-camera: places in pixels, sizes in pixels, depths all different by far more than float32 can confuse.
+A scene is a `Gaussians` (NumPy, float32) and a `Camera`. Random gaussians are laid out
+in front of their camera: places in pixels, sizes in pixels, depths all different by far
+more than float32 can confuse.
 """
 
 from __future__ import annotations
@@ -20,8 +22,11 @@ SH_C0 = 0.28209479177387814
 NAMES = ("means", "quats", "scales", "opacities", "sh")
 
 
-def camera(width=48, height=40, *, fx=50.0, fy=None, cx=None, cy=None, pose=None, near=0.01) -> Camera:
-    """Square pixels and a centred principal point unless told otherwise; looks along z unless posed."""
+def camera(
+    width=48, height=40, *, fx=50.0, fy=None, cx=None, cy=None, pose=None, near=0.01
+) -> Camera:
+    """Square pixels and a centred principal point unless told otherwise; looks along z
+    unless posed."""
     K = [[fx, 0, width / 2 if cx is None else cx], [0, fx if fy is None else fy, 0], [0, 0, 1]]
     K[1][2] = height / 2 if cy is None else cy
     return Camera(np.eye(4) if pose is None else pose, K, width, height, near)
@@ -42,8 +47,12 @@ CAMERAS = {
     "posed": camera(pose=pose(1)),
     "off_centre": camera(61, 37, fx=45.0, cx=9.5, cy=31.25, pose=pose(2)),
     "non_square": camera(33, 70, fx=38.0, fy=81.0, cx=14.0, cy=40.5, pose=pose(3)),
-    "outside": camera(40, 40, fx=60.0, cx=-25.0, cy=55.0, pose=pose(4)),  # principal point not in the image
-    "wide": camera(64, 32, fx=12.0, pose=pose(5)),  # 139 degrees: slopes are large, Jacobians get clamped
+    "outside": camera(
+        40, 40, fx=60.0, cx=-25.0, cy=55.0, pose=pose(4)
+    ),  # principal point not in the image
+    "wide": camera(
+        64, 32, fx=12.0, pose=pose(5)
+    ),  # 139 degrees: slopes are large, Jacobians get clamped
     "one_pixel": camera(1, 1, fx=3.0),
 }
 
@@ -51,7 +60,8 @@ CAMERAS = {
 def gaussians(
     means, quats=(1, 0, 0, 0), scales=0.1, opacities=0.8, color=(0.9, 0.5, 0.2), sh=None
 ) -> Gaussians:
-    """Gaussians by hand: what is given once holds for all; `color` is what degree 0 shows, unless `sh`."""
+    """Gaussians by hand: what is given once holds for all; `color` is what degree 0
+    shows, unless `sh`."""
     means = np.atleast_2d(np.asarray(means, np.float32))
     num = len(means)
 
@@ -83,7 +93,8 @@ def random_gaussians(
 ) -> Gaussians:
     """Gaussians all over the image and `margin` of its size beyond.
 
-    The largest standard deviation is log-uniform in `size_px` pixels, the others up to `aspect` smaller.
+    The largest standard deviation is log-uniform in `size_px` pixels, the others up to
+    `aspect` smaller.
     """
     rng = np.random.default_rng(seed)
     step = (depth[1] - depth[0]) / max(num, 1)
@@ -110,7 +121,8 @@ def random_gaussians(
 
 
 def trained_like(seed, camera, num, sh_degree=3) -> Gaussians:
-    """What training makes: many small, some large, thin discs and needles, opacities heaped at both ends."""
+    """What training makes: many small, some large, thin discs and needles, opacities
+    heaped at both ends."""
     g = random_gaussians(seed, camera, num, size_px=(0.1, 20.0), aspect=1e3, sh_degree=sh_degree)
     rng = np.random.default_rng(seed + 1)
     return replaced(g, opacities=rng.beta(0.4, 0.4, num).astype(np.float32))
@@ -121,14 +133,19 @@ def replaced(g, **arrays) -> Gaussians:
 
 
 def degenerate() -> dict[str, Gaussians]:
-    """Everything that a formula could trip over and that has a meaning, for the camera `CAMERAS["plain"]`."""
+    """Everything that a formula could trip over and that has a meaning, for the camera
+    `CAMERAS["plain"]`."""
     on_grid = [[x / 5, y / 5, 2.0] for x in range(-4, 5) for y in range(-4, 5)]
     return {
         "empty": gaussians(np.zeros((0, 3))),
         "one": gaussians([0.03, 0.02, 1.5]),
         "behind": gaussians([[0, 0, -1], [0.1, 0, -0.01], [0, 0.1, 0]]),
-        "around_near": gaussians([[0, 0, 0.0099], [1e-4, 0, 0.0101], [0, 1e-4, 0.05]], scales=0.001),
-        "larger_than_screen": gaussians([[0, 0, 2], [0.3, -0.2, 3]], scales=[[30.0] * 3, [100.0] * 3]),
+        "around_near": gaussians(
+            [[0, 0, 0.0099], [1e-4, 0, 0.0101], [0, 1e-4, 0.05]], scales=0.001
+        ),
+        "larger_than_screen": gaussians(
+            [[0, 0, 2], [0.3, -0.2, 3]], scales=[[30.0] * 3, [100.0] * 3]
+        ),
         "far_off_axis": gaussians(
             [[8, 0.3, 1], [-0.2, 9, 1.5], [-30, -30, 2]], scales=[[3.0] * 3, [5.0] * 3, [20.0] * 3]
         ),
@@ -136,17 +153,27 @@ def degenerate() -> dict[str, Gaussians]:
         "tiny": gaussians(on_grid, scales=1e-4),
         "tiny_on_pixel_centres": gaussians(np.add(on_grid, [0.02, 0.02, 0]), scales=1e-4),
         "smaller_than_any_pixel": gaussians([[0.0312, 0.0213, 2.0]], scales=1e-12),
-        "needles": gaussians(on_grid, quats=(0.9, 0.1, 0.3, 0.2), scales=(0.5, 5e-4, 5e-4), opacities=0.9),
+        "needles": gaussians(
+            on_grid, quats=(0.9, 0.1, 0.3, 0.2), scales=(0.5, 5e-4, 5e-4), opacities=0.9
+        ),
         "discs_edge_on": gaussians(on_grid, quats=(1, 0, 1e-3, 0), scales=(1e-4, 0.2, 0.2)),
         "equal_depths": gaussians(
-            [[0.02 * i, 0.01 * i, 2.0] for i in range(12)], scales=0.2, color=np.eye(3)[np.arange(12) % 3]
+            [[0.02 * i, 0.01 * i, 2.0] for i in range(12)],
+            scales=0.2,
+            color=np.eye(3)[np.arange(12) % 3],
         ),
-        "same_place": gaussians([[0.1, 0.1, 2.0]] * 7, color=np.random.default_rng(0).uniform(size=(7, 3))),
+        "same_place": gaussians(
+            [[0.1, 0.1, 2.0]] * 7, color=np.random.default_rng(0).uniform(size=(7, 3))
+        ),
         "opacity_zero": gaussians([[0, 0, 2.0], [0.1, 0, 3.0]], opacities=[0.0, 0.7]),
-        "opacity_one": gaussians([[0, 0, 2.0], [0.1, 0, 3.0], [0, 0.1, 4.0]], scales=3.0, opacities=1.0),
+        "opacity_one": gaussians(
+            [[0, 0, 2.0], [0.1, 0, 3.0], [0, 0.1, 4.0]], scales=3.0, opacities=1.0
+        ),
         "opacity_below_threshold": gaussians([[0, 0, 2.0]], opacities=0.0039),
         "one_flat_axis": gaussians([[0, 0, 2.0]], quats=(1, 0.3, 0.2, 0), scales=(0.3, 0.2, 0.0)),
-        "two_flat_axes": gaussians([[0.013, 0.007, 2.0]], quats=(1, 0.3, 0.2, 0), scales=(0.3, 0.0, 0.0)),
+        "two_flat_axes": gaussians(
+            [[0.013, 0.007, 2.0]], quats=(1, 0.3, 0.2, 0), scales=(0.3, 0.0, 0.0)
+        ),
         "zero_scale": gaussians([[0.013, 0.007, 2.0]], scales=0.0),
         "long_and_short_quats": gaussians(
             [[-0.3, 0, 2.0], [0.3, 0, 2.0]],
@@ -155,15 +182,29 @@ def degenerate() -> dict[str, Gaussians]:
         ),
         "zero_quats": gaussians([0.1, 0, 2.0], quats=0, scales=(0.3, 0.1, 0.2)),
         "negative_colors": gaussians([[0, 0, 2.0]], color=(-3.0, 0.5, -0.1)),
-        "thick_fog": gaussians([[0, 0, 2 + 0.01 * i] for i in range(300)], scales=0.5, opacities=0.05),
+        "thick_fog": gaussians(
+            [[0, 0, 2 + 0.01 * i] for i in range(300)], scales=0.5, opacities=0.05
+        ),
     }
 
 
 def poison() -> dict[str, Gaussians]:
-    """One gaussian each that has no meaning, large and in front of the camera `CAMERAS["plain"]`."""
-    good = {"means": [0, 0, 1.0], "quats": (1, 0, 0, 0), "scales": (0.3, 0.3, 0.3), "opacities": 0.9}
+    """One gaussian each that has no meaning, large and in front of the camera
+    `CAMERAS["plain"]`."""
+    good = {
+        "means": [0, 0, 1.0],
+        "quats": (1, 0, 0, 0),
+        "scales": (0.3, 0.3, 0.3),
+        "opacities": 0.9,
+    }
     poisoned = {}
-    for name, place in (("means", 0), ("means", 2), ("quats", 1), ("scales", 1), ("opacities", None)):
+    for name, place in (
+        ("means", 0),
+        ("means", 2),
+        ("quats", 1),
+        ("scales", 1),
+        ("opacities", None),
+    ):
         for value in (math.nan, math.inf, -math.inf):
             if name == "opacities":
                 changed = value
@@ -183,7 +224,9 @@ def doubles(g, *, torch, requires_grad=False) -> SimpleNamespace:
     """The same gaussians as float64 torch tensors, for the core's double precision."""
     return SimpleNamespace(
         **{
-            name: torch.from_numpy(np.array(getattr(g, name), np.float64)).requires_grad_(requires_grad)
+            name: torch.from_numpy(np.array(getattr(g, name), np.float64)).requires_grad_(
+                requires_grad
+            )
             for name in NAMES
         }
     )
@@ -192,18 +235,23 @@ def doubles(g, *, torch, requires_grad=False) -> SimpleNamespace:
 def leaves(torch, gaussians, background, dtype, device="cpu"):
     """The five inputs and the background as leaf tensors."""
     arrays = [getattr(gaussians, name) for name in NAMES] + [background]
-    return [torch.tensor(np.asarray(a), dtype=dtype, device=device, requires_grad=True) for a in arrays]
+    return [
+        torch.tensor(np.asarray(a), dtype=dtype, device=device, requires_grad=True) for a in arrays
+    ]
 
 
 def is_smooth(g, camera, *, filter_px2=0.0, antialiased=False, band=1e-3) -> bool:
-    """Whether nothing in the picture is near a step or a kink, so that finite differences mean something."""
+    """Whether nothing in the picture is near a step or a kink, so that finite
+    differences mean something."""
     options = {"filter_px2": filter_px2, "antialiased": antialiased}
     picture = reference_rasterize.rasterize(g, camera, **options)
     projection = reference_project.project(g, camera, filter_px2=filter_px2)
     means = np.asarray(g.means, np.float64)
     degree = math.isqrt(g.sh.shape[1]) - 1
     series = np.einsum(
-        "nk,nkc->nc", reference_sh.basis(means - camera.position, degree), np.asarray(g.sh, np.float64)
+        "nk,nkc->nc",
+        reference_sh.basis(means - camera.position, degree),
+        np.asarray(g.sh, np.float64),
     )
     slope = (projection.mean_px - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     size, center = np.array([camera.width, camera.height]), np.array([camera.cx, camera.cy])

@@ -1,4 +1,5 @@
-"""Bundles with a real layout in space, random poses and cameras: what selection is tested on."""
+"""Bundles with a real layout in space, random poses and cameras: what selection is
+tested on."""
 
 import itertools
 
@@ -35,7 +36,9 @@ def box_of(gaussians):
     reach = REACH * np.sqrt(np.diagonal(covariances(gaussians), axis1=1, axis2=2))
     lo, hi = (gaussians.means - reach).min(axis=0), (gaussians.means + reach).max(axis=0)
     lo32, hi32 = lo.astype(np.float32), hi.astype(np.float32)
-    return np.stack([np.nextafter(lo32, np.float32(-np.inf)), np.nextafter(hi32, np.float32(np.inf))])
+    return np.stack(
+        [np.nextafter(lo32, np.float32(-np.inf)), np.nextafter(hi32, np.float32(np.inf))]
+    )
 
 
 def blob(rng, count, *, origin=0.0, size=1.0, sh_degree=0):
@@ -52,15 +55,17 @@ def blob(rng, count, *, origin=0.0, size=1.0, sh_degree=0):
 
 
 def lod_bundle(rng, asset, cluster_size, *, group_size=2, past_root=2, filter_px2=0.1):
-    """A bundle with the layout that a build gives: median split, groups of neighbours, half the gaussians up.
+    """A bundle with the layout that a build gives: median split, groups of neighbours,
+    half the gaussians up.
 
-    A group of ``group_size`` clusters is thinned to half as many clusters, at least one; from one cluster on,
-    ``past_root`` further levels halve it.
+    A group of ``group_size`` clusters is thinned to half as many clusters, at least
+    one; from one cluster on, ``past_root`` further levels halve it.
     """
     halvings = _core.num_halvings(len(asset), cluster_size)
     order, leaf_offset = _core.median_split(asset.means, np.array([0, len(asset)]), halvings)
     level = [asset.subset(order[a:b]) for a, b in itertools.pairwise(leaf_offset)]
-    # A unit: clusters made by one group, that group (-1: none), the ball that must be contained.
+    # A unit: clusters made by one group, that group (-1: none), the ball that must be
+    # contained.
     units = [([cluster], -1, None) for cluster in level]
     clusters, balls, weights, group_level, group_parent, links = [], [], [], [], [], []
     depth = 0
@@ -88,7 +93,9 @@ def lod_bundle(rng, asset, cluster_size, *, group_size=2, past_root=2, filter_px
                 radii = together.scales.max(axis=1, initial=0.0, keepdims=True)
                 spheres = np.concatenate([together.means, radii], axis=1)
             ball = _core.bound_spheres(spheres, np.array([0, len(spheres)]))[0]
-            keep = together.subset(np.sort(rng.permutation(len(together))[: max(1, len(together) // 2)]))
+            keep = together.subset(
+                np.sort(rng.permutation(len(together))[: max(1, len(together) // 2)])
+            )
             num_made = max(1, len(below) // 2)
             parts = [keep.subset(part) for part in np.array_split(np.arange(len(keep)), num_made)]
             below_weights = [weights[own] for _, own, _ in run if own >= 0]
@@ -141,14 +148,20 @@ def random_camera(rng, *, distance=5.0, origin=0.0, width=64, height=48, **chang
     eye = np.asarray(origin) + distance * rng.normal(size=3)
     target = np.asarray(origin) + rng.normal(size=3)
     fov_x = float(rng.uniform(0.2, 2.4))
-    return Camera.look_at(eye, target, rng.normal(size=3), fov_x, width=width, height=height, **change)
+    return Camera.look_at(
+        eye, target, rng.normal(size=3), fov_x, width=width, height=height, **change
+    )
 
 
 def turned(camera, rng):
     """The camera with another view direction."""
     axis = rng.normal(size=3)
     return Camera.look_at(
-        camera.position, camera.position + axis, rng.normal(size=3), width=camera.width, height=camera.height
+        camera.position,
+        camera.position + axis,
+        rng.normal(size=3),
+        width=camera.width,
+        height=camera.height,
     )
 
 
@@ -164,7 +177,8 @@ def instances_of(scene):
 
 
 def group_metrics(subject, camera, *, footprint="solid_angle"):
-    """For each instance what tolerance is compared with: its groups' metrics, (G,) in px²."""
+    """For each instance what tolerance is compared with: its groups' metrics, (G,) in
+    px²."""
     scene = Scene.of(subject)
     tables = [residency.table(bundle) for bundle in scene.bundles]
     rule = rule_of(0.0, None, 0, footprint, False)

@@ -1,4 +1,5 @@
-"""v3dg and benchmarks with worlds and builds so small that what the docs say can be run; a program, too."""
+"""v3dg and benchmarks with worlds and builds so small that what the docs say can be
+run; a program, too."""
 
 import sys
 from dataclasses import replace

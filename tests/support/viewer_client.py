@@ -1,4 +1,5 @@
-"""A page's side of the viewer's connection: moves a camera, changes settings, takes pictures."""
+"""A page's side of the viewer's connection: moves a camera, changes settings, takes
+pictures."""
 
 import io
 import json
@@ -110,7 +111,9 @@ class Tab:
     @property
     def is_answered(self):
         """Whether the last picture is the final one of what was asked for last."""
-        return bool(self.figures) and self.figures["final"] and self.figures["number"] == self._number
+        return (
+            bool(self.figures) and self.figures["final"] and self.figures["number"] == self._number
+        )
 
     def send(self, message):
         """Send what becomes JSON, or else a text or bytes as they are."""

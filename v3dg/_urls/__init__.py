@@ -1,8 +1,10 @@
-"""Files at URLs, by fsspec: what is needed of one, or all, comes to files without a name.
+"""Files at URLs, by fsspec: what is needed of one, or all, comes to files without a
+name.
 
-`names` says what is a URL and how one is shown, `addresses` which hosts may be asked, `http` how web servers
-are asked and what their answers may cost, `others` the same for all other places, `failures` what is told of
-what goes wrong, and `opened` has the files.
+`names` says what is a URL and how one is shown, `addresses` which hosts may be asked,
+`http` how web servers are asked and what their answers may cost, `others` the same for
+all other places, `failures` what is told of what goes wrong, and `opened` has the
+files.
 """
 
 from v3dg._urls.names import beside as beside

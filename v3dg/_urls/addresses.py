@@ -8,7 +8,8 @@ _Address: TypeAlias = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 class Reach(IntEnum):
-    """From where an address is reached; a redirect may not lead to one that is reached from fewer places."""
+    """From where an address is reached; a redirect may not lead to one that is reached
+    from fewer places."""
 
     HOST = 0
     """This machine or its link, also addresses that are no single host's."""
@@ -18,7 +19,8 @@ class Reach(IntEnum):
     """The internet."""
 
 
-# RFC 6890, RFC 1122, RFC 3927, RFC 4291, RFC 5771. Lists of Python differ between its versions.
+# RFC 6890, RFC 1122, RFC 3927, RFC 4291, RFC 5771. Lists of Python differ between its
+# versions.
 _HOST = [
     ipaddress.ip_network(text)
     for text in (
@@ -70,7 +72,8 @@ def is_address(host: str) -> bool:
 
 
 def _inner(address: _Address) -> list[_Address]:
-    """Addresses of IPv4 that a gateway makes of one of IPv6; itself where there are none."""
+    """Addresses of IPv4 that a gateway makes of one of IPv6; itself where there are
+    none."""
     if isinstance(address, ipaddress.IPv4Address) or any(address in network for network in _HOST):
         return [address]
     if address.ipv4_mapped is not None:

@@ -1,4 +1,5 @@
-"""What is told of a URL that cannot be read: the right type of error, and one line without secrets."""
+"""What is told of a URL that cannot be read: the right type of error, and one line
+without secrets."""
 
 import contextlib
 import errno
@@ -14,7 +15,8 @@ _LONGEST = 200  # characters that a library may say
 
 
 class Problem(Exception):
-    """Says why a file cannot be had, and the type of the error that this is; the URL is not in its text."""
+    """Says why a file cannot be had, and the type of the error that this is; the URL is
+    not in its text."""
 
     def __init__(self, kind: type[OSError] | type[ValueError], text: str) -> None:
         super().__init__(text)
@@ -24,7 +26,9 @@ class Problem(Exception):
 def status_problem(status: int) -> Problem:
     """What an answer with a status that is no success means."""
     try:
-        phrase = f"{status} {http.HTTPStatus(status).phrase}"  # a server's own words may be anything
+        phrase = (
+            f"{status} {http.HTTPStatus(status).phrase}"  # a server's own words may be anything
+        )
     except ValueError:
         phrase = str(status)
     kind, advice = _kind_of_status(status)
@@ -35,7 +39,10 @@ def _kind_of_status(status: int) -> tuple[type[OSError], str]:
     if status in (404, 410):
         return FileNotFoundError, "check the address"
     if status in (401, 403):
-        return PermissionError, "check user, password or signature in the URL; a signed one may have expired"
+        return (
+            PermissionError,
+            "check user, password or signature in the URL; a signed one may have expired",
+        )
     if status in (408, 504):
         return TimeoutError, _AGAIN
     if status == 429 or status >= 500:
@@ -45,13 +52,15 @@ def _kind_of_status(status: int) -> tuple[type[OSError], str]:
 
 @contextlib.contextmanager
 def naming_errors(url: str) -> Iterator[None]:
-    """Make one line of whatever a package that knows such URLs raises; the text of its error is cleaned."""
+    """Make one line of whatever a package that knows such URLs raises; the text of its
+    error is cleaned."""
     try:
         yield
     except (ImportError, MemoryError):
         raise
     except Exception as error:
-        # The other error is not shown: its text, and those of its causes, may have the whole URL.
+        # The other error is not shown: its text, and those of its causes, may have the
+        # whole URL.
         raise _failure_of(url, error) from None
 
 
@@ -64,10 +73,13 @@ def _failure_of(url: str, error: Exception) -> Exception:
 
 
 def _problem_of(url: str, error: Exception) -> Problem:
-    """Meaning of an error of the system, of fsspec or of aiohttp, whose types are known by their names."""
+    """Meaning of an error of the system, of fsspec or of aiohttp, whose types are known
+    by their names."""
     names = {kind.__name__ for kind in type(error).__mro__}
     cause = error
-    system_error = getattr(error, "os_error", None)  # aiohttp's reason why a connection could not be made
+    system_error = getattr(
+        error, "os_error", None
+    )  # aiohttp's reason why a connection could not be made
     if isinstance(system_error, OSError):
         cause = system_error
     text = _text_of(url, error)
@@ -75,8 +87,14 @@ def _problem_of(url: str, error: Exception) -> Problem:
         return Problem(ValueError, text)
     if isinstance(cause, ssl.SSLError | ssl.CertificateError) or "ClientSSLError" in names:
         certificate = getattr(error, "certificate_error", cause)
-        reason = getattr(certificate, "verify_message", "") or getattr(certificate, "reason", "") or "no TLS"
-        return Problem(ConnectionError, f"no secure connection ({reason}); check the server's certificate")
+        reason = (
+            getattr(certificate, "verify_message", "")
+            or getattr(certificate, "reason", "")
+            or "no TLS"
+        )
+        return Problem(
+            ConnectionError, f"no secure connection ({reason}); check the server's certificate"
+        )
     if isinstance(cause, socket.gaierror):
         return Problem(
             ConnectionError, "the name of the host is not known; check the address and the network"
@@ -95,11 +113,14 @@ def _problem_of(url: str, error: Exception) -> Problem:
 def _problem_of_connection(error: Exception, text: str) -> Problem:
     if isinstance(error, ConnectionRefusedError):
         return Problem(ConnectionRefusedError, "the connection was refused; check host and port")
-    return Problem(ConnectionError, f"the connection was lost or could not be made ({text}); {_AGAIN}")
+    return Problem(
+        ConnectionError, f"the connection was lost or could not be made ({text}); {_AGAIN}"
+    )
 
 
 def _problem_of_answer(names: set[str]) -> Problem | None:
-    """The problem of an answer that came, by the names of an error's types; None for other errors."""
+    """The problem of an answer that came, by the names of an error's types; None for
+    other errors."""
     if "ClientPayloadError" in names:
         return Problem(ConnectionError, f"the server's answer was not complete; {_AGAIN}")
     if names & {"ClientResponseError", "BadHttpMessage"}:
@@ -130,4 +151,6 @@ def no_room(folder: str, error: OSError | None = None) -> Problem:
         name = errno.errorcode.get(error.errno or 0)
         if name is not None:
             reason += f" ({name})"
-    return Problem(OSError, f"no room for it in {folder}: {reason}; set TMPDIR to a folder with more")
+    return Problem(
+        OSError, f"no room for it in {folder}: {reason}; set TMPDIR to a folder with more"
+    )

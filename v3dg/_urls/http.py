@@ -1,8 +1,10 @@
-"""Files of web servers, which may be hostile: no more is asked for, waited for or kept than a request needs.
+"""Files of web servers, which may be hostile: no more is asked for, waited for or kept
+than a request needs.
 
-Requests are made with aiohttp on the event loop of fsspec, without compression. Redirects are followed here,
-and each host is checked before it is asked. Addresses are checked once more when a connection is made,
-because a name may resolve to another address by then.
+Requests are made with aiohttp on the event loop of fsspec, without compression.
+Redirects are followed here, and each host is checked before it is asked. Addresses are
+checked once more when a connection is made, because a name may resolve to another
+address by then.
 """
 
 import asyncio
@@ -31,7 +33,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 PATIENCE_S = 30.0
-"""Seconds until an answer begins, with all redirects, and for each `STEP_BYTES` of it."""
+"""Seconds until an answer begins, with all redirects, and for each `STEP_BYTES` of it.
+"""
 
 STEP_BYTES = 128 << 10
 
@@ -83,7 +86,8 @@ class _FileInfo(NamedTuple):
 
 
 class _ContentRange(NamedTuple):
-    """What an answer with a part says: first byte, the one behind the last, and the size of the file."""
+    """What an answer with a part says: first byte, the one behind the last, and the
+    size of the file."""
 
     first: int | None
     last: int | None
@@ -96,7 +100,9 @@ _sessions: dict[_SessionKey, "ClientSession"] = {}
 async def resolve(host: str, port: int) -> list[str]:
     """Addresses of a host; tests put others in place of this function."""
     loop = asyncio.get_running_loop()
-    entries = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_ADDRCONFIG)
+    entries = await loop.getaddrinfo(
+        host, port, type=socket.SOCK_STREAM, flags=socket.AI_ADDRCONFIG
+    )
     return list(dict.fromkeys(str(entry[4][0]) for entry in entries))
 
 
@@ -105,7 +111,8 @@ class WebSource:
 
     Attributes:
         num_bytes: Size; None where the server does not say it.
-        tag: Differs when the content does; empty where the server sends nothing of the kind.
+        tag: Differs when the content does; empty where the server sends nothing of the
+            kind.
     """
 
     def __init__(self, file_system: HttpFileSystem, address: str) -> None:
@@ -134,11 +141,13 @@ class WebSource:
         self.tag = info.tag
 
     def read_parts(self, parts: Sequence[tuple[int, int]], write: Write) -> bool:
-        """Write the bytes from each first to each last; returns whether all of the file came instead."""
+        """Write the bytes from each first to each last; returns whether all of the file
+        came instead."""
         return _run(self._read_parts(parts, write))
 
     def read_all(self, max_bytes: int, write: Write) -> int:
-        """Write the whole file, which may have at most `max_bytes`, and return its size."""
+        """Write the whole file, which may have at most `max_bytes`, and return its
+        size."""
         return _run(self._read_all(max_bytes, write))
 
     async def _info(self) -> _FileInfo:
@@ -157,7 +166,9 @@ class WebSource:
             return _FileInfo(num_bytes, _tag_of(answer))
 
     async def _read_parts(self, parts: Sequence[tuple[int, int]], write: Write) -> bool:
-        tasks = [asyncio.ensure_future(self._read_part(first, last, write)) for first, last in parts]
+        tasks = [
+            asyncio.ensure_future(self._read_part(first, last, write)) for first, last in parts
+        ]
         try:
             return any(await asyncio.gather(*tasks))
         finally:
@@ -173,7 +184,9 @@ class WebSource:
             if answer.status == 416:
                 raise changed(first, last, 0)
             if answer.status == 200:
-                raise Problem(ConnectionError, "the server gave parts of the file before and now does not")
+                raise Problem(
+                    ConnectionError, "the server gave parts of the file before and now does not"
+                )
             if answer.status != 206:
                 raise status_problem(answer.status)
             self._check_range(_range_of(answer), first, last)
@@ -182,13 +195,16 @@ class WebSource:
             return False
 
     def _check_range(self, content: _ContentRange, first: int, last: int) -> None:
-        """Refuse a part of a file of another size, and another part than the one that was asked for."""
+        """Refuse a part of a file of another size, and another part than the one that
+        was asked for."""
         if content.num_bytes is not None and content.num_bytes != self.num_bytes:
             problem = f"one of {content.num_bytes}; it has changed, open it again"
             raise Problem(ValueError, f"expected a file of {self.num_bytes} bytes, got {problem}")
         if (content.first, content.last) != (first, last):
             problem = f"an answer with those from {content.first} to {content.last}"
-            raise Problem(ConnectionError, f"expected the bytes from {first} to {last}, got {problem}")
+            raise Problem(
+                ConnectionError, f"expected the bytes from {first} to {last}, got {problem}"
+            )
 
     async def _read_all(self, max_bytes: int, write: Write) -> int:
         async with self._answer("GET") as answer:
@@ -201,7 +217,8 @@ class WebSource:
 
     @contextlib.asynccontextmanager
     async def _answer(self, method: str, part: str = "") -> "AsyncIterator[ClientResponse]":
-        """The beginning of an answer that is no redirect; the caller reads its body, or leaves it."""
+        """The beginning of an answer that is no redirect; the caller reads its body, or
+        leaves it."""
         headers: dict[str, str] = {}
         if part:
             headers["Range"] = part
@@ -209,7 +226,9 @@ class WebSource:
         try:
             encoding = answer.headers.get("Content-Encoding", "identity").strip().lower()
             if encoding not in ("", "identity") and answer.status < 300:
-                raise Problem(ConnectionError, "expected the file as it is, got a compressed answer")
+                raise Problem(
+                    ConnectionError, "expected the file as it is, got a compressed answer"
+                )
             yield answer
         finally:
             answer.close()  # also where it would go on, as the text of an error without end
@@ -238,15 +257,19 @@ class WebSource:
             answer.close()
             url = _next_url(url, answer.headers.get("Location", ""))
         raise Problem(
-            ConnectionError, f"expected at most {_MOST_REDIRECTS} redirects, got more; check the address"
+            ConnectionError,
+            f"expected at most {_MOST_REDIRECTS} redirects, got more; check the address",
         )
 
     def _session(self, reach: Reach) -> "ClientSession":
-        """A session whose connections stay open, to hosts that have at least this reach."""
+        """A session whose connections stay open, to hosts that have at least this
+        reach."""
         loop = asyncio.get_running_loop()
         key = _SessionKey(os.getpid(), id(loop), reach, self._trust_env)
         if key not in _sessions:
-            timeout = self._aiohttp.ClientTimeout(total=None, sock_connect=PATIENCE_S, sock_read=PATIENCE_S)
+            timeout = self._aiohttp.ClientTimeout(
+                total=None, sock_connect=PATIENCE_S, sock_read=PATIENCE_S
+            )
             session = self._aiohttp.ClientSession(
                 connector=self._aiohttp.TCPConnector(resolver=_resolver(reach)),
                 auto_decompress=False,
@@ -260,7 +283,8 @@ class WebSource:
 
 
 def _run(work: Coroutine[None, None, T]) -> T:
-    """Run a coroutine on the event loop of fsspec; an interrupt of this thread cancels it."""
+    """Run a coroutine on the event loop of fsspec; an interrupt of this thread cancels
+    it."""
     future = asyncio.run_coroutine_threadsafe(work, _extras.load("fsspec.asyn").get_loop())
     try:
         return future.result()
@@ -283,7 +307,9 @@ def _resolver(least_reach: Reach) -> "AbstractResolver":
         async def resolve(
             self, host: str, port: int = 0, family: int = socket.AF_INET
         ) -> "list[ResolveResult]":
-            addresses = [address for address in await resolve(host, port) if reach_of(address) >= least_reach]
+            addresses = [
+                address for address in await resolve(host, port) if reach_of(address) >= least_reach
+            ]
             if not addresses:
                 raise _refused()
             return [_entry(host, port, address) for address in addresses]
@@ -309,7 +335,8 @@ def _entry(host: str, port: int, address: str) -> "ResolveResult":
 
 
 async def _checked(url: "URL", least_reach: Reach | None) -> Reach:
-    """Reach of a host, which is that of its farthest address; one below `least_reach` is refused."""
+    """Reach of a host, which is that of its farthest address; one below `least_reach`
+    is refused."""
     host = url.host
     port = url.port
     assert host is not None
@@ -330,11 +357,14 @@ def _wrong_url() -> Problem:
 
 def _refused() -> Problem:
     advice = "if it is meant, use its own address"
-    return Problem(PermissionError, f"refused to go on from a public server to a private address; {advice}")
+    return Problem(
+        PermissionError, f"refused to go on from a public server to a private address; {advice}"
+    )
 
 
 def _next_url(url: "URL", location: str) -> "URL":
-    """The address that a redirect leads to; another user or password in it is left out."""
+    """The address that a redirect leads to; another user or password in it is left
+    out."""
     try:
         target = url.join(type(url)(location)).with_user(None).with_fragment(None)
         is_web = bool(location) and target.scheme in ("http", "https") and bool(target.host)
@@ -342,7 +372,8 @@ def _next_url(url: "URL", location: str) -> "URL":
         is_web = False
     if not is_web:
         raise Problem(
-            ConnectionError, "the server sent us on to what is no address of the web; check the address"
+            ConnectionError,
+            "the server sent us on to what is no address of the web; check the address",
         )
     return target
 
@@ -381,7 +412,8 @@ async def _read(answer: "ClientResponse", first: int, last: int, write: Write) -
 
 
 async def _read_to_end(answer: "ClientResponse", first: int, max_bytes: int, write: Write) -> int:
-    """Write a body of at most `max_bytes` and return its size; each step of it must come in time."""
+    """Write a body of at most `max_bytes` and return its size; each step of it must
+    come in time."""
     num_bytes = 0
 
     async def step() -> bool:

@@ -12,7 +12,8 @@ _SECRET = re.compile(r"[@?#]")
 
 
 def is_url(path: str | os.PathLike[str]) -> bool:
-    """Whether this is the name of a file elsewhere: a local file of that name comes first."""
+    """Whether this is the name of a file elsewhere: a local file of that name comes
+    first."""
     return bool(_URL.match(os.fspath(path))) and not os.path.lexists(path)
 
 
@@ -22,14 +23,16 @@ def full(path: str | os.PathLike[str]) -> str:
 
 
 def shown(path: str | os.PathLike[str]) -> str:
-    """The name of a file as messages and results show it; of a URL, nothing that may be secret."""
+    """The name of a file as messages and results show it; of a URL, nothing that may be
+    secret."""
     if is_url(path):
         return _without_secrets(full(path))
     return os.fspath(path)
 
 
 def cleaned(text: str) -> str:
-    """A text of somebody else in which every URL is shown without what may be secret."""
+    """A text of somebody else in which every URL is shown without what may be
+    secret."""
     return _URL_IN_TEXT.sub(_cleaned_match, text)
 
 

@@ -1,4 +1,5 @@
-"""Files at URLs that this process reads: what is needed of one comes to a file without a name, once."""
+"""Files at URLs that this process reads: what is needed of one comes to a file without
+a name, once."""
 
 import contextlib
 import os
@@ -36,21 +37,29 @@ _opened: dict[str, "FileAtUrl"] = {}
 
 
 def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUrl":
-    """A local file, or one at a URL, as it is there now, of which nothing is fetched yet.
+    """A local file, or one at a URL, as it is there now, of which nothing is fetched
+    yet.
 
     A file of which its place says that it is the same as before is not fetched again.
 
     Raises:
-        ImportError: The extra `fsspec` is not installed, or what it needs for such URLs.
-        ValueError: It is a URL of no file, of one that names others, or of one inside of another.
-        FileNotFoundError, PermissionError, TimeoutError, ConnectionError, OSError: It cannot be had.
+        ImportError: The extra `fsspec` is not installed, or what it needs for such
+            URLs.
+        ValueError: It is a URL of no file, of one that names others, or of one inside
+            of another.
+        FileNotFoundError, PermissionError, TimeoutError, ConnectionError, OSError: It
+            cannot be had.
     """
     if not is_url(path):
         return path
     url = full(path)
     name = beside(path).name
     expected = "the URL of a bundle, or of an asset in one file"
-    check(shown(url), name and not name.endswith(".json"), f"{expected}, got one of a file that names others")
+    check(
+        shown(url),
+        name and not name.endswith(".json"),
+        f"{expected}, got one of a file that names others",
+    )
     check(shown(url), "::" not in url, f"{expected}, got a chain of places; fetch the file")
     with naming_errors(url):
         source = _source_of(url)
@@ -65,7 +74,8 @@ def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUr
 
 @contextlib.contextmanager
 def reading(path: "str | os.PathLike[str] | FileAtUrl") -> Iterator[str | os.PathLike[str]]:
-    """A name under which a file, which is fetched whole from a URL, is read; errors inside name the URL."""
+    """A name under which a file, which is fetched whole from a URL, is read; errors
+    inside name the URL."""
     file = path
     if not isinstance(file, FileAtUrl):
         file = in_parts(file)
@@ -96,12 +106,14 @@ def _source_of(url: str) -> Source:
 
 
 class FileAtUrl(os.PathLike[str]):
-    """A file at a URL, and a file without a name here, to which comes what is needed, once.
+    """A file at a URL, and a file without a name here, to which comes what is needed,
+    once.
 
     However the process ends, nothing of that file stays.
 
     Attributes:
-        file: The file here, in which bytes that are not fetched are 0, or missing at the end.
+        file: The file here, in which bytes that are not fetched are 0, or missing at
+            the end.
         num_bytes: Size of the file there.
         tag: Differs when the content there does; empty if that cannot be known.
         needs_name: Whether its reader goes by the end of its name.
@@ -130,8 +142,8 @@ class FileAtUrl(os.PathLike[str]):
     def named(self) -> Iterator[str]:
         """The name of a file that has all of it, while it is needed; errors as `fetch`.
 
-        The name is of an open file of this process. Where a reader needs the end of a name, it is a link to
-        that, which goes at once afterwards.
+        The name is of an open file of this process. Where a reader needs the end of a
+        name, it is a link to that, which goes at once afterwards.
         """
         self._fetch_whole()
         name = f"/proc/self/fd/{self.file.fileno()}"
@@ -156,7 +168,8 @@ class FileAtUrl(os.PathLike[str]):
         for start in range(0, len(runs), _MOST_PIECES):
             batch = runs[start : start + _MOST_PIECES]
             places = [
-                (first * _BLOCK_BYTES, min(last * _BLOCK_BYTES, self.num_bytes)) for first, last in batch
+                (first * _BLOCK_BYTES, min(last * _BLOCK_BYTES, self.num_bytes))
+                for first, last in batch
             ]
             with naming_errors(self._url):
                 self._check_room(sum(last - first for first, last in places))
@@ -170,7 +183,8 @@ class FileAtUrl(os.PathLike[str]):
                 is_fetched[first - piece * _MOST_BLOCKS : last - piece * _MOST_BLOCKS] = True
 
     def _missing(self, parts: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Runs of blocks that parts need and that are not fetched, none longer than a piece."""
+        """Runs of blocks that parts need and that are not fetched, none longer than a
+        piece."""
         is_needed: dict[int, NDArray[np.bool_]] = {}
         for first, last in parts:
             expected = f"parts of its {self.num_bytes} bytes, got {first} to {last}"

@@ -38,7 +38,8 @@ class OtherSource:
 
     Attributes:
         num_bytes: Size; None where that is not known before all is read.
-        tag: Differs when the content does; empty where the file system says nothing of the kind.
+        tag: Differs when the content does; empty where the file system says nothing of
+            the kind.
     """
 
     def __init__(self, file_system: FileSystem, path: str) -> None:
@@ -55,7 +56,8 @@ class OtherSource:
             self._lock = contextlib.nullcontext()
 
     def read_parts(self, parts: Sequence[tuple[int, int]], write: Write) -> bool:
-        """Write the bytes from each first to each last; returns whether all of the file came instead."""
+        """Write the bytes from each first to each last; returns whether all of the file
+        came instead."""
         firsts = [first for first, _ in parts]
         lasts = [last for _, last in parts]
         with self._lock:
@@ -72,7 +74,8 @@ class OtherSource:
         return False
 
     def read_all(self, max_bytes: int, write: Write) -> int:
-        """Write the whole file, which may have at most `max_bytes`, and return its size."""
+        """Write the whole file, which may have at most `max_bytes`, and return its
+        size."""
         num_bytes = 0
         with self._lock, self._file_system.open(self._path, "rb") as file:
             while data := file.read(_STEP_BYTES):
@@ -85,12 +88,15 @@ class OtherSource:
 
 def changed(first: int, last: int, num_bytes: int) -> Problem:
     """The problem of a part that has another number of bytes than was asked for."""
-    text = f"expected {last - first} bytes at {first}, got {num_bytes}; it has changed, open it again"
+    text = (
+        f"expected {last - first} bytes at {first}, got {num_bytes}; it has changed, open it again"
+    )
     return Problem(ValueError, text)
 
 
 def too_long(max_bytes: int) -> Problem:
     """The problem of a file that does not end."""
     return Problem(
-        ValueError, f"expected at most {max_bytes} bytes, got more; check the address, or fetch the file"
+        ValueError,
+        f"expected at most {max_bytes} bytes, got more; check the address, or fetch the file",
     )

@@ -1,4 +1,5 @@
-"""Bundle: all clusters of all levels of one asset, with the tables that selection reads; write and open."""
+"""Bundle: all clusters of all levels of one asset, with the tables that selection
+reads; write and open."""
 
 from v3dg.bundle.bundle import Bundle
 from v3dg.bundle.tables import NESTING_MARGIN, Clusters, Groups

@@ -18,7 +18,14 @@ from v3dg._urls import in_parts, is_url, shown
 from v3dg.bundle.codec import Codec, codec_of
 from v3dg.bundle.file import BundleFile, BundlePlan, write_pages
 from v3dg.bundle.format import HASH_BYTES, VERSION, config_to_json, page_tables
-from v3dg.bundle.pages import CodePages, FilePages, MemoryPages, PageLayout, on_threads, runs_of_pages
+from v3dg.bundle.pages import (
+    CodePages,
+    FilePages,
+    MemoryPages,
+    PageLayout,
+    on_threads,
+    runs_of_pages,
+)
 from v3dg.bundle.tables import Clusters, Groups, check_index, check_tables
 from v3dg.gaussians import Gaussians
 
@@ -27,17 +34,20 @@ _RUN_BYTES = 64 << 20  # of pages that are written together
 
 
 class Bundle:
-    """All clusters of all levels of one asset, in memory, or in a file of which pages are read on demand.
+    """All clusters of all levels of one asset, in memory, or in a file of which pages
+    are read on demand.
 
     Attributes:
         config: How it was built, as JSON values.
         sh_degree: 0 to 3, the same for all gaussians.
-        codec: How its file keeps gaussians. "float32": every bit. "quantized": in 16 (SH degree 0) to 40
-            bytes (degree 3), to which they are rounded when the bundle is made; docs/format.md has the error.
+        codec: How its file keeps gaussians. "float32": every bit. "quantized": in 16
+            (SH degree 0) to 40 bytes (degree 3), to which they are rounded when the
+            bundle is made; docs/format.md has the error.
 
     Raises:
-        ValueError: The tables do not fit each other or the gaussians, do not guarantee an exact cut,
-            ``config`` is not JSON, or the codec is unknown or cannot hold a value.
+        ValueError: The tables do not fit each other or the gaussians, do not guarantee
+            an exact cut, ``config`` is not JSON, or the codec is unknown or cannot hold
+            a value.
     """
 
     _file: BundleFile | None = None
@@ -53,7 +63,8 @@ class Bundle:
         check_type("clusters", clusters, Clusters, "Clusters")
         check_type("groups", groups, Groups, "Groups")
         check_type("gaussians", gaussians, Gaussians, "Gaussians")
-        # Constructed again, because unpickled tables were not checked and their arrays are writable.
+        # Constructed again, because unpickled tables were not checked and their arrays
+        # are writable.
         clusters = replace(clusters)
         groups = replace(groups)
         check_tables(clusters, groups, len(gaussians))
@@ -69,7 +80,9 @@ class Bundle:
             pages = CodePages.of(layout, gaussians, page_codec)
         self._set(clusters, groups, parse_json(config_to_json(config or {})), pages)
 
-    def _set(self, clusters: Clusters, groups: Groups, config: dict[str, Any], pages: _Pages) -> None:
+    def _set(
+        self, clusters: Clusters, groups: Groups, config: dict[str, Any], pages: _Pages
+    ) -> None:
         self.config = config
         self._clusters = clusters
         self._groups = groups
@@ -81,15 +94,18 @@ class Bundle:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Bundle:
-        """Open a bundle file: read and check its header and tables, leave the gaussians on disk until used.
+        """Open a bundle file: read and check its header and tables, leave the gaussians
+        on disk until used.
 
-        The file stays open, so a file that is later saved over it does not change this bundle. With the extra
-        `fsspec` it may be at a URL, of which what is used is fetched, once by a process.
+        The file stays open, so a file that is later saved over it does not change this
+        bundle. With the extra `fsspec` it may be at a URL, of which what is used is
+        fetched, once by a process.
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: It is not a bundle, is newer than this build can read, or is damaged; the message says
-                which file and field. Damage in the gaussians is found when they are read.
+            ValueError: It is not a bundle, is newer than this build can read, or is
+                damaged; the message says which file and field. Damage in the gaussians
+                is found when they are read.
         """
         return cls.open_all([in_parts(path)])[0]
 
@@ -98,13 +114,17 @@ class Bundle:
         """Open several bundle files as `open` does, at the same time.
 
         Raises:
-            FileNotFoundError, ValueError: As `open`, for the first file with which something is wrong.
+            FileNotFoundError, ValueError: As `open`, for the first file with which
+                something is wrong.
         """
         reader = _core.HashedReader()
         paths = list(paths)
         try:
-            # More threads than processors are useful: a disk serves several requests at a time.
-            return on_threads(lambda path: cls._open(BundleFile(path, reader)), paths, max_threads=8)
+            # More threads than processors are useful: a disk serves several requests at
+            # a time.
+            return on_threads(
+                lambda path: cls._open(BundleFile(path, reader)), paths, max_threads=8
+            )
         except (OSError, ValueError):
             for path in paths[:-1]:
                 cls.open_all([path])  # raises the error of an earlier file, if it has one
@@ -136,8 +156,8 @@ class Bundle:
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the bundle to a file; the same bundle gives the same bytes.
 
-        The file appears at ``path`` when it is complete and not before: on an error or an interrupt, a file
-        that existed stays as it was, and no other file remains.
+        The file appears at ``path`` when it is complete and not before: on an error or
+        an interrupt, a file that existed stays as it was, and no other file remains.
 
         Raises:
             ValueError: The name does not end in `.v3dg`, or is of a device or a pipe.
@@ -156,7 +176,8 @@ class Bundle:
             plan.write_header(file.fileno())
 
     def __reduce__(self) -> tuple[object, tuple[object, ...]]:
-        """Pickle a bundle in memory whole, and a bundle of a file as its path, which the copy opens."""
+        """Pickle a bundle in memory whole, and a bundle of a file as its path, which
+        the copy opens."""
         path = self.path
         if path is not None:
             if not is_url(path):
@@ -176,7 +197,8 @@ class Bundle:
 
     @property
     def path(self) -> str | None:
-        """Name of the file that the bundle was opened from, if it was; of one at a URL, the whole URL."""
+        """Name of the file that the bundle was opened from, if it was; of one at a URL,
+        the whole URL."""
         if self._file is None:
             return None
         return self._file.name
@@ -190,7 +212,8 @@ class Bundle:
 
     @property
     def num_pages(self) -> int:
-        """Number of pages: page g is the clusters that group g replaces, the last page is the last level."""
+        """Number of pages: page g is the clusters that group g replaces, the last page
+        is the last level."""
         return self._layout.num_pages
 
     @property
@@ -228,7 +251,8 @@ class Bundle:
 
     @property
     def gaussians(self) -> Gaussians:
-        """All gaussians, in the order of the clusters; read and verified on first use, then cached.
+        """All gaussians, in the order of the clusters; read and verified on first use,
+        then cached.
 
         A quantised bundle caches its codes: each use decodes them to new rows.
         """
@@ -239,7 +263,8 @@ class Bundle:
 
     @property
     def codes(self) -> _core.Codes | None:
-        """All codes of a quantised bundle, for the compiled operations; read, verified and cached."""
+        """All codes of a quantised bundle, for the compiled operations; read, verified
+        and cached."""
         if self.codec == Codec.name:
             return None
         pages = self._in_memory()
@@ -263,18 +288,21 @@ class Bundle:
 
     @property
     def page_source(self) -> Any:
-        """The source of single pages for the core: the file, or all gaussians if they are in memory."""
+        """The source of single pages for the core: the file, or all gaussians if they
+        are in memory."""
         if self._file is None or isinstance(self._pages, MemoryPages):
             return self.gaussians.rows
         return self._file.source
 
     def read_page(self, page: int) -> Gaussians:
-        """Gaussians of the clusters that share parent group ``page``, or of the last level; verified."""
+        """Gaussians of the clusters that share parent group ``page``, or of the last
+        level; verified."""
         check_index("page", page, self.num_pages)
         return self._pages.read(page, page + 1)
 
     def cluster_gaussians(self, cluster: int) -> Gaussians:
-        """Gaussians of one cluster; reads its page and caches it until another page is read."""
+        """Gaussians of one cluster; reads its page and caches it until another page is
+        read."""
         check_index("cluster", cluster, len(self.clusters))
         page = int(np.searchsorted(self._layout.first_cluster, cluster, side="right")) - 1
         first = int(self._layout.first_gaussian[page])
@@ -289,7 +317,8 @@ class Bundle:
         return self._pages.read(int(first), int(last))
 
     def info(self) -> dict[str, Any]:
-        """Describe the bundle in JSON values, without reading gaussians; sizes are those of its file."""
+        """Describe the bundle in JSON values, without reading gaussians; sizes are
+        those of its file."""
         page_level = self.clusters.level[self._layout.first_cluster[:-1]]
         page_sizes = self._layout.page_bytes(self._codec)
         sizes = [int(page_sizes[page_level == level].sum()) for level in range(self.num_levels)]
@@ -336,12 +365,22 @@ class Bundle:
 def _check_page_tables(pages: FilePages, file: BundleFile) -> None:
     num_pages = len(file.tables["pages.offset"])
     expected_num_pages = pages.layout.num_pages
-    check("pages", num_pages == expected_num_pages, f"{expected_num_pages} for the clusters, got {num_pages}")
+    check(
+        "pages",
+        num_pages == expected_num_pages,
+        f"{expected_num_pages} for the clusters, got {num_pages}",
+    )
     for name, expected in page_tables(pages.layout, pages.codec).items():
         values = file.tables[name]
-        check_all(name, values, values == expected, lambda row, e=expected: f"{e[row]} for its clusters")
+        check_all(
+            name, values, values == expected, lambda row, e=expected: f"{e[row]} for its clusters"
+        )
     total = int(pages.layout.page_bytes(pages.codec).sum())
-    check("pages", total == file.pages_bytes, f"{total} bytes for the gaussians, got {file.pages_bytes}")
+    check(
+        "pages",
+        total == file.pages_bytes,
+        f"{total} bytes for the gaussians, got {file.pages_bytes}",
+    )
 
 
 def _mean_of_known(values: NDArray[np.float32]) -> float | None:

@@ -16,12 +16,14 @@ from v3dg.gaussians import Gaussians, empty, gaussian_bytes
 
 
 class Codec:
-    """Gaussians of one SH degree as bytes: the float32 arrays of a page, one after another.
+    """Gaussians of one SH degree as bytes: the float32 arrays of a page, one after
+    another.
 
     Attributes:
         name: The name for users and in files.
         alignment: A page begins in the file at a multiple of so many bytes.
-        gaussian_bytes, cluster_bytes: Bytes of a page for each gaussian and each cluster.
+        gaussian_bytes, cluster_bytes: Bytes of a page for each gaussian and each
+            cluster.
     """
 
     name: ClassVar[str] = "float32"
@@ -39,12 +41,16 @@ class Codec:
         num_bytes = num_gaussians * self.gaussian_bytes + num_clusters * self.cluster_bytes
         return (num_bytes + self.alignment - 1) & -self.alignment  # a power of two
 
-    def encode(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Sequence[NDArray[np.generic]]:
-        """The page of the clusters that begin at these rows, as arrays whose bytes follow each other."""
+    def encode(
+        self, gaussians: Gaussians, offset: NDArray[np.int64]
+    ) -> Sequence[NDArray[np.generic]]:
+        """The page of the clusters that begin at these rows, as arrays whose bytes
+        follow each other."""
         return [array[offset[0] : offset[-1]] for array in vars(gaussians).values()]
 
     def rounded(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Gaussians:
-        """The gaussians of these clusters after encoding and decoding, on the device where they are."""
+        """The gaussians of these clusters after encoding and decoding, on the device
+        where they are."""
         return gaussians
 
     def empty(self, count: int) -> Gaussians:
@@ -53,7 +59,8 @@ class Codec:
 
 
 class Quantized(Codec):
-    """Codes of 16 bytes and up to 24 for the higher degrees, relative to the ranges of a cluster."""
+    """Codes of 16 bytes and up to 24 for the higher degrees, relative to the ranges of
+    a cluster."""
 
     name = "quantized"
 
@@ -61,7 +68,9 @@ class Quantized(Codec):
         self.sh_degree = sh_degree
         self.gaussian_bytes, self.cluster_bytes, self.alignment = _core.page_code_bytes(sh_degree)
 
-    def encode(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Sequence[NDArray[np.generic]]:
+    def encode(
+        self, gaussians: Gaussians, offset: NDArray[np.int64]
+    ) -> Sequence[NDArray[np.generic]]:
         return [_core.encode_page(gaussians.rows, offset)]
 
     def rounded(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Gaussians:

@@ -1,7 +1,8 @@
-"""The file of a bundle: a safetensors container with aligned, hashed pages in front of the tables.
+"""The file of a bundle: a safetensors container with aligned, hashed pages in front of
+the tables.
 
-docs/format.md says what is in the file and why. This module moves bytes and trusts none of them; what the
-tables mean is checked by `v3dg.bundle.tables`.
+docs/format.md says what is in the file and why. This module moves bytes and trusts none
+of them; what the tables mean is checked by `v3dg.bundle.tables`.
 """
 
 import os
@@ -19,13 +20,22 @@ from v3dg._numbers import check
 from v3dg._urls import FileAtUrl
 from v3dg.bundle import format as file_format
 from v3dg.bundle.codec import CODECS, Codec
-from v3dg.bundle.format import DTYPES, HASH_BYTES, VERSION, entries_of, page_hash, page_tables, schema_of
+from v3dg.bundle.format import (
+    DTYPES,
+    HASH_BYTES,
+    VERSION,
+    entries_of,
+    page_hash,
+    page_tables,
+    schema_of,
+)
 from v3dg.bundle.pages import PageLayout, PageRun, on_threads
 from v3dg.bundle.tables import Clusters, Groups, check_tables, columns_of
 from v3dg.gaussians import Gaussians
 
 _FIRST_BYTES = 4096  # of the header: what a disk writes at once
-# Of tables at a URL, whose size is a claim until they are here; those of a billion gaussians have less.
+# Of tables at a URL, whose size is a claim until they are here; those of a billion
+# gaussians have less.
 _MOST_FETCHED_TABLE_BYTES = 1 << 30
 _FREE_CLUSTERS = 1 << 18  # that may all be empty; others have a gaussian each
 
@@ -38,11 +48,13 @@ _PageSource: TypeAlias = tuple[
     NDArray[np.generic],
     Callable[[Iterable[tuple[int, int]]], None] | None,
 ]
-"""The tuple that the core reads pages with: name, descriptor, codec, SH degree, places, hashes, fetch."""
+"""The tuple that the core reads pages with: name, descriptor, codec, SH degree, places,
+hashes, fetch."""
 
 
 class BundlePlan:
-    """The places of all parts of a bundle's file, which follow from the layout, the codec and the config."""
+    """The places of all parts of a bundle's file, which follow from the layout, the
+    codec and the config."""
 
     def __init__(self, layout: PageLayout, codec: Codec, config: dict[str, Any]) -> None:
         self.layout = layout
@@ -56,7 +68,9 @@ class BundlePlan:
         self.header = file_format.header_of(entries, codec, config)
         self._pages_end = len(self.header) + int(entries["pages"]["data_offsets"][1])
         self.num_bytes = len(self.header) + int(entries["hash"]["data_offsets"][1])
-        self._places = np.append(len(self.header) + self._page_tables["pages.offset"], self._pages_end)
+        self._places = np.append(
+            len(self.header) + self._page_tables["pages.offset"], self._pages_end
+        )
 
     def run(self, first_page: int, last_page: int) -> PageRun:
         """A run of the pages."""
@@ -65,11 +79,14 @@ class BundlePlan:
     def write_tables(
         self, descriptor: int, clusters: Clusters, groups: Groups, hashes: NDArray[np.uint8]
     ) -> None:
-        """Write the tables, which are checked, behind the pages; those have these hashes, (P, 16)."""
+        """Write the tables, which are checked, behind the pages; those have these
+        hashes, (P, 16)."""
         check_tables(clusters, groups, int(self.layout.first_gaussian[-1]))
         tables = self._page_tables | columns_of(clusters, groups) | {"pages.hash": hashes}
         schema = schema_of(self.codec)
-        end = b"".join(tables[name].astype(DTYPES[kind], copy=False).tobytes() for name, kind, _, _ in schema)
+        end = b"".join(
+            tables[name].astype(DTYPES[kind], copy=False).tobytes() for name, kind, _, _ in schema
+        )
         end += file_format.hash_of_pieces(self.header + end)
         assert self._pages_end + len(end) == self.num_bytes
         _files.write_at(descriptor, end, self._pages_end)
@@ -80,8 +97,11 @@ class BundlePlan:
         _files.write_at(descriptor, self.header[:_FIRST_BYTES], 0)
 
 
-def write_pages(descriptor: int, run: PageRun, codec: Codec, gaussians: Gaussians) -> NDArray[np.uint8]:
-    """Write the gaussians of a run of pages, on any device, to their place; (n, 16) their hashes."""
+def write_pages(
+    descriptor: int, run: PageRun, codec: Codec, gaussians: Gaussians
+) -> NDArray[np.uint8]:
+    """Write the gaussians of a run of pages, on any device, to their place; (n, 16)
+    their hashes."""
     host = gaussians.numpy()
     sizes = np.diff(run.places)
     hashes = np.empty((len(run), HASH_BYTES), np.uint8)
@@ -97,19 +117,27 @@ def write_pages(descriptor: int, run: PageRun, codec: Codec, gaussians: Gaussian
 
 
 def read_pages(
-    path: str | os.PathLike[str], descriptor: int, run: PageRun, codec: Codec, hashes: NDArray[np.uint8]
+    path: str | os.PathLike[str],
+    descriptor: int,
+    run: PageRun,
+    codec: Codec,
+    hashes: NDArray[np.uint8],
 ) -> Gaussians:
-    """The gaussians of a run of pages; ValueError unless they are there and have these hashes."""
+    """The gaussians of a run of pages; ValueError unless they are there and have these
+    hashes."""
     result = codec.empty(run.rows.stop - run.rows.start)
-    _core.read_pages(os.fspath(path), descriptor, result.rows, codec.name, hashes[: len(run)], **vars(run))
+    _core.read_pages(
+        os.fspath(path), descriptor, result.rows, codec.name, hashes[: len(run)], **vars(run)
+    )
     return result
 
 
 class BundleFile:
-    """A bundle file: header and tables are read, pages are not; `verify` tells whether they are damaged.
+    """A bundle file: header and tables are read, pages are not; `verify` tells whether
+    they are damaged.
 
-    What is allocated follows from the size of the file, which is closed when this is dropped; of one at a
-    URL, from what is fetched.
+    What is allocated follows from the size of the file, which is closed when this is
+    dropped; of one at a URL, from what is fetched.
 
     Attributes:
         name: The file's name, or its URL, as it was given.
@@ -146,10 +174,16 @@ class BundleFile:
             self.num_bytes = os.fstat(self._fd).st_size
         check(self.path, self.num_bytes >= 8, f"a bundle, got a file of {self.num_bytes} bytes")
         header_bytes = int.from_bytes(self._read(8, 0), "little")
-        check(self.path, header_bytes > 0, "a bundle, got one that is not finished, or another kind of file")
+        check(
+            self.path,
+            header_bytes > 0,
+            "a bundle, got one that is not finished, or another kind of file",
+        )
         fits = header_bytes <= min(self.num_bytes - 8, file_format.MAX_HEADER_BYTES)
         problem = f"a header length of {header_bytes} in a file of {self.num_bytes} bytes"
-        expected = f"a bundle (safetensors), got {problem}; it is truncated, or no bundle: see v3dg.open"
+        expected = (
+            f"a bundle (safetensors), got {problem}; it is truncated, or no bundle: see v3dg.open"
+        )
         self._check("header", fits, expected)
         text = header_bytes.to_bytes(8, "little") + self._read(header_bytes, 8)
         header = self._object("header", text[8:])
@@ -178,7 +212,11 @@ class BundleFile:
         name: object = Codec.name
         if self.version > 1:
             name = values.get("codec")
-        if not isinstance(name, str) or name not in CODECS or (self.version, name) == (2, Codec.name):
+        if (
+            not isinstance(name, str)
+            or name not in CODECS
+            or (self.version, name) == (2, Codec.name)
+        ):
             self._fail(f"codec: expected one that this build reads, got {shown(name)}; update v3dg")
         self.codec = CODECS[name](int(degree))
         config = values.get("config")
@@ -195,7 +233,8 @@ class BundleFile:
         return dict(value)
 
     def _check_entries(self, header: dict[str, Any]) -> dict[str, Any]:
-        """Compare the header with the one that its own counts and the file's size call for."""
+        """Compare the header with the one that its own counts and the file's size call
+        for."""
         counts = []
         for name in ("clusters.level", "groups.parent", "pages.offset", "pages"):
             entry = header.get(name)
@@ -204,7 +243,10 @@ class BundleFile:
                 self._fail(f"{name}: expected a tensor with one side, got {shown(entry)}")
             counts.append(side)
         largest = max(counts)
-        text = f"more than {shown(largest)} bytes for tensors, got {self.num_bytes}; the file is truncated"
+        text = (
+            f"more than {shown(largest)} bytes for tensors, got {self.num_bytes}; "
+            "the file is truncated"
+        )
         self._check("size", largest <= self.num_bytes, text)
         expected = entries_of(self.codec, *counts)
         for name, entry in expected.items():
@@ -216,7 +258,9 @@ class BundleFile:
             self._fail(f"{shown(unknown[0])}: expected only the tensors of version {self.version}")
         for name, value in (("header", self._data_start), ("pages", counts[3])):
             is_aligned = value % self.codec.alignment == 0
-            self._check(name, is_aligned, f"to end at a multiple of {self.codec.alignment}, got {value}")
+            self._check(
+                name, is_aligned, f"to end at a multiple of {self.codec.alignment}, got {value}"
+            )
         size = self._data_start + expected["hash"]["data_offsets"][1]
         problem = "followed by other data"
         if size > self.num_bytes:
@@ -225,21 +269,33 @@ class BundleFile:
         self._check("size", size == self.num_bytes, text)
         return expected
 
-    def _check_counts(self, num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int) -> None:
-        """Refuse tables at a URL that are larger than the gaussians can need, before they are fetched."""
+    def _check_counts(
+        self, num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int
+    ) -> None:
+        """Refuse tables at a URL that are larger than the gaussians can need, before
+        they are fetched."""
         if self._at_url is None:
             return
         limit = _FREE_CLUSTERS + pages_bytes // self.codec.gaussian_bytes
-        self._check("clusters", num_clusters <= limit, f"at most {limit} for its pages, got {num_clusters}")
-        self._check("groups", num_groups <= num_clusters, f"at most {num_clusters}, got {num_groups}")
-        self._check("pages", num_pages <= num_groups + 1, f"at most {num_groups + 1}, got {num_pages}")
+        self._check(
+            "clusters", num_clusters <= limit, f"at most {limit} for its pages, got {num_clusters}"
+        )
+        self._check(
+            "groups", num_groups <= num_clusters, f"at most {num_clusters}, got {num_groups}"
+        )
+        self._check(
+            "pages", num_pages <= num_groups + 1, f"at most {num_groups + 1}, got {num_pages}"
+        )
 
-    def _read_tables(self, entries: dict[str, Any], text: bytes, reader: _core.HashedReader) -> None:
+    def _read_tables(
+        self, entries: dict[str, Any], text: bytes, reader: _core.HashedReader
+    ) -> None:
         place = self._data_start + self.pages_bytes
         num_bytes = self.num_bytes - place
         is_small = self._at_url is None or num_bytes <= _MOST_FETCHED_TABLE_BYTES
         expected = (
-            f"at most {_MOST_FETCHED_TABLE_BYTES} bytes at a URL, got {num_bytes}; fetch the file first"
+            f"at most {_MOST_FETCHED_TABLE_BYTES} bytes at a URL, got {num_bytes}; "
+            "fetch the file first"
         )
         self._check("tables", is_small, expected)
         self._fetch(place, self.num_bytes)
@@ -251,7 +307,8 @@ class BundleFile:
             self.tables[name] = data[first:last].view(DTYPES[dtype]).reshape(entries[name]["shape"])
 
     def verify(self) -> None:
-        """Compare header and tables with the file's own hash, once, for which this waits; ValueError."""
+        """Compare header and tables with the file's own hash, once, for which this
+        waits; ValueError."""
         if not self._reading.is_sound():
             self._fail(f"hash: the header and tables do not match it; {_core.DAMAGED}")
         del self._reading
@@ -260,7 +317,9 @@ class BundleFile:
         self._fetch(offset, offset + num_bytes)
         out = np.empty(num_bytes, np.uint8)
         if not _files.read_at(self._fd, out, offset):
-            self._fail(f"size: expected bytes at {offset}, got the end of the file; it was truncated")
+            self._fail(
+                f"size: expected bytes at {offset}, got the end of the file; it was truncated"
+            )
         return out.tobytes()
 
     @property
@@ -285,14 +344,16 @@ class BundleFile:
         )
 
     def read(self, run: PageRun, out: _core.Rows | NDArray[np.int32]) -> None:
-        """Fill rows with the gaussians of a run of pages, or words with quantised pages; verified."""
+        """Fill rows with the gaussians of a run of pages, or words with quantised
+        pages; verified."""
         self._fetch(*run.places[[0, -1]])
         hashes = self.tables["pages.hash"][run.first_page :][: len(run)]
         _core.read_pages(self.path, self._fd, out, self.codec.name, hashes, **vars(run))
 
 
 def _only_side(entry: object) -> int | None:
-    """The length of a tensor with one side, from its entry in a header; None for anything else."""
+    """The length of a tensor with one side, from its entry in a header; None for
+    anything else."""
     if not isinstance(entry, dict):
         return None
     shape = entry.get("shape")

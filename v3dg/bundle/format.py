@@ -1,4 +1,5 @@
-"""The parts of a bundle file: its tables, its header and its hashes. docs/format.md says why."""
+"""The parts of a bundle file: its tables, its header and its hashes. docs/format.md
+says why."""
 
 import hashlib
 import json
@@ -19,12 +20,15 @@ if TYPE_CHECKING:
 FORMAT = "v3dg"
 VERSION = 3  # the newest one, which is written
 HASH_BYTES = 16
-MAX_HEADER_BYTES = 1 << 20  # the header holds 20 entries and the config; a longer one is damage or an attack
+MAX_HEADER_BYTES = (
+    1 << 20
+)  # the header holds 20 entries and the config; a longer one is damage or an attack
 
 DTYPES = {"I64": "<i8", "F32": "<f4", "I32": "<i4", "U8": "|u1"}
 SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
-    # name, safetensors dtype, rows (C clusters, C+1, G groups, P pages), rest of the shape. In file order:
-    # wide types first, so that every table is aligned to its own type.
+    # name, safetensors dtype, rows (C clusters, C+1, G groups, P pages), rest of the
+    # shape. In file order: wide types first, so that every table is aligned to its own
+    # type.
     ("clusters.offset", "I64", "C+1", ()),
     ("pages.offset", "I64", "P", ()),
     ("pages.bytes", "I64", "P", ()),
@@ -45,7 +49,10 @@ SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
 )
 
 
-_ONLY_OF_FLOATS = ("pages.bytes", "pages.num_clusters")  # with codes, they follow from the other tables
+_ONLY_OF_FLOATS = (
+    "pages.bytes",
+    "pages.num_clusters",
+)  # with codes, they follow from the other tables
 
 
 def schema_of(codec: "Codec") -> list[tuple[str, str, str, tuple[int, ...]]]:
@@ -54,7 +61,8 @@ def schema_of(codec: "Codec") -> list[tuple[str, str, str, tuple[int, ...]]]:
 
 
 def page_tables(layout: "PageLayout", codec: "Codec") -> dict[str, NDArray[np.generic]]:
-    """The tables of the pages except the hashes; they follow from the clusters of each page."""
+    """The tables of the pages except the hashes; they follow from the clusters of each
+    page."""
     tables: dict[str, NDArray[np.generic]] = {
         "pages.offset": offset_of(layout.page_bytes(codec))[:-1],
         "pages.bytes": np.diff(layout.first_gaussian) * codec.gaussian_bytes,
@@ -65,7 +73,8 @@ def page_tables(layout: "PageLayout", codec: "Codec") -> dict[str, NDArray[np.ge
 
 
 def offset_of(sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(N + 1,) start of each of N parts that follow each other, and the end of the last."""
+    """(N + 1,) start of each of N parts that follow each other, and the end of the
+    last."""
     return np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes)])
 
 
@@ -78,7 +87,8 @@ def page_hash(pieces: Iterable[NDArray[np.generic]]) -> bytes:
 
 
 def hash_of_pieces(message: bytes) -> bytes:
-    """BLAKE2b-128 of the digests of the message's pieces, which are hashed side by side."""
+    """BLAKE2b-128 of the digests of the message's pieces, which are hashed side by
+    side."""
     data = np.frombuffer(message, np.uint8)
     size = _core.HASH_PIECE_BYTES
     digests = _core.blake2b(np.split(data, range(size, len(data), size)))
@@ -88,7 +98,8 @@ def hash_of_pieces(message: bytes) -> bytes:
 def entries_of(
     codec: "Codec", num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int
 ) -> dict[str, Any]:
-    """The entries of the header: dtype, shape and place of every tensor of the file, in file order."""
+    """The entries of the header: dtype, shape and place of every tensor of the file, in
+    file order."""
     num_rows = {"C": num_clusters, "C+1": num_clusters + 1, "G": num_groups, "P": num_pages}
     tensors = [("pages", "U8", [pages_bytes])]
     for name, dtype, rows, row_shape in schema_of(codec):
@@ -104,7 +115,8 @@ def entries_of(
 
 
 def header_of(entries: dict[str, Any], codec: "Codec", config: dict[str, Any]) -> bytes:
-    """The length and the JSON of the header, padded with spaces so that the data starts aligned.
+    """The length and the JSON of the header, padded with spaces so that the data starts
+    aligned.
 
     Raises:
         ValueError: The config is so long that the header exceeds its limit.
@@ -116,7 +128,9 @@ def header_of(entries: dict[str, Any], codec: "Codec", config: dict[str, Any]) -
         "codec": codec.name,
         "config": config_to_json(config),
     }
-    text = json.dumps({"__metadata__": metadata, **entries}, sort_keys=True, separators=(",", ":")).encode()
+    text = json.dumps(
+        {"__metadata__": metadata, **entries}, sort_keys=True, separators=(",", ":")
+    ).encode()
     text += b" " * (-(8 + len(text)) % codec.alignment)
     expected = f"at most {MAX_HEADER_BYTES} bytes of JSON in the header that contains it"
     check("config", len(text) <= MAX_HEADER_BYTES, f"{expected}, got {len(text)}; shorten it")
@@ -124,7 +138,8 @@ def header_of(entries: dict[str, Any], codec: "Codec", config: dict[str, Any]) -
 
 
 def config_to_json(config: dict[str, Any]) -> str:
-    """The config as JSON; TypeError unless it is a dict, ValueError if JSON cannot hold a value."""
+    """The config as JSON; TypeError unless it is a dict, ValueError if JSON cannot hold
+    a value."""
     check_type("config", config, dict, "a dict")
     try:
         return json.dumps(config, sort_keys=True, separators=(",", ":"), allow_nan=False)

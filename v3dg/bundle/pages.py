@@ -1,4 +1,5 @@
-"""Pages: the clusters of each, and the sources of their gaussians. codec.py defines their bytes."""
+"""Pages: the clusters of each, and the sources of their gaussians. codec.py defines
+their bytes."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -27,7 +28,8 @@ _MAX_THREADS = min(8, os.cpu_count() or 1)
 
 @dataclass(frozen=True, eq=False)
 class PageLayout:
-    """P pages in file order: page g is what group g replaces, the last page is the last level."""
+    """P pages in file order: page g is what group g replaces, the last page is the last
+    level."""
 
     first_cluster: NDArray[np.int64]  # (P+1,) of each page, and the number of clusters
     offset: NDArray[np.int64]  # (C+1,) gaussians of each cluster
@@ -38,7 +40,9 @@ class PageLayout:
         parent = clusters.parent_group
         starts = np.flatnonzero(parent[1:] != parent[:-1]) + 1
         count = len(clusters)
-        first = np.concatenate([np.zeros(min(count, 1), np.int64), starts, [count]]).astype(np.int64)
+        first = np.concatenate([np.zeros(min(count, 1), np.int64), starts, [count]]).astype(
+            np.int64
+        )
         return PageLayout(first, clusters.offset)
 
     @cached_property
@@ -59,7 +63,8 @@ class PageLayout:
         return codec.page_bytes(np.diff(self.first_gaussian), np.diff(self.first_cluster))
 
     def run(self, first_page: int, last_page: int, places: NDArray[np.int64]) -> "PageRun":
-        """A run of the pages; ``places`` has the first byte of every page in a file, and the end."""
+        """A run of the pages; ``places`` has the first byte of every page in a file,
+        and the end."""
         clusters = self.first_cluster[first_page : last_page + 1]
         return PageRun(
             first_page=first_page,
@@ -71,7 +76,8 @@ class PageLayout:
 
 @dataclass(frozen=True, eq=False)
 class PageRun:
-    """Neighbouring pages: their clusters, the rows of their gaussians and their place in the file."""
+    """Neighbouring pages: their clusters, the rows of their gaussians and their place
+    in the file."""
 
     first_page: int  # number in the bundle
     first_cluster: NDArray[np.int64]  # (n+1,) of each page, in the run, and the end
@@ -87,7 +93,8 @@ class PageRun:
         return slice(int(self.offset[0]), int(self.offset[-1]))
 
     def clusters_of(self, number: int) -> NDArray[np.int64]:
-        """Gaussians of each cluster of one page, by its place in the run, among those of all; and the end."""
+        """Gaussians of each cluster of one page, by its place in the run, among those
+        of all; and the end."""
         first, last = self.first_cluster[number : number + 2].tolist()
         return np.asarray(self.offset[first : last + 1] - self.offset[0])
 
@@ -134,7 +141,8 @@ class CodePages:
 
 
 class FilePages:
-    """Pages that are read from a file on demand; the last single page that was read is cached."""
+    """Pages that are read from a file on demand; the last single page that was read is
+    cached."""
 
     def __init__(self, layout: PageLayout, file: "BundleFile") -> None:
         self.layout = layout
@@ -171,7 +179,8 @@ class FilePages:
 def on_threads(
     work: Callable[[_Item], _Result], items: Sequence[_Item], max_threads: int = _MAX_THREADS
 ) -> list[_Result]:
-    """The results of ``work`` for all items, computed by several threads if there are several items."""
+    """The results of ``work`` for all items, computed by several threads if there are
+    several items."""
     if len(items) < 2:
         return list(map(work, items))
     with ThreadPoolExecutor(max_threads) as pool:
@@ -181,7 +190,8 @@ def on_threads(
 def runs_of_pages(
     first_page: int, last_page: int, page_bytes: NDArray[np.int64], num_bytes: int
 ) -> Iterator[range]:
-    """Split a run of pages into runs of about ``num_bytes``, which bounds the memory that a run takes."""
+    """Split a run of pages into runs of about ``num_bytes``, which bounds the memory
+    that a run takes."""
     ends = np.cumsum(page_bytes[first_page:last_page]) // num_bytes
     cuts = (np.flatnonzero(np.diff(ends)) + first_page + 1).tolist()
     for start, stop in zip([first_page, *cuts], [*cuts, last_page], strict=True):

@@ -1,4 +1,5 @@
-"""The tables of a bundle, which selection reads, and the checks that guarantee an exact cut."""
+"""The tables of a bundle, which selection reads, and the checks that guarantee an exact
+cut."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,22 +13,26 @@ from v3dg.bundle.format import DTYPES, SCHEMA
 from v3dg.gaussians import Gaussians
 
 NESTING_MARGIN = _core.nesting_margin
-"""A group's ball contains the balls of the groups below it with this relative margin; see docs/format.md."""
+"""A group's ball contains the balls of the groups below it with this relative margin;
+see docs/format.md."""
 
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """C clusters, by level (0 first), then by position in the split tree; the arrays are read-only.
+    """C clusters, by level (0 first), then by position in the split tree; the arrays
+    are read-only.
 
     Attributes:
         offset: (C+1,) int64. Cluster c holds gaussians offset[c] to offset[c+1].
         level: (C,) int32.
-        own_group: (C,) int32. Group whose simplification made the cluster; -1 at level 0.
-        parent_group: (C,) int32. Group that the cluster is simplified in; -1 at the last level.
-        box: (C,2,3) float32. Lower and upper corner of what the cluster draws, in the asset's frame, without
-            the reach of the filter.
-        filter_px2: (C,) float32. Variance of the low-pass on the screen that the cluster is drawn with, but
-            that level 0 has one in a fade, too.
+        own_group: (C,) int32. Group whose simplification made the cluster; -1 at level
+            0.
+        parent_group: (C,) int32. Group that the cluster is simplified in; -1 at the
+            last level.
+        box: (C,2,3) float32. Lower and upper corner of what the cluster draws, in the
+            asset's frame, without the reach of the filter.
+        filter_px2: (C,) float32. Variance of the low-pass on the screen that the
+            cluster is drawn with, but that level 0 has one in a fade, too.
         antialiased: (C,) uint8. 1 where opacity is compensated for the filter.
     """
 
@@ -46,7 +51,8 @@ class Clusters:
         return len(self.level)
 
     def around(self, gaussians: Gaussians) -> "Clusters":
-        """The same clusters with boxes around other gaussians; those of empty clusters stay."""
+        """The same clusters with boxes around other gaussians; those of empty clusters
+        stay."""
         has_gaussians = np.diff(self.offset)[:, None, None] > 0
         box = np.where(has_gaussians, _core.bound_by_boxes(gaussians.rows, self.offset), self.box)
         return replace(self, box=box)
@@ -54,15 +60,18 @@ class Clusters:
 
 @dataclass(frozen=True, eq=False)
 class Groups:
-    """G groups, in the order of the clusters that they replace, hence by level; the arrays are read-only.
+    """G groups, in the order of the clusters that they replace, hence by level; the
+    arrays are read-only.
 
     Attributes:
-        ball: (G,4) float32. Centre and radius in the asset's frame; contains the balls of the groups below.
-        weight: (G,) float32. One over the number of gaussians the group was simplified to by the build, at
-            least the largest weight below.
+        ball: (G,4) float32. Centre and radius in the asset's frame; contains the balls
+            of the groups below.
+        weight: (G,) float32. One over the number of gaussians the group was simplified
+            to by the build, at least the largest weight below.
         parent: (G,) int32. Group above, -1 for those that made the last level.
         level: (G,) int32. Level of the clusters that the group makes; 1 or more.
-        error: (G,2) float32. Final residual of the fit in colour and alpha; not a number where not known.
+        error: (G,2) float32. Final residual of the fit in colour and alpha; not a
+            number where not known.
     """
 
     ball: NDArray[np.float32]
@@ -84,9 +93,12 @@ def check_index(name: str, index: int, count: int) -> None:
 
 
 def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
-    """Check dtypes and shapes, and replace writable arrays by read-only copies, so that the checks hold."""
+    """Check dtypes and shapes, and replace writable arrays by read-only copies, so that
+    the checks hold."""
     count = np.size(part.level)
-    for name, kind, rows, row_shape in [column for column in SCHEMA if column[0].startswith(prefix)]:
+    for name, kind, rows, row_shape in [
+        column for column in SCHEMA if column[0].startswith(prefix)
+    ]:
         array = getattr(part, name.removeprefix(prefix))
         check_type(name, array, np.ndarray, "a NumPy array")
         dtype = np.dtype(DTYPES[kind])
@@ -109,6 +121,7 @@ def columns_of(clusters: Clusters, groups: Groups) -> dict[str, NDArray[Any]]:
 
 
 def check_tables(clusters: Clusters, groups: Groups, num_gaussians: int) -> None:
-    """Raise ValueError unless the tables fit each other and the gaussians, and the cut will be exact."""
+    """Raise ValueError unless the tables fit each other and the gaussians, and the cut
+    will be exact."""
     check("clusters", len(clusters) < 1 << 31, f"fewer than 2^31, got {len(clusters)}")
     _core.check_tables(*columns_of(clusters, groups).values(), num_gaussians=num_gaussians)

@@ -1,10 +1,23 @@
-"""Command line: parse, call, print. Each command has a module; its work is in the modules that it calls.
+"""Command line: parse, call, print. Each command has a module; its work is in the
+modules that it calls.
 
-Exit codes: 0 done, 1 failed, 2 wrong usage, 130 interrupted. Errors are one line on stderr, results go to
-stdout.
+Exit codes: 0 done, 1 failed, 2 wrong usage, 130 interrupted. Errors are one line on
+stderr, results go to stdout.
 """
 
-from v3dg.cli import build, compare, completion, convert, demo, doctor, export, info, refine, render, view
+from v3dg.cli import (
+    build,
+    compare,
+    completion,
+    convert,
+    demo,
+    doctor,
+    export,
+    info,
+    refine,
+    render,
+    view,
+)
 from v3dg.cli._program import Commands, Program
 
 COMMANDS: Commands = {

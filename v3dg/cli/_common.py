@@ -22,7 +22,8 @@ class UsageError(Exception):
     """Arguments that cannot be meant; exit code 2."""
 
 
-# Exceptions that a command reports in one line on stderr; any other is a bug, whose traceback is shown.
+# Exceptions that a command reports in one line on stderr; any other is a bug, whose
+# traceback is shown.
 FAILURES = (OSError, MemoryError, ValueError, RuntimeError, ImportError)
 
 
@@ -39,7 +40,8 @@ def failure_text(error: BaseException) -> str:
 
 
 def printable(line: str) -> str:
-    """A line with its control characters escaped, because file names and texts of files may hold any."""
+    """A line with its control characters escaped, because file names and texts of files
+    may hold any."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
 
 
@@ -49,7 +51,8 @@ def tell(text: str) -> None:
 
 
 def option(metavar: str, *aliases: str) -> Any:
-    """Annotation of an option that is None by default; its help says what None means."""
+    """Annotation of an option that is None by default; its help says what None
+    means."""
     return tyro.conf.arg(metavar=metavar, aliases=aliases or None, help_behavior_hint="")
 
 
@@ -72,14 +75,16 @@ class Common:
 @dataclass(kw_only=True)
 class OnDevice(Common):
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to compute; auto is a CUDA device if there is one that torch can use, else the CPU."""
+    """Where to compute; auto is a CUDA device if there is one that torch can use, else
+    the CPU."""
 
 
 @dataclass(kw_only=True)
 class OnPool(OnDevice):
     memory: Annotated[str, option("SIZE")] = "auto"
-    """Draw from so much memory of the device, as 2GB, with pages read from the files as cameras need them.
-    all: from as much as it takes. auto: so if that fits into what is free, else from half of what is free."""
+    """Draw from so much memory of the device, as 2GB, with pages read from the files as
+    cameras need them. all: from as much as it takes. auto: so if that fits into what is
+    free, else from half of what is free."""
 
     def pool(self) -> str | None:
         """The memory of the pool as `Renderer` takes it: None draws without a pool."""
@@ -93,9 +98,11 @@ class Cut:
     """Which cut of a bundle or a scene is drawn."""
 
     tolerance: Annotated[float | None, option("PX2")] = None
-    """Screen area in px² that one gaussian of a coarser cluster may stand for; 3 if not given, 0: all."""
+    """Screen area in px² that one gaussian of a coarser cluster may stand for; 3 if not
+    given, 0: all."""
     budget: Annotated[int | None, option("N")] = None
-    """Most gaussians to draw in one picture; without a tolerance, the picture is as fine as that allows."""
+    """Most gaussians to draw in one picture; without a tolerance, the picture is as
+    fine as that allows."""
 
 
 def check_usage(name: str, holds: object, expected: str) -> None:
@@ -109,14 +116,19 @@ def check_range(name: str, value: float, least: float, most: float) -> None:
 
 
 def require_file(path: Path, *suffixes: str) -> None:
-    check(path, is_url(path) or path.exists(), f"a file, got a path that does not exist{_similar(path)}")
+    check(
+        path,
+        is_url(path) or path.exists(),
+        f"a file, got a path that does not exist{_similar(path)}",
+    )
     got = "a folder" if path.is_dir() else "another name"
     is_known = beside(path).name.lower().endswith(suffixes)
     check(shown(path), is_known, f"a file ending in {', '.join(suffixes)}, got {got}")
 
 
 def _similar(path: Path) -> str:
-    """The advice for a file that does not exist: a file of a similar name, if there is one."""
+    """The advice for a file that does not exist: a file of a similar name, if there is
+    one."""
     if path.parent.is_dir():
         similar = difflib.get_close_matches(path.name, os.listdir(path.parent), 1, 0.75)
         if similar:
@@ -125,11 +137,14 @@ def _similar(path: Path) -> str:
 
 
 def check_output(output: Path, *inputs: Path) -> None:
-    """Refuse to overwrite an input, whose content may be more than that of the output."""
+    """Refuse to overwrite an input, whose content may be more than that of the
+    output."""
     for path in inputs:
         is_another = not (output.exists() and path.exists() and output.samefile(path))
         check_usage(
-            str(output), is_another, f"another file than {shown(path)}, which is read; choose another name"
+            str(output),
+            is_another,
+            f"another file than {shown(path)}, which is read; choose another name",
         )
 
 
@@ -144,7 +159,8 @@ def level_size(bundle: Bundle, level: int) -> int:
 
 
 def finite(number: float) -> float | None:
-    """A number for JSON, which has no infinity: None for the infinite tolerance of a small budget."""
+    """A number for JSON, which has no infinity: None for the infinite tolerance of a
+    small budget."""
     if math.isfinite(number):
         return number
     return None
@@ -159,7 +175,8 @@ def print_result(as_json: bool, result: dict[str, Any], lines: Iterable[str]) ->
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table: its head, and the format of its cells, as `str.format_map` takes it."""
+    """A column of a table: its head, and the format of its cells, as `str.format_map`
+    takes it."""
 
     head: str
     form: str
@@ -173,7 +190,8 @@ class Column:
 
 
 def table_lines(columns: Sequence[Column], rows: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Lines of a table, whose first column is aligned to the left, the others to the right."""
+    """Lines of a table, whose first column is aligned to the left, the others to the
+    right."""
     table = [[column.head for column in columns]]
     for row in rows:
         table.append([column.cell(row) for column in columns])

@@ -1,4 +1,5 @@
-"""A program of several commands: parses, runs one, and turns failures into one line and an exit code."""
+"""A program of several commands: parses, runs one, and turns failures into one line and
+an exit code."""
 
 import contextlib
 import difflib
@@ -26,14 +27,16 @@ Commands: TypeAlias = Mapping[str, tuple[type[Any], Callable[[Any], None]]]
 
 INTERRUPTED = 130  # exit code
 
-# More than any machine has cores. If the system refuses a thread, OpenMP ends the process.
+# More than any machine has cores. If the system refuses a thread, OpenMP ends the
+# process.
 _MOST_THREADS = 1024
 _LEAST_COLUMNS = 40
 
 
 @dataclass(frozen=True)
 class Program:
-    """The name that starts the program, the description in its help, and its commands."""
+    """The name that starts the program, the description in its help, and its
+    commands."""
 
     name: str
     description: str
@@ -42,7 +45,8 @@ class Program:
     def parse(self, arguments: Sequence[str]) -> Any:
         """Parse the command line; tyro's boxed message becomes one line."""
         subcommands: Any = [
-            Annotated[options, tyro.conf.subcommand(name)] for name, (options, _) in self.commands.items()
+            Annotated[options, tyro.conf.subcommand(name)]
+            for name, (options, _) in self.commands.items()
         ]
         if "" in arguments:  # as a path it would be the working folder, and everything in it
             place = list(arguments).index("") + 1
@@ -63,7 +67,8 @@ class Program:
             raise UsageError(self._one_line(caught.getvalue(), arguments)) from None
 
     def _one_line(self, boxed: str, arguments: Sequence[str]) -> str:
-        """The message for a wrong command line: an unknown name, or else the text of tyro's first box."""
+        """The message for a wrong command line: an unknown name, or else the text of
+        tyro's first box."""
         if not arguments:
             return f"{_text_of_first_box(boxed)}; run {self.name} --help"
         command = arguments[0]
@@ -75,7 +80,8 @@ class Program:
         return f"{text}; run {self.name} {command} --help"
 
     def _unknown_option(self, command: str, arguments: Sequence[str]) -> str | None:
-        """The message for the first option that a command does not have, if there is one."""
+        """The message for the first option that a command does not have, if there is
+        one."""
         known = self._options(command)
         for argument in arguments:
             name = argument.partition("=")[0].replace("_", "-")
@@ -91,7 +97,8 @@ class Program:
         return re.findall(r"--[a-z][a-z-]*", printed.getvalue())
 
     def main(self, arguments: Sequence[str] | None = None) -> int:
-        """Run one command, by default the one this program was started with, and return its exit code."""
+        """Run one command, by default the one this program was started with, and return
+        its exit code."""
         if arguments is None:
             warnings.showwarning = lambda message, *_, **__: tell(f"v3dg: warning: {message}")
         code = 0
@@ -135,7 +142,8 @@ class Program:
 
 @contextlib.contextmanager
 def _legible_width() -> Iterator[None]:
-    """Have a narrow terminal taken for one with room for a few words: in 5 columns, tyro finds no end."""
+    """Have a narrow terminal taken for one with room for a few words: in 5 columns,
+    tyro finds no end."""
     if shutil.get_terminal_size().columns >= _LEAST_COLUMNS:
         yield
         return
@@ -150,7 +158,8 @@ def _legible_width() -> Iterator[None]:
 
 
 def _suggestion(name: str, known: Sequence[str]) -> str:
-    """The known name that is most like an unknown one, as the end of a message; empty if none is."""
+    """The known name that is most like an unknown one, as the end of a message; empty
+    if none is."""
     similar = difflib.get_close_matches(name, known, 1, 0.7)
     if similar:
         return f"; perhaps you meant {similar[0]}"
@@ -165,7 +174,8 @@ def _text_of_first_box(boxed: str) -> str:
 
 
 def _plainly(text: str) -> str:
-    """A message of tyro without types of Python, with its choices in a fixed order and without None."""
+    """A message of tyro without types of Python, with its choices in a fixed order and
+    without None."""
     if match := re.match(r"Error parsing (--[a-z-]+): (.*)", text):
         expected = "numbers" if "float" in match[2].lower() else "whole numbers"
         return f"{match[1]}: expected {expected}, got " + ", ".join(re.findall("'.*?'", match[2]))
@@ -175,13 +185,16 @@ def _plainly(text: str) -> str:
         known = set(re.findall(r"'(.*?)'", match[3])) - {"None"}
         expected = ", ".join(sorted(known, key=lambda name: (name[0] == "-", name)))
         return f"{match[2]}: expected one of {expected}, got {match[1]}"
-    if match := re.match(r"Missing value for argument '(?:.*/)?(--.*)'. Expected (\d) values", text):
+    if match := re.match(
+        r"Missing value for argument '(?:.*/)?(--.*)'. Expected (\d) values", text
+    ):
         return f"{match[1]}: expected {match[2]} value{'s' * (match[2] != '1')}, got fewer"
     return text
 
 
 def _set_threads(threads: int | None) -> None:
-    """Restart this process with that many threads: OpenMP reads the number once, when it is loaded."""
+    """Restart this process with that many threads: OpenMP reads the number once, when
+    it is loaded."""
     if threads is None:
         return
     check_range("--threads", threads, 1, _MOST_THREADS)

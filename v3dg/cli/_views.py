@@ -1,4 +1,5 @@
-"""The cameras of commands: those of a file, a scene's own, or a turntable around the subject."""
+"""The cameras of commands: those of a file, a scene's own, or a turntable around the
+subject."""
 
 import math
 import os
@@ -17,14 +18,22 @@ from v3dg.bundle import Bundle
 from v3dg.camera_file import read_cameras
 from v3dg.cameras import AXES, DEFAULT_FOV_X, Axis, Camera, turntable
 from v3dg.cleaning import ball_of_most, examine
-from v3dg.cli._common import check_range, check_usage, level_size, option, printable, require_subject
+from v3dg.cli._common import (
+    check_range,
+    check_usage,
+    level_size,
+    option,
+    printable,
+    require_subject,
+)
 from v3dg.gaussians import Gaussians
 from v3dg.pictures import MOST_SIDE, check_size
 from v3dg.scene import Scene, Subject
 from v3dg.scene.file import is_scene
 from v3dg.upright import ASSUMED, direction_of, up_of
 
-# Gaussians of the level that a turntable is centred on: enough to find the centre, and quick to read.
+# Gaussians of the level that a turntable is centred on: enough to find the centre, and
+# quick to read.
 _ENOUGH_TO_FRAME = 50_000
 
 # All cameras are made before the first picture is drawn.
@@ -36,13 +45,14 @@ class CameraFile:
     """Cameras of another program to look from."""
 
     cameras: Annotated[Path | None, option("PATH")] = None
-    """Look from the cameras of this nerfstudio transforms.json, run of nerfstudio, or model of COLMAP; `view`
-    offers them with their photographs."""
+    """Look from the cameras of this nerfstudio transforms.json, run of nerfstudio, or
+    model of COLMAP; `view` offers them with their photographs."""
     distortion: Literal["refuse", "ignore"] = "refuse"
     """Whether lens distortion in that file is an error, or left out of the pictures."""
 
     def read(self, size: tuple[int, int] = (800, 800)) -> dict[str, Camera]:
-        """The cameras of --cameras, of this size where their file has none; none if it is not given."""
+        """The cameras of --cameras, of this size where their file has none; none if it
+        is not given."""
         if self.cameras is None:
             return {}
         cameras = read_cameras(self.cameras, size=size, distortion=self.distortion)
@@ -52,21 +62,26 @@ class CameraFile:
 
 @dataclass
 class ViewOptions(CameraFile):
-    """From where to look: a scene's own cameras, those of a camera file, or a turntable."""
+    """From where to look: a scene's own cameras, those of a camera file, or a
+    turntable."""
 
     camera: Annotated[str | None, option("NAME")] = None
-    """Draw only this camera of a file with cameras: its name, or its place in the file, from 0."""
+    """Draw only this camera of a file with cameras: its name, or its place in the file,
+    from 0."""
     views: Annotated[int | None, option("N")] = None
     """Views around the turntable; 1 if not given, and 8 to compare."""
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="W H")] = (800, 800)
-    """Width and height in px of a turntable's pictures, and of cameras whose file gives them no size."""
+    """Width and height in px of a turntable's pictures, and of cameras whose file gives
+    them no size."""
     elevation: Annotated[float | None, option("DEGREES")] = None
     """Height of the turntable's cameras above the horizon; 20 if not given."""
     up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
-    """The turntable's axis; what the file says or what is guessed from it if not given."""
+    """The turntable's axis; what the file says or what is guessed from it if not given.
+    """
 
     def check(self, *subjects: Path) -> None:
-        """Refuse, before anything is read, wrong subjects, and options that do not apply to them."""
+        """Refuse, before anything is read, wrong subjects, and options that do not
+        apply to them."""
         for path in subjects:
             require_subject(path)
         for side in self.size:
@@ -75,7 +90,9 @@ class ViewOptions(CameraFile):
         expected = "--cameras or a scene (.json) to take it from; leave it out"
         check_usage("--camera", self.camera is None or file, expected)
         for name, value in self.turntable().items():
-            expected = f"a turntable to set with it, got the cameras of {shown(file or '')}; leave it out"
+            expected = (
+                f"a turntable to set with it, got the cameras of {shown(file or '')}; leave it out"
+            )
             check_usage(name, value is None or not file, expected)
         check_range("--views", 1 if self.views is None else self.views, 1, _MOST_VIEWS)
         check_range("--elevation", self.elevation or 0, -89.99, 89.99)
@@ -85,14 +102,20 @@ class ViewOptions(CameraFile):
         return {"--views": self.views, "--elevation": self.elevation, "--up": self.up}
 
 
-# Field of a command's options that holds them; on the command line they stand beside the others.
+# Field of a command's options that holds them; on the command line they stand beside
+# the others.
 Views: TypeAlias = Annotated[ViewOptions, tyro.conf.OmitArgPrefixes]
 
 
 def choose_cameras(
-    options: ViewOptions, path: Path, subject: Subject, own_cameras: dict[str, Camera] | None, views: int = 1
+    options: ViewOptions,
+    path: Path,
+    subject: Subject,
+    own_cameras: dict[str, Camera] | None,
+    views: int = 1,
 ) -> dict[str, Camera]:
-    """The cameras of --cameras, else the subject's own, else a turntable around it, by default of `views`."""
+    """The cameras of --cameras, else the subject's own, else a turntable around it, by
+    default of `views`."""
     cameras = options.read(options.size) or own_cameras
     if cameras is None and not isinstance(subject, Scene):
         cameras = _around(subject, options, options.views or views, path)
@@ -118,13 +141,18 @@ def _camera_name(text: str, names: Sequence[str]) -> str:
     raise ValueError(f"--camera: expected one of {known}, or 0 to {len(names) - 1}, got {text}")
 
 
-def _around(subject: Bundle | Gaussians, options: ViewOptions, views: int, path: Path) -> dict[str, Camera]:
-    """Cameras around the ball of most gaussians, at a distance that shows nearly all of it."""
+def _around(
+    subject: Bundle | Gaussians, options: ViewOptions, views: int, path: Path
+) -> dict[str, Camera]:
+    """Cameras around the ball of most gaussians, at a distance that shows nearly all of
+    it."""
     if isinstance(subject, Gaussians):
         means = subject.means[examine(subject).drawable]
     else:
         levels = range(subject.num_levels)
-        level = next((i for i in levels if level_size(subject, i) <= _ENOUGH_TO_FRAME), len(levels) - 1)
+        level = next(
+            (i for i in levels if level_size(subject, i) <= _ENOUGH_TO_FRAME), len(levels) - 1
+        )
         means = subject.level_gaussians(level).means if levels else np.zeros((0, 3), np.float32)
     centre, radius = ball_of_most(means) if len(means) else (np.zeros(3), 1.0)
     narrow = math.tan(DEFAULT_FOV_X / 2) * min(1.0, options.size[1] / options.size[0])
@@ -146,7 +174,8 @@ def _around(subject: Bundle | Gaussians, options: ViewOptions, views: int, path:
 def choose_up(
     requested: Axis | None, subject: Subject, cameras: Mapping[str, Camera] | None, path: Path
 ) -> tuple[Axis, list[str]]:
-    """The axis that is up: that of --up, or else as `up_of` finds it, with a line that says so.
+    """The axis that is up: that of --up, or else as `up_of` finds it, with a line that
+    says so.
 
     If nothing tells the axis, a user at a terminal is asked.
     """
@@ -160,20 +189,23 @@ def choose_up(
 
 
 def lines_of_up(path: Path, axis: Axis, reason: str) -> list[str]:
-    """The line that says which axis is up and why; none without a reason, which is for --up."""
+    """The line that says which axis is up and why; none without a reason, which is for
+    --up."""
     if not reason:
         return []
     return [f"{beside(path).name}: {axis} is up, {reason}; --up says otherwise"]
 
 
 def is_at_terminal() -> bool:
-    """Whether a user can answer; a job in the background, which would be stopped, cannot."""
+    """Whether a user can answer; a job in the background, which would be stopped,
+    cannot."""
     is_open = sys.stdin and sys.stdin.isatty() and sys.stderr.isatty()
     return bool(is_open and os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp())
 
 
 def ask_up(path: Path, axis: Axis) -> Axis:
-    """Ask the user at the terminal which axis is up; Enter, or the end of the input, accepts `axis`."""
+    """Ask the user at the terminal which axis is up; Enter, or the end of the input,
+    accepts `axis`."""
     while True:
         question = printable(f"{beside(path).name}: which way is up, {', '.join(AXES)}? [{axis}] ")
         print(question, end="", file=sys.stderr, flush=True)
@@ -183,13 +215,17 @@ def ask_up(path: Path, axis: Axis) -> Axis:
 
 
 def picture_paths(output: Path, cameras: Collection[str]) -> list[Path]:
-    """The paths of the pictures of cameras; if there are several, each path has the name of its camera.
+    """The paths of the pictures of cameras; if there are several, each path has the
+    name of its camera.
 
-    If two paths would be the same, all have the number of their camera in the file instead, from 0.
+    If two paths would be the same, all have the number of their camera in the file
+    instead, from 0.
     """
     if len(cameras) == 1:
         return [output]
-    names = ["".join(c if c.isalnum() or c in "-_." else "_" for c in name)[:100] for name in cameras]
+    names = [
+        "".join(c if c.isalnum() or c in "-_." else "_" for c in name)[:100] for name in cameras
+    ]
     if len(set(names)) < len(names):
         names = [str(place) for place in range(len(names))]
     return [output.with_name(f"{output.stem}_{name}{output.suffix}") for name in names]

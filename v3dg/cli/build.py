@@ -28,7 +28,8 @@ from v3dg.upright import ASSUMED, up_of
 
 _PATIENCE_S = 20  # time for a scheduler to answer
 _MOST_REASON = 200  # characters of an error of dask's
-# The axis that is up is guessed from so many samples of an asset, of so many gaussians each.
+# The axis that is up is guessed from so many samples of an asset, of so many gaussians
+# each.
 _NUM_SAMPLES = 64
 _SAMPLE_SIZE = 256
 _SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
@@ -36,33 +37,40 @@ _SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
 
 @dataclass
 class Build(_common.OnDevice):
-    """Build a bundle from a trained asset, or from each of many; one that fails does not stop the others."""
+    """Build a bundle from a trained asset, or from each of many; one that fails does
+    not stop the others."""
 
     assets: Annotated[tuple[Path, ...], tyro.conf.Positional, _SEVERAL]
-    """Files of trained gaussians, or folders of such files. With an --output that ends in .v3dg they make
-    one asset together."""
+    """Files of trained gaussians, or folders of such files. With an --output that ends
+    in .v3dg they make one asset together."""
     output: Annotated[Path | None, _common.option("PATH", "-o")] = None
-    """Bundle to write, or the folder for those of many assets; if not given, beside each asset."""
+    """Bundle to write, or the folder for those of many assets; if not given, beside
+    each asset."""
     config: Literal["default", "paper"] = "default"
     """Settings to start from: ours, or those of the V3DG paper."""
     cluster_size: Annotated[int | None, _common.option("N")] = None
     """Maximum number of gaussians in a cluster; the config's own if not given."""
     codec: Literal["float32", "quantized"] = "float32"
-    """How gaussians are kept: every bit, or rounded to 16 to 40 bytes (docs/format.md has the error)."""
+    """How gaussians are kept: every bit, or rounded to 16 to 40 bytes (docs/format.md
+    has the error)."""
     up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
-    """The axis that is up in the asset, which the bundle records; asked for at a terminal if unknown."""
+    """The axis that is up in the asset, which the bundle records; asked for at a
+    terminal if unknown."""
     seed: int = 0
-    """The same seed gives the same file, byte for byte, on the same kind of device and any threads."""
+    """The same seed gives the same file, byte for byte, on the same kind of device and
+    any threads."""
     strict: _common.Flag = False
-    """Refuse an asset with wrong values, instead of leaving out the gaussians that have them."""
+    """Refuse an asset with wrong values, instead of leaving out the gaussians that have
+    them."""
     resume: _common.Flag = False
-    """Continue after the last finished level; keep bundles of these gaussians and settings."""
+    """Continue after the last finished level; keep bundles of these gaussians and
+    settings."""
     memory: Annotated[str | None, _common.option("SIZE")] = None
-    """Memory of the host for the build, as 8GiB; half of what is free if not given. An asset that does not
-    fit is brought into order on the disk of the output."""
+    """Memory of the host for the build, as 8GiB; half of what is free if not given. An
+    asset that does not fit is brought into order on the disk of the output."""
     scheduler: Annotated[str | None, _common.option("ADDRESS")] = None
-    """Build on the workers of a dask scheduler, as tcp://host:8786, which reach the output's folder, too;
-    needs the extra `cluster`."""
+    """Build on the workers of a dask scheduler, as tcp://host:8786, which reach the
+    output's folder, too; needs the extra `cluster`."""
 
 
 def run(options: Build) -> None:
@@ -83,7 +91,8 @@ def run(options: Build) -> None:
 
 
 def _asked_up(path: Path) -> Axis | None:
-    """The user's answer which axis is up, asked at a terminal if neither format nor gaussians tell it."""
+    """The user's answer which axis is up, asked at a terminal if neither format nor
+    gaussians tell it."""
     if not is_at_terminal():
         return None
     _common.require_file(path, *SUFFIXES)
@@ -116,7 +125,8 @@ def _executor_at(address: str | None) -> Iterator[Executor | None]:
     except (OSError, ValueError) as error:
         reason = " ".join(str(error).split()) or "no answer"
         raise RuntimeError(f"{expected} that answers, got none ({reason})") from None
-    except Exception as error:  # of any kind, as of one that speaks of other things, or another version
+    except Exception as error:
+        # of any kind, as of one that speaks of other things, or another version
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:_MOST_REASON]
         raise RuntimeError(f"{expected}, got something else ({reason})") from None
     with client:
@@ -124,7 +134,8 @@ def _executor_at(address: str | None) -> Iterator[Executor | None]:
 
 
 def _greet(address: str) -> None:
-    """Say hello to a scheduler; RuntimeError unless something of dask's answers in time.
+    """Say hello to a scheduler; RuntimeError unless something of dask's answers in
+    time.
 
     A client would wait for ever for one that listens and says nothing.
     """
@@ -148,10 +159,16 @@ def _greet(address: str) -> None:
         reason = " ".join(str(error).split()) or "no answer"
         raise RuntimeError(f"{expected} that answers, got none ({reason})") from None
     except TypeError as error:  # TLS without certificates
-        raise RuntimeError(f"{expected} that can be asked, got none ({error}); set dask's security") from None
-    except Exception:  # what dask makes of another protocol, whose first eight bytes it takes for a size
+        raise RuntimeError(
+            f"{expected} that can be asked, got none ({error}); set dask's security"
+        ) from None
+    except Exception:
+        # what dask makes of another protocol, whose first eight bytes it takes for a
+        # size
         advice = "give the address that `dask scheduler` prints"
-        raise RuntimeError(f"{expected}, got a server that speaks another protocol; {advice}") from None
+        raise RuntimeError(
+            f"{expected}, got a server that speaks another protocol; {advice}"
+        ) from None
 
 
 def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor | None) -> None:
@@ -202,13 +219,16 @@ def _print_many(options: Build, results: list[dict[str, Any]], seconds: float) -
         rows.append(row)
     counts = Counter(result["status"] for result in results)
     summary = {name: counts[name] for name in ("built", "kept", "failed")}
-    last_line = ", ".join(f"{count} {name}" for name, count in summary.items()) + f", {seconds:.1f} s"
+    last_line = (
+        ", ".join(f"{count} {name}" for name, count in summary.items()) + f", {seconds:.1f} s"
+    )
     lines = [*_common.table_lines(columns, rows), "", last_line]
     _common.print_result(options.json, {**summary, "seconds": seconds, "assets": results}, lines)
 
 
 def _assets_of(paths: Sequence[Path]) -> dict[Path, list[Path]]:
-    """The files of each asset, by the path that names it: a file, or the folder of a trainer's run."""
+    """The files of each asset, by the path that names it: a file, or the folder of a
+    trainer's run."""
     assets: dict[Path, list[Path]] = {}
     for path in paths:
         if not path.is_dir():
@@ -216,7 +236,9 @@ def _assets_of(paths: Sequence[Path]) -> dict[Path, list[Path]]:
         elif files := run_files(path):
             assets[path] = files
         else:
-            files = sorted(p for p in path.iterdir() if p.name.lower().endswith(SUFFIXES) and p.is_file())
+            files = sorted(
+                p for p in path.iterdir() if p.name.lower().endswith(SUFFIXES) and p.is_file()
+            )
             expected = f"a folder with assets ({', '.join(SUFFIXES)}), or a run of a trainer"
             check(path, files, f"{expected}, got one without")
             for file in files:
@@ -243,11 +265,17 @@ def _outputs(assets: Sequence[Path], folder: Path | None) -> dict[Path, Path]:
     for asset in assets:
         output = _output_of(asset, folder)
         first = asset_from_output.setdefault(output, asset)
-        check(output, first == asset, f"one asset for it, got {shown(first)} and {shown(asset)}; rename one")
+        check(
+            output,
+            first == asset,
+            f"one asset for it, got {shown(first)} and {shown(asset)}; rename one",
+        )
     return {asset: output for output, asset in asset_from_output.items()}
 
 
-def _build(options: Build, paths: Sequence[Path], output: Path, executor: Executor | None) -> dict[str, Any]:
+def _build(
+    options: Build, paths: Sequence[Path], output: Path, executor: Executor | None
+) -> dict[str, Any]:
     """Build and write one bundle; returns its description, as JSON values."""
     for path in paths:
         _common.require_file(path, *SUFFIXES)
@@ -299,7 +327,8 @@ def _build(options: Build, paths: Sequence[Path], output: Path, executor: Execut
 
 
 def _resume_advice(output: Path) -> str:
-    """The end of a message about a build that did not finish: where it can continue, if anywhere."""
+    """The end of a message about a build that did not finish: where it can continue, if
+    anywhere."""
     levels = levels_path(output)
     if levels.exists():
         return f"; `--resume` continues from {levels}"

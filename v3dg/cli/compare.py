@@ -23,30 +23,37 @@ from v3dg.opening import open_with_cameras
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import render
 
-# From this number of views on, measuring in other processes is quicker, in spite of starting them.
+# From this number of views on, measuring in other processes is quicker, in spite of
+# starting them.
 _ENOUGH_TO_SHARE = 6
 
-# Smaller pictures are enlarged to about this width, in px, when they are shown side by side.
+# Smaller pictures are enlarged to about this width, in px, when they are shown side by
+# side.
 _LEAST_WIDTH = 300
 
 
 @dataclass
 class Compare(_common.Cut, _common.OnDevice):
-    """Draw two subjects from the same cameras, or take two pictures, and measure how far apart they look.
+    """Draw two subjects from the same cameras, or take two pictures, and measure how
+    far apart they look.
 
     By PSNR and SSIM, and by FLIP where the extra `flip` is installed.
     """
 
     reference: tyro.conf.Positional[Path]
-    """An asset, a bundle (.v3dg) or a scene (.json), to be drawn with all gaussians; or a picture (.png)."""
+    """An asset, a bundle (.v3dg) or a scene (.json), to be drawn with all gaussians; or
+    a picture (.png)."""
     test: tyro.conf.Positional[Path]
-    """The subject to compare with it: any of those, drawn with a tolerance, or a picture of the same size."""
+    """The subject to compare with it: any of those, drawn with a tolerance, or a
+    picture of the same size."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("compare.png")
-    """Picture to write, .png or .jpg: reference, test and, where FLIP is installed, a map of it."""
+    """Picture to write, .png or .jpg: reference, test and, where FLIP is installed, a
+    map of it."""
     pictures: Literal["worst", "all"] = "worst"
     """Show the view that differs most, or write a picture of every view."""
     supersample: Annotated[int, tyro.conf.arg(metavar="N")] = 1
-    """Draw the reference this many times larger and average it; with 2, aliasing is not taken for detail."""
+    """Draw the reference this many times larger and average it; with 2, aliasing is not
+    taken for detail."""
     view: Views = field(default_factory=ViewOptions)
 
 
@@ -104,12 +111,17 @@ def run(options: Compare) -> None:
     if mean["flip"] is None:
         lines.append(FLIP_MISSING)
     if pairs.finest is not None and all(row["gaussians_selected"] == pairs.finest for row in rows):
-        lines.append("every view needs the finest level; a smaller `--size` shows the test as from far away")
+        lines.append(
+            "every view needs the finest level; a smaller `--size` shows the test as from far away"
+        )
     _common.print_result(options.json, result, lines)
 
 
-def _measure(options: Compare, pairs: _Pairs, output: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Measure all pairs and write their pictures; the rows of the result, and the one that differs most."""
+def _measure(
+    options: Compare, pairs: _Pairs, output: Path
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Measure all pairs and write their pictures; the rows of the result, and the one
+    that differs most."""
     paths = [output] * len(pairs.names)
     if options.pictures == "all":
         paths = picture_paths(output, pairs.names)
@@ -158,9 +170,13 @@ def _draw(options: Compare) -> _Pairs:
     if reference_cameras is None and test_cameras is not None:
         cameras = choose_cameras(options.view, options.test, reference, test_cameras, views=8)
     else:
-        cameras = choose_cameras(options.view, options.reference, reference, reference_cameras, views=8)
+        cameras = choose_cameras(
+            options.view, options.reference, reference, reference_cameras, views=8
+        )
     for name, camera in cameras.items():
-        pictures.check_size(f"camera {name}", camera.width, camera.height, pictures.MOST_PIXELS_COMPARED)
+        pictures.check_size(
+            f"camera {name}", camera.width, camera.height, pictures.MOST_PIXELS_COMPARED
+        )
         pictures.check_size(
             f"camera {name}, supersampled",
             camera.width * options.supersample,
@@ -180,7 +196,8 @@ def _draw(options: Compare) -> _Pairs:
                 tolerance=options.tolerance,
                 budget=options.budget,
                 device=device,
-                min_transmittance=MIN_TRANSMITTANCE,  # the truth's, so that only the gaussians differ
+                # the truth's, so that only the gaussians differ
+                min_transmittance=MIN_TRANSMITTANCE,
             )
             yield _Pair(name, truth, to_8bit(image.color), image.stats.gaussians_selected)
 

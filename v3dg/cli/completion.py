@@ -10,7 +10,8 @@ import tyro
 
 from v3dg.cli._common import Common
 
-# Replacements in tyro's scripts that complete file names if neither a command nor an option matches.
+# Replacements in tyro's scripts that complete file names if neither a command nor an
+# option matches.
 _OR_FILES = {
     "bash": ("complete -F", "complete -o default -F"),
     "zsh": ('[[ "$completions" ==', '[[ -z "$completions" || "$completions" =='),
@@ -20,7 +21,8 @@ _OR_FILES = {
 
 @dataclass
 class Completion(Common):
-    """Print a script that completes commands, options and files (docs/install.md says where to put it)."""
+    """Print a script that completes commands, options and files (docs/install.md says
+    where to put it)."""
 
     shell: tyro.conf.Positional[Literal["bash", "zsh", "fish"]]
     """Shell that will read it."""

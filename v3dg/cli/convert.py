@@ -24,15 +24,20 @@ from v3dg.select import select
 
 @dataclass
 class Convert(_common.Cut, _common.Common):
-    """Write an asset, a level of a bundle, or its cut for a camera, in another format; or a bundle anew."""
+    """Write an asset, a level of a bundle, or its cut for a camera, in another format;
+    or a bundle anew."""
 
     subject: tyro.conf.Positional[Path]
-    """An asset in any format that is read (docs/formats.md), a bundle (.v3dg) or a scene (.json)."""
+    """An asset in any format that is read (docs/formats.md), a bundle (.v3dg) or a
+    scene (.json)."""
     output: tyro.conf.Positional[Path]
-    """File to write, .ply, .compressed.ply, .spz, .sog, .glb or .usd; of a bundle also .v3dg, with all its
-    levels."""
-    codec: Annotated[Literal["float32", "quantized"] | None, _common.option("{float32,quantized}")] = None
-    """How a .v3dg that is written keeps gaussians, as for `v3dg build`; as the bundle does if not given."""
+    """File to write, .ply, .compressed.ply, .spz, .sog, .glb or .usd; of a bundle also
+    .v3dg, with all its levels."""
+    codec: Annotated[
+        Literal["float32", "quantized"] | None, _common.option("{float32,quantized}")
+    ] = None
+    """How a .v3dg that is written keeps gaussians, as for `v3dg build`; as the bundle
+    does if not given."""
     level: Annotated[int | None, _common.option("N")] = None
     """Write this level of a bundle; 0, the asset itself, if no cut is asked for."""
     outside: Literal["drop", "keep"] = "drop"
@@ -96,7 +101,8 @@ def _is_bundle(path: Path) -> bool:
 
 
 def _check_output(options: Convert) -> None:
-    """Refuse an output that cannot be written, and options that do not apply to its format."""
+    """Refuse an output that cannot be written, and options that do not apply to its
+    format."""
     output = options.output
     name = output.name.lower()
     suffixes = (*WRITE_SUFFIXES, ".v3dg")
@@ -123,7 +129,9 @@ def _part_options(options: Convert) -> list[str]:
 
 def _write_bundle(options: Convert, bundle: Bundle) -> None:
     codec = options.codec or bundle.codec
-    Bundle(bundle.clusters, bundle.groups, bundle.gaussians, bundle.config, codec).write(options.output)
+    Bundle(bundle.clusters, bundle.groups, bundle.gaussians, bundle.config, codec).write(
+        options.output
+    )
 
 
 def _level(options: Convert, bundle: Bundle) -> _Part:
@@ -135,7 +143,9 @@ def _level(options: Convert, bundle: Bundle) -> _Part:
 def _cut(options: Convert, subject: Scene | Bundle, own_cameras: dict[str, Camera] | None) -> _Part:
     cameras = choose_cameras(options.view, options.subject, subject, own_cameras)
     expected = f"one camera to look from, got {len(cameras)}; choose one"
-    _common.check_usage("--views" if options.view.views else "--camera", len(cameras) == 1, expected)
+    _common.check_usage(
+        "--views" if options.view.views else "--camera", len(cameras) == 1, expected
+    )
     name, camera = next(iter(cameras.items()))
     selection = select(
         subject,
@@ -146,7 +156,9 @@ def _cut(options: Convert, subject: Scene | Bundle, own_cameras: dict[str, Camer
         device=CPU,
     )
     if isinstance(subject, Bundle) and len(selection):  # only the clusters of the cut are read
-        gaussians = Gaussians.concatenate([subject.cluster_gaussians(int(c)) for c in selection.cluster_ids])
+        gaussians = Gaussians.concatenate(
+            [subject.cluster_gaussians(int(c)) for c in selection.cluster_ids]
+        )
     else:
         gaussians = selection.gaussians(device=CPU)
     description = {

@@ -13,7 +13,8 @@ from v3dg.select import DEFAULT_TOLERANCE, rule_of
 
 @dataclass
 class Demo(Common):
-    """Build an asset that v3dg makes itself, place it 2,000 times, draw it from near to far, and measure."""
+    """Build an asset that v3dg makes itself, place it 2,000 times, draw it from near to
+    far, and measure."""
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("v3dg_demo.png")
     """Picture to write, .png or .jpg."""
@@ -59,8 +60,8 @@ def run(options: Demo) -> None:
         for name in ("full", "bundle")
     ]
     lines = [
-        f"{options.instances:,} instances of {options.gaussians:,} gaussians, {result['levels']} levels "
-        f"built in {result['build_seconds']:.1f} s, tolerance {options.tolerance:g} px²",
+        f"{options.instances:,} instances of {options.gaussians:,} gaussians, {result['levels']} "
+        f"levels built in {result['build_seconds']:.1f} s, tolerance {options.tolerance:g} px²",
         "",
         *table_lines(columns, panels),
         "",

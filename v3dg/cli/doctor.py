@@ -22,7 +22,8 @@ _PATIENCE_S = 20  # time for a program to answer
 
 @dataclass
 class Doctor(Common):
-    """List the parts of this machine that v3dg can use, and for missing parts their purpose and source."""
+    """List the parts of this machine that v3dg can use, and for missing parts their
+    purpose and source."""
 
 
 def run(options: Doctor) -> None:
@@ -55,7 +56,9 @@ def _findings() -> Iterator[_Finding]:
     python = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
     yield _Finding("Python", python, "")
     compiler = _answer(os.environ.get("CXX", "c++"), "--version")
-    yield _Finding("compiler", compiler, "to build from source: apt install g++, or as your system has it")
+    yield _Finding(
+        "compiler", compiler, "to build from source: apt install g++, or as your system has it"
+    )
     nvcc = os.environ.get("CUDACXX") or shutil.which("nvcc") or "/usr/local/cuda/bin/nvcc"
     advice = "12.4 or newer, to build with CUDA: https://developer.nvidia.com/cuda-downloads"
     yield _Finding("CUDA toolkit", _answer(nvcc, "--version", line=-2), advice)
@@ -79,6 +82,8 @@ def _findings() -> Iterator[_Finding]:
 def _answer(*command: str, line: int = 0) -> str | None:
     """A line of the output of a program; None if the program is missing or fails."""
     with contextlib.suppress(OSError, subprocess.SubprocessError, IndexError):
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE_S, check=True)
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=_PATIENCE_S, check=True
+        )
         return done.stdout.splitlines()[line].strip()
     return None

@@ -55,7 +55,9 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
     boxes = {"box": _box(drawable.means), "box_without_outliers": _box(drawable.means[~far])}
     values = {"longest_scale": drawable.scales.max(axis=1), "opacity": drawable.opacities}
     spread = {
-        name: np.percentile(array, (5, 50, 95)).tolist() for name, array in values.items() if len(array)
+        name: np.percentile(array, (5, 50, 95)).tolist()
+        for name, array in values.items()
+        if len(array)
     }
     result: dict[str, Any] = {
         "path": shown(path),
@@ -76,9 +78,12 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
     if len(drawable):
         lines.append("means from {} to {}".format(*map(_point, boxes["box"])))
     if far.any():
-        lines.append("without outliers from {} to {}".format(*map(_point, boxes["box_without_outliers"])))
         lines.append(
-            f"{far.sum():,} outliers, {OUTLIER_DISTANCE:g} median distances from the median or farther"
+            "without outliers from {} to {}".format(*map(_point, boxes["box_without_outliers"]))
+        )
+        lines.append(
+            f"{far.sum():,} outliers, {OUTLIER_DISTANCE:g} median distances from the median or "
+            "farther"
         )
     for name, (p5, p50, p95) in spread.items():
         name = name.replace("_", " ")
@@ -112,7 +117,8 @@ def _bundle_info(bundle: Bundle) -> _Description:
         f"{result['path']}: bundle, version {result['version']} ({result['codec']}), "
         f"{_common.bytes_text(result['bytes'])}{each}",
         f"{bundle.num_gaussians:,} gaussians, SH degree {bundle.sh_degree}, "
-        f"{len(bundle.clusters):,} clusters, {len(bundle.groups):,} groups, {result['num_pages']:,} pages",
+        f"{len(bundle.clusters):,} clusters, {len(bundle.groups):,} groups, "
+        f"{result['num_pages']:,} pages",
         "",
         *_common.table_lines(columns, levels),
         "",
@@ -125,7 +131,9 @@ def _bundle_info(bundle: Bundle) -> _Description:
             for name, value in _settings(bundle.config)
             if name not in usual or value != usual[name]
         ]
-        text = f"built with {', '.join(others)}, all else by default" if others else "built by default"
+        text = (
+            f"built with {', '.join(others)}, all else by default" if others else "built by default"
+        )
         lines += textwrap.wrap(_common.printable(text), 100, break_on_hyphens=False)
     return result, lines
 
@@ -143,7 +151,8 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
     ]
     total = sum(bundle["instances"] * bundle["asset_gaussians"] for bundle in bundles)
     sizes = [
-        {"name": name, "width": camera.width, "height": camera.height} for name, camera in cameras.items()
+        {"name": name, "width": camera.width, "height": camera.height}
+        for name, camera in cameras.items()
     ]
     result = {
         "path": str(path),
@@ -158,7 +167,10 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
         _common.Column("instances", "{instances:,}"),
         _common.Column("asset gaussians", "{asset_gaussians:,}"),
     ]
-    camera_columns = [_common.Column("camera", "{name}"), _common.Column("size", "{width} x {height}")]
+    camera_columns = [
+        _common.Column("camera", "{name}"),
+        _common.Column("size", "{width} x {height}"),
+    ]
     lines = [
         f"{path}: scene, {len(scene):,} instances, {total:,} gaussians at full detail",
         "",
@@ -172,7 +184,8 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
 
 
 def _settings(config: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Names and values of a bundle's config; names of nested settings, but for the build's, have a prefix."""
+    """Names and values of a bundle's config; names of nested settings, but for the
+    build's, have a prefix."""
     for name, value in config.items():
         if isinstance(value, dict):
             yield from _settings(value, "" if name == "build" else f"{name} ")

@@ -9,7 +9,16 @@ import tyro
 from v3dg import _device
 from v3dg._progress import counted
 from v3dg._urls import beside, shown
-from v3dg.cli._common import Column, Cut, OnPool, check_usage, finite, option, print_result, table_lines
+from v3dg.cli._common import (
+    Column,
+    Cut,
+    OnPool,
+    check_usage,
+    finite,
+    option,
+    print_result,
+    table_lines,
+)
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, choose_up, picture_paths
 from v3dg.false_color import ColorBy
 from v3dg.opening import open_with_cameras
@@ -20,21 +29,27 @@ from v3dg.select import DEFAULT_FADE, CutOptions
 
 @dataclass
 class Render(Cut, OnPool):
-    """Draw a scene from its cameras, a bundle or an asset from a turntable, or any from a camera file."""
+    """Draw a scene from its cameras, a bundle or an asset from a turntable, or any from
+    a camera file."""
 
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg) or an asset (.ply, .spz, ...)."""
     output: Annotated[Path | None, option("PATH", "-o")] = None
-    """Picture to write, .png or .jpg; several get a number or the camera's name. Default: as the subject."""
+    """Picture to write, .png or .jpg; several get a number or the camera's name.
+    Default: as the subject."""
     min_level: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Draw no level finer than this, except where an asset has no coarser one."""
     fade: Annotated[float | None, option("FACTOR")] = None
-    """Draw what is within this factor of the tolerance on two levels, one coming as the other goes, and level
-    0 with a low-pass, so that a film neither pops nor flickers. Default: 1.02 for several views of a
-    turntable, otherwise 1, which is none."""
+    """Draw what is within this factor of the tolerance on two levels, one coming as the
+    other goes, and level 0 with a low-pass, so that a film neither pops nor flickers.
+    Default: 1.02 for several views of a turntable, otherwise 1, which is none."""
     color_by: ColorBy = "appearance"
     """What a gaussian's colour shows."""
-    background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
+    background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
     """Red, green and blue of the background, each 0 to 1."""
     view: Views = field(default_factory=ViewOptions)
 
@@ -43,7 +58,9 @@ def run(options: Render) -> None:
     options.view.check(options.subject)
     is_color = all(0 <= part <= 1 for part in options.background)
     check_usage("--background", is_color, f"three numbers from 0 to 1, got {options.background}")
-    output = check_picture_path(options.output or Path(beside(options.subject).with_suffix(".png").name))
+    output = check_picture_path(
+        options.output or Path(beside(options.subject).with_suffix(".png").name)
+    )
     device = _device.resolve(options.device)
     subject, own_cameras = open_with_cameras(options.subject)
     is_turntable = options.view.cameras is None and own_cameras is None
@@ -57,7 +74,8 @@ def run(options: Render) -> None:
     pictures: list[dict[str, Any]] = []
     views = list(zip(picture_paths(output, cameras), cameras.items(), strict=True))
     show = len(views) > 1 and not options.quiet
-    # With a fade the pictures are a sequence, in which the tolerance of a budget changes in steps.
+    # With a fade the pictures are a sequence, in which the tolerance of a budget
+    # changes in steps.
     renderer = Renderer(subject, color_by=options.color_by, device=device, memory=options.pool())
     cut = CutOptions(
         tolerance=options.tolerance, budget=options.budget, min_level=options.min_level, fade=fade

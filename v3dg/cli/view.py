@@ -19,12 +19,22 @@ import tyro
 from v3dg._start import SIGNALS
 from v3dg._urls import beside, shown
 from v3dg.cameras import Axis
-from v3dg.cli._common import Cut, Flag, OnPool, check_usage, option, print_result, require_subject, tell
+from v3dg.cli._common import (
+    Cut,
+    Flag,
+    OnPool,
+    check_usage,
+    option,
+    print_result,
+    require_subject,
+    tell,
+)
 from v3dg.cli._views import CameraFile, lines_of_up
 from v3dg.opening import open_with_cameras
 from v3dg.upright import ASSUMED, direction_of, up_of
 
-# Time between checks for a signal: an endless wait would miss one that comes just before it.
+# Time between checks for a signal: an endless wait would miss one that comes just
+# before it.
 _SECONDS = 0.1
 
 
@@ -35,13 +45,16 @@ class View(CameraFile, Cut, OnPool):
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg) or an asset (.ply)."""
     host: str = "127.0.0.1"
-    """Address to listen at; by default for this machine alone, at 0.0.0.0 for all who have the URL."""
+    """Address to listen at; by default for this machine alone, at 0.0.0.0 for all who
+    have the URL."""
     port: int = 8080
     """Port to listen at; the next free one where it is taken."""
     no_browser: Flag = False
-    """Open no browser; none is opened over ssh, without a display, or where other machines can connect."""
+    """Open no browser; none is opened over ssh, without a display, or where other
+    machines can connect."""
     up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
-    """Which way is up at first; what the file says or what is guessed from it or its cameras if not given."""
+    """Which way is up at first; what the file says or what is guessed from it or its
+    cameras if not given."""
 
 
 def run(options: View) -> None:
@@ -71,7 +84,9 @@ def run(options: View) -> None:
         up, reason = up_of(subject, cameras, options.subject)
     lines = lines_of_up(options.subject, up, reason)
     scene_view = SceneView(subject, device=options.device, memory=options.pool())
-    with contextlib.suppress(ImportError):  # imported early because it takes long; the site reports errors
+    with contextlib.suppress(
+        ImportError
+    ):  # imported early because it takes long; the site reports errors
         importlib.import_module("v3dg.viewer.tab")
     with _interrupts() as interrupts:
         site = Site(
@@ -102,7 +117,8 @@ def run(options: View) -> None:
 
 
 def _has_browser() -> bool:
-    """Whether to open a browser: not over ssh, on the wrong machine, nor a text browser without a display."""
+    """Whether to open a browser: not over ssh, on the wrong machine, nor a text browser
+    without a display."""
     if "SSH_CONNECTION" in os.environ:
         return False
     has_display = any(os.environ.get(name) for name in ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY"))
@@ -110,7 +126,8 @@ def _has_browser() -> bool:
 
 
 def _photographs(cameras: Path, names: Iterable[str]) -> dict[str, Path]:
-    """The photographs of cameras by name, beside the file of the cameras or in a folder `images` near it."""
+    """The photographs of cameras by name, beside the file of the cameras or in a folder
+    `images` near it."""
     folder = cameras if cameras.is_dir() else cameras.parent
     nearby = (folder, *folder.resolve().parents[:2])
     places = [place / part for place in nearby for part in ("", "images")]
@@ -127,8 +144,9 @@ def _photographs(cameras: Path, names: Iterable[str]) -> dict[str, Path]:
 def _interrupts() -> Iterator[list[int]]:
     """Collect the numbers of the received signals, Ctrl-C and SIGTERM, in a list.
 
-    Exceptions would leave threads half started. After a signal, further ones are ignored, because the process
-    ends. A handler may run while its thread holds any lock, so it must not take one.
+    Exceptions would leave threads half started. After a signal, further ones are
+    ignored, because the process ends. A handler may run while its thread holds any
+    lock, so it must not take one.
     """
     received: list[int] = []
     numbers = (*SIGNALS, signal.SIGTERM)

@@ -1,4 +1,5 @@
-"""`rasterization` with the arguments and the results of gsplat's, for programs that train with it.
+"""`rasterization` with the arguments and the results of gsplat's, for programs that
+train with it.
 
 Pictures and gradients are those of `v3dg.rasterize`, on the CPU and on CUDA devices.
 """
@@ -15,7 +16,14 @@ from v3dg import _core
 from v3dg._numbers import check, one_of, real, shown, whole
 from v3dg.cameras import Camera
 from v3dg.gaussians import Array, Gaussians
-from v3dg.rasterize import CenterGradient, CenterProbe, DrawSettings, check_device, draw_views, joined
+from v3dg.rasterize import (
+    CenterGradient,
+    CenterProbe,
+    DrawSettings,
+    check_device,
+    draw_views,
+    joined,
+)
 
 if TYPE_CHECKING:
     import torch
@@ -71,7 +79,8 @@ def rasterization(
         quats: (N, 4).
         scales: (N, 3).
         opacities: (N,).
-        colors: (N, 3) or (C, N, 3) colours; with `sh_degree` (N, K, 3) or (C, N, K, 3) coefficients.
+        colors: (N, 3) or (C, N, 3) colours; with `sh_degree` (N, K, 3) or (C, N, K, 3)
+            coefficients.
         viewmats: (C, 4, 4), without gradient.
         Ks: (C, 3, 3).
         width: Width of the pictures in px.
@@ -83,16 +92,20 @@ def rasterization(
         sh_degree: Degree of the coefficients in `colors`; None for colours.
         packed: Whether the dict has only the pairs of camera and gaussian in sight.
         backgrounds: (C, 3) colours; black if None.
-        render_mode: "RGB", "D", "ED", "RGB+D" or "RGB+ED", where D is depth and ED expected depth.
+        render_mode: "RGB", "D", "ED", "RGB+D" or "RGB+ED", where D is depth and ED
+            expected depth.
         absgrad: Whether `means2d` gets `.absgrad`.
-        rasterize_mode: "classic", or "antialiased" to compensate opacities for the filter.
-        options: The other arguments of gsplat. `tile_size`, `channel_chunk` and `segmented` only affect how
-            gsplat computes and are ignored. The rest must have a value that turns them off.
+        rasterize_mode: "classic", or "antialiased" to compensate opacities for the
+            filter.
+        options: The other arguments of gsplat. `tile_size`, `channel_chunk` and
+            `segmented` only affect how gsplat computes and are ignored. The rest must
+            have a value that turns them off.
 
     Returns:
-        Pictures (C, H, W, D), alphas (C, H, W, 1), and a dict: `means2d`, `depths`, `conics`, `opacities` and
-        `radii`, (C, N, ...) or if `packed` of the pairs in sight, with their `camera_ids` and `gaussian_ids`;
-        `width`, `height`, `n_cameras`. `means2d` takes gradients, and has `.absgrad` with `absgrad`.
+        Pictures (C, H, W, D), alphas (C, H, W, 1), and a dict: `means2d`, `depths`,
+        `conics`, `opacities` and `radii`, (C, N, ...) or if `packed` of the pairs in
+        sight, with their `camera_ids` and `gaussian_ids`; `width`, `height`,
+        `n_cameras`. `means2d` takes gradients, and has `.absgrad` with `absgrad`.
 
     Raises:
         ValueError: A shape or a value is wrong, or is not supported.
@@ -117,7 +130,9 @@ def rasterization(
             raise TypeError(f"{name}: expected a torch tensor, got {type(value).__name__}")
     check_device(means)
     cameras = _cameras(viewmats, Ks, width, height, near_plane)
-    pictures, alphas, info = _draw(look, cameras, [tensor.contiguous() for tensor in shape.values()], colors)
+    pictures, alphas, info = _draw(
+        look, cameras, [tensor.contiguous() for tensor in shape.values()], colors
+    )
     info["width"] = width
     info["height"] = height
     info["n_cameras"] = len(cameras)
@@ -126,7 +141,9 @@ def rasterization(
 
 def rasterization_2dgs(*arguments: object, **options: object) -> NoReturn:
     """Raise NotImplementedError: 2D gaussians are not supported."""
-    raise NotImplementedError("rasterization_2dgs: expected 3D gaussians, got 2D ones; draw them with gsplat")
+    raise NotImplementedError(
+        "rasterization_2dgs: expected 3D gaussians, got 2D ones; draw them with gsplat"
+    )
 
 
 @dataclass
@@ -167,10 +184,13 @@ class _Look:
 
 
 def _check_unsupported(options: dict[str, object]) -> None:
-    """Raise for arguments that gsplat does not have, and for those that ask for what v3dg cannot do."""
+    """Raise for arguments that gsplat does not have, and for those that ask for what
+    v3dg cannot do."""
     for name in options.keys() - _IGNORED:
         if name not in _UNSUPPORTED:
-            raise TypeError(f"{name}: expected an argument of gsplat 1.5's rasterization, got another")
+            raise TypeError(
+                f"{name}: expected an argument of gsplat 1.5's rasterization, got another"
+            )
         value = options[name]
         if str(value) not in {"None", "False", "pinhole", "RollingShutterType.GLOBAL"}:
             raise ValueError(f"{name}: {shown(value)} is not supported; {_UNSUPPORTED[name]}")
@@ -179,8 +199,14 @@ def _check_unsupported(options: dict[str, object]) -> None:
 def _cameras(
     viewmats: torch.Tensor, Ks: torch.Tensor, width: int, height: int, near: float
 ) -> list[_core.Camera]:
-    check("viewmats", not viewmats.requires_grad, "no gradient; cameras are not trained, call .detach()")
-    check("Ks", len(Ks) == len(viewmats), f"one for each of {len(viewmats)} viewmats, got {len(Ks)}")
+    check(
+        "viewmats",
+        not viewmats.requires_grad,
+        "no gradient; cameras are not trained, call .detach()",
+    )
+    check(
+        "Ks", len(Ks) == len(viewmats), f"one for each of {len(viewmats)} viewmats, got {len(Ks)}"
+    )
     pairs = zip(viewmats.cpu().numpy(), Ks.detach().cpu().numpy(), strict=True)
     return [Camera(viewmat, K, width, height, near).core for viewmat, K in pairs]
 
@@ -220,10 +246,20 @@ def _background_of_views(look: _Look, num_cameras: int, dtype: torch.dtype) -> l
 def _draw(
     look: _Look, cameras: list[_core.Camera], shape: list[torch.Tensor], colors: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
-    """Pictures, alphas and the dict of gsplat; ``shape`` is means, quats, scales and opacities."""
+    """Pictures, alphas and the dict of gsplat; ``shape`` is means, quats, scales and
+    opacities."""
     *geometry, opacity = shape
     gradient = CenterGradient()
-    names = ("means2d", "depths", "conics", "opacities", "radii", "camera_ids", "gaussian_ids", "is_seen")
+    names = (
+        "means2d",
+        "depths",
+        "conics",
+        "opacities",
+        "radii",
+        "camera_ids",
+        "gaussian_ids",
+        "is_seen",
+    )
     info: dict[str, Any] = dict(zip(names, _locate()(look, cameras, gradient, *shape), strict=True))
     is_seen = info.pop("is_seen")
     pairs: tuple[torch.Tensor, torch.Tensor] | EllipsisType = ...
@@ -268,10 +304,12 @@ def _picture(
 
 @functools.cache
 def _locate() -> Callable[..., tuple[torch.Tensor | None, ...]]:
-    """The operation that locates gaussians on the images, whose results are the tensors of the dict.
+    """The operation that locates gaussians on the images, whose results are the tensors
+    of the dict.
 
-    The gradient of a picture reaches the gaussians through the picture; `means2d` only shows it to training
-    strategies. A loss on `means2d` or `depths` would therefore be lost, and is refused.
+    The gradient of a picture reaches the gaussians through the picture; `means2d` only
+    shows it to training strategies. A loss on `means2d` or `depths` would therefore be
+    lost, and is refused.
     """
     import torch
 
@@ -301,7 +339,9 @@ def _locate() -> Callable[..., tuple[torch.Tensor | None, ...]]:
                 arrays = [array[camera_ids, gaussian_ids] for array in arrays]
             means2d, depths, *constants = arrays
             optional = (camera_ids, gaussian_ids, is_seen)
-            ctx.mark_non_differentiable(*constants, *(tensor for tensor in optional if tensor is not None))
+            ctx.mark_non_differentiable(
+                *constants, *(tensor for tensor in optional if tensor is not None)
+            )
             return means2d, depths, *constants, *optional
 
         @staticmethod
@@ -316,7 +356,11 @@ def _locate() -> Callable[..., tuple[torch.Tensor | None, ...]]:
                 and d_depths is None
                 and d_means2d.data_ptr() == gradient.data_ptr()
             )
-            check("means2d, depths", is_all, "no loss but that of pictures; project the means for another")
+            check(
+                "means2d, depths",
+                is_all,
+                "no loss but that of pictures; project the means for another",
+            )
             return (None,) * 7
 
     return Locate.apply

@@ -1,4 +1,5 @@
-"""Bundles and scenes for the viewers of other programs: a module a format (docs/formats.md)."""
+"""Bundles and scenes for the viewers of other programs: a module a format
+(docs/formats.md)."""
 
 from v3dg.export._folder import check_outside
 from v3dg.export.site import SITE_NEEDS, Site, write_site
@@ -6,5 +7,14 @@ from v3dg.export.streamed_sog import DEFAULT_CHUNK, INDEX, Export, write_streame
 from v3dg.export.tiles import CESIUM, TILES_NEED, Tiles, write_tiles
 from v3dg.export.usd import write_usd
 
-__all__ = ["CESIUM", "DEFAULT_CHUNK", "INDEX", "SITE_NEEDS", "TILES_NEED", "Export", "Site", "Tiles"]
+__all__ = [
+    "CESIUM",
+    "DEFAULT_CHUNK",
+    "INDEX",
+    "SITE_NEEDS",
+    "TILES_NEED",
+    "Export",
+    "Site",
+    "Tiles",
+]
 __all__ += ["check_outside", "write_site", "write_streamed_sog", "write_tiles", "write_usd"]

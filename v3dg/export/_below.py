@@ -1,4 +1,5 @@
-"""What is below a folder, reached by relative names without following a link on the way."""
+"""What is below a folder, reached by relative names without following a link on the
+way."""
 
 import errno
 import os
@@ -19,9 +20,11 @@ def folders_above(name: str) -> list[str]:
 
 
 class Folder(AbstractContextManager["Folder"]):
-    """An open folder. All names are relative to it, with `/` between folders, and no link is followed.
+    """An open folder. All names are relative to it, with `/` between folders, and no
+    link is followed.
 
-    A folder on the way that is a link or a file is an OSError. Errors name `display_path`, not the path.
+    A folder on the way that is a link or a file is an OSError. Errors name
+    `display_path`, not the path.
     """
 
     def __init__(self, path: Path, display_path: Path) -> None:
@@ -59,12 +62,15 @@ class Folder(AbstractContextManager["Folder"]):
             return None
 
     def open_file(self, name: str) -> int:
-        """A descriptor to read a file; OSError for a link, ValueError for a folder or a device."""
+        """A descriptor to read a file; OSError for a link, ValueError for a folder or a
+        device."""
         with self._folder_of(name) as (folder, last):
             descriptor = os.open(last, _FILE, dir_fd=folder)
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             os.close(descriptor)
-            raise ValueError(f"{self._display_path / name}: expected a file, got a folder or a device")
+            raise ValueError(
+                f"{self._display_path / name}: expected a file, got a folder or a device"
+            )
         return descriptor
 
     def make_folder(self, name: str) -> None:
@@ -73,10 +79,14 @@ class Folder(AbstractContextManager["Folder"]):
             os.mkdir(last, dir_fd=folder)
 
     def move(self, source: str, target: str) -> None:
-        """Rename a file, and make the folders above its new name; FileExistsError where that is taken."""
+        """Rename a file, and make the folders above its new name; FileExistsError where
+        that is taken."""
         for parent in folders_above(target):
             self.make_folder(parent)
-        with self._folder_of(source) as (folder, last), self._folder_of(target) as (new_folder, new_last):
+        with (
+            self._folder_of(source) as (folder, last),
+            self._folder_of(target) as (new_folder, new_last),
+        ):
             with suppress(FileNotFoundError):
                 os.stat(new_last, dir_fd=new_folder, follow_symlinks=False)
                 raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), target)
@@ -87,6 +97,7 @@ class Folder(AbstractContextManager["Folder"]):
             os.unlink(last, dir_fd=folder)
 
     def remove_empty_folder(self, name: str) -> None:
-        """Remove a folder with nothing in it; what is not there or is in use stays as it is."""
+        """Remove a folder with nothing in it; what is not there or is in use stays as
+        it is."""
         with suppress(OSError), self._folder_of(name) as (folder, last):
             os.rmdir(last, dir_fd=folder)

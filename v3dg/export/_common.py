@@ -1,4 +1,5 @@
-"""What exports share: which way is up, turning gaussians, names of bundles, documents."""
+"""What exports share: which way is up, turning gaussians, names of bundles,
+documents."""
 
 import json
 import math
@@ -20,7 +21,8 @@ from v3dg.scene import Scene
 
 _OTHER_LETTERS = re.compile("[^A-Za-z0-9]")  # than names of folders have
 
-# Quaternions w x y z that turn an axis to -y, which is up where y is down, as viewers take it.
+# Quaternions w x y z that turn an axis to -y, which is up where y is down, as viewers
+# take it.
 _HALF = math.sqrt(0.5)
 _TO_UPRIGHT: dict[Axis, tuple[float, float, float, float]] = {
     "x": (_HALF, 0.0, 0.0, -_HALF),
@@ -31,11 +33,15 @@ _TO_UPRIGHT: dict[Axis, tuple[float, float, float, float]] = {
     "-z": (_HALF, -_HALF, 0.0, 0.0),
 }
 # From there to where y is up, as in WebGL, and z, as on a globe.
-_FROM_UPRIGHT = {"y": np.diag([-1.0, -1.0, 1.0]), "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
+_FROM_UPRIGHT = {
+    "y": np.diag([-1.0, -1.0, 1.0]),
+    "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+}
 
 
 def turn_upright(up: Axis) -> Floats:
-    """(4,) w x y z that turns what is up in an asset to -y; ValueError for another name."""
+    """(4,) w x y z that turns what is up in an asset to -y; ValueError for another
+    name."""
     one_of(up, "up", tuple(_TO_UPRIGHT))
     return np.array(_TO_UPRIGHT[up])
 
@@ -46,13 +52,15 @@ def rotation_to(up: Axis, frame: Literal["y", "z"]) -> Floats:
 
 
 def names_of(scene: Scene, reserved: Collection[str] = ()) -> list[str]:
-    """The name of a folder for each bundle, made from that of its file; no reserved name is used."""
+    """The name of a folder for each bundle, made from that of its file; no reserved
+    name is used."""
     stems = [beside(bundle.path or "bundle").stem[:80] for bundle in scene.bundles]
     return distinct([_OTHER_LETTERS.sub("_", stem) for stem in stems], reserved)
 
 
 def distinct(names: Iterable[str], reserved: Collection[str] = ()) -> list[str]:
-    """The names with a number added to each that is reserved or repeats an earlier one, whatever its case."""
+    """The names with a number added to each that is reserved or repeats an earlier one,
+    whatever its case."""
     results: list[str] = []
     used = {name.casefold() for name in reserved}
     for number, name in enumerate(names):
@@ -72,13 +80,18 @@ def rows_by(numbers: NDArray[np.int32] | NDArray[np.int64], count: int) -> list[
 
 
 def detail_of(bundle: Bundle) -> dict[str, float]:
-    """How far levels reach: `reach` times focal length in px over √tolerance is where level 1 is enough.
+    """How far levels reach: `reach` times focal length in px over √tolerance is where
+    level 1 is enough.
 
     Each further level is enough from `ratio` times the distance of the one before it.
     """
     groups = bundle.groups
-    radius = groups.ball[:, 3].astype(np.float64) * np.sqrt(math.pi * groups.weight.astype(np.float64))
-    reach = [float(np.median(radius[groups.level == level])) for level in range(1, bundle.num_levels)]
+    radius = groups.ball[:, 3].astype(np.float64) * np.sqrt(
+        math.pi * groups.weight.astype(np.float64)
+    )
+    reach = [
+        float(np.median(radius[groups.level == level])) for level in range(1, bundle.num_levels)
+    ]
     if not reach:
         return {"reach": 0.0, "ratio": math.sqrt(2)}
     ratio = (reach[-1] / reach[0]) ** (1 / max(1, len(reach) - 1))

@@ -1,9 +1,11 @@
-"""The folder of an export: what an earlier one wrote there is replaced, and nothing else is touched.
+"""The folder of an export: what an earlier one wrote there is replaced, and nothing
+else is touched.
 
-New files are written to `new` in a hidden folder inside, so that all moves stay within one file system. Once
-they are complete, the record of them is written beside `new`, what they replace goes to `old`, and they take
-its place; the move of the record ends it. Until then all goes back to where it was: on an error at once, and
-after the process was killed when the next export begins.
+New files are written to `new` in a hidden folder inside, so that all moves stay within
+one file system. Once they are complete, the record of them is written beside `new`,
+what they replace goes to `old`, and they take its place; the move of the record ends
+it. Until then all goes back to where it was: on an error at once, and after the process
+was killed when the next export begins.
 """
 
 import contextlib
@@ -41,7 +43,8 @@ class NewFiles:
 
     Attributes:
         path: A folder for the new files, which take their place at the end.
-        earlier: Files of an earlier export that are as they were written; all others stay.
+        earlier: Files of an earlier export that are as they were written; all others
+            stay.
     """
 
     path: Path
@@ -49,7 +52,8 @@ class NewFiles:
 
 
 def check_outside(folder: Path, inputs: Iterable[str | os.PathLike[str] | None]) -> None:
-    """Refuse, with ValueError, to write to a folder that a file lies in that is read."""
+    """Refuse, with ValueError, to write to a folder that a file lies in that is
+    read."""
     if not folder.is_dir():
         return
     status = folder.stat()
@@ -58,28 +62,33 @@ def check_outside(folder: Path, inputs: Iterable[str | os.PathLike[str] | None])
             continue
         parents = [parent for parent in Path(os.path.realpath(path)).parents if parent.exists()]
         if any(os.path.samestat(parent.stat(), status) for parent in parents):
-            raise ValueError(f"{folder}: {os.fspath(path)}, which is read, is in it; choose another folder")
+            raise ValueError(
+                f"{folder}: {os.fspath(path)}, which is read, is in it; choose another folder"
+            )
 
 
 @contextlib.contextmanager
 def replacing_export(
     folder: Path, scene: Scene, certain: Iterable[str] = (), *, overwrite: bool = False
 ) -> Iterator[NewFiles]:
-    """Give a folder to fill; at the end its files take the place of those of an earlier export.
+    """Give a folder to fill; at the end its files take the place of those of an earlier
+    export.
 
-    The folder itself stays, with its permissions. On a failure it is as it was, and where it was not there,
-    it is not there.
+    The folder itself stays, with its permissions. On a failure it is as it was, and
+    where it was not there, it is not there.
 
     Args:
         folder: Where to; a link to a folder stays one.
         scene: What is exported, whose files may not be in the folder.
-        certain: Names of files that will be written, so that it is known at once whether they may.
-        overwrite: Whether files of the same names may be replaced that are not of an earlier export. All
-            others stay in any case.
+        certain: Names of files that will be written, so that it is known at once
+            whether they may.
+        overwrite: Whether files of the same names may be replaced that are not of an
+            earlier export. All others stay in any case.
 
     Raises:
-        ValueError: A file that is read is in the folder, there is something else at ``folder``, something may
-            not be replaced, or the record of the earlier export is none.
+        ValueError: A file that is read is in the folder, there is something else at
+            ``folder``, something may not be replaced, or the record of the earlier
+            export is none.
         RuntimeError: Another export is using the folder.
         OSError: A file cannot be written.
     """
@@ -101,7 +110,8 @@ def replacing_export(
 
 
 def _restore_and_remove(root: Folder, hidden: str, folder: Path) -> None:
-    """Bring back what an export moved that did not end, and remove its hidden folder, which is its alone."""
+    """Bring back what an export moved that did not end, and remove its hidden folder,
+    which is its alone."""
     with contextlib.suppress(OSError, ValueError):  # what failed before is told
         if _restore(root, hidden, folder):
             _remove_unused_folders(root, hidden, folder)
@@ -114,7 +124,8 @@ def _restore_and_remove(root: Folder, hidden: str, folder: Path) -> None:
 
 @contextlib.contextmanager
 def _made(folder: Path) -> Iterator[Path]:
-    """The folder without links, made with those above it, which are gone again on a failure if empty."""
+    """The folder without links, made with those above it, which are gone again on a
+    failure if empty."""
     target = Path(os.path.realpath(folder))
     missing = [path for path in (target, *target.parents) if not path.exists()]  # the lowest first
     try:
@@ -129,17 +140,24 @@ def _made(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _naming_errors(folder: Path, target: Path) -> Iterator[None]:
-    """Have the system's errors name files as they will be called, outside of the hidden folder."""
+    """Have the system's errors name files as they will be called, outside of the hidden
+    folder."""
     try:
         yield
     except OSError as error:
         name = error.filename
-        if error.errno is None or not isinstance(name, str) or not Path(name).is_relative_to(target):
+        if (
+            error.errno is None
+            or not isinstance(name, str)
+            or not Path(name).is_relative_to(target)
+        ):
             raise
         parts = Path(name).relative_to(target).parts
         if parts and _HIDDEN.fullmatch(parts[0]):
             parts = parts[2:]
-        raise OSError(error.errno, os.strerror(error.errno), os.fspath(folder.joinpath(*parts))) from error
+        raise OSError(
+            error.errno, os.strerror(error.errno), os.fspath(folder.joinpath(*parts))
+        ) from error
 
 
 class _Place:
@@ -155,8 +173,12 @@ class _Place:
             _clear_up(root, name, folder)
         record = read_record(root, RECORD, folder / RECORD)
         is_empty = not set(os.listdir(root.descriptor)) - set(unfinished)
-        advice = "choose another, or overwrite, which replaces files of the same names and removes none"
-        expected = f"a new folder, or one with an earlier export, got one without {RECORD}; {advice}"
+        advice = (
+            "choose another, or overwrite, which replaces files of the same names and removes none"
+        )
+        expected = (
+            f"a new folder, or one with an earlier export, got one without {RECORD}; {advice}"
+        )
         check(folder, overwrite or is_empty or record is not None, expected)
         self._record = record or Record({}, [])
         self.earlier: dict[str, Stamp] = self._record.unchanged(root)
@@ -164,7 +186,8 @@ class _Place:
             self.earlier[RECORD] = _stamp(root, RECORD)
 
     def check(self, names: Iterable[str]) -> None:
-        """Refuse, with ValueError, to write files of these names where something has them that may not go."""
+        """Refuse, with ValueError, to write files of these names where something has
+        them that may not go."""
         for name in names:
             for parent in folders_above(name):
                 status = self._root.status(parent)
@@ -176,17 +199,24 @@ class _Place:
                 continue
             expected = "a file, got a folder, a link or a device, which an export does not replace"
             check(self._folder / name, is_file(status), f"{expected}; move it elsewhere")
-            expected = "a file of an earlier export, got one that was changed, or that no export wrote"
+            expected = (
+                "a file of an earlier export, got one that was changed, or that no export wrote"
+            )
             advice = "move it elsewhere, or overwrite"
             check(self._folder / name, self._overwrite, f"{expected}; {advice}")
 
     def put(self, record: Record, path: Path) -> None:
-        """Have the new files take the place of the earlier ones; `path` is for the new record until then."""
+        """Have the new files take the place of the earlier ones; `path` is for the new
+        record until then."""
         root = self._root
         hidden = self.hidden
         self.check([*record.files, RECORD])
         earlier = self._record.folders
-        folders = [name for name in folders_of(record.files) if name in earlier or root.status(name) is None]
+        folders = [
+            name
+            for name in folders_of(record.files)
+            if name in earlier or root.status(name) is None
+        ]
         path.write_bytes(Record(record.files, folders).encode())
         for name in dict.fromkeys((*self.earlier, *record.files)):
             status = root.status(name)
@@ -205,7 +235,8 @@ def _stamp(root: Folder, name: str) -> Stamp:
 
 
 def _restore(root: Folder, hidden: str, folder: Path) -> bool:
-    """Bring all back that was moved for an export that did not end; returns whether all is in its place."""
+    """Bring all back that was moved for an export that did not end; returns whether all
+    is in its place."""
     record = read_record(root, f"{hidden}/{RECORD}", folder / hidden / RECORD)
     if record is None:  # it had not begun to move anything, or has ended
         return True
@@ -229,7 +260,8 @@ def _restore(root: Folder, hidden: str, folder: Path) -> bool:
 
 
 def _remove_unused_folders(root: Folder, hidden: str, folder: Path) -> None:
-    """Remove what an earlier export made, if it is empty and the one that replaced it does not use it."""
+    """Remove what an earlier export made, if it is empty and the one that replaced it
+    does not use it."""
     earlier = read_record(root, f"{hidden}/old/{RECORD}", folder / hidden / "old" / RECORD)
     later = read_record(root, RECORD, folder / RECORD)
     if earlier is not None and later is not None:
@@ -238,7 +270,8 @@ def _remove_unused_folders(root: Folder, hidden: str, folder: Path) -> None:
 
 
 def _clear_up(root: Folder, hidden: str, folder: Path) -> None:
-    """After an export that was killed: bring back what it moved, and remove what records say that it wrote.
+    """After an export that was killed: bring back what it moved, and remove what
+    records say that it wrote.
 
     What it wrote before there was a record stays.
     """
@@ -246,7 +279,8 @@ def _clear_up(root: Folder, hidden: str, folder: Path) -> None:
         if not _restore(root, hidden, folder):
             return
         _remove_unused_folders(root, hidden, folder)
-        # It went back and has a record, or it ended, and that of the earlier one is left.
+        # It went back and has a record, or it ended, and that of the earlier one is
+        # left.
         present = read_record(root, RECORD, folder / RECORD)
         folders: set[str] = set()
         if present is not None:

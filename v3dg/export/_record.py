@@ -1,7 +1,8 @@
 """The record of an export: which files and folders it wrote, and what was in the files.
 
-It lies in the folder of the export, so anybody may have written it: only names that an export can have, all
-of them below the folder, are taken from it, and only files with the size and the hash that it gives are ours.
+It lies in the folder of the export, so anybody may have written it: only names that an
+export can have, all of them below the folder, are taken from it, and only files with
+the size and the hash that it gives are ours.
 """
 
 import hashlib
@@ -33,7 +34,8 @@ _HASH = re.compile(f"[0-9a-f]{{{2 * _HASH_BYTES}}}")
 
 
 class Stamp(NamedTuple):
-    """The identity of a file: another file, or one that was written to, has another stamp."""
+    """The identity of a file: another file, or one that was written to, has another
+    stamp."""
 
     inode: int
     num_bytes: int
@@ -51,14 +53,16 @@ class Content:
 
 @dataclass(frozen=True)
 class Record:
-    """Files by their names relative to the folder, and the folders that were made for them."""
+    """Files by their names relative to the folder, and the folders that were made for
+    them."""
 
     files: dict[str, Content]
     folders: list[str]
 
     @classmethod
     def of_files_below(cls, path: Path) -> "Record":
-        """The record of all files below a folder that nobody else writes to; without folders.
+        """The record of all files below a folder that nobody else writes to; without
+        folders.
 
         Files that others refer to come last.
         """
@@ -73,7 +77,8 @@ class Record:
         return json.dumps(document, separators=(",", ":")).encode("ascii")
 
     def unchanged(self, root: Folder, prefix: str = "") -> dict[str, Stamp]:
-        """Of the files that are there, below `prefix`, those that are as they were written."""
+        """Of the files that are there, below `prefix`, those that are as they were
+        written."""
         stamps: dict[str, Stamp] = {}
         for name, content in self.files.items():
             stamp = stamp_of_content(root, f"{prefix}{name}", content)
@@ -101,7 +106,11 @@ def read_record(root: Folder, name: str, display_path: Path) -> Record | None:
     check(display_path, is_file(status), expected)
     with open(root.open_file(name), "rb") as file:
         text = file.read(_MOST_BYTES + 1)
-    check(display_path, len(text) <= _MOST_BYTES, f"a record of at most {_MOST_BYTES >> 20} MiB, got more")
+    check(
+        display_path,
+        len(text) <= _MOST_BYTES,
+        f"a record of at most {_MOST_BYTES >> 20} MiB, got more",
+    )
     try:
         document = Node(parse_json(text), str(display_path), "")
     except ValueError as error:
@@ -121,10 +130,13 @@ def read_record(root: Folder, name: str, display_path: Path) -> Record | None:
 
 
 def _checked_name(node: Node, pattern: re.Pattern[str]) -> str:
-    """A name that an export can have written; others lead elsewhere, or to what is not ours."""
+    """A name that an export can have written; others lead elsewhere, or to what is not
+    ours."""
     name = node.value
     if not isinstance(name, str) or not pattern.fullmatch(name) or name == RECORD:
-        raise node.error("a name that an export writes, below its folder", "remove the record to start again")
+        raise node.error(
+            "a name that an export writes, below its folder", "remove the record to start again"
+        )
     return name
 
 
@@ -139,7 +151,8 @@ def _content_of_node(node: Node) -> Content:
 
 
 def stamp_of_content(root: Folder, name: str, content: Content) -> Stamp | None:
-    """The stamp of a file that holds just this; None for any other, or what cannot be read."""
+    """The stamp of a file that holds just this; None for any other, or what cannot be
+    read."""
     try:
         descriptor = root.open_file(name)
     except (OSError, ValueError):
@@ -175,4 +188,6 @@ def _digest_of(file: io.FileIO) -> str:
 
 def folders_of(names: Iterable[str]) -> list[str]:
     """The folders that files are in, the highest first."""
-    return sorted({name[:end] for name in names for end, letter in enumerate(name) if letter == "/"})
+    return sorted(
+        {name[:end] for name in names for end, letter in enumerate(name) if letter == "/"}
+    )

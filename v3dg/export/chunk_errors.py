@@ -1,4 +1,5 @@
-"""How far the coarser levels of chunks are from the finest, in pictures of them: `errors` of streamed SOG."""
+"""How far the coarser levels of chunks are from the finest, in pictures of them:
+`errors` of streamed SOG."""
 
 from collections import defaultdict
 from typing import NamedTuple
@@ -27,8 +28,9 @@ class _Finest(NamedTuple):
 class ChunkErrors:
     """Errors of chunks whose levels are added from the finest on.
 
-    An error is the mean of the squared differences of colour and alpha from the pictures of the finest level,
-    from four sides. It never falls from a level to the next. Of each chunk 128 KiB of pictures are kept.
+    An error is the mean of the squared differences of colour and alpha from the
+    pictures of the finest level, from four sides. It never falls from a level to the
+    next. Of each chunk 128 KiB of pictures are kept.
 
     Attributes:
         of_chunk: The errors by chunk, a number for each level.

@@ -1,6 +1,8 @@
-"""A scene as a web page: every bundle once as streamed SOG, instances, cameras, and a page that draws them.
+"""A scene as a web page: every bundle once as streamed SOG, instances, cameras, and a
+page that draws them.
 
-The page needs nothing but a static server and PlayCanvas's engine, one file of its npm package.
+The page needs nothing but a static server and PlayCanvas's engine, one file of its npm
+package.
 """
 
 import math
@@ -29,7 +31,8 @@ from v3dg.upright import up_of
 SITE = "site.json"
 ENGINE = "playcanvas.min.mjs"
 SITE_NEEDS = "npm install playcanvas@2.23.3", f"cp node_modules/playcanvas/build/{ENGINE} {{}}/"
-"""Commands that bring PlayCanvas's engine, in the version that the page is tested with, to a folder."""
+"""Commands that bring PlayCanvas's engine, in the version that the page is tested with,
+to a folder."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,8 @@ class Site:
         bundles: Bundles, each of them once.
         instances: Instances of them.
         gaussians: Of the finest level, of all instances.
-        coarsest: Of the coarsest level, of all instances: the least that a viewer can come down to.
+        coarsest: Of the coarsest level, of all instances: the least that a viewer can
+            come down to.
         bytes: Of all files that were written.
         has_engine: Whether PlayCanvas's engine is beside the page.
     """
@@ -63,15 +67,18 @@ def write_site(
     progress: Progress = False,
     overwrite: bool = False,
 ) -> Site:
-    """Write a scene or a bundle as a web page, replacing the files of an earlier export once all is written.
+    """Write a scene or a bundle as a web page, replacing the files of an earlier export
+    once all is written.
 
-    The levels of a bundle alone are in the folder itself, those of a scene's bundles in folders of their own.
-    PlayCanvas's engine is that of the folder, or taken from `node_modules` here or above.
+    The levels of a bundle alone are in the folder itself, those of a scene's bundles in
+    folders of their own. PlayCanvas's engine is that of the folder, or taken from
+    `node_modules` here or above.
 
     Args:
         subject: Or its file, of which a scene's brings cameras.
-        folder: Where to; new, empty, or with an earlier export. Folders above it are made. `v3dg-export.json`
-            in it says what was written, and nothing else is replaced or removed.
+        folder: Where to; new, empty, or with an earlier export. Folders above it are
+            made. `v3dg-export.json` in it says what was written, and nothing else is
+            replaced or removed.
         cameras: From where to look, by name; the page begins with the first.
         chunk: As in `write_streamed_sog`.
         up: What is up in the world; as `v3dg.upright.up_of` takes it if None.
@@ -105,7 +112,8 @@ def write_site(
     with replacing_export(Path(folder), scene, certain, overwrite=overwrite) as new:
         levels = _write_bundles(plans, names, new.path, turn, progress)
         bundles = [
-            _bundle(name, plan, export) for name, plan, export in zip(names, plans, levels, strict=True)
+            _bundle(name, plan, export)
+            for name, plan, export in zip(names, plans, levels, strict=True)
         ]
         _common.write_document(new.path / SITE, _document(scene, bundles, axes, cameras))
         _common.write_page(new.path, "site.html")
@@ -125,7 +133,8 @@ class _Axes(NamedTuple):
 
 
 def _axes(is_scene: bool, up: Axis) -> _Axes:
-    """A bundle alone is turned to what viewers take to be up; a scene's stay as its instances have them."""
+    """A bundle alone is turned to what viewers take to be up; a scene's stay as its
+    instances have them."""
     if is_scene:
         return _Axes(asset="-y", files=up, cameras=up)
     return _Axes(asset=up, files="-y", cameras=up)
@@ -134,7 +143,8 @@ def _axes(is_scene: bool, up: Axis) -> _Axes:
 def _write_bundles(
     plans: list[Plan], names: list[str], folder: Path, turn: Floats, progress: Progress
 ) -> list[Export]:
-    """Write the levels of each bundle to the folder of its name, which is made unless it is `.`."""
+    """Write the levels of each bundle to the folder of its name, which is made unless
+    it is `.`."""
     levels: list[Export] = []
     with Bar(sum(plan.bundle.num_gaussians for plan in plans), "export", progress) as bar:
         for name, plan in zip(names, plans, strict=True):
@@ -186,15 +196,19 @@ def _camera(name: str, camera: Camera) -> dict[str, object]:
 
 
 def _bring_engine(folder: Path, new: NewFiles) -> bool:
-    """Have PlayCanvas's engine beside the page, if npm or somebody else has put it anywhere.
+    """Have PlayCanvas's engine beside the page, if npm or somebody else has put it
+    anywhere.
 
-    One that an earlier export brought is part of this one, too; one that somebody put there stays.
+    One that an earlier export brought is part of this one, too; one that somebody put
+    there stays.
     """
     present = folder / ENGINE
     if present.is_file() and ENGINE not in new.earlier:
         return True
     start = Path.cwd()
-    modules = [parent / "node_modules" / "playcanvas" / "build" for parent in (start, *start.parents)]
+    modules = [
+        parent / "node_modules" / "playcanvas" / "build" for parent in (start, *start.parents)
+    ]
     for place in (folder, *modules):
         engine = place / ENGINE
         if engine.is_file():

@@ -1,9 +1,11 @@
-"""A bundle for stock web viewers: streamed SOG, the level-of-detail format of PlayCanvas and SuperSplat.
+"""A bundle for stock web viewers: streamed SOG, the level-of-detail format of
+PlayCanvas and SuperSplat.
 
-The asset is cut into chunks, which are subtrees of the bundle, and a viewer chooses a level for each. Up to
-the level at which a single group is left of a chunk, any choice is a cut of the bundle; of coarser levels a
-chunk has the gaussians that are nearest to it. Chunks of one level are stored side by side in folders of SOG,
-and `lod-meta.json` says which gaussians of which folder they are.
+The asset is cut into chunks, which are subtrees of the bundle, and a viewer chooses a
+level for each. Up to the level at which a single group is left of a chunk, any choice
+is a cut of the bundle; of coarser levels a chunk has the gaussians that are nearest to
+it. Chunks of one level are stored side by side in folders of SOG, and `lod-meta.json`
+says which gaussians of which folder they are.
 """
 
 import json
@@ -39,7 +41,8 @@ from v3dg.upright import up_of
 INDEX = "lod-meta.json"
 SETTINGS = "settings.json"
 DEFAULT_CHUNK = 16384
-# A folder is filled chunk by chunk until it holds so many gaussians: about a megabyte to load at once.
+# A folder is filled chunk by chunk until it holds so many gaussians: about a megabyte
+# to load at once.
 _FOLDER_GAUSSIANS = 1 << 17
 _FOV_DEGREES = 50.0  # vertical, of the camera that a viewer starts with
 
@@ -53,7 +56,8 @@ class _Lod(TypedDict):
 
 
 class _Leaf(TypedDict):
-    """The levels of a chunk, by their numbers as text, and how far each is from the finest."""
+    """The levels of a chunk, by their numbers as text, and how far each is from the
+    finest."""
 
     lods: dict[str, _Lod]
     errors: list[float]
@@ -112,26 +116,30 @@ def write_streamed_sog(
     progress: Progress = False,
     overwrite: bool = False,
 ) -> Export:
-    """Write a bundle as streamed SOG, replacing the files of an earlier export once all is written.
+    """Write a bundle as streamed SOG, replacing the files of an earlier export once all
+    is written.
 
-    Besides, `settings.json` tells SuperSplat's viewer where to start. Memory is needed for one folder of SOG,
-    and for 128 KiB of pictures a chunk.
+    Besides, `settings.json` tells SuperSplat's viewer where to start. Memory is needed
+    for one folder of SOG, and for 128 KiB of pictures a chunk.
 
     Args:
         bundle: Or the file of it.
-        folder: Where to; new, empty, or with an earlier export. Folders above it are made. `v3dg-export.json`
-            in it says what was written, and nothing else is replaced or removed.
-        chunk: Most gaussians of the asset in a chunk. Smaller chunks follow the view more closely, and fewer
-            of their levels go together exactly, whichever each of them has.
-        up: What is up in the asset, which is turned to what viewers take to be up. Trained assets mostly have
-            y down, so nothing is turned.
+        folder: Where to; new, empty, or with an earlier export. Folders above it are
+            made. `v3dg-export.json` in it says what was written, and nothing else is
+            replaced or removed.
+        chunk: Most gaussians of the asset in a chunk. Smaller chunks follow the view
+            more closely, and fewer of their levels go together exactly, whichever each
+            of them has.
+        up: What is up in the asset, which is turned to what viewers take to be up.
+            Trained assets mostly have y down, so nothing is turned.
         progress: As in `v3dg.build_bundle`.
-        overwrite: Write to any folder, and replace files of the same names there; all others stay.
+        overwrite: Write to any folder, and replace files of the same names there; all
+            others stay.
 
     Raises:
-        ValueError: There is something else at ``folder``, or the bundle's file is in it; a file of the
-            earlier export was changed; ``chunk`` is too small for the bundle's groups; or a gaussian has
-            values that SOG cannot hold.
+        ValueError: There is something else at ``folder``, or the bundle's file is in
+            it; a file of the earlier export was changed; ``chunk`` is too small for the
+            bundle's groups; or a gaussian has values that SOG cannot hold.
         RuntimeError: Another export is using the folder.
         OSError: A file cannot be written.
 
@@ -148,7 +156,9 @@ def write_streamed_sog(
         return write_levels(plan, new.path, turn, bar.update)
 
 
-def write_levels(plan: "Plan", place: Path, turn: Floats, advance: Callable[[int], object]) -> Export:
+def write_levels(
+    plan: "Plan", place: Path, turn: Floats, advance: Callable[[int], object]
+) -> Export:
     """Fill a folder with the levels of a bundle, turned by a quaternion (4,)."""
     folders = _write_folders(place, plan, turn, advance)
     counts = folders.counts
@@ -170,7 +180,9 @@ def write_levels(plan: "Plan", place: Path, turn: Floats, advance: Callable[[int
     return Export(counts, plan.num_chunks, len(folders.names), _common.bytes_below(place))
 
 
-def _write_folders(place: Path, plan: "Plan", turn: Floats, advance: Callable[[int], object]) -> _Folders:
+def _write_folders(
+    place: Path, plan: "Plan", turn: Floats, advance: Callable[[int], object]
+) -> _Folders:
     """Write the gaussians of all levels to one folder of SOG after another."""
     names: list[str] = []
     errors = ChunkErrors()
@@ -185,7 +197,11 @@ def _write_folders(place: Path, plan: "Plan", turn: Floats, advance: Callable[[i
         for number, part in enumerate(plan.parts(level)):
             chunk = check_writable(part).transform(turn)
             errors.add(number, chunk)
-            leaves[number]["lods"][str(level)] = {"file": len(names), "offset": size, "count": len(chunk)}
+            leaves[number]["lods"][str(level)] = {
+                "file": len(names),
+                "offset": size,
+                "count": len(chunk),
+            }
             parts.append(chunk.subset(_core.morton_order(chunk.means)))
             size += len(chunk)
             if size >= _FOLDER_GAUSSIANS or number == plan.num_chunks - 1:
@@ -207,8 +223,10 @@ def _write_sog(folder: Path, gaussians: Gaussians) -> None:
 
 
 def _viewer_settings(gaussians: Gaussians) -> dict[str, object]:
-    """What SuperSplat's viewer reads beside an asset: a camera that shows most of it, and no effects."""
-    # Viewers have y up and turn an asset, whose y is taken to be down, by half a turn about z.
+    """What SuperSplat's viewer reads beside an asset: a camera that shows most of it,
+    and no effects."""
+    # Viewers have y up and turn an asset, whose y is taken to be down, by half a turn
+    # about z.
     centre, radius = ball_of_most(gaussians.means.astype(np.float64) * (-1.0, -1.0, 1.0))
     distance = 1.2 * radius / math.sin(math.radians(_FOV_DEGREES) / 2)
     position = centre + distance * np.array([0.4, 0.4, 0.8]) / np.linalg.norm([0.4, 0.4, 0.8])
@@ -219,11 +237,14 @@ def _viewer_settings(gaussians: Gaussians) -> dict[str, object]:
 
 @dataclass(frozen=True)
 class Plan:
-    """Chunks of a bundle: the groups of its level `top`, or all of a bundle of one level.
+    """Chunks of a bundle: the groups of its level `top`, or all of a bundle of one
+    level.
 
     Attributes:
-        chunk_of_cluster: (C,) number of the chunk, or -1 for clusters of coarser levels than `top`.
-        chunk_of_group: (G,) number of the chunk that a group of level `top` is, else -1.
+        chunk_of_cluster: (C,) number of the chunk, or -1 for clusters of coarser levels
+            than `top`.
+        chunk_of_group: (G,) number of the chunk that a group of level `top` is, else
+            -1.
     """
 
     bundle: Bundle
@@ -257,7 +278,8 @@ class Plan:
         number = np.full(len(groups), -1, np.int64)
         tops = np.flatnonzero(groups.level == top)
         number[tops] = np.arange(len(tops))
-        # A cluster belongs to the group that replaces it; those at the top to the group that made them.
+        # A cluster belongs to the group that replaces it; those at the top to the group
+        # that made them.
         group = np.where(clusters.level < top, clusters.parent_group, clusters.own_group)
         chunk_of_cluster = np.where(clusters.level <= top, number[ancestor[group]], -1)
         return cls(bundle, top, len(tops), chunk_of_cluster, number)
@@ -277,7 +299,8 @@ class Plan:
     def _nearest_chunks(
         self, gaussians: Gaussians, clusters: NDArray[np.int64], level: int
     ) -> NDArray[np.int64]:
-        """The chunk of each gaussian of a level above `top`: the nearest one below the gaussian's group."""
+        """The chunk of each gaussian of a level above `top`: the nearest one below the
+        gaussian's group."""
         table = self.bundle.clusters
         groups = self.bundle.groups
         tops = np.flatnonzero(self.chunk_of_group >= 0)
@@ -301,11 +324,14 @@ class Plan:
         return [clusters[rows] for rows in chunks]
 
     def tree(self, leaves: list[_Leaf], turn: Floats) -> _TreeNode:
-        """The spatial index: the groups above the chunks, with bounds, in boxes that stay along the axes."""
+        """The spatial index: the groups above the chunks, with bounds, in boxes that
+        stay along the axes."""
         parent = self.bundle.groups.parent
         nodes = self._leaf_nodes(leaves, turn)
         node_of_group = {
-            group: nodes[chunk] for group, chunk in enumerate(self.chunk_of_group.tolist()) if chunk in nodes
+            group: nodes[chunk]
+            for group, chunk in enumerate(self.chunk_of_group.tolist())
+            if chunk in nodes
         }
         if not node_of_group:
             node_of_group = {-1: nodes[0]}
@@ -317,7 +343,8 @@ class Plan:
         return node_of_group[-1]
 
     def _leaf_nodes(self, leaves: list[_Leaf], turn: Floats) -> dict[int, _TreeNode]:
-        """The leaves with their bounds, by the numbers of those chunks that have gaussians."""
+        """The leaves with their bounds, by the numbers of those chunks that have
+        gaussians."""
         clusters = self.bundle.clusters
         used = np.flatnonzero((self.chunk_of_cluster >= 0) & (np.diff(clusters.offset) > 0))
         corners = clusters.box.astype(np.float64) @ rotation_from_quaternion(turn).T

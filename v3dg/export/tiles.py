@@ -1,8 +1,10 @@
-"""Scenes and bundles as 3D Tiles 1.1: a group of a bundle is a tile, refined by replacement.
+"""Scenes and bundles as 3D Tiles 1.1: a group of a bundle is a tile, refined by
+replacement.
 
-A tile's content is what its group makes; its children are the groups below and, at the bottom, the gaussians
-of the asset. An instance is a tile that transforms the tileset of its bundle. Geometric errors are those at
-which a renderer's screen-space error of 16 px, the usual limit, is v3dg's tolerance of 3 px².
+A tile's content is what its group makes; its children are the groups below and, at the
+bottom, the gaussians of the asset. An instance is a tile that transforms the tileset of
+its bundle. Geometric errors are those at which a renderer's screen-space error of 16
+px, the usual limit, is v3dg's tolerance of 3 px².
 """
 
 import math
@@ -35,7 +37,8 @@ TILESET = "tileset.json"
 CESIUM = "cesium"
 """Folder beside the page with CesiumJS, which is not part of the export."""
 TILES_NEED = "npm install cesium@1.145.0", f"cp -r node_modules/cesium/Build/Cesium {{}}/{CESIUM}"
-"""Commands that bring CesiumJS, in the version that the page is tested with, to a folder."""
+"""Commands that bring CesiumJS, in the version that the page is tested with, to a
+folder."""
 
 _SCREEN_SPACE_ERROR = 16.0  # px, CesiumJS's limit where none is given
 # The content's y is up, the tiles' z.
@@ -90,27 +93,32 @@ def write_tiles(
     progress: Progress = False,
     overwrite: bool = False,
 ) -> Tiles:
-    """Write a scene or a bundle as 3D Tiles, replacing the files of an earlier export once all is written.
+    """Write a scene or a bundle as 3D Tiles, replacing the files of an earlier export
+    once all is written.
 
-    Tiles are `.glb` files with KHR_gaussian_splatting, compressed as SPZ. The importance of instances is left
-    out. The world's origin is at that of the tiles, the Earth's centre; viewers can put it elsewhere.
+    Tiles are `.glb` files with KHR_gaussian_splatting, compressed as SPZ. The
+    importance of instances is left out. The world's origin is at that of the tiles, the
+    Earth's centre; viewers can put it elsewhere.
 
     Args:
         subject: Or the file of it.
-        folder: Where to; new, empty, or with an earlier export. Folders above it are made. `v3dg-export.json`
-            in it says what was written, and nothing else is replaced or removed.
+        folder: Where to; new, empty, or with an earlier export. Folders above it are
+            made. `v3dg-export.json` in it says what was written, and nothing else is
+            replaced or removed.
         up: What is up in the world; as `v3dg.upright.up_of` takes it if None.
         progress: As in `v3dg.build_bundle`.
-        overwrite: Write to any folder, and replace files of the same names there; all others stay.
+        overwrite: Write to any folder, and replace files of the same names there; all
+            others stay.
 
     Raises:
-        ValueError: There is something else at ``folder``, or a file that is read is in it; a file of the
-            earlier export was changed; there is nothing to export; or a gaussian has values that SPZ cannot
-            hold.
+        ValueError: There is something else at ``folder``, or a file that is read is in
+            it; a file of the earlier export was changed; there is nothing to export; or
+            a gaussian has values that SPZ cannot hold.
         RuntimeError: Another export is using the folder.
         OSError: A file cannot be written.
 
-    Source: OGC, 3D Tiles 1.1; Khronos, KHR_gaussian_splatting and its compression by SPZ.
+    Source: OGC, 3D Tiles 1.1; Khronos, KHR_gaussian_splatting and its compression by
+    SPZ.
     """
     if isinstance(subject, str | os.PathLike):
         check_outside(Path(folder), [subject])
@@ -133,7 +141,8 @@ def write_tiles(
 
 
 def _write_bundles(scene: Scene, names: list[str], folder: Path, progress: Progress) -> list[_Tile]:
-    """Write a tileset of each bundle to a folder of its name; returns their root tiles."""
+    """Write a tileset of each bundle to a folder of its name; returns their root
+    tiles."""
     trees: list[_Tile] = []
     with Bar(sum(bundle.num_gaussians for bundle in scene.bundles), "export", progress) as bar:
         for name, bundle in zip(names, scene.bundles, strict=True):
@@ -154,7 +163,9 @@ def _instances(scene: Scene, names: list[str], trees: list[_Tile]) -> list[_Tile
             "geometricError": trees[bundle]["geometricError"],
             "content": {"uri": f"{names[bundle]}/{TILESET}"},
         }
-        for bundle, transform in zip(scene.instance_bundle.tolist(), _transforms(scene), strict=True)
+        for bundle, transform in zip(
+            scene.instance_bundle.tolist(), _transforms(scene), strict=True
+        )
     ]
 
 
@@ -170,28 +181,36 @@ class _Writer:
         radius = groups.ball[:, 3].astype(np.float64)
         limit = _SCREEN_SPACE_ERROR / math.sqrt(DEFAULT_TOLERANCE)
         self._error = limit * radius * np.sqrt(math.pi * groups.weight.astype(np.float64))
-        # By group: the groups below it, the clusters that it made, and those that it replaces.
+        # By group: the groups below it, the clusters that it made, and those that it
+        # replaces.
         self._children = _common.rows_by(groups.parent, len(groups))
         self._clusters = _common.rows_by(clusters.own_group, len(groups))
         self._replaced = _common.rows_by(clusters.parent_group, len(groups))
         self.tops = np.flatnonzero(groups.parent < 0).tolist() or [-1]
 
     def tile_of(self, group: int) -> _Tile:
-        """The tile of a group with all tiles below it; of -1, that of a bundle without groups."""
+        """The tile of a group with all tiles below it; of -1, that of a bundle without
+        groups."""
         if group < 0:
             return self._tile("asset", np.arange(len(self._bundle.clusters)), 0.0, [])
         level = self._bundle.groups.level[group]
         children = [self.tile_of(child) for child in self._children[group].tolist()]
         if level == 1:
             children = [self._tile(f"0_{group}", self._replaced[group], 0.0, [])]
-        return self._tile(f"{level}_{group}", self._clusters[group], float(self._error[group]), children)
+        return self._tile(
+            f"{level}_{group}", self._clusters[group], float(self._error[group]), children
+        )
 
-    def _tile(self, name: str, clusters: NDArray[np.intp], error: float, children: list[_Tile]) -> _Tile:
+    def _tile(
+        self, name: str, clusters: NDArray[np.intp], error: float, children: list[_Tile]
+    ) -> _Tile:
         boxes = self._bundle.clusters.box[clusters].astype(np.float64)
         bounds = np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
         volume = _box([bounds, *map(_bounds, children)])
         tile: _Tile = {"boundingVolume": volume, "geometricError": error}
-        gaussians = Gaussians.concatenate([self._bundle.cluster_gaussians(int(c)) for c in clusters])
+        gaussians = Gaussians.concatenate(
+            [self._bundle.cluster_gaussians(int(c)) for c in clusters]
+        )
         self._advance(len(gaussians))
         if len(gaussians):
             content = gltf.encode(check_writable(gaussians).transform(_TO_Y_UP), compressed=True)
@@ -243,7 +262,9 @@ def _write_tileset(path: Path, root: _Tile) -> None:
         "asset": {"version": "1.1", "generator": f"v3dg {__version__}"},
         "extensionsUsed": [_CONTENT],
         "extensionsRequired": [_CONTENT],
-        "extensions": {_CONTENT: extensions},  # of tiles in other tilesets, too: CesiumJS looks at the first
+        "extensions": {
+            _CONTENT: extensions
+        },  # of tiles in other tilesets, too: CesiumJS looks at the first
         "geometricError": root["geometricError"],
         "root": {"refine": "REPLACE", **root},
     }

@@ -1,4 +1,5 @@
-"""Scenes and bundles as OpenUSD: levels of detail under UsdLod, instances as a PointInstancer."""
+"""Scenes and bundles as OpenUSD: levels of detail under UsdLod, instances as a
+PointInstancer."""
 
 import math
 import os
@@ -28,22 +29,27 @@ _LEAST = 1e-30  # of a distance
 _INSTANCES = "/world/instances"
 
 
-def write_usd(subject: Scene | Bundle | File, path: str | os.PathLike[str], *, up: Axis | None = None) -> int:
-    """Write a scene or a bundle as OpenUSD, and return the bytes written; needs the extra `usd`.
+def write_usd(
+    subject: Scene | Bundle | File, path: str | os.PathLike[str], *, up: Axis | None = None
+) -> int:
+    """Write a scene or a bundle as OpenUSD, and return the bytes written; needs the
+    extra `usd`.
 
-    Each bundle is a prim with UsdLod's LODRootAPI, whose children are its levels, finest first, as
-    ParticleField3DGaussianSplat; they change where half of a level's groups have the default tolerance in a
-    picture of 1920 x 1080. A scene is a PointInstancer of them. Positions are float32, and importance is left
-    out.
+    Each bundle is a prim with UsdLod's LODRootAPI, whose children are its levels,
+    finest first, as ParticleField3DGaussianSplat; they change where half of a level's
+    groups have the default tolerance in a picture of 1920 x 1080. A scene is a
+    PointInstancer of them. Positions are float32, and importance is left out.
 
     Args:
         subject: Or the file of it.
         path: File to write, .usd, .usda or .usdc.
-        up: What is up in the world, which is turned to z; as `v3dg.upright.up_of` takes it if None.
+        up: What is up in the world, which is turned to z; as `v3dg.upright.up_of` takes
+            it if None.
 
     Raises:
         ImportError: usd-core is not installed.
-        ValueError: Another name, nothing to export, or a gaussian has values that are none.
+        ValueError: Another name, nothing to export, or a gaussian has values that are
+            none.
         OSError: The file cannot be written.
 
     Source: Pixar, OpenUSD 26.11, UsdVol and UsdLod.
@@ -95,7 +101,8 @@ def _define_levels(stage: "Usd.Stage", place: str, bundle: Bundle) -> None:
     high = bundle.clusters.box[:, 1].max(axis=0)
     radius = float(np.linalg.norm(high - low)) / 2
     detail = _common.detail_of(bundle)
-    # Share of the picture that the ball around the box covers from where level 1 is enough.
+    # Share of the picture that the ball around the box covers from where level 1 is
+    # enough.
     share = math.pi * DEFAULT_TOLERANCE / _PIXELS * (radius / max(detail["reach"], _LEAST)) ** 2
     sizes = [share / detail["ratio"] ** (2 * level) for level in range(bundle.num_levels - 1)]
     heuristic = pxr.UsdLod.ScreenSizeHeuristic.Define(stage, f"/lod{place.replace('/', '_')}")

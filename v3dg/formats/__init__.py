@@ -1,1 +1,2 @@
-"""Files of other programs: a module a format, with `read` and, where it is written, `write`."""
+"""Files of other programs: a module a format, with `read` and, where it is written,
+`write`."""

@@ -22,11 +22,14 @@ SH_C0 = _core.sh_base0
 DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
 """SH degree by the number of coefficients a channel past the first."""
 
-_BLOCK = 1 << 16  # gaussians decoded at once: the double precision of a block stays in the cache's reach
+_BLOCK = (
+    1 << 16
+)  # gaussians decoded at once: the double precision of a block stays in the cache's reach
 _MIN_LOG_SCALE = -20.0  # 2e-9: stands for scales of 0, whose log no quantised format can hold
 _LEAST_VISIBLE_OPACITY = np.float32(_core.min_alpha)
 
-# The components of a quaternion that are stored, in ascending order, by the one that is omitted.
+# The components of a quaternion that are stored, in ascending order, by the one that is
+# omitted.
 _STORED_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
@@ -36,7 +39,8 @@ def blocks(count: int) -> Iterator[slice]:
 
 
 def assemble(count: int, degree: int, decode: Callable[[slice], tuple[Floats, ...]]) -> Gaussians:
-    """Decode gaussians by blocks: ``decode`` returns means, quats, scales, opacities and sh of one."""
+    """Decode gaussians by blocks: ``decode`` returns means, quats, scales, opacities
+    and sh of one."""
     gaussians = empty(count, degree)
     with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are passed on
         for block in blocks(count):
@@ -46,7 +50,8 @@ def assemble(count: int, degree: int, decode: Callable[[slice], tuple[Floats, ..
 
 
 def quats_from_three(three: Floats, omitted: Integers) -> Floats:
-    """Unit quaternions (N, 4) from three components and the index of the omitted one, which is >= 0."""
+    """Unit quaternions (N, 4) from three components and the index of the omitted one,
+    which is >= 0."""
     omitted_component = np.sqrt(np.maximum(0.0, 1.0 - np.square(three).sum(axis=1)))
     quats = np.empty((len(three), 4))
     np.put_along_axis(quats, _STORED_COMPONENTS[omitted], three, axis=1)
@@ -55,7 +60,8 @@ def quats_from_three(three: Floats, omitted: Integers) -> Floats:
 
 
 def three_of_quats(quats: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """The inverse: three components (N, 3) within ±√½ and the index (N,) of the largest, which is omitted."""
+    """The inverse: three components (N, 3) within ±√½ and the index (N,) of the
+    largest, which is omitted."""
     unit = normalised(quats)
     largest = np.abs(unit).argmax(axis=1)
     sign = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1.0, 1.0)
@@ -74,15 +80,19 @@ def to_integers(values: Floats, largest: int) -> NDArray[np.uint32]:
 
 
 def opacity_bytes(opacities: Floats) -> NDArray[np.uint32]:
-    """The nearest of 255 steps, but 0 for opacities that are invisible: rounded up, they would be visible."""
+    """The nearest of 255 steps, but 0 for opacities that are invisible: rounded up,
+    they would be visible."""
     return np.where(opacities < _LEAST_VISIBLE_OPACITY, 0, to_integers(opacities * 255.0, 255))
 
 
 def check_writable(gaussians: Gaussians) -> Gaussians:
-    """The gaussians on the host; ValueError names the first value that a quantised format cannot hold."""
+    """The gaussians on the host; ValueError names the first value that a quantised
+    format cannot hold."""
     host = gaussians.numpy()
     for name, values in vars(host).items():
-        check_all(name, values, np.isfinite(values), "finite values (v3dg.cleaning.examine finds others)")
+        check_all(
+            name, values, np.isfinite(values), "finite values (v3dg.cleaning.examine finds others)"
+        )
     check_all("quats", host.quats, (host.quats != 0).any(axis=1), "a length above 0")
     check_all("scales", host.scales, host.scales >= 0, "values >= 0")
     check_all("opacities", host.opacities, abs(host.opacities - 0.5) <= 0.5, "values in [0, 1]")

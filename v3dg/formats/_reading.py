@@ -1,4 +1,5 @@
-"""Shared by the readers of untrusted files: assets that are read in parts, and bounds on memory."""
+"""Shared by the readers of untrusted files: assets that are read in parts, and bounds
+on memory."""
 
 import contextlib
 import os
@@ -28,12 +29,14 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 @dataclass(frozen=True, eq=False)
 class AssetFile:
-    """What the header of an asset's file says, and its gaussians on demand; open until it is dropped.
+    """What the header of an asset's file says, and its gaussians on demand; open until
+    it is dropped.
 
     Attributes:
-        read: Gaussians from a first row up to a last. Runs that follow each other are the quickest. Raises
-            what the format's own `read` raises.
-        whole_bytes: Memory that the first read takes and keeps, where the format can only be read whole.
+        read: Gaussians from a first row up to a last. Runs that follow each other are
+            the quickest. Raises what the format's own `read` raises.
+        whole_bytes: Memory that the first read takes and keeps, where the format can
+            only be read whole.
     """
 
     path: Path
@@ -49,9 +52,14 @@ def bytes_of(files: Iterable[Path]) -> int:
 
 
 def whole_file(
-    path: Path, count: int, sh_degree: int, read: Callable[[Path], Gaussians], files: Iterable[Path] = ()
+    path: Path,
+    count: int,
+    sh_degree: int,
+    read: Callable[[Path], Gaussians],
+    files: Iterable[Path] = (),
 ) -> AssetFile:
-    """A file, and others that it names, that can only be read whole: on the first read, and then cached."""
+    """A file, and others that it names, that can only be read whole: on the first read,
+    and then cached."""
     read_once = cache(lambda: read(path))
     # While it is read: the content of the files, and at most twice the gaussians.
     memory = bytes_of([path, *files]) + 2 * count * gaussian_bytes(sh_degree)
@@ -65,7 +73,8 @@ def whole_file(
 
 
 class File:
-    """A file with random access, closed when it is dropped; ValueError if it is not a regular file."""
+    """A file with random access, closed when it is dropped; ValueError if it is not a
+    regular file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -75,7 +84,8 @@ class File:
         self.num_bytes = os.fstat(self._descriptor).st_size
 
     def rows(self, dtype: np.dtype[_Scalar], offset: int, count: int) -> NDArray[_Scalar]:
-        """Read `count` records from an offset on; ValueError if the file has become shorter."""
+        """Read `count` records from an offset on; ValueError if the file has become
+        shorter."""
         rows = np.empty(count, dtype)
         with _files.naming_errors(self.path):
             is_whole = _files.read_at(self._descriptor, rows, offset)
@@ -84,7 +94,8 @@ class File:
 
 
 def least_bytes(count: int) -> int:
-    """Smallest size of a file that may claim `count` gaussians: a byte for each beyond a free number."""
+    """Smallest size of a file that may claim `count` gaussians: a byte for each beyond
+    a free number."""
     return max(0, count - _FREE_GAUSSIANS)
 
 
@@ -107,7 +118,8 @@ class Claims:
             return file.read()
 
     def add(self, path: Path, count: int) -> None:
-        """Accept that a file has so many gaussians, or raise ValueError; to be called before allocation."""
+        """Accept that a file has so many gaussians, or raise ValueError; to be called
+        before allocation."""
         self._gaussians += count
         num_bytes = sum(self._files.values())
         is_plausible = least_bytes(self._gaussians) <= num_bytes
@@ -116,7 +128,8 @@ class Claims:
 
 
 class Archive:
-    """A zip whose members are no larger than itself, or 1 MiB, and fit their checksums."""
+    """A zip whose members are no larger than itself, or 1 MiB, and fit their
+    checksums."""
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
         self._path = path
@@ -131,19 +144,29 @@ class Archive:
         check(self._path, name in self._zip.NameToInfo, f"{name!a} in the zip, got none")
         member = self._zip.getinfo(name)
         size = member.file_size
-        check(self._path, size <= self._max_bytes, f"{name!a} no larger than the zip, got {size} bytes")
+        check(
+            self._path,
+            size <= self._max_bytes,
+            f"{name!a} no larger than the zip, got {size} bytes",
+        )
         is_readable = member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
         check(self._path, is_readable, f"{name!a} stored or deflated in the zip, got neither")
         if getattr(member, "CRC", None) == 0:  # torch writes no checksum if it is configured so
             del member.CRC  # without the attribute, zipfile does not compare it
         with telling(self._path, "a zip that is not damaged"), self._zip.open(member) as file:
-            content = file.read(size)  # without a limit, zipfile expands everything before it truncates
+            content = file.read(
+                size
+            )  # without a limit, zipfile expands everything before it truncates
         check(self._path, len(content) == size, f"{size} bytes in {name!a}, got {len(content)}")
         return content
 
 
 def whole(node: Node, expected: str, low: int, high: int) -> int:
     """A JSON value that must be a whole number of ``low`` to ``high``."""
-    if not isinstance(node.value, int) or isinstance(node.value, bool) or not low <= node.value <= high:
+    if (
+        not isinstance(node.value, int)
+        or isinstance(node.value, bool)
+        or not low <= node.value <= high
+    ):
         raise node.error(expected)
     return node.value

@@ -1,9 +1,11 @@
-"""Checkpoints of trainers, `.pt` and `.ckpt`: gsplat's `simple_trainer`, and splatfacto of nerfstudio.
+"""Checkpoints of trainers, `.pt` and `.ckpt`: gsplat's `simple_trainer`, and splatfacto
+of nerfstudio.
 
-Both hold means, log scales, quaternions w x y z, logits of opacities and SH coefficients as tensors, gsplat
-in a dict `splats`, nerfstudio among the values of `pipeline`. The file is a zip of a pickle and of the
-numbers of each tensor. The pickle is followed as far as it builds dicts, plain values and tensors; nothing
-that it names is imported or called, and only the numbers of the gaussians are read.
+Both hold means, log scales, quaternions w x y z, logits of opacities and SH
+coefficients as tensors, gsplat in a dict `splats`, nerfstudio among the values of
+`pipeline`. The file is a zip of a pickle and of the numbers of each tensor. The pickle
+is followed as far as it builds dicts, plain values and tensors; nothing that it names
+is imported or called, and only the numbers of the gaussians are read.
 """
 
 import math
@@ -25,13 +27,37 @@ _NERFSTUDIO_PREFIX = "_model.gauss_params."
 _MAX_PICKLE = 1 << 20  # bytes; trainers' have far less, and each byte can be an object
 _MAX_DIMENSIONS = 8
 # Operations that push a plain value.
-_VALUES = ("BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "BINUNICODE", "NONE", "NEWTRUE", "NEWFALSE")
-_TYPES = {"DoubleStorage": "<f8", "FloatStorage": "<f4", "HalfStorage": "<f2", "BFloat16Storage": "<u2"}
-# Modules whose names a trainer's pickle may contain. Others are refused, and none is imported.
-_ALLOWED_MODULES = ("torch", "torch._utils", "torch._tensor", "torch.nn.parameter", "collections", "_codecs")
+_VALUES = (
+    "BININT",
+    "BININT1",
+    "BININT2",
+    "LONG1",
+    "BINFLOAT",
+    "BINUNICODE",
+    "NONE",
+    "NEWTRUE",
+    "NEWFALSE",
+)
+_TYPES = {
+    "DoubleStorage": "<f8",
+    "FloatStorage": "<f4",
+    "HalfStorage": "<f2",
+    "BFloat16Storage": "<u2",
+}
+# Modules whose names a trainer's pickle may contain. Others are refused, and none is
+# imported.
+_ALLOWED_MODULES = (
+    "torch",
+    "torch._utils",
+    "torch._tensor",
+    "torch.nn.parameter",
+    "collections",
+    "_codecs",
+)
 
 
-# A value that a pickle builds: None, a number, text, a tuple, a dict, a _Named or a _Tensor.
+# A value that a pickle builds: None, a number, text, a tuple, a dict, a _Named or a
+# _Tensor.
 _Value: TypeAlias = object
 _Numbers: TypeAlias = NDArray[np.number[Any]]
 
@@ -90,11 +116,18 @@ def read(path: Path) -> Gaussians:
 
 
 def _fields_of(path: Path, archive: Archive) -> tuple[dict[str, _Tensor], str]:
-    """The tensors of the gaussians, and the folder of the zip that holds their numbers."""
+    """The tensors of the gaussians, and the folder of the zip that holds their
+    numbers."""
     root = next((name[:-8] for name in archive.names if name.endswith("data.pkl")), "")
     pickle = archive.read(f"{root}data.pkl")
-    check(path, len(pickle) <= _MAX_PICKLE, f"a pickle of at most {_MAX_PICKLE} bytes, got {len(pickle)}")
-    is_little = f"{root}byteorder" not in archive.names or archive.read(f"{root}byteorder") == b"little"
+    check(
+        path,
+        len(pickle) <= _MAX_PICKLE,
+        f"a pickle of at most {_MAX_PICKLE} bytes, got {len(pickle)}",
+    )
+    is_little = (
+        f"{root}byteorder" not in archive.names or archive.read(f"{root}byteorder") == b"little"
+    )
     check(path, is_little, "little-endian numbers, got a checkpoint of another byte order")
     with telling(path, "a checkpoint of tensors and plain values"):
         content = _Unpickler().run(pickle)
@@ -118,7 +151,8 @@ def _doubles(values: _Numbers) -> Floats:
 
 
 def _fields(path: Path, content: _Value) -> dict[str, _Tensor]:
-    """The tensors of the gaussians by the names that gsplat has for them; ValueError if one is missing."""
+    """The tensors of the gaussians by the names that gsplat has for them; ValueError if
+    one is missing."""
     members: dict[str, _Value] = {}
     if isinstance(content, dict):
         members = content
@@ -161,9 +195,11 @@ def _array(path: Path, name: str, tensor: _Tensor, archive: Archive, root: str) 
 
 
 class _Unpickler:
-    """Builds what torch.save pickled: values of lists are dropped, and dict entries whose key is not text.
+    """Builds what torch.save pickled: values of lists are dropped, and dict entries
+    whose key is not text.
 
-    Each operation is one of a few on a stack, so time and memory are in proportion to the pickle.
+    Each operation is one of a few on a stack, so time and memory are in proportion to
+    the pickle.
     """
 
     def __init__(self) -> None:
@@ -172,7 +208,8 @@ class _Unpickler:
         self._memo: dict[int, _Value] = {}
 
     def run(self, pickle: bytes) -> _Value:
-        """The object that a pickle holds; ValueError for an operation or a name that is not allowed."""
+        """The object that a pickle holds; ValueError for an operation or a name that is
+        not allowed."""
         for opcode, argument, _ in pickletools.genops(pickle):
             if opcode.name == "STOP":
                 break
@@ -182,7 +219,8 @@ class _Unpickler:
         return self._stack.pop()
 
     def _push(self, operation: str, argument: Any) -> bool:
-        """Apply an operation that leaves the values on the stack as they are; whether it is one."""
+        """Apply an operation that leaves the values on the stack as they are; whether
+        it is one."""
         match operation:
             case "PROTO" | "BINPERSID":
                 pass  # the tuple that names a storage stands for the storage
@@ -242,7 +280,8 @@ class _Unpickler:
 
 
 def _allowed_name(argument: str) -> _Named:
-    """The name of a class or function, "module name"; ValueError unless its module is allowed."""
+    """The name of a class or function, "module name"; ValueError unless its module is
+    allowed."""
     module, _, name = argument.partition(" ")
     short = f"{module[:60]}.{name[:60]}"
     if module not in _ALLOWED_MODULES:
@@ -261,10 +300,15 @@ def _called(name: str, arguments: tuple[Any, ...]) -> _Value:
         return _Named(name)
     (_, storage, key, _, num_stored), offset, shape, strides = arguments[:4]
     kind = storage.name.removeprefix("torch.")
-    # Only as many numbers as a tensor may have dimensions: many calls can share a long tuple.
+    # Only as many numbers as a tensor may have dimensions: many calls can share a long
+    # tuple.
     numbers = (num_stored, offset, *shape[:_MAX_DIMENSIONS], *strides[:_MAX_DIMENSIONS])
     is_plain = all(type(number) is int and 0 <= number < 1 << 48 for number in numbers)
-    if not is_plain or not isinstance(key, str) or not len(shape) == len(strides) <= _MAX_DIMENSIONS:
+    if (
+        not is_plain
+        or not isinstance(key, str)
+        or not len(shape) == len(strides) <= _MAX_DIMENSIONS
+    ):
         raise ValueError("one with a tensor whose shape is not plain numbers")
     if kind not in _TYPES:
         return _Named(kind)

@@ -1,9 +1,11 @@
-"""`.compressed.ply`, of PlayCanvas and SuperSplat: 16 bytes a gaussian, within the ranges of chunks of 256.
+"""`.compressed.ply`, of PlayCanvas and SuperSplat: 16 bytes a gaussian, within the
+ranges of chunks of 256.
 
-Element `chunk` holds the lowest and highest position, log scale and colour of its gaussians as floats,
-element `vertex` a position and a scale (11, 10 and 11 bits of that range), a quaternion (index of its largest
-component, 10 bits each for the others), colour and opacity (8 bits each), and element `sh` a byte a
-coefficient, channel by channel, for -4 to 4. See docs/formats.md.
+Element `chunk` holds the lowest and highest position, log scale and colour of its
+gaussians as floats, element `vertex` a position and a scale (11, 10 and 11 bits of that
+range), a quaternion (index of its largest component, 10 bits each for the others),
+colour and opacity (8 bits each), and element `sh` a byte a coefficient, channel by
+channel, for -4 to 4. See docs/formats.md.
 """
 
 from collections.abc import Sequence
@@ -48,7 +50,11 @@ def open_file(path: Path) -> AssetFile:
     file = File(path)
     elements = _elements(file)
     for name in ("chunk", "vertex"):
-        check(path, name in elements, f"the elements chunk and vertex of a compressed .ply, got no {name}")
+        check(
+            path,
+            name in elements,
+            f"the elements chunk and vertex of a compressed .ply, got no {name}",
+        )
     chunk = elements["chunk"]
     vertex = elements["vertex"]
     sh = elements.get("sh")
@@ -56,7 +62,11 @@ def open_file(path: Path) -> AssetFile:
     kinds = _range_kinds(path, chunk)
     _require(path, "vertex", vertex, _PACKED, "uint")
     num_chunks = -(-count // _CHUNK)
-    check(path, chunk.count >= num_chunks, f"{num_chunks} chunks for {count} gaussians, got {chunk.count}")
+    check(
+        path,
+        chunk.count >= num_chunks,
+        f"{num_chunks} chunks for {count} gaussians, got {chunk.count}",
+    )
     degree = _degree(path, sh, count)
 
     def read_rows(first: int, last: int) -> Gaussians:
@@ -85,7 +95,13 @@ def open_file(path: Path) -> AssetFile:
             scales = np.exp(interpolated("scale_", _fractions(block["packed_scale"], _XYZ)))
             quats = _packing.quats_from_three(three, rotation >> 30)
             higher = _SH_VALUE[sh_bytes[rows]].reshape(len(block), 3, -1).transpose(0, 2, 1)
-            return means, quats, scales, rgba[:, 3], np.concatenate([color[:, None], higher], axis=1)
+            return (
+                means,
+                quats,
+                scales,
+                rgba[:, 3],
+                np.concatenate([color[:, None], higher], axis=1),
+            )
 
         return assemble(last - first, degree, decode)
 
@@ -93,7 +109,8 @@ def open_file(path: Path) -> AssetFile:
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
-    """Write a `.compressed.ply` file; gaussians are put in an order that keeps neighbours together."""
+    """Write a `.compressed.ply` file; gaussians are put in an order that keeps
+    neighbours together."""
     host = _packing.check_writable(gaussians)
     order = _core.morton_order(host.means)
     count = len(host)
@@ -131,11 +148,18 @@ def write(path: Path, gaussians: Gaussians) -> None:
         if num_rest:
             for block in _packing.blocks(count):
                 higher = host.sh[order[block], 1:].transpose(0, 2, 1).astype(np.float64)
-                file.write(np.clip(np.floor((higher / 8 + 0.5) * 256), 0, 255).astype(np.uint8).tobytes())
+                file.write(
+                    np.clip(np.floor((higher / 8 + 0.5) * 256), 0, 255).astype(np.uint8).tobytes()
+                )
 
 
 def _header(count: int, num_chunks: int, num_rest: int) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", "comment made by v3dg", f"element chunk {num_chunks}"]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment made by v3dg",
+        f"element chunk {num_chunks}",
+    ]
     lines += [f"property float {name}" for kind in _RANGES for name in _range_names(kind)]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
     if num_rest:
@@ -151,7 +175,9 @@ _SH_VALUE[255] = 4.0
 
 
 def _fractions(words: _packing.Integers, fields: _Fields) -> Floats:
-    return np.stack([((words >> shift) & largest) / float(largest) for shift, largest in fields], axis=1)
+    return np.stack(
+        [((words >> shift) & largest) / float(largest) for shift, largest in fields], axis=1
+    )
 
 
 def _word(fractions: Floats, fields: _Fields) -> NDArray[np.uint32]:
@@ -177,12 +203,15 @@ def _range_kinds(path: Path, chunk: _Element) -> list[str]:
 
 
 def _ranges(chunk: NDArray[np.void], kinds: Sequence[str]) -> dict[str, tuple[Floats, Floats]]:
-    """Lowest and highest value of each chunk, (C, 3) each; without ranges of colour, it is 0 to 1."""
+    """Lowest and highest value of each chunk, (C, 3) each; without ranges of colour, it
+    is 0 to 1."""
     shape = (len(chunk), 3)
     ranges: dict[str, tuple[Floats, Floats]] = {"color": (np.zeros(shape), np.ones(shape))}
     for kind in kinds:
         with np.errstate(invalid="ignore"):  # signalling NaN
-            values = np.stack([chunk[name] for name in _range_names(kind)], axis=1).astype(np.float64)
+            values = np.stack([chunk[name] for name in _range_names(kind)], axis=1).astype(
+                np.float64
+            )
         ranges[kind] = (values[:, :3], values[:, 3:])
     return ranges
 
@@ -193,7 +222,9 @@ def _degree(path: Path, sh: _Element | None, count: int) -> int:
     names = [f"f_rest_{i}" for i in range(len(sh.kinds))]
     num_coefficients, remainder = divmod(len(names), 3)
     is_known = remainder == 0 and num_coefficients in _packing.DEGREES
-    check(path, is_known, f"0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), got {len(names)}")
+    check(
+        path, is_known, f"0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), got {len(names)}"
+    )
     _require(path, "sh", sh, names, "uchar")
     check(path, sh.count == count, f"{count} rows of element sh like vertex, got {sh.count}")
     return _packing.DEGREES[num_coefficients]
@@ -201,7 +232,11 @@ def _degree(path: Path, sh: _Element | None, count: int) -> int:
 
 def _require(path: Path, label: str, element: _Element, names: Sequence[str], kind: str) -> None:
     for name in names:
-        check(path, element.kinds.get(name) == kind, f"'property {kind} {name}' in element {label}, got none")
+        check(
+            path,
+            element.kinds.get(name) == kind,
+            f"'property {kind} {name}' in element {label}, got none",
+        )
 
 
 def _elements(file: File) -> dict[str, _Element]:
@@ -209,13 +244,19 @@ def _elements(file: File) -> dict[str, _Element]:
     path = file.path
     encoding, offset, header = _core.ply_header(path)
     is_little = encoding == "binary_little_endian"
-    check(path, is_little, f"'format binary_little_endian 1.0' in a compressed .ply, got {encoding}")
+    check(
+        path, is_little, f"'format binary_little_endian 1.0' in a compressed .ply, got {encoding}"
+    )
     elements: dict[str, _Element] = {}
     for name, count, properties in header:
         label = f"element {name[:40]!a}"
         kinds = dict(properties)
         unknown_kind = next((kind for kind in kinds.values() if kind not in _PLY_TYPES), None)
-        check(path, unknown_kind is None, f"'property float|uint|uchar NAME' in {label}, got {unknown_kind}")
+        check(
+            path,
+            unknown_kind is None,
+            f"'property float|uint|uchar NAME' in {label}, got {unknown_kind}",
+        )
         is_unique = name not in elements and 0 < len(kinds) == len(properties)
         check(path, is_unique, f"properties of {label}, each once")
         dtype = np.dtype([(key, _PLY_TYPES[kind]) for key, kind in properties])
@@ -225,5 +266,9 @@ def _elements(file: File) -> dict[str, _Element]:
         check(path, num_bytes <= remaining, f"{expected}, got {remaining} bytes")
         elements[name] = _Element(kinds, dtype, count, offset)
         offset += num_bytes
-    check(path, offset == file.num_bytes, f"the end of the file after {offset} bytes, got {file.num_bytes}")
+    check(
+        path,
+        offset == file.num_bytes,
+        f"the end of the file after {offset} bytes, got {file.num_bytes}",
+    )
     return elements

@@ -1,7 +1,8 @@
-"""`.glb`: glTF 2.0 with KHR_gaussian_splatting, as float attributes or compressed in `.spz`.
+"""`.glb`: glTF 2.0 with KHR_gaussian_splatting, as float attributes or compressed in
+`.spz`.
 
-Written is one primitive; read are all primitives that are gaussians, of nodes without transforms. Coordinates
-are passed on as they are stored; glTF's have y up.
+Written is one primitive; read are all primitives that are gaussians, of nodes without
+transforms. Coordinates are passed on as they are stored; glTF's have y up.
 """
 
 import json
@@ -94,8 +95,12 @@ def encode(host: Gaussians, *, compressed: bool = False) -> bytes:
 
 
 def _columns(host: Gaussians, *, compressed: bool) -> dict[str, NDArray[np.generic]]:
-    """The attributes of gaussians by name, (N, width); if compressed, those that `.spz` does not replace."""
-    columns: dict[str, NDArray[np.generic]] = {"POSITION": host.means, f"{_NAME}:SCALE": host.scales}
+    """The attributes of gaussians by name, (N, width); if compressed, those that `.spz`
+    does not replace."""
+    columns: dict[str, NDArray[np.generic]] = {
+        "POSITION": host.means,
+        f"{_NAME}:SCALE": host.scales,
+    }
     columns[f"{_NAME}:ROTATION"] = np.roll(normalised(host.quats), -1, axis=1).astype(np.float32)
     if compressed:
         color = np.concatenate([host.sh[:, 0] * SH_C0 + 0.5, host.opacities[:, None]], axis=1)
@@ -109,7 +114,8 @@ def _columns(host: Gaussians, *, compressed: bool) -> dict[str, NDArray[np.gener
 
 
 def _accessor(name: str, values: NDArray[np.generic], view: int | None) -> JsonObject:
-    """The accessor of an attribute and its buffer view; None for gaussians that are compressed."""
+    """The accessor of an attribute and its buffer view; None for gaussians that are
+    compressed."""
     kind = _BYTE
     if values.dtype == np.float32:
         kind = _FLOAT
@@ -153,17 +159,27 @@ def _coefficients(degree: int) -> list[str]:
 
 
 class _Glb:
-    """A file: its JSON, its binary chunk, and the primitives in it that are gaussians, of one SH degree."""
+    """A file: its JSON, its binary chunk, and the primitives in it that are gaussians,
+    of one SH degree."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._claims = Claims()
         self._expanded = 0  # bytes of `.spz` that were decoded
         content = self._claims.read(path)
-        check(path, len(content) >= 20, f"a .glb file, glTF 2.0 that is whole, got {len(content)} bytes")
+        check(
+            path,
+            len(content) >= 20,
+            f"a .glb file, glTF 2.0 that is whole, got {len(content)} bytes",
+        )
         with telling(path, "a .glb file, glTF 2.0 that is whole"):
             magic, version, total, size, kind = struct.unpack_from("<IIIII", content)
-            if (magic, version, total, kind) != (_MAGIC, 2, len(content), _JSON) or size > _MOST_JSON:
+            if (magic, version, total, kind) != (
+                _MAGIC,
+                2,
+                len(content),
+                _JSON,
+            ) or size > _MOST_JSON:
                 raise ValueError(f"{content[:20].hex(' ')} at the start of {len(content)} bytes")
             self._root = Node(parse_json(content[20 : 20 + size].decode("utf-8")), str(path), "")
         self._blob = memoryview(content)[28 + size :]
@@ -186,7 +202,9 @@ class _Glb:
         for node in self._root.field("nodes").items():
             for name in ("matrix", "translation", "rotation", "scale"):
                 if node.has(name):
-                    raise node.problem(f"expected a node without a transform, got {name}; apply it first")
+                    raise node.problem(
+                        f"expected a node without a transform, got {name}; apply it first"
+                    )
 
     def _sh_degree(self) -> int:
         """The SH degree of the primitives; ValueError if they differ."""
@@ -196,7 +214,8 @@ class _Glb:
         return degrees[0]
 
     def _item(self, kind: str, node: Node, field: str) -> Node:
-        """The item of one of the root's arrays whose number is in a field of the node."""
+        """The item of one of the root's arrays whose number is in a field of the
+        node."""
         items = self._arrays[kind]
         return items[whole(node.field(field), f"0 to {len(items) - 1}", 0, len(items) - 1)]
 
@@ -207,11 +226,17 @@ class _Glb:
     def gaussians_of(self, primitive: Node) -> Gaussians:
         extension = primitive.field("extensions").field(_NAME)
         if extension.has("extensions") and extension.field("extensions").has(_SPZ):
-            view = self._item("bufferViews", extension.field("extensions").field(_SPZ), "bufferView")
+            view = self._item(
+                "bufferViews", extension.field("extensions").field(_SPZ), "bufferView"
+            )
             content = bytes(self._view(view))
-            self._expanded += len(content)  # limited, so that many primitives cannot share one large stream
+            self._expanded += len(
+                content
+            )  # limited, so that many primitives cannot share one large stream
             limit = len(self._blob)
-            check(self._path, self._expanded <= limit, f"{limit} bytes of .spz, got {self._expanded}")
+            check(
+                self._path, self._expanded <= limit, f"{limit} bytes of .spz, got {self._expanded}"
+            )
             return spz.decode(self._path, content, self._claims)
         count = self.count_of(primitive)
         attributes = primitive.field("attributes")
@@ -231,7 +256,13 @@ class _Glb:
             advice = "drafts of the extension had their logs; write the file with a newer program"
             check(self._path, not (widths < 0).any(), f"scales of 0 or more, got less; {advice}")
             colors = np.stack([coefficient(rows) for coefficient in sh], axis=1)
-            return mean(rows), normalised(np.roll(quat(rows), 1, axis=1)), widths, opacity(rows)[:, 0], colors
+            return (
+                mean(rows),
+                normalised(np.roll(quat(rows), 1, axis=1)),
+                widths,
+                opacity(rows)[:, 0],
+                colors,
+            )
 
         return assemble(count, self.degree, decode)
 
@@ -244,7 +275,8 @@ class _Glb:
         return self._blob[first : first + num_bytes]
 
     def _column(self, accessor: Node, count: int, width: int) -> Callable[[slice], Floats]:
-        """A function from a slice to these rows of an attribute, in double precision."""
+        """A function from a slice to these rows of an attribute, in double
+        precision."""
         kind = accessor.field("componentType")
         view = self._item("bufferViews", accessor, "bufferView")
         if not isinstance(kind.value, int) or kind.value not in _DTYPES:

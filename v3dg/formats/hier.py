@@ -1,8 +1,9 @@
-"""`.hier`, of Hierarchical 3DGS (H3DG): a tree of gaussians, of which the leaves are read.
+"""`.hier`, of Hierarchical 3DGS (H3DG): a tree of gaussians, of which the leaves are
+read.
 
-After the number of gaussians come their columns: positions, rotations w x y z, log scales, opacities and SH
-of degree 3, then the number of nodes, the nodes, and boxes. A number below zero means that all but the
-positions is in half precision.
+After the number of gaussians come their columns: positions, rotations w x y z, log
+scales, opacities and SH of degree 3, then the number of nodes, the nodes, and boxes. A
+number below zero means that all but the positions is in half precision.
 """
 
 import numpy as np
@@ -15,7 +16,8 @@ from v3dg.rotations import normalised
 
 _INT = np.dtype("<i4")
 _WIDTHS = (3, 4, 3, 1, 48)
-# The fields of a node that are read: its first gaussian, and how many of its gaussians are leaves.
+# The fields of a node that are read: its first gaussian, and how many of its gaussians
+# are leaves.
 _FLOAT_NODE = np.dtype(
     {"names": ["start", "leaves"], "formats": ["<i4", "<i4"], "offsets": [8, 12], "itemsize": 28}
 )
@@ -36,7 +38,10 @@ def open_file(path: Path) -> AssetFile:
         kind = "<f2"
         node = _HALF_NODE
     position_width, *other_widths = _WIDTHS
-    dtypes = [np.dtype(("<f4", position_width)), *(np.dtype((kind, width)) for width in other_widths)]
+    dtypes = [
+        np.dtype(("<f4", position_width)),
+        *(np.dtype((kind, width)) for width in other_widths),
+    ]
     column_starts = 4 + np.cumsum([0, *(count * dtype.itemsize for dtype in dtypes)])
     columns_end = int(column_starts[-1])
     check(path, columns_end + 4 <= file.num_bytes, f"{count} gaussians, got {file.num_bytes} bytes")
@@ -59,8 +64,11 @@ def open_file(path: Path) -> AssetFile:
         ]
 
         def decode(block: slice) -> tuple[Floats, ...]:
-            means, quats, log_scales, alphas, sh = (column[block].astype(np.float64) for column in columns)
-            # The sign of a stored opacity means nothing, and those of inner nodes exceed 1.
+            means, quats, log_scales, alphas, sh = (
+                column[block].astype(np.float64) for column in columns
+            )
+            # The sign of a stored opacity means nothing, and those of inner nodes
+            # exceed 1.
             opacities = np.minimum(np.abs(alphas[:, 0]), 1.0)
             return means, normalised(quats), np.exp(log_scales), opacities, sh.reshape(-1, 16, 3)
 

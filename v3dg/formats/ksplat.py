@@ -1,10 +1,13 @@
-"""`.ksplat`, of mkkellogg's viewer: sections of gaussians, at three levels of compression.
+"""`.ksplat`, of mkkellogg's viewer: sections of gaussians, at three levels of
+compression.
 
-After a header of 4,096 bytes come headers of 1,024 bytes a section, then the sections' data: for compression
-1 and 2 the sizes of buckets that are not full and the buckets' centres, then the gaussians. A gaussian is its
-mean (float32, or 16 bits a coordinate around its bucket's centre), its scales and its quaternion w x y z
-(float32 or half precision), red, green, blue and opacity (bytes), and higher SH (float32, half precision, or
-bytes for the range in the header), band by band and there channel by channel. See docs/formats.md.
+After a header of 4,096 bytes come headers of 1,024 bytes a section, then the sections'
+data: for compression 1 and 2 the sizes of buckets that are not full and the buckets'
+centres, then the gaussians. A gaussian is its mean (float32, or 16 bits a coordinate
+around its bucket's centre), its scales and its quaternion w x y z (float32 or half
+precision), red, green, blue and opacity (bytes), and higher SH (float32, half
+precision, or bytes for the range in the header), band by band and there channel by
+channel. See docs/formats.md.
 """
 
 import math
@@ -23,7 +26,8 @@ from v3dg.rotations import normalised
 _HEADER_BYTES = 4096
 _SECTION_BYTES = 1024
 _MAX_SECTIONS = 1 << 16
-# By compression: types of a mean's coordinates, of scales and quaternions, and of higher SH.
+# By compression: types of a mean's coordinates, of scales and quaternions, and of
+# higher SH.
 _TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 _SH_RANGE = (-1.5, 1.5)  # if the header has none
 _DEFAULT_STEPS = 32767  # per half side of a bucket
@@ -83,7 +87,8 @@ def read(path: Path) -> Gaussians:
 
 
 def _headers(path: Path, content: bytes) -> tuple[list[_Section], int, int]:
-    """The headers of all sections, the SH degree and the compression; ``content`` is the start of a file."""
+    """The headers of all sections, the SH degree and the compression; ``content`` is
+    the start of a file."""
     num_bytes = len(content)
     check(path, num_bytes >= _HEADER_BYTES, f"a header of {_HEADER_BYTES} bytes, got {num_bytes}")
     major, minor, num_sections, count, compression = struct.unpack_from("<BB2xI8xIH", content)
@@ -105,11 +110,14 @@ def _headers(path: Path, content: bytes) -> tuple[list[_Section], int, int]:
 def _section(
     path: Path, content: bytes, start: int, number: int, section: _Section, compression: int
 ) -> tuple[NDArray[np.void], _Buckets | None, int]:
-    """The rows of a section, the buckets that their means are relative to, and the end of the section."""
+    """The rows of a section, the buckets that their means are relative to, and the end
+    of the section."""
     mean_type, shape_type, sh_type = _TYPES[compression]
     count = section.num_gaussians
     max_count = section.max_gaussians
-    check(path, count <= max_count, f"at most {max_count} gaussians in section {number}, got {count}")
+    check(
+        path, count <= max_count, f"at most {max_count} gaussians in section {number}, got {count}"
+    )
     record = np.dtype(
         [
             ("mean", mean_type, 3),
@@ -122,11 +130,15 @@ def _section(
     buckets_start = start + 4 * section.num_partial_buckets
     rows_start = buckets_start + section.bucket_bytes * section.num_buckets
     end = rows_start + record.itemsize * max_count
-    check(path, end <= len(content), f"section {number} to end within {len(content)} bytes, got {end}")
+    check(
+        path, end <= len(content), f"section {number} to end within {len(content)} bytes, got {end}"
+    )
     rows = np.frombuffer(content, record, count, rows_start)
     if not compression:
         return rows, None, end
-    partial_sizes = np.frombuffer(content, "<u4", section.num_partial_buckets, start).astype(np.int64)
+    partial_sizes = np.frombuffer(content, "<u4", section.num_partial_buckets, start).astype(
+        np.int64
+    )
     num_used = section.num_full_buckets + section.num_partial_buckets
     fits = section.bucket_bytes >= 12 and num_used <= section.num_buckets
     check(path, fits, f"{section.num_buckets} buckets in section {number}, got {num_used}")
@@ -138,7 +150,9 @@ def _section(
     bucket = np.dtype((np.void, section.bucket_bytes))
     stored = np.frombuffer(content, bucket, section.num_buckets, buckets_start)
     strides = (section.bucket_bytes, 4)
-    centers: NDArray[np.float32] = np.ndarray((section.num_buckets, 3), "<f4", stored, strides=strides)
+    centers: NDArray[np.float32] = np.ndarray(
+        (section.num_buckets, 3), "<f4", stored, strides=strides
+    )
     num_steps = section.num_steps or _DEFAULT_STEPS
     step_world = section.bucket_side / 2 / num_steps
     return rows, _Buckets(centers[bucket_from_row], step_world, num_steps), end
@@ -147,7 +161,8 @@ def _section(
 def _decoded(
     records: NDArray[np.void], buckets: _Buckets | None, degree: int, sh_range: tuple[float, float]
 ) -> Gaussians:
-    """The gaussians of a section, padded with zeros to the coefficients of ``degree``."""
+    """The gaussians of a section, padded with zeros to the coefficients of
+    ``degree``."""
 
     def decode(block: slice) -> tuple[Floats, ...]:
         rows = records[block]

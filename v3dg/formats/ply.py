@@ -13,7 +13,8 @@ PlyEncoding = Literal["binary_little_endian", "binary_big_endian", "ascii"]
 
 
 def open_file(path: Path) -> AssetFile:
-    """Open a `.ply` file; one with packed positions is a compressed one, whatever its name."""
+    """Open a `.ply` file; one with packed positions is a compressed one, whatever its
+    name."""
     name = os.fspath(path)
     _, _, elements = _core.ply_header(name)
     if any("packed_position" in dict(properties) for _, _, properties in elements):

@@ -1,8 +1,10 @@
-"""SOG, of PlayCanvas: pictures whose pixels are gaussians, and a `meta.json`; in a zip (`.sog`) or a folder.
+"""SOG, of PlayCanvas: pictures whose pixels are gaussians, and a `meta.json`; in a zip
+(`.sog`) or a folder.
 
-Version 2: positions are 16 bits a coordinate of sign(x) ln(1 + |x|), log scales and colours are indices into
-tables of 256 values, quaternions three bytes and the index of the largest component, opacity is a byte, and
-higher SH an index into a palette of whole sets of coefficients. See docs/formats.md.
+Version 2: positions are 16 bits a coordinate of sign(x) ln(1 + |x|), log scales and
+colours are indices into tables of 256 values, quaternions three bytes and the index of
+the largest component, opacity is a byte, and higher SH an index into a palette of whole
+sets of coefficients. See docs/formats.md.
 """
 
 import io
@@ -22,13 +24,22 @@ from v3dg._json import Node, parse_json
 from v3dg._version import __version__
 from v3dg.formats import _packing
 from v3dg.formats._packing import SQRT2, Floats, assemble, opacity_bytes
-from v3dg.formats._reading import Archive, AssetFile, Claims, check, least_bytes, telling, whole, whole_file
+from v3dg.formats._reading import (
+    Archive,
+    AssetFile,
+    Claims,
+    check,
+    least_bytes,
+    telling,
+    whole,
+    whole_file,
+)
 from v3dg.gaussians import Gaussians
 
 _Pixels: TypeAlias = NDArray[np.uint8]
 _MAX_GAUSSIANS = 1 << 28  # pixels of the largest WebP
-# A picture may have up to so many pixels: a multiple of what is needed, because writers round up differently,
-# and a constant.
+# A picture may have up to so many pixels: a multiple of what is needed, because writers
+# round up differently, and a constant.
 _MAX_PIXELS_FACTOR = 4
 _FREE_PIXELS = 1 << 16
 _PALETTE_COLUMNS = 64  # entries of the palette side by side in its picture
@@ -55,7 +66,9 @@ def read(path: str | os.PathLike[str], claims: Claims | None = None) -> Gaussian
     path = Path(path)
     claims = claims or Claims()
     if path.suffix == ".json":
-        return _read(path, claims.read(path), lambda name: claims.read(path.with_name(name)), claims)
+        return _read(
+            path, claims.read(path), lambda name: claims.read(path.with_name(name)), claims
+        )
     with claims.open(path) as file:
         archive = Archive(path, file)
         return _read(path, archive.read("meta.json"), archive.read, claims)
@@ -95,7 +108,9 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
         label_pixels = pixels(names["shN"][1])
         labels = label_pixels[:, 0] | (label_pixels[:, 1].astype(np.uint16) << 8)
         largest = labels.max(initial=0)
-        check(path, largest < len(higher.entries), f"labels below {higher.num_entries}, got {largest}")
+        check(
+            path, largest < len(higher.entries), f"labels below {higher.num_entries}, got {largest}"
+        )
 
     def decode(rows: slice) -> tuple[Floats, ...]:
         steps = lower[rows, :3] | (upper[rows, :3].astype(np.uint16) << 8)
@@ -105,7 +120,13 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
         widths = np.exp(scale_table[scales[rows, :3]])
         base = color_table[color[rows, :3]][:, None]
         sh = np.concatenate([base, higher.table[higher.entries[labels[rows]]]], axis=1)
-        return means, _packing.quats_from_three(three, tags[rows] - 252), widths, color[rows, 3] / 255.0, sh
+        return (
+            means,
+            _packing.quats_from_three(three, tags[rows] - 252),
+            widths,
+            color[rows, 3] / 255.0,
+            sh,
+        )
 
     return assemble(count, degree, decode)
 
@@ -121,7 +142,9 @@ class _Palette(NamedTuple):
 _NO_HIGHER_SH = _Palette(np.zeros(1), np.zeros((1, 0, 3), np.uint8), 1)
 
 
-def _palette(path: Path, part: Node, name: str, pictures: dict[str, bytes], degree: int) -> _Palette:
+def _palette(
+    path: Path, part: Node, name: str, pictures: dict[str, bytes], degree: int
+) -> _Palette:
     num_entries = whole(part.field("count"), "1 to 65536 entries", 1, 65536)
     table = _codebook(part)
     num_rows = -(-num_entries // _PALETTE_COLUMNS)
@@ -151,7 +174,8 @@ def _size(meta: dict[str, Node]) -> tuple[int, int]:
 
 
 def _names(meta: dict[str, Node]) -> dict[str, list[str]]:
-    """Names of the pictures of each part, beside meta.json; nothing outside of its folder is read."""
+    """Names of the pictures of each part, beside meta.json; nothing outside of its
+    folder is read."""
     names = {}
     for part, count in _PARTS.items():
         if part in meta:
@@ -170,7 +194,8 @@ def _beside(node: Node) -> str:
 def _codebook(part: Node) -> Floats:
     """A table of 256 values."""
     entries = list(part.field("codebook").items("1 to 256 numbers", 1, 256))
-    # Some versions of splat-transform wrote null for the first value, which is extrapolated.
+    # Some versions of splat-transform wrote null for the first value, which is
+    # extrapolated.
     has_null = entries[0].value is None and len(entries) == 256
     values = [entry.number() for entry in entries[has_null:]]
     if has_null:
@@ -178,8 +203,11 @@ def _codebook(part: Node) -> Floats:
     return np.pad(values, (0, 256 - len(values)))
 
 
-def _decoded(path: Path, name: str, content: bytes, num_pixels: int, row: int | None = None) -> _Pixels:
-    """(H, W, 4) pixels of a picture, of at least ``num_pixels`` and not many more, in rows of ``row``."""
+def _decoded(
+    path: Path, name: str, content: bytes, num_pixels: int, row: int | None = None
+) -> _Pixels:
+    """(H, W, 4) pixels of a picture, of at least ``num_pixels`` and not many more, in
+    rows of ``row``."""
     from PIL.WebPImagePlugin import WebPImageFile  # Image.open would also try other formats
 
     width, height = _size_of_webp(content)
@@ -188,15 +216,21 @@ def _decoded(path: Path, name: str, content: bytes, num_pixels: int, row: int | 
     expected = f"{num_pixels} pixels"
     if row is not None:
         expected += f" in rows of {row}"
-    check(path, has_size and row in (None, width), f"{expected} in {name!a}, got {width} x {height}")
-    with telling(path, f"a WebP picture in {name!a}"), WebPImageFile(io.BytesIO(content)) as picture:
+    check(
+        path, has_size and row in (None, width), f"{expected} in {name!a}, got {width} x {height}"
+    )
+    with (
+        telling(path, f"a WebP picture in {name!a}"),
+        WebPImageFile(io.BytesIO(content)) as picture,
+    ):
         if picture.size != (width, height):
             raise ValueError(f"one of {picture.size}")
         return np.asarray(picture.convert("RGBA"))
 
 
 def _size_of_webp(content: bytes) -> tuple[int, int]:
-    """Width and height from the first chunk, known before a decoder allocates; 0, 0 for another file."""
+    """Width and height from the first chunk, known before a decoder allocates; 0, 0 for
+    another file."""
 
     def number(first: int, size: int) -> int:
         return int.from_bytes(content[first : first + size], "little")
@@ -212,20 +246,25 @@ def _size_of_webp(content: bytes) -> tuple[int, int]:
 
 
 def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a `.sog` file; gaussians are put in an order that keeps neighbours together."""
+    """Write a `.sog` file; gaussians are put in an order that keeps neighbours
+    together."""
     host = _packing.check_writable(gaussians)
     contents = encode(host.subset(_core.morton_order(host.means)))
-    # Readers refuse files that are too small for what they claim; equal gaussians compress to almost nothing.
+    # Readers refuse files that are too small for what they claim; equal gaussians
+    # compress to almost nothing.
     missing = least_bytes(len(host)) - sum(map(len, contents.values()))
     if missing > 0:
         contents["padding"] = bytes(missing)
     with _files.replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as bundle:
         for name, content in contents.items():
-            bundle.writestr(zipfile.ZipInfo(name), content)  # dated 1980, so that files are reproducible
+            bundle.writestr(
+                zipfile.ZipInfo(name), content
+            )  # dated 1980, so that files are reproducible
 
 
 def encode(gaussians: Gaussians) -> dict[str, bytes]:
-    """The files of a SOG by name; ``gaussians`` have passed `check_writable`, and their order stays."""
+    """The files of a SOG by name; ``gaussians`` have passed `check_writable`, and their
+    order stays."""
     count = len(gaussians)
     width = 4 * max(1, math.ceil(math.sqrt(count) / 4))
     height = 4 * max(1, math.ceil(count / width / 4))
@@ -240,7 +279,9 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
     if count:
         low = logs.min(axis=0)
         high = logs.max(axis=0)
-    steps = _packing.to_integers((logs - low) / np.where(high > low, high - low, 1.0) * 65535.0, 65535)
+    steps = _packing.to_integers(
+        (logs - low) / np.where(high > low, high - low, 1.0) * 65535.0, 65535
+    )
     three, largest = _packing.three_of_quats(gaussians.quats)
     log_widths = _packing.log_scales(gaussians.scales)
     scale_table = _table_of(log_widths)
@@ -249,14 +290,22 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
         "means_l.webp": picture(*(steps & 255).T),
         "means_u.webp": picture(*(steps >> 8).T),
         "scales.webp": picture(*_nearest(scale_table, log_widths).T),
-        "quats.webp": picture(*_packing.to_integers((three * SQRT2 + 1.0) * 127.5, 255).T, largest + 252),
-        "sh0.webp": picture(*_nearest(color_table, gaussians.sh[:, 0]).T, opacity_bytes(gaussians.opacities)),
+        "quats.webp": picture(
+            *_packing.to_integers((three * SQRT2 + 1.0) * 127.5, 255).T, largest + 252
+        ),
+        "sh0.webp": picture(
+            *_nearest(color_table, gaussians.sh[:, 0]).T, opacity_bytes(gaussians.opacities)
+        ),
     }
     meta: dict[str, Any] = {
         "version": 2,
         "asset": {"generator": f"v3dg {__version__}"},
         "count": count,
-        "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
+        "means": {
+            "mins": low.tolist(),
+            "maxs": high.tolist(),
+            "files": ["means_l.webp", "means_u.webp"],
+        },
         "scales": {"codebook": scale_table.tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_table.tolist(), "files": ["sh0.webp"]},
@@ -270,10 +319,12 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
 
 
 def _encoded_palette(gaussians: Gaussians) -> tuple[dict[str, object], bytes, _packing.Integers]:
-    """The part of meta.json for higher SH, the picture of its palette, and a label for each gaussian."""
+    """The part of meta.json for higher SH, the picture of its palette, and a label for
+    each gaussian."""
     count = len(gaussians)
     num_coefficients = (gaussians.sh_degree + 1) ** 2 - 1
-    # A quarter of the gaussians; at least 1024, so that a small asset loses nothing, and at most 16 bits.
+    # A quarter of the gaussians; at least 1024, so that a small asset loses nothing,
+    # and at most 16 bits.
     size = min(max(1024, count // 4), 65536)
     vectors = np.ascontiguousarray(gaussians.sh[:, 1:]).reshape(count, 3 * num_coefficients)
     palette, labels = _core.palette_of(vectors, size)

@@ -1,7 +1,9 @@
-"""`.splat`, of antimatter15's viewer: 32 bytes a gaussian, colour without view dependence.
+"""`.splat`, of antimatter15's viewer: 32 bytes a gaussian, colour without view
+dependence.
 
-A record is the mean (3 float32), the scales (3 float32, not logs), red, green, blue and opacity (a byte each)
-and the quaternion w x y z (a byte each, 128 for 0). There is no header.
+A record is the mean (3 float32), the scales (3 float32, not logs), red, green, blue and
+opacity (a byte each) and the quaternion w x y z (a byte each, 128 for 0). There is no
+header.
 """
 
 import numpy as np

@@ -1,9 +1,11 @@
-"""`.spz`, of Niantic: about 20 bytes a gaussian before compression, fixed-point positions.
+"""`.spz`, of Niantic: about 20 bytes a gaussian before compression, fixed-point
+positions.
 
-Versions 1 to 3 are one gzip stream: a header of 16 bytes, then positions, opacities, colours, scales,
-rotations and higher SH, each for all gaussians. Version 4 is a header of 32 bytes, a table of sizes and a
-zstd stream an attribute. Version 1 has positions in half precision, 1 and 2 quaternions without w.
-Coordinates are passed on as they are stored. See docs/formats.md.
+Versions 1 to 3 are one gzip stream: a header of 16 bytes, then positions, opacities,
+colours, scales, rotations and higher SH, each for all gaussians. Version 4 is a header
+of 32 bytes, a table of sizes and a zstd stream an attribute. Version 1 has positions in
+half precision, 1 and 2 quaternions without w. Coordinates are passed on as they are
+stored. See docs/formats.md.
 """
 
 import math
@@ -27,7 +29,9 @@ _HEADER = struct.Struct("<IIIBBBB")
 _ZSTD_HEADER_BYTES = 32
 _STREAM_SIZES = struct.Struct("<QQ")
 _MAX_TRAILER = 1 << 20  # bytes after the attributes, for extensions of vendors
-_MAX_START = 1 << 16  # bytes that contain the header, also after the optional fields of a gzip header
+_MAX_START = (
+    1 << 16
+)  # bytes that contain the header, also after the optional fields of a gzip header
 _COLOR_SCALE = 0.15
 _LARGEST_FIXED = (1 << 23) - 1
 
@@ -75,7 +79,9 @@ def decode(path: Path, content: bytes, claims: Claims) -> Gaussians:
     if content[:2] == b"\x1f\x8b":
         return _decode(*_sections_of_gzip(path, content, claims))
     is_zstd = content[:4] == _MAGIC.to_bytes(4, "little")
-    check(path, is_zstd, f"a .spz file, which begins with 1f 8b or NGSP, got {content[:4].hex(' ')}")
+    check(
+        path, is_zstd, f"a .spz file, which begins with 1f 8b or NGSP, got {content[:4].hex(' ')}"
+    )
     return _decode(*_sections_of_zstd(path, content, claims))
 
 
@@ -86,7 +92,8 @@ def write(path: Path, gaussians: Gaussians, version: int = 3) -> None:
     with _files.replacing(path) as temporary, open(temporary, "wb") as file:
         for part in encode(host, version):
             file.write(part)
-        # Readers refuse files that are too small for what they claim, and ignore zeros at the end.
+        # Readers refuse files that are too small for what they claim, and ignore zeros
+        # at the end.
         file.write(bytes(max(0, least_bytes(len(host)) - file.tell())))
 
 
@@ -96,7 +103,8 @@ def encode(host: Gaussians, version: int = 3) -> Iterator[bytes]:
     integer_bits = 0
     if reach > 0:
         integer_bits = math.ceil(math.log2(reach))
-    # Fraction bits: 12, as in Niantic's writer, or more if a step were above 2^-17 of the largest coordinate.
+    # Fraction bits: 12, as in Niantic's writer, or more if a step were above 2^-17 of
+    # the largest coordinate.
     bits = max(0, min(max(12, 17 - integer_bits), 22 - integer_bits, 24))
     fits = reach * 2**bits <= _LARGEST_FIXED
     check("means", fits, f"coordinates within ±{_LARGEST_FIXED} for .spz, got {reach:g}")
@@ -130,8 +138,11 @@ def encode(host: Gaussians, version: int = 3) -> Iterator[bytes]:
     yield compressor.flush()
 
 
-def _zstd_parts(header: bytes, count: int, sections: list[Callable[[slice], bytes]]) -> Iterator[bytes]:
-    """The header, with number of streams and offset of their table; the table of sizes; the streams."""
+def _zstd_parts(
+    header: bytes, count: int, sections: list[Callable[[slice], bytes]]
+) -> Iterator[bytes]:
+    """The header, with number of streams and offset of their table; the table of sizes;
+    the streams."""
     import zstandard
 
     raw = [b"".join(map(section, _packing.blocks(count))) for section in sections]
@@ -165,7 +176,8 @@ def _decode(header: _Header, sections: list[memoryview]) -> Gaussians:
     count = header.num_gaussians
     positions = np.frombuffer(sections[0], "u1")
     opacities, colors, scales, rotations, higher_sh = (
-        np.frombuffer(section, "u1").reshape(count, len(section) // max(1, count)) for section in sections[1:]
+        np.frombuffer(section, "u1").reshape(count, len(section) // max(1, count))
+        for section in sections[1:]
     )
 
     def means(block: slice) -> Floats:
@@ -180,7 +192,13 @@ def _decode(header: _Header, sections: list[memoryview]) -> Gaussians:
         higher = (higher_sh[block].astype(np.float64) - 128.0) / 128.0
         sh = np.concatenate([color[:, None], higher.reshape(len(color), -1, 3)], axis=1)
         log_scales = scales[block] / 16.0 - 10.0
-        return means(block), _quats(rotations[block]), np.exp(log_scales), opacities[block, 0] / 255.0, sh
+        return (
+            means(block),
+            _quats(rotations[block]),
+            np.exp(log_scales),
+            opacities[block, 0] / 255.0,
+            sh,
+        )
 
     return assemble(count, header.sh_degree, decode)
 
@@ -207,7 +225,9 @@ def _checked_header(path: Path, header: bytes, claims: Claims) -> _Header:
     return _Header(version, degree, fraction_bits, count)
 
 
-def _sections_of_gzip(path: Path, content: bytes, claims: Claims) -> tuple[_Header, list[memoryview]]:
+def _sections_of_gzip(
+    path: Path, content: bytes, claims: Claims
+) -> tuple[_Header, list[memoryview]]:
     stream = zlib.decompressobj(31)
     with telling(path, "a gzip stream that is not damaged"):
         start = stream.decompress(content, _HEADER.size)
@@ -219,7 +239,9 @@ def _sections_of_gzip(path: Path, content: bytes, claims: Claims) -> tuple[_Head
         # The limit is never 0, which would mean none.
         body = stream.decompress(stream.unconsumed_tail, total + _MAX_TRAILER)
         if not stream.eof and len(body) >= total:
-            stream.decompress(stream.unconsumed_tail, 1)  # reads the checksum if nothing else follows
+            stream.decompress(
+                stream.unconsumed_tail, 1
+            )  # reads the checksum if nothing else follows
     is_whole = len(body) >= total and stream.eof
     check(path, is_whole, f"a gzip stream that ends after {total} bytes of gaussians, got another")
     ends = np.cumsum(sizes).tolist()
@@ -227,14 +249,20 @@ def _sections_of_gzip(path: Path, content: bytes, claims: Claims) -> tuple[_Head
     return header, sections
 
 
-def _sections_of_zstd(path: Path, content: bytes, claims: Claims) -> tuple[_Header, list[memoryview]]:
+def _sections_of_zstd(
+    path: Path, content: bytes, claims: Claims
+) -> tuple[_Header, list[memoryview]]:
     import zstandard
 
     num_bytes = len(content)
     has_header = num_bytes >= _ZSTD_HEADER_BYTES
     check(path, has_header, f"a header of {_ZSTD_HEADER_BYTES} bytes, got {num_bytes}")
     header = _checked_header(path, content, claims)
-    check(path, header.version == 4, f"version {header.version} in a gzip stream, got it outside of one")
+    check(
+        path,
+        header.version == 4,
+        f"version {header.version} in a gzip stream, got it outside of one",
+    )
     sizes = header.section_bytes
     if not header.sh_degree:
         del sizes[-1]
@@ -242,7 +270,11 @@ def _sections_of_zstd(path: Path, content: bytes, claims: Claims) -> tuple[_Head
     table = int.from_bytes(content[16:20], "little")
     first = table + num_streams * _STREAM_SIZES.size
     has_table = num_streams == len(sizes) and table >= _ZSTD_HEADER_BYTES and first <= num_bytes
-    check(path, has_table, f"a table of {len(sizes)} streams after the header, got {num_streams} at {table}")
+    check(
+        path,
+        has_table,
+        f"a table of {len(sizes)} streams after the header, got {num_streams} at {table}",
+    )
     sections = []
     for i, size in enumerate(sizes):
         packed, expanded = _STREAM_SIZES.unpack_from(content, table + i * _STREAM_SIZES.size)

@@ -1,6 +1,8 @@
-"""Streamed SOG, of PlayCanvas: `lod-meta.json` and folders of SOG; v3dg.export writes it.
+"""Streamed SOG, of PlayCanvas: `lod-meta.json` and folders of SOG; v3dg.export writes
+it.
 
-Each leaf of a tree lists, for each level, which gaussians of which folder represent what is in its bounds.
+Each leaf of a tree lists, for each level, which gaussians of which folder represent
+what is in its bounds.
 """
 
 import os
@@ -41,7 +43,9 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         count = len(gaussians)
         fits = sum(len(run) for run in rows) <= count and max(run.stop for run in rows) <= count
         check(path, fits, f"at most {count} gaussians of {str(name)!a}, got more")
-        parts.append(gaussians.subset(np.concatenate([np.arange(run.start, run.stop) for run in rows])))
+        parts.append(
+            gaussians.subset(np.concatenate([np.arange(run.start, run.stop) for run in rows]))
+        )
     if environment is not None:
         parts.append(sog.read(path.parent / environment, claims))
     degrees = sorted({part.sh_degree for part in parts})
@@ -52,12 +56,17 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 def files(path: Path) -> list[Path]:
     """The index and the files of all levels and of the environment that exist."""
     _, names, environment = _index(path, Claims().read(path))
-    parts = [path.parent / name for name in dict.fromkeys([*names, environment]) if name is not None]
+    parts = [
+        path.parent / name for name in dict.fromkeys([*names, environment]) if name is not None
+    ]
     return [path, *(file for part in parts if part.exists() for file in sog.files(part))]
 
 
-def _used(path: Path, claims: Claims) -> tuple[dict[PurePosixPath, list[range]], PurePosixPath | None]:
-    """The rows to read of each file, in their order, and the file of the environment."""
+def _used(
+    path: Path, claims: Claims
+) -> tuple[dict[PurePosixPath, list[range]], PurePosixPath | None]:
+    """The rows to read of each file, in their order, and the file of the
+    environment."""
     tree, names, environment = _index(path, claims.read(path))
     finest = _finest(tree, names)
     check(path, finest or environment is not None, "gaussians in the tree, got none")
@@ -66,7 +75,8 @@ def _used(path: Path, claims: Claims) -> tuple[dict[PurePosixPath, list[range]],
 
 
 def _index(path: Path, text: bytes) -> tuple[Node, list[PurePosixPath], PurePosixPath | None]:
-    """The tree, the names of the files, and the name of the environment's file if there is one."""
+    """The tree, the names of the files, and the name of the environment's file if there
+    is one."""
     with telling(path, "JSON"):
         index = Node(parse_json(text.decode("utf-8")), os.fspath(path), "")
     if index.has("version") and index.field("version").value != 1:
@@ -79,7 +89,8 @@ def _index(path: Path, text: bytes) -> tuple[Node, list[PurePosixPath], PurePosi
 
 
 def _inside(node: Node) -> PurePosixPath:
-    """The path of a file in the folder of the index or below it; ValueError for any other."""
+    """The path of a file in the folder of the index or below it; ValueError for any
+    other."""
     path = PurePosixPath(node.text())
     if path.is_absolute() or ".." in path.parts or "\\" in node.text():
         raise node.error("a path below that of lod-meta.json")
@@ -89,7 +100,9 @@ def _inside(node: Node) -> PurePosixPath:
 def _finest(tree: Node, names: list[PurePosixPath]) -> dict[PurePosixPath, list[range]]:
     """For each file, the runs of gaussians that are the finest level of a leaf."""
     runs: dict[PurePosixPath, list[range]] = {}
-    todo = [iter([tree])]  # iterators, because a list of a million empty nodes would be as large as a scene
+    todo = [
+        iter([tree])
+    ]  # iterators, because a list of a million empty nodes would be as large as a scene
     while todo:
         node = next(todo[-1], None)
         if node is None:

@@ -1,7 +1,8 @@
 """OpenUSD: gaussians as prims `ParticleField3DGaussianSplat`, with Pixar's usd-core.
 
-One prim is written. All prims are read and transformed, into one asset, or into an asset each with the
-poses of its instances. Of levels of detail, the first is read. Coordinates are passed on as they are stored.
+One prim is written. All prims are read and transformed, into one asset, or into an
+asset each with the poses of its instances. Of levels of detail, the first is read.
+Coordinates are passed on as they are stored.
 """
 
 from __future__ import annotations
@@ -34,14 +35,26 @@ if TYPE_CHECKING:
 SUFFIXES = (".usd", ".usda", ".usdc")
 _Pose: TypeAlias = tuple[tuple[float, float, float, float], Floats, float]
 _SH = "radiance:sphericalHarmonics"
-_HALVES = ("positions", "orientations", "scales", "opacities", f"{_SH}Coefficients")  # or in half precision
+_HALVES = (
+    "positions",
+    "orientations",
+    "scales",
+    "opacities",
+    f"{_SH}Coefficients",
+)  # or in half precision
 _COLUMNS = (f"{_SH}Degree", *_HALVES, *(f"{name}h" for name in _HALVES))
 
 
 @cache
 def pxr() -> ModuleType:
     """The package `pxr`; ImportError says how to get it."""
-    for part in ("Usd", "UsdGeom", "UsdLod", "UsdVol", "Vt"):  # importing them makes them attributes
+    for part in (
+        "Usd",
+        "UsdGeom",
+        "UsdLod",
+        "UsdVol",
+        "Vt",
+    ):  # importing them makes them attributes
         _extras.load(f"pxr.{part}")
     package: ModuleType = _extras.load("pxr")
     return package
@@ -80,7 +93,8 @@ def has_instances(path: AnyPath) -> bool:
 
 
 def read_world(path: AnyPath) -> tuple[list[Gaussians], list[int], list[_Pose], Axis]:
-    """Read the distinct assets of a USD file, asset and pose of each instance, and the axis that is up.
+    """Read the distinct assets of a USD file, asset and pose of each instance, and the
+    axis that is up.
 
     Prims whose values come from the same place are one asset, as references to it are.
     """
@@ -94,7 +108,9 @@ def read_world(path: AnyPath) -> tuple[list[Gaussians], list[int], list[_Pose], 
             path_of_prim = prim.GetPath()
             if path_of_prim not in asset_from_path:
                 stacks = [prim.GetAttribute(name).GetPropertyStack() for name in _COLUMNS]
-                source = tuple((stack[0].layer.identifier, stack[0].path) for stack in stacks if stack)
+                source = tuple(
+                    (stack[0].layer.identifier, stack[0].path) for stack in stacks if stack
+                )
                 if source not in asset_from_source:
                     asset_from_source[source] = len(assets)
                     assets.append(_gaussians_of(prim))
@@ -109,8 +125,11 @@ def read_world(path: AnyPath) -> tuple[list[Gaussians], list[int], list[_Pose], 
 
 @contextlib.contextmanager
 def _opened(path: AnyPath, expected: str) -> Iterator[tuple[ModuleType, Usd.Prim]]:
-    """The package `pxr`, and the root of the prims of a file; ValueError unless some are gaussians."""
-    check(path, Path(path).suffix.lower() in SUFFIXES, f"a file name ending in {', '.join(SUFFIXES)}")
+    """The package `pxr`, and the root of the prims of a file; ValueError unless some
+    are gaussians."""
+    check(
+        path, Path(path).suffix.lower() in SUFFIXES, f"a file name ending in {', '.join(SUFFIXES)}"
+    )
     usd = pxr()
     os.close(_files.open_regular(path))
     with telling(path, expected):
@@ -121,7 +140,8 @@ def _opened(path: AnyPath, expected: str) -> Iterator[tuple[ModuleType, Usd.Prim
 
 
 def _prims(usd: ModuleType, root: Usd.Prim) -> Iterator[Usd.Prim]:
-    """Prims of gaussians and instancers at and below a root, without those of coarser levels."""
+    """Prims of gaussians and instancers at and below a root, without those of coarser
+    levels."""
     walk = iter(usd.Usd.PrimRange(root, usd.Usd.TraverseInstanceProxies()))
     for prim in walk:
         parent = prim.GetParent()
@@ -134,7 +154,8 @@ def _prims(usd: ModuleType, root: Usd.Prim) -> Iterator[Usd.Prim]:
 
 
 def _placed(usd: ModuleType, root: Usd.Prim) -> Iterator[tuple[Usd.Prim, Floats]]:
-    """Prims of gaussians, each with the (4, 4) matrix from it, or from an instance of it, to the root."""
+    """Prims of gaussians, each with the (4, 4) matrix from it, or from an instance of
+    it, to the root."""
     root_from_world = np.linalg.inv(_to_world(usd, root))
     time = usd.Usd.TimeCode.EarliestTime()
     for prim in _prims(usd, root):
@@ -143,7 +164,9 @@ def _placed(usd: ModuleType, root: Usd.Prim) -> Iterator[tuple[Usd.Prim, Floats]
             yield prim, matrix
             continue
         instancer = usd.UsdGeom.PointInstancer(prim)
-        targets = map(prim.GetStage().GetPrimAtPath, instancer.GetPrototypesRel().GetForwardedTargets())
+        targets = map(
+            prim.GetStage().GetPrimAtPath, instancer.GetPrototypesRel().GetForwardedTargets()
+        )
         prototypes = [list(_placed(usd, target)) for target in targets]
         kinds = np.array(instancer.GetProtoIndicesAttr().Get(time))
         kinds = kinds[np.array(instancer.ComputeMaskAtTime(time) or np.ones(len(kinds)), bool)]
@@ -162,7 +185,9 @@ def _similarity(prim: Usd.Prim, matrix: Floats) -> _Pose:
     """Quaternion, translation and scale of a (4, 4) matrix that places a prim."""
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not (scale > 0 and is_rotation(matrix[:3, :3] / scale)):
-        raise ValueError(f"a transform of {prim.GetPath()} that is no rotation, translation and one scale")
+        raise ValueError(
+            f"a transform of {prim.GetPath()} that is no rotation, translation and one scale"
+        )
     return quaternion_from_rotation(matrix[:3, :3] / scale), matrix[:3, 3], scale
 
 
@@ -202,9 +227,12 @@ def new_stage(up: Literal["Y", "Z"]) -> Usd.Stage:
 
 
 def export(stage: Usd.Stage, path: AnyPath) -> None:
-    """Write a stage to a file in one step, in the encoding that belongs to the suffix."""
+    """Write a stage to a file in one step, in the encoding that belongs to the
+    suffix."""
     with _files.replacing(path) as temporary, tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / f"stage{Path(path).suffix.lower()}"  # USD takes the encoding from the suffix
+        file = (
+            Path(folder) / f"stage{Path(path).suffix.lower()}"
+        )  # USD takes the encoding from the suffix
         stage.GetRootLayer().Export(os.fspath(file))
         shutil.copyfile(file, temporary)
 
@@ -216,7 +244,9 @@ def define(stage: Usd.Stage, path: str, host: Gaussians) -> Usd.Prim:
     reach = 3 * host.scales.max(axis=1, keepdims=True, initial=0.0)
     extent = np.zeros((0, 3), np.float32)
     if len(host):
-        extent = np.array([(host.means - reach).min(axis=0), (host.means + reach).max(axis=0)], np.float32)
+        extent = np.array(
+            [(host.means - reach).min(axis=0), (host.means + reach).max(axis=0)], np.float32
+        )
     vectors = usd.Vt.Vec3fArray.FromNumpy
     quats = np.roll(normalised(host.quats), -1, axis=1)
     values = {

@@ -1,4 +1,5 @@
-"""Build a bundle from an asset: split it into clusters, then halve and fit level after level."""
+"""Build a bundle from an asset: split it into clusters, then halve and fit level after
+level."""
 
 import os
 from concurrent.futures import Executor
@@ -31,40 +32,49 @@ def build_bundle(
     executor: Executor | None = None,
     codec: Literal["float32", "quantized"] = "float32",
 ) -> Bundle:
-    """Build all levels of one asset (V3DG, algorithm 1; what we do differently is in docs/levels.md).
+    """Build all levels of one asset (V3DG, algorithm 1; what we do differently is in
+    docs/levels.md).
 
-    The same asset, config, seed and device give the same bundle, bit for bit, whatever the number of threads
-    (on one instruction set or one kind of GPU: others round differently).
+    The same asset, config, seed and device give the same bundle, bit for bit, whatever
+    the number of threads (on one instruction set or one kind of GPU: others round
+    differently).
 
     Args:
-        asset: At least one gaussian that can be drawn; or the file of it, as for `read_asset`.
+        asset: At least one gaussian that can be drawn; or the file of it, as for
+            `read_asset`.
         config: Settings; ours by default.
         seed: Of the views that groups are fitted to.
-        progress: Show a bar with the level, its groups done, the time left and their mean loss; four lines
-            where stderr is no terminal. Or a function that is called with the gaussians that are fitted, of
-            how many, and a text; what it raises ends the build. The four lines are also logged in any case,
-            as INFO of the logger `v3dg`.
-        device: Where to compute; the bundle is on the host in any case. "auto" and "cuda" are the asset's or
-            the current CUDA device and all others of its kind, where torch can use it; "auto" else the CPU.
-        resume_path: The file of the bundle, which is written there as it is built, and opened from there; a
-            build of the same asset, config, seed and device goes on from what it finds.
-        unusable: Whether gaussians with wrong values (not finite, negative scales, opacities outside 0 to 1)
-            are left out, with a `v3dg.cleaning.AssetWarning`, or are an error. Those that no pixel can show,
-            because their opacity is below 1/255, are left out in any case. How many of each kind is kept in
-            the bundle's config as "dropped".
-        executor: Whose workers build, as `dask.distributed.Client.get_executor()`; by default, threads of
-            this process. They are to have devices of one kind with this process, which builds the topmost
-            levels, and to reach `resume_path`, where they write their parts (docs/cluster.md).
-        codec: How the bundle keeps gaussians, see `v3dg.Bundle`. Where that rounds, levels are fitted to what
-            those below them were rounded to.
+        progress: Show a bar with the level, its groups done, the time left and their
+            mean loss; four lines where stderr is no terminal. Or a function that is
+            called with the gaussians that are fitted, of how many, and a text; what it
+            raises ends the build. The four lines are also logged in any case, as INFO
+            of the logger `v3dg`.
+        device: Where to compute; the bundle is on the host in any case. "auto" and
+            "cuda" are the asset's or the current CUDA device and all others of its
+            kind, where torch can use it; "auto" else the CPU.
+        resume_path: The file of the bundle, which is written there as it is built, and
+            opened from there; a build of the same asset, config, seed and device goes
+            on from what it finds.
+        unusable: Whether gaussians with wrong values (not finite, negative scales,
+            opacities outside 0 to 1) are left out, with a `v3dg.cleaning.AssetWarning`,
+            or are an error. Those that no pixel can show, because their opacity is
+            below 1/255, are left out in any case. How many of each kind is kept in the
+            bundle's config as "dropped".
+        executor: Whose workers build, as `dask.distributed.Client.get_executor()`; by
+            default, threads of this process. They are to have devices of one kind with
+            this process, which builds the topmost levels, and to reach `resume_path`,
+            where they write their parts (docs/cluster.md).
+        codec: How the bundle keeps gaussians, see `v3dg.Bundle`. Where that rounds,
+            levels are fitted to what those below them were rounded to.
 
     Raises:
         ValueError: The asset has nothing that can be drawn, or a setting is wrong.
-        RuntimeError: The device is "cuda", and something is missing for it; another build is using
-            `resume_path`; or a worker is of another kind, or ended.
+        RuntimeError: The device is "cuda", and something is missing for it; another
+            build is using `resume_path`; or a worker is of another kind, or ended.
         OSError: `resume_path` cannot be written; what is finished stays there.
         MemoryError: The device has too little memory; the message has the numbers.
-        KeyboardInterrupt: Ctrl-C; threads have stopped, what is finished is at `resume_path`.
+        KeyboardInterrupt: Ctrl-C; threads have stopped, what is finished is at
+            `resume_path`.
     """
     asset = loaded(asset)
     check_type("asset", asset, Gaussians, "Gaussians")
@@ -74,4 +84,6 @@ def build_bundle(
     leaves = MemoryLeaves(asset, config, unusable, devices[0])
     has_place = executor is None or resume_path is not None
     check("resume_path", has_place, "a file that all workers of the executor reach, got None")
-    return build_into(resume_path, leaves, config, seed, devices, progress, codec=codec, executor=executor)
+    return build_into(
+        resume_path, leaves, config, seed, devices, progress, codec=codec, executor=executor
+    )

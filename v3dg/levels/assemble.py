@@ -11,16 +11,22 @@ from v3dg.levels.plan import Plan
 from v3dg.levels.simplify import LevelTables
 
 
-def assemble(plan: Plan, tables: Sequence[LevelTables], config: BuildConfig) -> tuple[Clusters, Groups]:
+def assemble(
+    plan: Plan, tables: Sequence[LevelTables], config: BuildConfig
+) -> tuple[Clusters, Groups]:
     """The tables of all levels, in order."""
     levels = plan.levels
     num_clusters = [level.num_clusters for level in levels]
-    num_groups = [0, *(level.num_groups for level in levels[1:])]  # a bundle has no groups of level 0
+    num_groups = [
+        0,
+        *(level.num_groups for level in levels[1:]),
+    ]  # a bundle has no groups of level 0
     sizes = np.concatenate([np.diff(level.offset) for level in levels])
     level = np.repeat(np.arange(len(levels), dtype=np.int32), num_clusters)
     last_px2 = 0.0
     if config.filter_px2 > 0 or config.smooth == "yes":
-        # The last level is also drawn at all smaller sizes, with the variance of a whole pixel, 1/12.
+        # The last level is also drawn at all smaller sizes, with the variance of a
+        # whole pixel, 1/12.
         last_px2 = max(config.filter_px2, 1 / 12)
     coarse_px2 = np.where(level < len(levels) - 1, config.filter_px2, last_px2)
     clusters = Clusters(
@@ -37,13 +43,18 @@ def assemble(plan: Plan, tables: Sequence[LevelTables], config: BuildConfig) -> 
         weight=np.concatenate([np.zeros(0, np.float32), *(level.weight for level in levels[1:])]),
         parent=_groups_from(num_groups, num_groups, 1),
         level=np.repeat(np.arange(len(levels), dtype=np.int32), num_groups),
-        error=np.concatenate([np.zeros((0, 2), np.float32), *(table.error for table in tables[1:])]),
+        error=np.concatenate(
+            [np.zeros((0, 2), np.float32), *(table.error for table in tables[1:])]
+        ),
     )
     return clusters, groups
 
 
-def _groups_from(counts: Sequence[int], num_groups: Sequence[int], num_up: int) -> npt.NDArray[np.int32]:
-    """The group, `num_up` levels up, of each of the `counts` rows of every level; -1 where there is none.
+def _groups_from(
+    counts: Sequence[int], num_groups: Sequence[int], num_up: int
+) -> npt.NDArray[np.int32]:
+    """The group, `num_up` levels up, of each of the `counts` rows of every level; -1
+    where there is none.
 
     All groups of a level have the same number of rows.
     """

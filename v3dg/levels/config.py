@@ -11,7 +11,8 @@ _MOST_SIDE = 8192
 # Samples along a pixel's side, in targets of deep levels; more samples gain nothing.
 _MOST_SAMPLES = 8
 _DEEP = 64  # a level whose targets have that many samples
-# Pixels of all views of a group together: each thread that fits a group keeps them, 16 bytes each.
+# Pixels of all views of a group together: each thread that fits a group keeps them, 16
+# bytes each.
 _MOST_PIXELS_KEPT = 1 << 26
 
 _KINDS: dict[Any, tuple[Any, str]] = {
@@ -26,52 +27,64 @@ _Setting = int | float | bool | str
 
 @dataclass(frozen=True)
 class BuildConfig:
-    """How a bundle is built. The defaults are ours, with the reasons in docs/levels.md; `paper()` is V3DG's.
+    """How a bundle is built. The defaults are ours, with the reasons in docs/levels.md;
+    `paper()` is V3DG's.
 
-    Numbers have their least and their greatest value beside their type. Whole numbers are 32 bits wide in the
-    core, others float32, whose squares and products with each other must be finite, and not 0 where they are
-    divided by.
+    Numbers have their least and their greatest value beside their type. Whole numbers
+    are 32 bits wide in the core, others float32, whose squares and products with each
+    other must be finite, and not 0 where they are divided by.
 
     Attributes:
         cluster_size: Maximum number of gaussians in a cluster of level 0.
-        group_size: Clusters that are simplified together, a power of two; 2 makes a tree.
+        group_size: Clusters that are simplified together, a power of two; 2 makes a
+            tree.
         min_clusters: Levels stop before there are fewer clusters than this ...
         min_gaussians: ... or fewer gaussians than this.
-        init: Start of a coarser cluster: "merge" alike gaussians in pairs, or "prune" the lesser half.
+        init: Start of a coarser cluster: "merge" alike gaussians in pairs, or "prune"
+            the lesser half.
         prune_growth: Factor for the scales of gaussians that survive pruning.
-        targets: What a level is fitted to: the "finest" level below that its views can show, or the
-            "previous" one.
+        targets: What a level is fitted to: the "finest" level below that its views can
+            show, or the "previous" one.
         steps: Maximum number of steps of Adam for each group; 0 keeps the start.
-        first_steps: Steps at level 1; each level takes twice as many as the one below, up to `steps`.
+        first_steps: Steps at level 1; each level takes twice as many as the one below,
+            up to `steps`.
         views_per_step: Views that one step looks at.
         num_views: Views of a group, drawn once; 0 draws a fresh random one each time.
-        supersample: The factor by which targets of level 1 are drawn larger before they are box-averaged. It
-            grows by one every two levels, up to 8, because higher levels show finer gaussians; targets of the
-            previous level keep it.
-        image_size: Side of the views in px; 0 shows a group at the size at which it will be selected.
-        px2_per_gaussian: That size: px² of the group's footprint for each gaussian that it is simplified to.
+        supersample: The factor by which targets of level 1 are drawn larger before they
+            are box-averaged. It grows by one every two levels, up to 8, because higher
+            levels show finer gaussians; targets of the previous level keep it.
+        image_size: Side of the views in px; 0 shows a group at the size at which it
+            will be selected.
+        px2_per_gaussian: That size: px² of the group's footprint for each gaussian that
+            it is simplified to.
         distance: From the camera to the centre of the group, in radii.
-        filter_px2: Variance of the low-pass that the coarser levels are drawn with, px²; the last one with a
-            pixel's, 1/12, if that is more, unless this is 0.
-        smooth: Whether the asset's gaussians are about as wide as they are far apart, so that one sample a
-            pixel shows it well from near. Its coarser levels have no filter, but the last one a pixel's, and
-            a group of level 1 is selected where pictures of the asset tell that it is no worse than its
-            leaves, or at half the size if there are more than a million leaves. Where levels are fitted, and
-            with a filter, it is measured: some groups of level 1 are fitted with 0.05 px² and without, and an
-            asset that hardly gains by the filter is smooth.
-        asset_filter_px2: The filter of level 0: what the asset was trained with (0.3 for the original 3DGS)
-            at the size of its photographs; without, it is better seen from farther away. Coarser levels are
-            fitted to the asset without a filter.
-        asset_antialiased: Whether the asset was trained with opacities compensated for its filter.
+        filter_px2: Variance of the low-pass that the coarser levels are drawn with,
+            px²; the last one with a pixel's, 1/12, if that is more, unless this is 0.
+        smooth: Whether the asset's gaussians are about as wide as they are far apart,
+            so that one sample a pixel shows it well from near. Its coarser levels have
+            no filter, but the last one a pixel's, and a group of level 1 is selected
+            where pictures of the asset tell that it is no worse than its leaves, or at
+            half the size if there are more than a million leaves. Where levels are
+            fitted, and with a filter, it is measured: some groups of level 1 are fitted
+            with 0.05 px² and without, and an asset that hardly gains by the filter is
+            smooth.
+        asset_filter_px2: The filter of level 0: what the asset was trained with (0.3
+            for the original 3DGS) at the size of its photographs; without, it is better
+            seen from farther away. Coarser levels are fitted to the asset without a
+            filter.
+        asset_antialiased: Whether the asset was trained with opacities compensated for
+            its filter.
         loss_l1, loss_dssim, loss_alpha: Weights of the parts of the loss.
-        step_position: Step size of positions, in radii of the group, or in world units if
-            `position_in_world`; the others are of log scales, quaternions, logits and SH coefficients.
-        final_step: The factor that the step sizes have reached in the end, by exponential decay.
+        step_position: Step size of positions, in radii of the group, or in world units
+            if `position_in_world`; the others are of log scales, quaternions, logits
+            and SH coefficients.
+        final_step: The factor that the step sizes have reached in the end, by
+            exponential decay.
         beta2: Decay of Adam's running mean of squared gradients.
 
     Raises:
-        ValueError: A setting is of another kind or out of its range, or all views of a group have too many
-            pixels to be kept.
+        ValueError: A setting is of another kind or out of its range, or all views of a
+            group have too many pixels to be kept.
     """
 
     cluster_size: Annotated[int, (2, 1 << 30)] = 256
@@ -120,7 +133,9 @@ class BuildConfig:
             is_kind = isinstance(value, classes) and isinstance(value, bool) == (kind is bool)
             self._require(field.name, is_kind, expected)
             for minimum, maximum in ranges:
-                self._require(field.name, minimum <= value <= maximum, f"{minimum:,} to {maximum:,}")
+                self._require(
+                    field.name, minimum <= value <= maximum, f"{minimum:,} to {maximum:,}"
+                )
         self._require("group_size", self.group_size.bit_count() == 1, "a power of two")
         self.check_views(1)
 
@@ -128,23 +143,28 @@ class BuildConfig:
         check(name, is_good, f"{expected}, got {getattr(self, name)!r}")
 
     def check_views(self, most_gaussians: int) -> None:
-        """Refuse views of groups of at most `most_gaussians` that have too many pixels, with ValueError."""
+        """Refuse views of groups of at most `most_gaussians` that have too many pixels,
+        with ValueError."""
         if self.image_size > 0:
             name = "image_size"
             side = self.image_size
         else:
             name = "px2_per_gaussian"
             side = self._view_side(most_gaussians)
-        fits = side * self.samples_at(_DEEP) <= _MOST_SIDE and side**2 * self.num_views <= _MOST_PIXELS_KEPT
+        fits = (
+            side * self.samples_at(_DEEP) <= _MOST_SIDE
+            and side**2 * self.num_views <= _MOST_PIXELS_KEPT
+        )
         check(
             name,
             fits,
-            f"views of at most {_MOST_SIDE} px a side with `supersample`, and {_MOST_PIXELS_KEPT} px in all "
-            f"`num_views`, got {side} px a side; reduce one of them, or `cluster_size`",
+            f"views of at most {_MOST_SIDE} px a side with `supersample`, and {_MOST_PIXELS_KEPT} "
+            f"px in all `num_views`, got {side} px a side; reduce one of them, or `cluster_size`",
         )
 
     def _view_side(self, num_gaussians: int) -> int:
-        """The side, in px, of a view of a group of `num_gaussians`, as fit_view() of the core chooses it."""
+        """The side, in px, of a view of a group of `num_gaussians`, as fit_view() of
+        the core chooses it."""
         x2 = self.distance**-2
         footprint_of_focal = 2 * math.pi * (1 - math.sqrt(1 - x2))
         radius2 = num_gaussians * self.px2_per_gaussian / footprint_of_focal * x2 / (1 - x2)
@@ -163,7 +183,8 @@ class BuildConfig:
     def target_of(self, level: int) -> int:
         """The level that the groups of a level are fitted to.
 
-        A level finer than one with two gaussians for each sample of a target picture shows no more.
+        A level finer than one with two gaussians for each sample of a target picture
+        shows no more.
         """
         if self.targets == "previous":
             return max(0, level - 1)
@@ -172,9 +193,9 @@ class BuildConfig:
     def levels_at_once(self, first: int, end: int) -> range:
         """The levels before `end` that are fitted together with level `first`.
 
-        The lowest levels, which are seen most, start from the fitted level below. The levels above them have
-        few groups, which would take long one level after another; they start together, by repeated merging
-        of the last fitted level.
+        The lowest levels, which are seen most, start from the fitted level below. The
+        levels above them have few groups, which would take long one level after
+        another; they start together, by repeated merging of the last fitted level.
         """
         end = min(end, first + self._visible_levels)
         stop = first + 1
@@ -185,7 +206,8 @@ class BuildConfig:
 
     @property
     def _visible_levels(self) -> int:
-        """The number of levels down to gaussians about as small as half a sample of a target picture."""
+        """The number of levels down to gaussians about as small as half a sample of a
+        target picture."""
         px2 = self.px2_per_gaussian
         if self.image_size > 0:  # the ball covers about 0.4 of the picture
             px2 = 0.4 * self.image_size**2 / (self.cluster_size * self.group_size / 2)
@@ -198,11 +220,12 @@ class BuildConfig:
 
     @staticmethod
     def paper(**changes: _Setting) -> "BuildConfig":
-        """The settings of the paper and its code (V3DG, section 3.2 and 5.1), with `changes` to them.
+        """The settings of the paper and its code (V3DG, section 3.2 and 5.1), with
+        `changes` to them.
 
-        4,096 gaussians a cluster, two clusters a group, stop at two clusters; prune, grow scales by 2^(1/6);
-        640 fresh random views of 64 x 64 px at four radii, against the previous level, without a filter;
-        0.8 L1 + 0.2 D-SSIM + 0.1 alpha.
+        4,096 gaussians a cluster, two clusters a group, stop at two clusters; prune,
+        grow scales by 2^(1/6); 640 fresh random views of 64 x 64 px at four radii,
+        against the previous level, without a filter; 0.8 L1 + 0.2 D-SSIM + 0.1 alpha.
         """
         config = BuildConfig(
             cluster_size=4096,

@@ -10,14 +10,16 @@ from v3dg.bundle.format import page_hash
 from v3dg.gaussians import Gaussians
 
 PIECE = 1 << 16
-"""Number of gaussians that are read, examined and hashed at a time; the digest of an asset depends on it."""
+"""Number of gaussians that are read, examined and hashed at a time; the digest of an
+asset depends on it."""
 
 
 def digest_of(asset: Gaussians) -> str:
-    """The digest of an asset, which does not depend on the file that it was read from."""
+    """The digest of an asset, which does not depend on the file that it was read
+    from."""
     pieces = pieces_of(asset.numpy())
-    # To hash a few pieces is less work than to start threads, which Python does not do safely when memory is
-    # short.
+    # To hash a few pieces is less work than to start threads, which Python does not do
+    # safely when memory is short.
     if len(pieces) <= 3:
         return digest_of_hashes(map(hash_of, pieces))
     with new_pool() as pool:
@@ -26,7 +28,9 @@ def digest_of(asset: Gaussians) -> str:
 
 def pieces_of(gaussians: Gaussians) -> list[Gaussians]:
     """Cut gaussians into pieces, which share their memory."""
-    return [gaussians.subset(slice(start, start + PIECE)) for start in range(0, len(gaussians), PIECE)]
+    return [
+        gaussians.subset(slice(start, start + PIECE)) for start in range(0, len(gaussians), PIECE)
+    ]
 
 
 def hash_of(piece: Gaussians) -> bytes:
@@ -34,7 +38,8 @@ def hash_of(piece: Gaussians) -> bytes:
 
 
 def digest_of_hashes(hashes: Iterable[bytes]) -> str:
-    """The digest of an asset from the hashes of its pieces, which all cores can compute together."""
+    """The digest of an asset from the hashes of its pieces, which all cores can compute
+    together."""
     return page_hash([np.frombuffer(b"".join(hashes), np.uint8)]).hex()
 
 

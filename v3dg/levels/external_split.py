@@ -1,7 +1,8 @@
 """The median split of more points than memory holds.
 
-A node that does not fit is split in passes over its points: for the longest side of its box, twice for the
-median of that axis (the upper and the lower half of its bits), and once to move the points.
+A node that does not fit is split in passes over its points: for the longest side of its
+box, twice for the median of that axis (the upper and the lower half of its bits), and
+once to move the points.
 """
 
 from collections.abc import Iterator
@@ -27,10 +28,14 @@ def points_of(means: npt.NDArray[np.float32], index: npt.NDArray[np.integer]) ->
     return np.column_stack([means.view(np.uint32), index.astype(np.uint32)])
 
 
-def split(files: tuple[RowFile, RowFile], count: int, depth: int, num_fitting: int, order: RowFile) -> None:
-    """Write the indices of points in the order of `_core.median_split`, with which it agrees in every bit.
+def split(
+    files: tuple[RowFile, RowFile], count: int, depth: int, num_fitting: int, order: RowFile
+) -> None:
+    """Write the indices of points in the order of `_core.median_split`, with which it
+    agrees in every bit.
 
-    The first `count` rows of one file have the points, finite, by ascending index; the other is for passes.
+    The first `count` rows of one file have the points, finite, by ascending index; the
+    other is for passes.
     """
     todo = [(0, count, depth, 0)]
     while todo:
@@ -56,7 +61,8 @@ def _split_in_memory(points: Points, depth: int) -> Words:
 
 
 def _partition(source: RowFile, first: int, middle: int, last: int, target: RowFile) -> None:
-    """Write the lower half of a node at `first` and the upper half at `middle`, both in the same order."""
+    """Write the lower half of a node at `first` and the upper half at `middle`, both in
+    the same order."""
     axis = _longest_axis(source, first, last)
     median, num_ties = _median(source, first, middle, last, axis)
     ends = [first, middle]
@@ -82,7 +88,8 @@ def _longest_axis(source: RowFile, first: int, last: int) -> int:
 
 
 def _median(source: RowFile, first: int, middle: int, last: int, axis: int) -> tuple[int, int]:
-    """The greatest key of the lower half, as of `_ordered`, and how many points of the lower half have it."""
+    """The greatest key of the lower half, as of `_ordered`, and how many points of the
+    lower half have it."""
 
     def keys() -> Iterator[Words]:
         return (_ordered(points[:, axis]) for points in source.blocks(first, last, _AT_ONCE))
@@ -94,7 +101,8 @@ def _median(source: RowFile, first: int, middle: int, last: int, axis: int) -> t
 
 
 def _bin_of(rank: int, values: Iterator[Words]) -> tuple[int, int]:
-    """The 16-bit value of a rank, counted from 1, and its rank among the values that are equal to it."""
+    """The 16-bit value of a rank, counted from 1, and its rank among the values that
+    are equal to it."""
     counts = np.zeros(1 << 16, np.int64)
     for block in values:
         counts += np.bincount(block, minlength=1 << 16)
@@ -104,7 +112,8 @@ def _bin_of(rank: int, values: Iterator[Words]) -> tuple[int, int]:
 
 
 def _ordered(bits: Words) -> Words:
-    """Numbers that compare like the floats with these bits; zeros of both signs are equal."""
+    """Numbers that compare like the floats with these bits; zeros of both signs are
+    equal."""
     bits = (bits.view(np.float32) + np.float32(0)).view(np.uint32)
     sign = bits >> 31
     return np.asarray(bits ^ ((np.uint32(0) - sign) | np.uint32(1 << 31)))

@@ -1,4 +1,5 @@
-"""From files of an asset to the file of its bundle: builds it if needed, and resumes an interrupted build."""
+"""From files of an asset to the file of its bundle: builds it if needed, and resumes an
+interrupted build."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -41,27 +42,33 @@ def build_file(
     codec: Literal["float32", "quantized"] = "float32",
     up: Axis | None = None,
 ) -> tuple[Bundle, bool]:
-    """Build the bundle of an asset's file, or of several that make one asset, straight into a file.
+    """Build the bundle of an asset's file, or of several that make one asset, straight
+    into a file.
 
-    While it is built it is at `levels_path`; an asset that does not fit in memory is sorted in a scratch
-    folder beside it.
+    While it is built it is at `levels_path`; an asset that does not fit in memory is
+    sorted in a scratch folder beside it.
 
     Args:
         asset: The content of the asset's file, if it is in memory already.
-        resume: Keep a bundle whose config says that it was made of these gaussians with these settings, and
-            continue from the levels of a build that was interrupted; otherwise everything is built again.
-        memory: Memory of the host that the build may use in addition to what the process uses already:
-            bytes, or text like "8GiB". Default: half of the free memory.
-        up: The axis that is up in the asset, which the bundle records for viewers and exports.
-        config, seed, progress, device, unusable, executor, codec: As for `build_bundle`.
+        resume: Keep a bundle whose config says that it was made of these gaussians with
+            these settings, and continue from the levels of a build that was
+            interrupted; otherwise everything is built again.
+        memory: Memory of the host that the build may use in addition to what the
+            process uses already: bytes, or text like "8GiB". Default: half of the free
+            memory.
+        up: The axis that is up in the asset, which the bundle records for viewers and
+            exports.
+        config, seed, progress, device, unusable, executor, codec: As for
+            `build_bundle`.
 
     Returns:
         The bundle, opened from its file, and whether it was built.
 
     Raises:
-        ValueError: Memory is too little (the message says how much is needed), or the file name does not end
-            in .v3dg.
-        ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: As `read_asset` and `build_bundle`.
+        ValueError: Memory is too little (the message says how much is needed), or the
+            file name does not end in .v3dg.
+        ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: As
+            `read_asset` and `build_bundle`.
     """
     paths = [asset_path] if isinstance(asset_path, str | os.PathLike) else list(asset_path)
     bundle_path = Path(bundle_path)
@@ -90,12 +97,15 @@ def build_file(
                 reserved=unit_bytes,
                 device=devices[0],
                 progress=progress,
-                # Workers of an executor cannot read leaves in the memory of this process.
+                # Workers of an executor cannot read leaves in the memory of this
+                # process.
                 most_in_memory=MOST_GAUSSIANS if executor is None else 0,
             )
         del asset
         with source as leaves:
-            if resume and _is_made_with(bundle_path, made_with(leaves, config, seed, codec, up), codec):
+            if resume and _is_made_with(
+                bundle_path, made_with(leaves, config, seed, codec, up), codec
+            ):
                 with suppress(RuntimeError):  # another build has begun to write there
                     discard_levels(levels)
                 return Bundle.open(bundle_path), False
@@ -128,7 +138,8 @@ def _naming_asset(path: AssetPath) -> Iterator[None]:
 
 
 def _is_made_with(bundle_path: Path, config: dict[str, Any], codec: str) -> bool:
-    """Whether a bundle exists, has this config, and was not converted to another codec since."""
+    """Whether a bundle exists, has this config, and was not converted to another codec
+    since."""
     try:
         bundle = Bundle.open(bundle_path)
         return bundle.config == config and bundle.codec == codec
@@ -137,7 +148,8 @@ def _is_made_with(bundle_path: Path, config: dict[str, Any], codec: str) -> bool
 
 
 def levels_path(bundle_path: str | os.PathLike[str]) -> Path:
-    """The file in which `build_file` makes the bundle, and from which an interrupted build continues."""
+    """The file in which `build_file` makes the bundle, and from which an interrupted
+    build continues."""
     path = Path(bundle_path)
     if path.is_symlink():  # the file is beside the target of the link, which it will replace
         path = Path(os.path.realpath(path))

@@ -1,4 +1,5 @@
-"""The core's fit: its settings, and running it while Ctrl-C and the display of progress keep working."""
+"""The core's fit: its settings, and running it while Ctrl-C and the display of progress
+keep working."""
 
 import _thread
 import threading
@@ -43,9 +44,12 @@ def fit_config(config: BuildConfig, seed: int, level: int) -> _core.FitConfig:
 
 
 def run_fit(
-    fit: Callable[[_core.FitProgress], _T], device: Device, show: Callable[[_core.FitProgress], None]
+    fit: Callable[[_core.FitProgress], _T],
+    device: Device,
+    show: Callable[[_core.FitProgress], None],
 ) -> _T:
-    """Run `fit` on a thread of its own, `show` its progress meanwhile, and return its result."""
+    """Run `fit` on a thread of its own, `show` its progress meanwhile, and return its
+    result."""
     state = _core.FitProgress()
     result: list[_T] = []
     run = _device.with_this_stream(lambda: result.append(fit(state)), device)
@@ -61,8 +65,9 @@ def run_fit(
         finally:
             done.set()
 
-    # Not threading.Thread: if the thread ends before its first line because memory is short, start() waits
-    # for ever; and after Ctrl-C during join(), Python 3.11 can take a running thread for finished.
+    # Not threading.Thread: if the thread ends before its first line because memory is
+    # short, start() waits for ever; and after Ctrl-C during join(), Python 3.11 can
+    # take a running thread for finished.
     tokens = [_Token()]
     running_token = weakref.ref(tokens[0])
     try:

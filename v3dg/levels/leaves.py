@@ -1,4 +1,5 @@
-"""The leaves of a build: the gaussians of an asset that can be drawn, in the order of the median split."""
+"""The leaves of a build: the gaussians of an asset that can be drawn, in the order of
+the median split."""
 
 import threading
 import warnings
@@ -39,10 +40,15 @@ class Leaves(ABC):
 
 
 class MemoryLeaves(Leaves):
-    """The leaves of an asset in memory, on any device; the first `read` splits them, on `device`."""
+    """The leaves of an asset in memory, on any device; the first `read` splits them, on
+    `device`."""
 
     def __init__(
-        self, asset: Gaussians, config: BuildConfig, unusable: Unusable = "drop", device: Device = _device.CPU
+        self,
+        asset: Gaussians,
+        config: BuildConfig,
+        unusable: Unusable = "drop",
+        device: Device = _device.CPU,
     ) -> None:
         is_single = str(asset.means.dtype).endswith("32")
         check("asset", is_single, "float32 arrays, got float64; convert them first")
@@ -79,7 +85,9 @@ class MemoryLeaves(Leaves):
         return self._asset.subset(self._order[first:last])
 
 
-def made_with(leaves: Leaves, config: BuildConfig, seed: int, codec: str, up: Axis | None) -> dict[str, Any]:
+def made_with(
+    leaves: Leaves, config: BuildConfig, seed: int, codec: str, up: Axis | None
+) -> dict[str, Any]:
     """The config of a bundle: the asset and the settings that it was made with."""
     seed = whole_number(seed, "seed")
     check("seed", 0 <= seed < 2**58, f"0 to 2^58 - 1, got {shown(seed)}")
@@ -120,8 +128,11 @@ class Tally:
         return {kind: self._counts[kind] for kind in cleaning.KINDS if kind in self._counts}
 
     def check(self, unusable: Unusable) -> None:
-        """Refuse an asset that cannot be built, and warn of gaussians that are left out."""
-        text = cleaning.summary(self.num_gaussians - self.num_drawable, self.num_gaussians, self.counts)
+        """Refuse an asset that cannot be built, and warn of gaussians that are left
+        out."""
+        text = cleaning.summary(
+            self.num_gaussians - self.num_drawable, self.num_gaussians, self.counts
+        )
         check("asset", self.num_gaussians, "at least one gaussian, got none")
         is_allowed = not self.num_wrong or unusable != "refuse"
         check("asset", is_allowed, f"gaussians that can be drawn, got others: {text}")

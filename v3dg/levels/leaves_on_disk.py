@@ -1,8 +1,9 @@
 """The leaves of an asset in files, one or many, that need not fit in memory.
 
-An asset that does not fit in memory is read twice, in blocks. The first pass writes its means to scratch
-files, where they are split (`external_split`) down to *buckets*: nodes that are small enough to be sorted
-when they are read. The second pass writes every gaussian to its bucket. docs/size.md counts the bytes.
+An asset that does not fit in memory is read twice, in blocks. The first pass writes its
+means to scratch files, where they are split (`external_split`) down to *buckets*: nodes
+that are small enough to be sorted when they are read. The second pass writes every
+gaussian to its bucket. docs/size.md counts the bytes.
 """
 
 import math
@@ -50,7 +51,8 @@ _Blocks = Iterator[tuple[int, Gaussians]]
 
 @dataclass(eq=False)
 class DiskLeaves(Leaves):
-    """Leaves in a scratch folder, while that exists; can be pickled, and read by several threads at once."""
+    """Leaves in a scratch folder, while that exists; can be pickled, and read by
+    several threads at once."""
 
     path: Path
     bucket_offset: npt.NDArray[np.int64]
@@ -89,15 +91,19 @@ def leaves_on_disk(
     progress: Progress = False,
     most_in_memory: int = MOST_GAUSSIANS,
 ) -> Iterator[Leaves]:
-    """The leaves of the asset that consists of the gaussians of some files, within `memory` bytes.
+    """The leaves of the asset that consists of the gaussians of some files, within
+    `memory` bytes.
 
-    Their order is that of the median split of all of them and does not depend on the memory. `reserved` says
-    how much of it other work needs, from the number of gaussians and the SH degree. An asset of more than
-    `most_in_memory` gaussians is sorted on disk even if it fits in memory. The scratch folder is made only if
-    it is needed, and removed at the end.
+    Their order is that of the median split of all of them and does not depend on the
+    memory. `reserved` says how much of it other work needs, from the number of
+    gaussians and the SH degree. An asset of more than `most_in_memory` gaussians is
+    sorted on disk even if it fits in memory. The scratch folder is made only if it is
+    needed, and removed at the end.
     """
     files = map(open_asset, paths)  # lazily, so that few files are open at once
-    tiles = [_Tile(file.path, file.num_gaussians, file.sh_degree, file.whole_bytes) for file in files]
+    tiles = [
+        _Tile(file.path, file.num_gaussians, file.sh_degree, file.whole_bytes) for file in files
+    ]
     count = sum(tile.num_gaussians for tile in tiles)
     check("asset", count < MOST_GAUSSIANS, f"fewer than 2^32 gaussians, got {count:,}")
     degree = max(tile.sh_degree for tile in tiles)
@@ -105,7 +111,9 @@ def leaves_on_disk(
     folder = Path(folder)
     fits = count <= min(sizes.in_memory, most_in_memory)
     scratch: AbstractContextManager[None] = nullcontext()
-    if not fits or os.path.lexists(folder):  # a folder that a killed build left is removed in any case
+    if not fits or os.path.lexists(
+        folder
+    ):  # a folder that a killed build left is removed in any case
         scratch = scratch_folder(folder, _NAMES)
     with scratch, Bar(2 * count, "reading", False if fits else progress) as bar:
         if fits:
@@ -147,7 +155,8 @@ class _Tile(NamedTuple):
 
 
 class _Sizes(NamedTuple):
-    """Maximum number of gaussians: in memory at once, in a block, in a node that is split, in a bucket."""
+    """Maximum number of gaussians: in memory at once, in a block, in a node that is
+    split, in a bucket."""
 
     in_memory: int
     in_block: int
@@ -165,7 +174,8 @@ class _Sizes(NamedTuple):
         expected = f"at least {in_mib(required)}"
         if largest.whole_bytes:
             expected += (
-                f" for {shown(largest.path)}, whose format can only be read whole (or convert it to .ply)"
+                f" for {shown(largest.path)}, whose format can only be read whole "
+                "(or convert it to .ply)"
             )
         check("memory", memory >= required, f"{expected}, got {memory / (1 << 20):,.1f} MiB")
         memory -= reserved
@@ -180,7 +190,8 @@ class _Sizes(NamedTuple):
 
 
 def _bytes_in_bucket(degree: int) -> int:
-    """Memory for each gaussian of a bucket that is sorted: two copies of it, and the split."""
+    """Memory for each gaussian of a bucket that is sorted: two copies of it, and the
+    split."""
     return 2 * gaussian_bytes(degree) + external_split.FITTING_BYTES
 
 
@@ -190,7 +201,8 @@ def scratch_bytes(count: int, degree: int) -> int:
 
 
 def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Bar) -> _Blocks:
-    """The asset in blocks that fill the buffer, each with its first row; one is valid until the next."""
+    """The asset in blocks that fill the buffer, each with its first row; one is valid
+    until the next."""
     first = 0
     filled = 0
     for tile in tiles:
@@ -216,12 +228,19 @@ def _put_rows(rows: npt.NDArray[np.float32], out: Gaussians, start: int) -> None
     column = 0
     for array in vars(out).values():
         width = math.prod(array.shape[1:])
-        array[start : start + len(rows)] = rows[:, column : column + width].reshape(-1, *array.shape[1:])
+        array[start : start + len(rows)] = rows[:, column : column + width].reshape(
+            -1, *array.shape[1:]
+        )
         column += width
 
 
 def _sort_on_disk(
-    tiles: Sequence[_Tile], folder: Path, sizes: _Sizes, config: BuildConfig, unusable: Unusable, bar: Bar
+    tiles: Sequence[_Tile],
+    folder: Path,
+    sizes: _Sizes,
+    config: BuildConfig,
+    unusable: Unusable,
+    bar: Bar,
 ) -> DiskLeaves:
     degree = max(tile.sh_degree for tile in tiles)
     points, spare, order, rows = (folder / name for name in _NAMES)
@@ -266,7 +285,8 @@ def _sort_on_disk(
 
 
 def _write_points(blocks: _Blocks, points: RowFile, tally: Tally) -> str:
-    """The first pass: write the means of the drawable gaussians, with their rows in the asset; the digest."""
+    """The first pass: write the means of the drawable gaussians, with their rows in the
+    asset; the digest."""
     hashes: list[bytes] = []
     with new_pool() as pool:
         for first, block in blocks:
@@ -275,12 +295,15 @@ def _write_points(blocks: _Blocks, points: RowFile, tally: Tally) -> str:
             for number, piece in enumerate(pieces):
                 end = tally.num_drawable
                 row = np.flatnonzero(tally.add(piece))
-                points.write(end, external_split.points_of(piece.means[row], first + number * PIECE + row))
+                points.write(
+                    end, external_split.points_of(piece.means[row], first + number * PIECE + row)
+                )
     return digest_of_hashes(hashes)
 
 
 def _write_rows(blocks: _Blocks, order: RowFile, ends: npt.NDArray[np.int64], rows: RowFile) -> str:
-    """The second pass: write every gaussian to its bucket, in the order of the asset; the digest."""
+    """The second pass: write every gaussian to its bucket, in the order of the asset;
+    the digest."""
     hashes: list[bytes] = []
     with new_pool() as pool:
         for number, (first, block) in enumerate(blocks):
@@ -294,9 +317,14 @@ def _write_rows(blocks: _Blocks, order: RowFile, ends: npt.NDArray[np.int64], ro
                 arrays: list[npt.NDArray[np.float32]] = arrays,
             ) -> None:
                 for start in range(begin, end, _SENT_AT_ONCE):
-                    index = order.read(start, min(start + _SENT_AT_ONCE, end)).astype(np.int64) - first
+                    index = (
+                        order.read(start, min(start + _SENT_AT_ONCE, end)).astype(np.int64) - first
+                    )
                     # Unlike an index in brackets, take() releases the GIL.
-                    rows.write(start, np.concatenate([array.take(index, axis=0) for array in arrays], axis=1))
+                    rows.write(
+                        start,
+                        np.concatenate([array.take(index, axis=0) for array in arrays], axis=1),
+                    )
 
             deque(pool.map(send, ends[:, number].tolist(), ends[:, number + 1].tolist()), maxlen=0)
     return digest_of_hashes(hashes)
@@ -305,9 +333,14 @@ def _write_rows(blocks: _Blocks, order: RowFile, ends: npt.NDArray[np.int64], ro
 def _ends_in_buckets(
     order: RowFile, offset: npt.NDArray[np.int64], block: int, asset_gaussians: int
 ) -> npt.NDArray[np.int64]:
-    """(B, blocks + 1) places in the order: the start of each bucket, then its end in each block."""
+    """(B, blocks + 1) places in the order: the start of each bucket, then its end in
+    each block."""
     counts = np.zeros((len(offset) - 1, 1 - (-asset_gaussians // block)), np.int64)
-    for bucket, (begin, end) in enumerate(zip(offset[:-1].tolist(), offset[1:].tolist(), strict=True)):
+    for bucket, (begin, end) in enumerate(
+        zip(offset[:-1].tolist(), offset[1:].tolist(), strict=True)
+    ):
         for index in order.blocks(begin, end, _MOST_IN_BUCKET):
-            counts[bucket, 1:] += np.bincount(index // np.uint32(block), minlength=counts.shape[1] - 1)
+            counts[bucket, 1:] += np.bincount(
+                index // np.uint32(block), minlength=counts.shape[1] - 1
+            )
     return offset[:-1, None] + np.cumsum(counts, axis=1)

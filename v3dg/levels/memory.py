@@ -14,9 +14,10 @@ from v3dg.levels.leaves import Leaves
 from v3dg.levels.whole import UNIT_LEAVES
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
-# Memory that each leaf of a unit needs until the levels are written: a number of bytes that does not depend
-# on the SH degree, and copies of the gaussian. A unit of 1,048,576 leaves took 380 bytes a leaf at SH degree
-# 0, where a gaussian has 56 bytes, and 870 at degree 3, where it has 236.
+# Memory that each leaf of a unit needs until the levels are written: a number of bytes
+# that does not depend on the SH degree, and copies of the gaussian. A unit of 1,048,576
+# leaves took 380 bytes a leaf at SH degree 0, where a gaussian has 56 bytes, and 870 at
+# degree 3, where it has 236.
 _LEAF_BYTES = 320
 _LEAF_COPIES = 2.5
 
@@ -26,7 +27,9 @@ def in_bytes(memory: int | str | None) -> int:
     if memory is None:
         return free_bytes() // 2
     is_amount = isinstance(memory, str | int | float | np.number) and not isinstance(memory, bool)
-    is_long = isinstance(memory, int) and memory.bit_length() > 128  # which Python may refuse to print
+    is_long = (
+        isinstance(memory, int) and memory.bit_length() > 128
+    )  # which Python may refuse to print
     text = str(memory) if is_amount and not is_long else ""
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?\s*", text, re.IGNORECASE)
     if match is None or not float(match[1]) > 0:
@@ -35,7 +38,8 @@ def in_bytes(memory: int | str | None) -> int:
 
 
 def pool_bytes(memory: int | str | None) -> int | Literal["auto"] | None:
-    """What a renderer is given as its memory: bytes, "auto", or None; ValueError for anything else."""
+    """What a renderer is given as its memory: bytes, "auto", or None; ValueError for
+    anything else."""
     if memory is None:
         return None
     if isinstance(memory, str) and memory == "auto":
@@ -45,12 +49,16 @@ def pool_bytes(memory: int | str | None) -> int | Literal["auto"] | None:
 
 def most_units(memory: int, leaves: Leaves) -> int:
     """Units that may be in memory at once, beside the leaves; at least one."""
-    return max(1, (memory - leaves.resident_bytes) // unit_bytes(leaves.num_gaussians, leaves.sh_degree))
+    return max(
+        1, (memory - leaves.resident_bytes) // unit_bytes(leaves.num_gaussians, leaves.sh_degree)
+    )
 
 
 def unit_bytes(num_gaussians: int, sh_degree: int) -> int:
     """Memory that a unit of an asset needs, in bytes."""
-    return int(min(num_gaussians, UNIT_LEAVES) * (_LEAF_BYTES + _LEAF_COPIES * gaussian_bytes(sh_degree)))
+    return int(
+        min(num_gaussians, UNIT_LEAVES) * (_LEAF_BYTES + _LEAF_COPIES * gaussian_bytes(sh_degree))
+    )
 
 
 def in_mib(num_bytes: int) -> str:
@@ -59,7 +67,8 @@ def in_mib(num_bytes: int) -> str:
 
 
 def free_bytes() -> int:
-    """Free memory, in bytes: of the system, or of the container of the process if that has less."""
+    """Free memory, in bytes: of the system, or of the container of the process if that
+    has less."""
     free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     with suppress(OSError, ValueError, AttributeError, TypeError):
         text = Path("/proc/meminfo").read_text(encoding="ascii")

@@ -1,4 +1,5 @@
-"""The shape of every level, from counts alone: what a group is made of is known before anything is built."""
+"""The shape of every level, from counts alone: what a group is made of is known before
+anything is built."""
 
 import itertools
 import math
@@ -17,7 +18,8 @@ Offsets = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class LevelPlan:
-    """One level, or a run of its groups: C clusters made by G groups, each of as many clusters.
+    """One level, or a run of its groups: C clusters made by G groups, each of as many
+    clusters.
 
     At level 0 every cluster is a group of its own.
     """
@@ -59,8 +61,8 @@ class LevelPlan:
 class Plan:
     """The levels of a whole asset, or those of a subtree of it.
 
-    All counts of clusters and groups are powers of two, so groups nest evenly: those under a run of groups
-    are a run of whole groups of every level below.
+    All counts of clusters and groups are powers of two, so groups nest evenly: those
+    under a run of groups are a run of whole groups of every level below.
     """
 
     levels: tuple[LevelPlan, ...]
@@ -91,11 +93,16 @@ class Plan:
         return Plan(tuple(levels))
 
     def units(self, most_leaves: int) -> "list[Plan]":
-        """Cut the plan into parts that share no page, each above at most `most_leaves` where possible."""
-        num_units = 1 << max(0, math.ceil(self.levels[0].num_gaussians / most_leaves) - 1).bit_length()
+        """Cut the plan into parts that share no page, each above at most `most_leaves`
+        where possible."""
+        num_units = (
+            1 << max(0, math.ceil(self.levels[0].num_gaussians / most_leaves) - 1).bit_length()
+        )
         if num_units == 1 or len(self.levels) == 1:
             return [self]
-        top = max(n for n, level in enumerate(self.levels) if n < 2 or level.num_groups >= num_units)
+        top = max(
+            n for n, level in enumerate(self.levels) if n < 2 or level.num_groups >= num_units
+        )
         num_groups = self.levels[top].num_groups
         unit_groups = max(1, num_groups // num_units)
         units = []
@@ -126,13 +133,17 @@ class Plan:
 
 
 def _next_shape(lower: LevelPlan, config: BuildConfig) -> tuple[int, int] | None:
-    """The number of groups that a level's clusters form, and of the clusters that each group makes.
+    """The number of groups that a level's clusters form, and of the clusters that each
+    group makes.
 
     None after the last level.
     """
     num_groups = max(1, lower.num_clusters // config.group_size)
     clusters_made = max(1, lower.num_clusters // num_groups // 2)
-    if num_groups * clusters_made < config.min_clusters or lower.num_gaussians // 2 < config.min_gaussians:
+    if (
+        num_groups * clusters_made < config.min_clusters
+        or lower.num_gaussians // 2 < config.min_gaussians
+    ):
         return None
     return num_groups, clusters_made
 
@@ -150,7 +161,8 @@ def _level_above(lower: LevelPlan, num_groups: int, clusters_made: int) -> Level
 
 
 def halved(sizes: npt.NDArray[np.int64], depth: int) -> Offsets:
-    """The first element of each part, and the end, after splitting nodes in two `depth` times.
+    """The first element of each part, and the end, after splitting nodes in two `depth`
+    times.
 
     The halves have the sizes that the median split gives them.
     """

@@ -13,7 +13,8 @@ class Stopped(Exception):
 
 
 class Bar(_progress.Bar):
-    """One bar over all levels. It advances by fitted gaussians, because the time is proportional to them."""
+    """One bar over all levels. It advances by fitted gaussians, because the time is
+    proportional to them."""
 
     def __init__(self, plan: Plan, initial: int, progress: Progress) -> None:
         total = sum(level.num_gaussians for level in plan.levels[1:])
@@ -31,7 +32,9 @@ class Bar(_progress.Bar):
     def show_of(self, part: int) -> Show:
         """The progress callback of the fits of a part."""
 
-        def show(levels: range, num_groups: int, num_gaussians: int, state: _core.FitProgress) -> None:
+        def show(
+            levels: range, num_groups: int, num_gaussians: int, state: _core.FitProgress
+        ) -> None:
             if self._is_stopped:
                 raise Stopped
             text = f"level {levels[-1]}/{self._last_level}"

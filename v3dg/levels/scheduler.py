@@ -1,9 +1,11 @@
-"""Whether the dask scheduler behind an executor still answers, so that no build waits for it without end.
+"""Whether the dask scheduler behind an executor still answers, so that no build waits
+for it without end.
 
-A client of dask's that keeps its connection sends messages and waits for results: it does not notice that a
-scheduler has stopped, on a machine that hangs, say. So the scheduler is asked for next to nothing, again and
-again, while units are built. Only its silence ends a build: units may take as long as they need, and workers
-that die are the scheduler's to notice.
+A client of dask's that keeps its connection sends messages and waits for results: it
+does not notice that a scheduler has stopped, on a machine that hangs, say. So the
+scheduler is asked for next to nothing, again and again, while units are built. Only its
+silence ends a build: units may take as long as they need, and workers that die are the
+scheduler's to notice.
 """
 
 import asyncio
@@ -17,7 +19,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# A scheduler that lives may be busy for long with the graphs of others, which its one thread works on.
+# A scheduler that lives may be busy for long with the graphs of others, which its one
+# thread works on.
 _MOST_SILENCE_S = 120.0
 _TICK_S = 5.0  # between two questions
 _ADVICE = "look after it; finished units are kept, and a build that is resumed goes on from them"
@@ -45,10 +48,11 @@ class Watch:
         self._silent_s = 0.0
 
     def tick(self) -> None:
-        """Note that another tick has passed; SchedulerError after too many without an answer.
+        """Note that another tick has passed; SchedulerError after too many without an
+        answer.
 
-        Ticks are counted and no clock is read: a process that was itself stopped for a while has heard
-        nothing, and must not conclude anything from that.
+        Ticks are counted and no clock is read: a process that was itself stopped for a
+        while has heard nothing, and must not conclude anything from that.
         """
         self._silent_s += _TICK_S
         if self._question is not None and self._question.done():
@@ -67,7 +71,8 @@ async def _ask(client: "Client") -> None:
 
 
 def watch_over(executor: Executor) -> Watch | None:
-    """A watch over the scheduler whose workers an executor has; None for executors of other kinds."""
+    """A watch over the scheduler whose workers an executor has; None for executors of
+    other kinds."""
     module = sys.modules.get("distributed.cfexecutor")
     if module is None or not isinstance(executor, module.ClientExecutor):
         return None
@@ -76,13 +81,16 @@ def watch_over(executor: Executor) -> Watch | None:
 
 
 def completed(futures: Collection[Future[T]], watch: Watch | None) -> Iterator[Future[T]]:
-    """Futures in the order in which they end; SchedulerError where the scheduler drops them or is silent."""
+    """Futures in the order in which they end; SchedulerError where the scheduler drops
+    them or is silent."""
     waiting = set(futures)
     while waiting:
         done, waiting = wait(waiting, None if watch is None else _TICK_S, FIRST_COMPLETED)
         if watch is not None:
             if any(future.cancelled() for future in done):
-                raise SchedulerError(f"{watch.name}: connection lost, or units cancelled; {_ADVICE}")
+                raise SchedulerError(
+                    f"{watch.name}: connection lost, or units cancelled; {_ADVICE}"
+                )
             if done:
                 watch.hear()
             else:

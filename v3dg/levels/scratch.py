@@ -17,9 +17,12 @@ _MARK = "v3dg-scratch"  # a file by which the folder is known
 
 
 class RowFile(AbstractContextManager["RowFile"]):
-    """A file of rows of one width, float32 or uint32, in the byte order of the machine."""
+    """A file of rows of one width, float32 or uint32, in the byte order of the
+    machine."""
 
-    def __init__(self, path: Path, width: int, dtype: npt.DTypeLike, *, must_be_new: bool = False) -> None:
+    def __init__(
+        self, path: Path, width: int, dtype: npt.DTypeLike, *, must_be_new: bool = False
+    ) -> None:
         self.path = path
         self._width = width
         self._dtype = np.dtype(dtype)
@@ -67,10 +70,14 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
         foreign_names = sorted(set(present) - {_MARK, *names} if _MARK in present else present)
         if foreign_names:
             raise ValueError(
-                f"{folder}: expected scratch of a build, got {foreign_names[0]!a}; move it elsewhere"
+                f"{folder}: expected scratch of a build, got {foreign_names[0]!a}; move it "
+                "elsewhere"
             )
-        # The mark comes before any other file and goes after the last: without it none of them is ours.
-        os.close(os.open(folder / _MARK, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600))
+        # The mark comes before any other file and goes after the last: without it none
+        # of them is ours.
+        os.close(
+            os.open(folder / _MARK, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        )
         try:
             _remove(folder, names)
             yield
@@ -84,7 +91,8 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
 
 
 def lock(descriptor: int, path: str | os.PathLike[str], work: str = "build") -> None:
-    """Lock an open file or folder against others that do the same work, until it is closed."""
+    """Lock an open file or folder against others that do the same work, until it is
+    closed."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -92,7 +100,8 @@ def lock(descriptor: int, path: str | os.PathLike[str], work: str = "build") -> 
             f"{os.fspath(path)}: another {work} is using it; wait for it, or write to another place"
         ) from None
     except OSError as error:
-        # Some network file systems have no locks; users must not start two builds of one output there.
+        # Some network file systems have no locks; users must not start two builds of
+        # one output there.
         if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
             raise
 

@@ -1,4 +1,5 @@
-"""The unit of work: from the leaves of an asset or of a subtree of it to the levels above them."""
+"""The unit of work: from the leaves of an asset or of a subtree of it to the levels
+above them."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,11 +24,14 @@ Show = Callable[[range, int, int, _core.FitProgress], None]
 
 @dataclass(frozen=True, eq=False)
 class LevelTables:
-    """The measured values of a level, on the host; everything else follows from the plan."""
+    """The measured values of a level, on the host; everything else follows from the
+    plan."""
 
     box: npt.NDArray[np.float32]  # (C, 2, 3), bounds of the drawn clusters
     ball: npt.NDArray[np.float32]  # (G, 4), nested, for selection
-    fit_ball: npt.NDArray[np.float32]  # (G, 4), as small as is known, framed by the views of the fit
+    fit_ball: npt.NDArray[
+        np.float32
+    ]  # (G, 4), as small as is known, framed by the views of the fit
     error: npt.NDArray[np.float32]  # (G, 2), residual of the fits
 
 
@@ -43,10 +47,10 @@ class Level:
 class LevelBuilder:
     """Makes the levels of a plan: of a whole asset, or of any subtree of it.
 
-    What a group becomes depends on the leaves under it, the config, the seed, its level and its number in
-    the level, and on nothing else. So on the CPU the same groups get the same bits, whatever the plan. On
-    CUDA, how many groups are fitted at once can change how a group is spread over the GPU, and thereby the
-    last bits.
+    What a group becomes depends on the leaves under it, the config, the seed, its level
+    and its number in the level, and on nothing else. So on the CPU the same groups get
+    the same bits, whatever the plan. On CUDA, how many groups are fitted at once can
+    change how a group is spread over the GPU, and thereby the last bits.
     """
 
     plan: Plan
@@ -60,7 +64,8 @@ class LevelBuilder:
         finished: Iterable[Level] = (),
         show: Show = lambda levels, num_groups, num_gaussians, state: None,
     ) -> Iterator[Level]:
-        """Yield all levels, one after another: the leaves first, as level 0; some may be `finished`."""
+        """Yield all levels, one after another: the leaves first, as level 0; some may
+        be `finished`."""
         plan = self.plan.levels[0]
         leaves = self.codec.rounded(leaves, plan.offset)
         ball = _device.to_host(_core.bound_spheres(_spheres(leaves), plan.leaf_offset))
@@ -78,7 +83,8 @@ class LevelBuilder:
     def levels_above(
         self, lower_levels: dict[int, Level], finished: Iterable[Level], show: Show
     ) -> Iterator[Level]:
-        """Yield the levels above `lower_levels`, by number, which keeps those that the next are fitted to."""
+        """Yield the levels above `lower_levels`, by number, which keeps those that the
+        next are fitted to."""
         saved = iter(finished)
         num_levels = len(self.plan.levels)
         last = max(lower_levels)
@@ -97,7 +103,9 @@ class LevelBuilder:
             while levels:  # a level that was yielded is not kept alive
                 yield levels.pop(0)
 
-    def _simplify(self, lower_levels: Mapping[int, Level], numbers: range, show: Show) -> list[Level]:
+    def _simplify(
+        self, lower_levels: Mapping[int, Level], numbers: range, show: Show
+    ) -> list[Level]:
         """Make the next levels, whose groups are fitted together."""
         config = self.config
         plans = [self.plan.levels[number] for number in numbers]
@@ -108,7 +116,9 @@ class LevelBuilder:
         target_offsets: list[Offsets] = []
         fit_balls: list[npt.NDArray[np.float32]] = []
         for number in numbers:
-            offset, fit_ball = _view(lower_levels[config.target_of(number)], self.plan, number, config)
+            offset, fit_ball = _view(
+                lower_levels[config.target_of(number)], self.plan, number, config
+            )
             target_offsets.append(offset)
             fit_balls.append(fit_ball)
         first_row = np.cumsum([0, *(plan.num_gaussians for plan in plans)])
@@ -139,7 +149,8 @@ class LevelBuilder:
         return levels
 
     def _starts(self, gaussians: Gaussians, numbers: range) -> Gaussians:
-        """The starts of the groups of some levels, each level halved from the one below it."""
+        """The starts of the groups of some levels, each level halved from the one below
+        it."""
         starts: list[Gaussians] = []
         for number in numbers:
             plan = self.plan.levels[number]
@@ -152,7 +163,9 @@ class LevelBuilder:
 
 def _streams(number: int, plan: LevelPlan) -> npt.NDArray[np.int64]:
     """(G,) streams of random numbers: every group of the asset has one of its own."""
-    return (number << 40) + np.arange(plan.first_group, plan.first_group + plan.num_groups, dtype=np.int64)
+    return (number << 40) + np.arange(
+        plan.first_group, plan.first_group + plan.num_groups, dtype=np.int64
+    )
 
 
 def _joined(parts: Sequence[Gaussians]) -> Gaussians:
@@ -173,7 +186,9 @@ def _level(
     """A level of fitted groups, each split into its clusters."""
     clusters_made = plan.num_clusters // plan.num_groups
     if clusters_made > 1:
-        order, _ = _core.median_split(gaussians.means, plan.group_offset, clusters_made.bit_length() - 1)
+        order, _ = _core.median_split(
+            gaussians.means, plan.group_offset, clusters_made.bit_length() - 1
+        )
         gaussians = gaussians.subset(order)
     gaussians = codec.rounded(gaussians, plan.offset)
     box = _device.to_host(_core.bound_by_boxes(gaussians.rows, plan.offset))
@@ -183,18 +198,22 @@ def _level(
 def _view(
     target: Level, plan: Plan, number: int, config: BuildConfig
 ) -> tuple[Offsets, npt.NDArray[np.float32]]:
-    """The targets of a level's groups: (G + 1,) offsets of their gaussians; (G, 4) balls to look at."""
+    """The targets of a level's groups: (G + 1,) offsets of their gaussians; (G, 4)
+    balls to look at."""
     source = config.target_of(number)
     leaf_offset = plan.levels[number].leaf_offset
     if source == 0:
         ball = _core.bound_spheres(_spheres(target.gaussians), leaf_offset)
         return leaf_offset, _device.to_host(ball)
     children = _children(plan, source, number)
-    return plan.levels[source].group_offset[children], _core.bound_spheres(target.tables.fit_ball, children)
+    return plan.levels[source].group_offset[children], _core.bound_spheres(
+        target.tables.fit_ball, children
+    )
 
 
 def _children(plan: Plan, lower: int, number: int) -> Offsets:
-    """(G + 1,) offsets: the groups of level `lower` that are under each group of level `number`."""
+    """(G + 1,) offsets: the groups of level `lower` that are under each group of level
+    `number`."""
     num_groups = plan.levels[number].num_groups
     return np.arange(num_groups + 1, dtype=np.int64) * (plan.levels[lower].num_groups // num_groups)
 
@@ -205,11 +224,15 @@ def _spheres(gaussians: Gaussians) -> Array:
     return library.concatenate([gaussians.means, radius], axis=1)
 
 
-def _target(lower_levels: Mapping[int, Level], numbers: range, config: BuildConfig) -> _core.FitTarget:
-    """The gaussians that groups are fitted to, drawn as they are drawn when they are selected.
+def _target(
+    lower_levels: Mapping[int, Level], numbers: range, config: BuildConfig
+) -> _core.FitTarget:
+    """The gaussians that groups are fitted to, drawn as they are drawn when they are
+    selected.
 
-    The filter of the asset is left out: it spreads gaussians without reducing their opacity, the more the
-    smaller they are shown, and coarser levels would learn to be too thick.
+    The filter of the asset is left out: it spreads gaussians without reducing their
+    opacity, the more the smaller they are shown, and coarser levels would learn to be
+    too thick.
     """
     rows = _joined([lower_levels[number].gaussians for number in numbers]).rows
     if numbers[0] == 0:
@@ -217,8 +240,11 @@ def _target(lower_levels: Mapping[int, Level], numbers: range, config: BuildConf
     return _core.FitTarget(rows, config.filter_px2, True)
 
 
-def _start(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: BuildConfig) -> Gaussians:
-    """The start of the fit of groups: their gaussians halved, from `offset` to `out_offset`."""
+def _start(
+    gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: BuildConfig
+) -> Gaussians:
+    """The start of the fit of groups: their gaussians halved, from `offset` to
+    `out_offset`."""
     if _device.of(gaussians.means).is_cuda:
         return _halved(gaussians, offset, out_offset, config)
     result = empty(int(out_offset[-1]), gaussians.sh_degree)
@@ -226,12 +252,16 @@ def _start(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: B
         part_offset = offset[first : first + _GROUPS_AT_ONCE + 1]
         part_out_offset = out_offset[first : first + _GROUPS_AT_ONCE + 1]
         part = gaussians.subset(slice(part_offset[0], part_offset[-1]))
-        halved = _halved(part, part_offset - part_offset[0], part_out_offset - part_out_offset[0], config)
+        halved = _halved(
+            part, part_offset - part_offset[0], part_out_offset - part_out_offset[0], config
+        )
         put(halved, result, part_out_offset[0])
     return result
 
 
-def _halved(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: BuildConfig) -> Gaussians:
+def _halved(
+    gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: BuildConfig
+) -> Gaussians:
     if config.init == "merge":
         return Gaussians(*_core.merge(gaussians.rows, offset, out_offset))
     pruned = gaussians.subset(_core.prune(gaussians.rows, offset, out_offset))
@@ -239,7 +269,8 @@ def _halved(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: 
 
 
 def _ranges(offsets: Sequence[Offsets], counts: Sequence[int] | Offsets) -> npt.NDArray[np.int64]:
-    """(S, 2) first element and end of each segment of arrays of `counts` elements that are concatenated."""
+    """(S, 2) first element and end of each segment of arrays of `counts` elements that
+    are concatenated."""
     first = np.cumsum([0, *counts])
     moved = [offset + start for offset, start in zip(offsets, first[:-1], strict=True)]
     return np.concatenate([np.stack([offset[:-1], offset[1:]], axis=1) for offset in moved])

@@ -1,4 +1,5 @@
-"""Whether an asset is smooth: its gaussians as wide as they are far apart, so that no filter is needed."""
+"""Whether an asset is smooth: its gaussians as wide as they are far apart, so that no
+filter is needed."""
 
 from dataclasses import replace
 
@@ -16,14 +17,16 @@ _GROUPS = 32
 _FILTER_PX2 = 0.05
 # Leaves of a group: larger ones would take too long.
 _MOST_LEAVES = 1 << 15
-# An asset needs the filter if its loss without it is larger by this factor (docs/levels.md).
+# An asset needs the filter if its loss without it is larger by this factor
+# (docs/levels.md).
 _NEEDED = 1.4
 
 
 def measured_config(
     config: BuildConfig, plan: Plan, leaves: Leaves, seed: int, codec: Codec, device: Device
 ) -> BuildConfig:
-    """The config that levels are built with: smooth="measured" becomes "yes" if the asset is smooth."""
+    """The config that levels are built with: smooth="measured" becomes "yes" if the
+    asset is smooth."""
     smooth = replace(config, smooth="yes", filter_px2=0.0)
     if config.smooth == "yes":
         return smooth
@@ -38,7 +41,8 @@ def measured_config(
     first_leaves = level_1.leaf_offset[stride // 2 : -1 : stride].tolist()
     parts = [_device.place(leaves.read(first, first + size), device) for first in first_leaves]
     sample = Gaussians.concatenate(parts)
-    # The sample has as many groups as were read, each of two clusters, whatever the groups of the build have.
+    # The sample has as many groups as were read, each of two clusters, whatever the
+    # groups of the build have.
     sample_config = replace(
         config,
         init="merge",

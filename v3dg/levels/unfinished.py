@@ -1,8 +1,9 @@
 """The unfinished bundle, from which an interrupted build continues.
 
-It is the file of the bundle, with the finished pages at their places. The journal begins at the end of the
-finished file: a record for each finished level of each part, with its tables and the hashes of its pages. The
-first bytes, a header of length 0 and the digest of the asset and the settings, distinguish it from a bundle.
+It is the file of the bundle, with the finished pages at their places. The journal
+begins at the end of the finished file: a record for each finished level of each part,
+with its tables and the hashes of its pages. The first bytes, a header of length 0 and
+the digest of the asset and the settings, distinguish it from a bundle.
 """
 
 import json
@@ -33,7 +34,9 @@ from v3dg.levels.plan import LevelPlan
 from v3dg.levels.scratch import lock
 from v3dg.levels.simplify import Level, LevelTables
 
-_RECORD = struct.Struct("<II16s")  # precedes a level: its part, its number, the hash of the following arrays
+_RECORD = struct.Struct(
+    "<II16s"
+)  # precedes a level: its part, its number, the hash of the following arrays
 _MAGIC = bytes(8) + b"unfinished v3dg 1\n"
 
 
@@ -50,19 +53,22 @@ class FinishedLevel:
 
 
 Part = Mapping[int, tuple[LevelPlan, PageRun]]
-"""The work of one worker: the plan and the pages of each level, by the number of the level."""
+"""The work of one worker: the plan and the pages of each level, by the number of the
+level."""
 
 
 @dataclass(frozen=True)
 class PageFile:
-    """The pages of an unfinished bundle, for every process on every machine that can open its file."""
+    """The pages of an unfinished bundle, for every process on every machine that can
+    open its file."""
 
     path: Path
     head: bytes
     codec: Codec
 
     def write(self, run: PageRun, gaussians: Gaussians) -> npt.NDArray[np.uint8]:
-        """Write the gaussians of a run of pages, on any device; (n, 16) their hashes."""
+        """Write the gaussians of a run of pages, on any device; (n, 16) their
+        hashes."""
         with self._opened(os.O_RDWR) as descriptor:
             return write_pages(descriptor, run, self.codec, gaussians)
 
@@ -73,7 +79,8 @@ class PageFile:
 
     @contextmanager
     def _opened(self, flags: int) -> Iterator[int]:
-        """Open the file again, so that writes of other machines are seen, and they see those of this one."""
+        """Open the file again, so that writes of other machines are seen, and they see
+        those of this one."""
         with _files.naming_errors(self.path):
             descriptor = os.open(self.path, flags | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
             try:
@@ -85,14 +92,21 @@ class PageFile:
 
 
 class Unfinished:
-    """A bundle that is being built, in a file that replaces `bundle_path` at the end; without, it stays.
+    """A bundle that is being built, in a file that replaces `bundle_path` at the end;
+    without, it stays.
 
-    A truncated record is ignored; a damaged record or page is an error. The file is locked while a build uses
-    it, and removed after a build that finished no level but the leaves.
+    A truncated record is ignored; a damaged record or page is an error. The file is
+    locked while a build uses it, and removed after a build that finished no level but
+    the leaves.
     """
 
     def __init__(
-        self, path: Path, plan: BundlePlan, parts: Sequence[Part], device: Device, bundle_path: Path | None
+        self,
+        path: Path,
+        plan: BundlePlan,
+        parts: Sequence[Part],
+        device: Device,
+        bundle_path: Path | None,
     ) -> None:
         self._path = path
         self._bundle_path = bundle_path
@@ -107,7 +121,11 @@ class Unfinished:
         self._lock = threading.Lock()
 
     def __enter__(self) -> "Unfinished":
-        check("resume_path", self._path.parent.is_dir(), f"a file in an existing folder, got {self._path}")
+        check(
+            "resume_path",
+            self._path.parent.is_dir(),
+            f"a file in an existing folder, got {self._path}",
+        )
         self._file = _open_locked(self._path)
         try:
             with _files.naming_errors(self._path):
@@ -118,7 +136,8 @@ class Unfinished:
         return self
 
     def _continue(self, descriptor: int, magic: bytes) -> None:
-        """Read what an interrupted build of the same bundle finished; begin an empty file."""
+        """Read what an interrupted build of the same bundle finished; begin an empty
+        file."""
         head = os.pread(descriptor, len(self._plan.header), 0)
         if head == self._plan.header:
             os.ftruncate(descriptor, self._plan.num_bytes)
@@ -136,8 +155,8 @@ class Unfinished:
                 raise
         else:
             raise ValueError(
-                f"{self._path}: holds something else, or levels of another asset, config, seed, device or "
-                "version; remove it to start again"
+                f"{self._path}: holds something else, or levels of another asset, config, seed, "
+                "device or version; remove it to start again"
             )
 
     def __exit__(self, *_: object) -> None:
@@ -151,8 +170,8 @@ class Unfinished:
             yield
         except (OSError, ValueError) as error:
             raise ValueError(
-                f"{self._path}: expected levels of an interrupted build, could not read them ({error}); "
-                "remove it to start again"
+                f"{self._path}: expected levels of an interrupted build, could not read them "
+                f"({error}); remove it to start again"
             ) from error
 
     def _read_journal(self) -> None:
@@ -185,7 +204,8 @@ class Unfinished:
             self._end = end
 
     def save(self, part: int, number: int, level: FinishedLevel) -> None:
-        """Append a level to the journal; a record that a full disk truncates is ignored later."""
+        """Append a level to the journal; a record that a full disk truncates is ignored
+        later."""
         arrays = [*vars(level.tables).values(), level.hashes]
         record = _RECORD.pack(part, number, page_hash(arrays))
         with self._lock, _files.naming_errors(self._path):
@@ -199,7 +219,8 @@ class Unfinished:
             self._end = end
 
     def finish(self, clusters: Clusters, groups: Groups, hashes: npt.NDArray[np.uint8]) -> None:
-        """Complete the bundle. After a kill at any moment the file is whole, or a build can continue it."""
+        """Complete the bundle. After a kill at any moment the file is whole, or a build
+        can continue it."""
         descriptor = self._file.fileno()
         with _files.naming_errors(self._path):
             self._plan.write_tables(descriptor, clusters, groups, hashes)
@@ -220,7 +241,8 @@ class Unfinished:
 
 
 class MemoryStore:
-    """The finished levels of a build in memory, and their pages: like `Unfinished` and `PageFile` in one."""
+    """The finished levels of a build in memory, and their pages: like `Unfinished` and
+    `PageFile` in one."""
 
     is_whole = False
 
@@ -246,11 +268,14 @@ class MemoryStore:
         self._groups = groups
 
     def bundle(self) -> Bundle:
-        return Bundle(self._clusters, self._groups, self._gaussians, self._plan.config, self.codec.name)
+        return Bundle(
+            self._clusters, self._groups, self._gaussians, self._plan.config, self.codec.name
+        )
 
 
 def described(device: Device) -> tuple[str, str]:
-    """The kind of a device and the version of v3dg, on which the last bits of a build depend."""
+    """The kind of a device and the version of v3dg, on which the last bits of a build
+    depend."""
     return _device.describe(device), __version__
 
 
@@ -281,7 +306,8 @@ def _is_bundle(path: str | os.PathLike[str]) -> bool:
 
 
 def _open_locked(path: str | os.PathLike[str]) -> FileIO:
-    """Open or create a file to read and write, locked against other builds until it is closed."""
+    """Open or create a file to read and write, locked against other builds until it is
+    closed."""
     # O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
     while True:

@@ -32,19 +32,22 @@ from v3dg.levels.simplify import Level, LevelBuilder, LevelTables, Show
 from v3dg.levels.smooth import measured_config
 from v3dg.levels.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
 
-# Leaves of a unit: enough to keep a GPU busy, and little memory. The last bits of a bundle depend on it.
+# Leaves of a unit: enough to keep a GPU busy, and little memory. The last bits of a
+# bundle depend on it.
 UNIT_LEAVES = 1 << 20
-# By how much balls of level 1 of a smooth asset grow that is too large to be measured: it is then selected at
-# half the size (docs/levels.md).
+# By how much balls of level 1 of a smooth asset grow that is too large to be measured:
+# it is then selected at half the size (docs/levels.md).
 _UNMEASURED = 2.0
-# Units that a GPU works on at once, so that others fill what the smallest levels of one leave idle.
+# Units that a GPU works on at once, so that others fill what the smallest levels of one
+# leave idle.
 _UNITS_ON_GPU = 4
 
 _Levels = dict[int, FinishedLevel]
 
 
 def devices_for(device: str | Device, asset: Gaussians | None = None) -> list[Device]:
-    """Where to build: with "auto" and "cuda" also on all devices like the asset's or the current one."""
+    """Where to build: with "auto" and "cuda" also on all devices like the asset's or
+    the current one."""
     where = _device.resolve(device)
     if not where.is_cuda or str(device) not in ("auto", "cuda"):
         return [where]
@@ -67,9 +70,12 @@ def build_into(
     executor: Executor | None = None,
     up: Axis | None = None,
 ) -> Bundle:
-    """Build all levels of an asset, in memory or in a file that replaces `bundle_path`; as `build_bundle`."""
+    """Build all levels of an asset, in memory or in a file that replaces `bundle_path`;
+    as `build_bundle`."""
     plan = Plan.of(leaves.num_gaussians, config)
-    config.check_views(max((np.diff(made.group_offset).max() for made in plan.levels[1:]), default=1))
+    config.check_views(
+        max((np.diff(made.group_offset).max() for made in plan.levels[1:]), default=1)
+    )
     units = plan.units(UNIT_LEAVES)
     kept = codec_of(codec, leaves.sh_degree)
     file = BundlePlan(plan.layout, kept, made_with(leaves, config, seed, codec, up))
@@ -82,7 +88,9 @@ def build_into(
     ):
         if not store.is_whole:
             config = measured_config(config, plan, leaves, seed, kept, devices[0])
-            done = sum(parts[part][number][0].num_gaussians for part, number in store.levels if number > 0)
+            done = sum(
+                parts[part][number][0].num_gaussians for part, number in store.levels if number > 0
+            )
             with Bar(plan, done, progress) as bar:
                 build = _Build(config, file.config["seed"], plan, units, parts, file, store, bar)
                 tables, hashes = build.all_levels(leaves, devices, most_units, executor)
@@ -128,7 +136,11 @@ class _Build:
         return len(self.units[0].levels)
 
     def all_levels(
-        self, leaves: Leaves, devices: Sequence[Device], most_units: int | None, executor: Executor | None
+        self,
+        leaves: Leaves,
+        devices: Sequence[Device],
+        most_units: int | None,
+        executor: Executor | None,
     ) -> tuple[list[LevelTables], npt.NDArray[np.uint8]]:
         """Build all levels; their tables, and the hashes of all pages."""
         if executor is None:
@@ -142,7 +154,9 @@ class _Build:
         below: dict[int, Level] = {}
         first = self.config.target_of(self.num_low) if runs else self.num_low - 1
         for n in range(first, self.num_low):  # what the levels above begin with
-            below[n] = Level(_device.place(self._level(n).gaussians, devices[0]), finished[n].tables)
+            below[n] = Level(
+                _device.place(self._level(n).gaussians, devices[0]), finished[n].tables
+            )
         builder = LevelBuilder(self.plan, self.config, self.seed, self.file.codec)
         above = builder.levels_above(below, saved, self.bar.show_of(top))
         for number, level in enumerate(above, self.num_low):
@@ -150,23 +164,32 @@ class _Build:
                 hashes = pages.write(runs[number], level.gaussians)
                 self.store.save(top, number, FinishedLevel(level.tables, hashes))
             finished.append(levels[top, number])
-        return [level.tables for level in finished], np.concatenate([level.hashes for level in finished])
+        return [level.tables for level in finished], np.concatenate(
+            [level.hashes for level in finished]
+        )
 
     def grown(self, tables: Sequence[LevelTables], device: Device) -> list[LevelTables]:
-        """The tables with larger balls: of level 1 by what is measured, if the asset is one unit."""
+        """The tables with larger balls: of level 1 by what is measured, if the asset is
+        one unit."""
         ball, here, config = tables[1].ball, self.plan.levels[1], self.config
         growth = np.full(len(ball), _UNMEASURED, np.float32)
         if len(self.units) == 1:
             leaves, level = (_device.place(self._level(n).gaussians, device).rows for n in (0, 1))
             filters = config.asset_filter_px2, config.asset_antialiased, config.filter_px2
-            growth = _core.first_selected(leaves, level, here.leaf_offset, here.group_offset, ball, *filters)
+            growth = _core.first_selected(
+                leaves, level, here.leaf_offset, here.group_offset, ball, *filters
+            )
         balls = _core.grown_balls([table.ball for table in tables], growth)
         return [replace(table, ball=ball) for table, ball in zip(tables, balls, strict=True)]
 
     def _level(self, n: int) -> Level:
-        return self._joined(n).read(self.store.pages, self.file.run(*self.plan.first_page[n : n + 2]))
+        return self._joined(n).read(
+            self.store.pages, self.file.run(*self.plan.first_page[n : n + 2])
+        )
 
-    def _build_here(self, leaves: Leaves, devices: Sequence[Device], most_units: int | None) -> None:
+    def _build_here(
+        self, leaves: Leaves, devices: Sequence[Device], most_units: int | None
+    ) -> None:
         workers = [device for _ in range(_UNITS_ON_GPU) for device in devices if device.is_cuda]
         workers = (workers or list(devices))[: min(most_units or len(self.parts), len(self.parts))]
         free: SimpleQueue[Device] = SimpleQueue()
@@ -177,7 +200,9 @@ class _Build:
             device = free.get()
             try:
                 with _device.own_stream(device), _device.memory_errors():
-                    for number, level in self._task(unit, leaves).levels(device, self.bar.show_of(unit)):
+                    for number, level in self._task(unit, leaves).levels(
+                        device, self.bar.show_of(unit)
+                    ):
                         self.store.save(unit, number, level)
             finally:
                 free.put(device)
@@ -209,8 +234,11 @@ class _Build:
             reason = f"{type(error).__name__}: {error}".rstrip(": ")
             raise RuntimeError(f"{name}: expected all units to be built, got {reason}") from error
 
-    def _collect(self, submit: Callable[[int], Future[_Levels]], watch: Watch | None = None) -> None:
-        """Have units built, and save what comes back; what fails, or an interrupt, ends the others."""
+    def _collect(
+        self, submit: Callable[[int], Future[_Levels]], watch: Watch | None = None
+    ) -> None:
+        """Have units built, and save what comes back; what fails, or an interrupt, ends
+        the others."""
         units: dict[Future[_Levels], int] = {}
         try:
             for unit in self._todo:
@@ -218,7 +246,9 @@ class _Build:
             for future in completed(units, watch):
                 for number, level in future.result().items():
                     self.store.save(units[future], number, level)
-                    self.bar.add(units[future], number, self.parts[units[future]][number][0].num_gaussians)
+                    self.bar.add(
+                        units[future], number, self.parts[units[future]][number][0].num_gaussians
+                    )
         except BaseException:
             self.bar.stop()
             for future in units:
@@ -248,7 +278,8 @@ class _Build:
 
 @dataclass(frozen=True, eq=False)
 class UnitTask:
-    """All that the work on a unit needs; it can be pickled where `leaves` and `pages` can."""
+    """All that the work on a unit needs; it can be pickled where `leaves` and `pages`
+    can."""
 
     leaves: Callable[[], Gaussians]
     builder: LevelBuilder
@@ -257,7 +288,8 @@ class UnitTask:
     pages: PageFile | MemoryStore
 
     def levels(self, device: Device, show: Show) -> Iterator[tuple[int, FinishedLevel]]:
-        """Build the levels that are not finished, one after another, and write their pages."""
+        """Build the levels that are not finished, one after another, and write their
+        pages."""
         finished = (self.finished[n].read(self.pages, self.runs[n]) for n in sorted(self.finished))
         leaves = next(finished).gaussians if self.finished else self.leaves()
         own = _device.place(leaves, device)
@@ -271,14 +303,18 @@ class UnitTask:
 
 
 def build_elsewhere(task: UnitTask, like: tuple[str, str, str], _: bytes) -> _Levels:
-    """Build a unit in a worker of an executor, on a device of this kind, which must be described like this.
+    """Build a unit in a worker of an executor, on a device of this kind, which must be
+    described like this.
 
-    The last argument is another in each build: dask gives what it has for the same arguments.
+    The last argument is another in each build: dask gives what it has for the same
+    arguments.
     """
     device, here = _device.resolve(like[0]), f"worker on {socket.gethostname()}: expected"
     if (own := described(device)) != like[1:]:
         wanted, got = (" with v3dg ".join(pair) for pair in (like[1:], own))
-        raise RuntimeError(f"{here} {wanted} as where the build began, got {got}; the last bits would differ")
+        raise RuntimeError(
+            f"{here} {wanted} as where the build began, got {got}; the last bits would differ"
+        )
     assert isinstance(task.pages, PageFile)
     if not task.pages.path.exists():
         raise RuntimeError(f"{here} {task.pages.path}, got none; share its folder")

@@ -38,7 +38,9 @@ class _Options(CutOptions, total=False):
 
 
 @overload
-def render(subject: Subject | File, camera: Camera, **options: Unpack[_Options]) -> RenderedImage: ...
+def render(
+    subject: Subject | File, camera: Camera, **options: Unpack[_Options]
+) -> RenderedImage: ...
 @overload
 def render(
     subject: Subject | File, camera: StereoCamera, **options: Unpack[_Options]
@@ -65,34 +67,42 @@ def render(
 ) -> RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 
-    Clusters whose gaussians each stand for at most `tolerance` px² are drawn in place of finer ones; level 0
-    with the asset's own filter, coarser levels with the filter they were made for (V3DG, section 3.4; our
-    metric is in docs/levels.md). An asset is drawn whole, without a filter.
+    Clusters whose gaussians each stand for at most `tolerance` px² are drawn in place
+    of finer ones; level 0 with the asset's own filter, coarser levels with the filter
+    they were made for (V3DG, section 3.4; our metric is in docs/levels.md). An asset is
+    drawn whole, without a filter.
 
     Args:
-        subject: What to draw, in world space; or the file of it, which is then opened anew by every call.
-        camera: Pinhole camera. With several, each has its own cut and its own picture, as if drawn alone. The
-            eyes of a stereo camera share one cut, and one frame: two pictures, whose statistics are those of
-            both together but for the gaussians that were selected.
+        subject: What to draw, in world space; or the file of it, which is then opened
+            anew by every call.
+        camera: Pinhole camera. With several, each has its own cut and its own picture,
+            as if drawn alone. The eyes of a stereo camera share one cut, and one frame:
+            two pictures, whose statistics are those of both together but for the
+            gaussians that were selected.
         tolerance: As in `v3dg.select`; so are `budget` and `min_level`.
-        fade: As in `v3dg.select`; weights multiply opacities. Give `v3dg.DEFAULT_FADE` for a film.
-        cut: Draw what was selected before from this scene, whatever the camera: a cut to walk around. Takes
-            the place of `tolerance`, `budget`, `min_level` and `fade`.
-        color_by: "level" or "cluster" colours gaussians by their own, "residency" where pages are missing.
+        fade: As in `v3dg.select`; weights multiply opacities. Give `v3dg.DEFAULT_FADE`
+            for a film.
+        cut: Draw what was selected before from this scene, whatever the camera: a cut
+            to walk around. Takes the place of `tolerance`, `budget`, `min_level` and
+            `fade`.
+        color_by: "level" or "cluster" colours gaussians by their own, "residency" where
+            pages are missing.
         background: Three numbers.
-        min_transmittance: A pixel stops behind the gaussian that lets no more than this share of light
-            through, 0 to 0.99, and gives that light to what it has blended: no channel is off by more than
-            this times the difference to what lies behind. None is 0.001 for scenes and bundles, and draws
-            assets as `v3dg.rasterize` does.
+        min_transmittance: A pixel stops behind the gaussian that lets no more than this
+            share of light through, 0 to 0.99, and gives that light to what it has
+            blended: no channel is off by more than this times the difference to what
+            lies behind. None is 0.001 for scenes and bundles, and draws assets as
+            `v3dg.rasterize` does.
         depth: Draw the expected depth, too.
-        device: "cpu" draws NumPy arrays; "cuda", or a certain one as "cuda:1", draws torch tensors there, on
-            the stream that is torch's current one, and keeps on the device what the next picture of the same
-            scene or bundle needs. Use a `Renderer` to say how long. "auto" is "cuda" where that works.
+        device: "cpu" draws NumPy arrays; "cuda", or a certain one as "cuda:1", draws
+            torch tensors there, on the stream that is torch's current one, and keeps on
+            the device what the next picture of the same scene or bundle needs. Use a
+            `Renderer` to say how long. "auto" is "cuda" where that works.
         memory: As in `Renderer`; each picture is settled.
 
     Raises:
-        ValueError: An argument is not as above, or the coarsest cut has more gaussians than the budget; on
-            CUDA that is raised where the picture is looked at.
+        ValueError: An argument is not as above, or the coarsest cut has more gaussians
+            than the budget; on CUDA that is raised where the picture is looked at.
         RuntimeError: `device` is "cuda" and something is missing for it.
     """
     chosen_device = _device.resolve(device)
@@ -107,13 +117,16 @@ def render(
         return frame.draw_settled(opened_subject, view, request, shade, cut)
 
     pictures: Picture | list[Picture] = for_each(camera, picture)
-    return cast("RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]", pictures)
+    return cast(
+        "RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]", pictures
+    )
 
 
 def _still_frame(
     subject: Subject, color_by: ColorBy, device: Device, memory: int | Literal["auto"] | None
 ) -> Frame:
-    """The frame that stills of a subject are drawn with, which is kept with a scene or a bundle.
+    """The frame that stills of a subject are drawn with, which is kept with a scene or
+    a bundle.
 
     All colours share a pool. Of pools of a given size, only the last one is kept.
     """

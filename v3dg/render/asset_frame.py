@@ -1,4 +1,5 @@
-"""The frame of an asset, which is drawn whole: it has no levels to choose from, and no pages."""
+"""The frame of an asset, which is drawn whole: it has no levels to choose from, and no
+pages."""
 
 from __future__ import annotations
 
@@ -44,7 +45,8 @@ class AssetFrame:
         cut: Selection | None = None,
         steps: _core.BudgetSteps | None = None,
     ) -> Picture:
-        """Draw the asset; ValueError where something is asked for that only levels have."""
+        """Draw the asset; ValueError where something is asked for that only levels
+        have."""
         check("cut", cut is None, "a scene or a bundle to choose from, got an asset")
         check_request(request)
         if isinstance(camera, StereoCamera):
@@ -71,7 +73,8 @@ class AssetFrame:
 
 
 def check_request(request: CutRequest) -> None:
-    """Refuse what an asset cannot have; a tolerance and a fade are accepted and change nothing."""
+    """Refuse what an asset cannot have; a tolerance and a fade are accepted and change
+    nothing."""
     if request.is_plain:
         _check_known(*request)
     else:

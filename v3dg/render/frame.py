@@ -1,4 +1,5 @@
-"""Frames: what pictures of one subject are drawn with on one device, and which of them a subject gets."""
+"""Frames: what pictures of one subject are drawn with on one device, and which of them
+a subject gets."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ if TYPE_CHECKING:
 
 
 class Frame(Protocol):
-    """Buffers that pictures of one subject are drawn with; it does not keep a scene or a bundle alive."""
+    """Buffers that pictures of one subject are drawn with; it does not keep a scene or
+    a bundle alive."""
 
     device: Device
 
@@ -65,8 +67,8 @@ class Frame(Protocol):
 class AutoFrame:
     """Draws with all gaussians resident where they fit, else from a pool.
 
-    Which of the two is decided when it is made, and again when bundles are added; once it has a pool it
-    keeps that.
+    Which of the two is decided when it is made, and again when bundles are added; once
+    it has a pool it keeps that.
 
     Attributes:
         device: Where it draws.

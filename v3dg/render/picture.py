@@ -13,8 +13,11 @@ from v3dg.image import RenderedImage, Stats
 Picture: TypeAlias = RenderedImage | tuple[RenderedImage, RenderedImage]
 
 
-def picture_of(drawing: _core.Drawing, camera: Camera | StereoCamera, finish: Callable[[], Stats]) -> Picture:
-    """The picture that a drawing makes; `finish` waits for it and returns what it cost."""
+def picture_of(
+    drawing: _core.Drawing, camera: Camera | StereoCamera, finish: Callable[[], Stats]
+) -> Picture:
+    """The picture that a drawing makes; `finish` waits for it and returns what it
+    cost."""
     left = RenderedImage(drawing, finish)
     if isinstance(camera, Camera):
         return left
@@ -22,7 +25,8 @@ def picture_of(drawing: _core.Drawing, camera: Camera | StereoCamera, finish: Ca
 
 
 def stats_of(stats: _core.FrameStats, tolerance: float) -> Stats:
-    """What a picture cost, as users see it, with the tolerance that its cut was chosen with."""
+    """What a picture cost, as users see it, with the tolerance that its cut was chosen
+    with."""
     return Stats(
         stats.gaussians,
         stats.in_frustum,

@@ -1,4 +1,5 @@
-"""The frame of a pool: of a scene's gaussians, those are resident that views need and that have room."""
+"""The frame of a pool: of a scene's gaussians, those are resident that views need and
+that have room."""
 
 from __future__ import annotations
 
@@ -99,7 +100,9 @@ class PoolFrame:
         if not self.device.is_cuda:
             _finish(picture)
         elif self._has_settled:
-            _finish(picture)  # which may draw again, from pages that other views put in place of its own
+            _finish(
+                picture
+            )  # which may draw again, from pages that other views put in place of its own
         self._has_settled = False
         return picture
 
@@ -111,7 +114,8 @@ class PoolFrame:
         shade: _core.Shade,
         cut: Selection | None = None,
     ) -> Picture:
-        """Settle and draw in one step, between which no other thread's view gets at the pool."""
+        """Settle and draw in one step, between which no other thread's view gets at the
+        pool."""
         _refuse_cut(cut)
         while True:
             with residency.turn(self.device):
@@ -121,9 +125,13 @@ class PoolFrame:
             with pool.lease:
                 pool.settle(resident, camera.core, request.rule, _STILL_TIMEOUT_SECONDS, math.inf)
                 with residency.turn(self.device):
-                    if resident.revision != revision:  # Another thread has changed the scene meanwhile.
+                    if (
+                        resident.revision != revision
+                    ):  # Another thread has changed the scene meanwhile.
                         continue
-                    picture = self._enqueue(resident, pool, camera, request, shade, None, None, None)
+                    picture = self._enqueue(
+                        resident, pool, camera, request, shade, None, None, None
+                    )
                 _finish(picture)
                 return picture
 
@@ -135,7 +143,8 @@ class PoolFrame:
         timeout: float = _STILL_TIMEOUT_SECONDS,
         seconds: float = math.inf,
     ) -> None:
-        """Bring in what a view needs, or what of it comes in within `seconds`; errors as of `Pool.settle`."""
+        """Bring in what a view needs, or what of it comes in within `seconds`; errors
+        as of `Pool.settle`."""
         real(timeout, "timeout", "seconds, at least 0", 0)
         rule = request.rule
         with residency.turn(self.device):
@@ -148,7 +157,8 @@ class PoolFrame:
     def pick(
         self, subject: Subject, pixel: _core.Camera, rule: _core.Rule
     ) -> tuple[int, int, float, float] | None:
-        """Instance, cluster, weight and depth of what a pixel shows most of; only on the CPU."""
+        """Instance, cluster, weight and depth of what a pixel shows most of; only on
+        the CPU."""
         resident = residency.scene(subject, self.device)
         pool = self.take(resident)
         return self._core.pick_resident(resident.core, pool.core, pixel, rule)

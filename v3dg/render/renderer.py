@@ -36,32 +36,38 @@ class _Options(CutOptions, total=False):
 class Renderer:
     """Draws one scene, bundle or asset on one device, with buffers of its own.
 
-    On a CUDA device, enqueuing a picture on torch's current stream there waits for nothing, so pictures can
-    be drawn ahead, and captured in a CUDA graph: draw once what the graph will meet, so that it is all on the
-    device, then capture `render`; what was not drawn before is a RuntimeError. Keep the renderer as long as
-    the graph, and capture again when the scene has changed. A picture that is under way when its scene is
-    changed is finished first.
+    On a CUDA device, enqueuing a picture on torch's current stream there waits for
+    nothing, so pictures can be drawn ahead, and captured in a CUDA graph: draw once
+    what the graph will meet, so that it is all on the device, then capture `render`;
+    what was not drawn before is a RuntimeError. Keep the renderer as long as the graph,
+    and capture again when the scene has changed. A picture that is under way when its
+    scene is changed is finished first.
 
-    With a budget and a fade, pictures are taken to follow each other: the tolerance goes in steps to the one
-    at which a part of the budget is free, never below that of `render`, so that slow motion is steady; at
-    rest it is there after eight pictures (docs/fades.md). Without a fade, pictures are those of `render`.
+    With a budget and a fade, pictures are taken to follow each other: the tolerance
+    goes in steps to the one at which a part of the budget is free, never below that of
+    `render`, so that slow motion is steady; at rest it is there after eight pictures
+    (docs/fades.md). Without a fade, pictures are those of `render`.
 
-    With a pool, only a part of the bundles is resident, so that they may be far larger than memory: pages
-    come in from the files as views need them, read by other threads. A picture waits for none of them: where
-    one is missing, the coarser clusters above it are drawn; with a fade, pages fade in. Use `settle` for a
-    picture that misses nothing. If a view needs more than there is room for, the tolerance is raised until it
-    fits.
+    With a pool, only a part of the bundles is resident, so that they may be far larger
+    than memory: pages come in from the files as views need them, read by other threads.
+    A picture waits for none of them: where one is missing, the coarser clusters above
+    it are drawn; with a fade, pages fade in. Use `settle` for a picture that misses
+    nothing. If a view needs more than there is room for, the tolerance is raised until
+    it fits.
 
     Args:
         subject: As in `v3dg.render`.
         color_by: As in `v3dg.render`; with a pool on a CUDA device, "appearance".
-        device: As in `v3dg.render`. The renderer stays on it, whichever device is torch's current one later.
-        memory: Of a pool for gaussians on the device: bytes, or text like "2GB". All are resident if None.
-            "auto" is None where all fit into what is free, less a quarter of that or 1 GiB; else half of it.
+        device: As in `v3dg.render`. The renderer stays on it, whichever device is
+            torch's current one later.
+        memory: Of a pool for gaussians on the device: bytes, or text like "2GB". All
+            are resident if None. "auto" is None where all fit into what is free, less a
+            quarter of that or 1 GiB; else half of it.
 
     Raises:
         RuntimeError: Something is missing for the device.
-        ValueError: `memory` has no room for the coarsest level, or the coarsest page of a file is damaged.
+        ValueError: `memory` has no room for the coarsest level, or the coarsest page of
+            a file is damaged.
     """
 
     def __init__(
@@ -96,7 +102,8 @@ class Renderer:
 
     @property
     def pool_frame(self) -> PoolFrame | None:
-        """What it draws with where not all is resident; else None. Not part of the public interface."""
+        """What it draws with where not all is resident; else None. Not part of the
+        public interface."""
         frame = self._frame
         if isinstance(frame, AutoFrame):
             frame = frame.chosen(self._subject)
@@ -141,10 +148,11 @@ class Renderer:
     ) -> None:
         """Wait until what a view needs is resident, so that its picture misses nothing.
 
-        The picture is then the same, bit for bit, as if all were resident; or as it is at the tolerance that
-        it says, where there is not enough room. That holds for the next picture, which is waited for, too, on
-        a CUDA device. Returns at once where all is resident. Threads that share a renderer may take each
-        other's pages between the two calls; `v3dg.render` settles and draws in one step.
+        The picture is then the same, bit for bit, as if all were resident; or as it is
+        at the tolerance that it says, where there is not enough room. That holds for
+        the next picture, which is waited for, too, on a CUDA device. Returns at once
+        where all is resident. Threads that share a renderer may take each other's pages
+        between the two calls; `v3dg.render` settles and draws in one step.
 
         Args:
             timeout: Seconds after which it gives up if not a single page came in.

@@ -32,7 +32,8 @@ class SceneFrame:
     Attributes:
         device: Where it draws.
         memory: None, for it draws from no pool.
-        num_bundles: How many of the scene's bundles have their gaussians there. A scene only adds bundles.
+        num_bundles: How many of the scene's bundles have their gaussians there. A scene
+            only adds bundles.
     """
 
     def __init__(self, color_by: ColorBy, device: Device) -> None:
@@ -73,7 +74,9 @@ class SceneFrame:
         """
         if cut is not None:
             if isinstance(camera, StereoCamera):
-                left, right = (self.draw_cut(subject, eye, request, shade, cut) for eye in camera.eyes)
+                left, right = (
+                    self.draw_cut(subject, eye, request, shade, cut) for eye in camera.eyes
+                )
                 return left, right
             return self.draw_cut(subject, camera, request, shade, cut)
         rule = request.rule
@@ -104,7 +107,12 @@ class SceneFrame:
         """Return at once, for all is resident."""
 
     def draw_cut(
-        self, subject: Subject, camera: Camera, request: CutRequest, shade: _core.Shade, cut: Selection
+        self,
+        subject: Subject,
+        camera: Camera,
+        request: CutRequest,
+        shade: _core.Shade,
+        cut: Selection,
     ) -> RenderedImage:
         """Draw a cut that was selected before."""
         with residency.turn(self.device):
@@ -140,12 +148,19 @@ class SceneFrame:
         return torch.tensor(values, device=str(self.device))
 
 
-def _check_cut(cut: Selection, subject: Subject, resident: ResidentScene, request: CutRequest) -> None:
-    """Refuse a cut that is not of this scene as it is, and whatever else is asked for."""
+def _check_cut(
+    cut: Selection, subject: Subject, resident: ResidentScene, request: CutRequest
+) -> None:
+    """Refuse a cut that is not of this scene as it is, and whatever else is asked
+    for."""
     check_type("cut", cut, Selection, "a Selection of v3dg.select")
     for name, value in request._asdict().items():
         check(name, not value, f"nothing beside a cut, which has been chosen, got {value}")
     is_from_bundle = isinstance(subject, Bundle) and cut.scene.bundles == (subject,)
-    check("cut", cut.scene is subject or is_from_bundle, "a selection from this scene, got one from another")
+    check(
+        "cut",
+        cut.scene is subject or is_from_bundle,
+        "a selection from this scene, got one from another",
+    )
     if isinstance(subject, Scene):
         cut.check(resident.revision)

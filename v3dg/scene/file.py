@@ -1,4 +1,5 @@
-"""Scene files: JSON with the bundles of a scene, the poses of their instances, and cameras."""
+"""Scene files: JSON with the bundles of a scene, the poses of their instances, and
+cameras."""
 
 import copy
 import os
@@ -32,7 +33,8 @@ class _Instance(NamedTuple):
 
 
 def is_scene(path: Path) -> bool:
-    """Whether a file has the name of a scene: JSON, but not the `meta.json` of an asset in SOG."""
+    """Whether a file has the name of a scene: JSON, but not the `meta.json` of an asset
+    in SOG."""
     name = beside(path).name
     return name.endswith(".json") and not name.endswith(SUFFIXES)
 
@@ -45,8 +47,9 @@ def read_scene(
     The layout files of the V3DG paper's published code are read too.
 
     Args:
-        bundles: Bundles that are already open, by their path in the file (for a published layout, by the
-            name of the asset); the others are opened, relative to the file's folder.
+        bundles: Bundles that are already open, by their path in the file (for a
+            published layout, by the name of the asset); the others are opened, relative
+            to the file's folder.
 
     Raises:
         ValueError: The content is not valid; the message names the place in the file.
@@ -70,24 +73,31 @@ def write_scene(
     bundle_paths: list[str] | None = None,
     cameras: Mapping[str, Camera] | None = None,
 ) -> None:
-    """Write a scene and named cameras as JSON (docs/scene.md); reading it back gives the same numbers.
+    """Write a scene and named cameras as JSON (docs/scene.md); reading it back gives
+    the same numbers.
 
     Args:
-        bundle_paths: One path for each of ``scene.bundles``, relative to the file's folder; if None, the
-            files that they were opened from.
+        bundle_paths: One path for each of ``scene.bundles``, relative to the file's
+            folder; if None, the files that they were opened from.
 
     Raises:
-        ValueError: The number of paths is wrong; a bundle was not opened from a file (write it and open
-            that); or the name is not one of a scene.
+        ValueError: The number of paths is wrong; a bundle was not opened from a file
+            (write it and open that); or the name is not one of a scene.
     """
-    check(path, is_scene(Path(path)), "a file name ending in .json, not meta.json; v3dg.open goes by it")
+    check(
+        path,
+        is_scene(Path(path)),
+        "a file name ending in .json, not meta.json; v3dg.open goes by it",
+    )
     check_type("scene", scene, Scene, "a Scene")
     cameras = cameras or {}
     check_cameras(cameras)
     if bundle_paths is None:
         bundle_paths = _paths_of_bundles(scene, os.path.dirname(os.path.abspath(path)))
     if isinstance(bundle_paths, str) or not isinstance(bundle_paths, Sequence):
-        raise TypeError(f"bundle_paths: expected a list of paths, got {type(bundle_paths).__name__}")
+        raise TypeError(
+            f"bundle_paths: expected a list of paths, got {type(bundle_paths).__name__}"
+        )
     count = len(scene.bundles)
     check("bundle_paths", len(bundle_paths) == count, f"{count} paths, got {len(bundle_paths)}")
     scene = copy.copy(scene)  # other threads may change the original meanwhile
@@ -112,7 +122,8 @@ def write_scene(
 
 
 def _paths_of_bundles(scene: Scene, folder: str) -> list[str]:
-    """The files that the bundles were opened from, relative to a folder; ValueError for those without one."""
+    """The files that the bundles were opened from, relative to a folder; ValueError for
+    those without one."""
     paths = []
     for number, bundle in enumerate(scene.bundles):
         if not bundle.path or is_url(bundle.path):
@@ -130,14 +141,18 @@ def _instances_as_json(scene: Scene, names: list[str]) -> list[dict[str, object]
     scales = scene.scales.tolist()
     instances: list[dict[str, object]] = [
         {"bundle": names[bundle], "position": position, "quaternion": quaternion, "scale": scale}
-        for bundle, position, quaternion, scale in zip(bundles, positions, quaternions, scales, strict=True)
+        for bundle, position, quaternion, scale in zip(
+            bundles, positions, quaternions, scales, strict=True
+        )
     ]
     for number in np.flatnonzero(scene.importance != 1).tolist():
         instances[number]["importance"] = scene.importance[number].item()
     return instances
 
 
-def _read_scene(root: Node, folder: Path, opened: dict[str, Bundle]) -> tuple[Scene, dict[str, Camera]]:
+def _read_scene(
+    root: Node, folder: Path, opened: dict[str, Bundle]
+) -> tuple[Scene, dict[str, Camera]]:
     top = root.fields(("format", "version", "bundles", "instances"), ("cameras", "up"))
     if top["format"].value != FORMAT:
         raise top["format"].error(f'"{FORMAT}"')
@@ -232,11 +247,16 @@ def _read_camera(node: Node, fields: dict[str, Node]) -> Camera:
     fov_x = DEFAULT_FOV_X
     if "fov_x" in fields:
         fov_x = fields["fov_x"].field_of_view()
-    return node.attempt(lambda: Camera.look_at(eye, target, up, fov_x, width=width, height=height, near=near))
+    return node.attempt(
+        lambda: Camera.look_at(eye, target, up, fov_x, width=width, height=height, near=near)
+    )
 
 
-def _read_layouts(root: Node, folder: Path, opened: dict[str, Bundle]) -> tuple[Scene, dict[str, Camera]]:
-    """Read a layout of the paper's published code; fields that only its programs use are ignored."""
+def _read_layouts(
+    root: Node, folder: Path, opened: dict[str, Bundle]
+) -> tuple[Scene, dict[str, Camera]]:
+    """Read a layout of the paper's published code; fields that only its programs use
+    are ignored."""
     layouts = list(root.field("layouts").items())
     if len(layouts) != 1:
         advice = "each layout is a scene, so make a file of each"
@@ -250,7 +270,9 @@ def _read_layouts(root: Node, folder: Path, opened: dict[str, Bundle]) -> tuple[
         name = fields["asset_name"].text()
         suffix = fields["ply_suffix"].text()
         # The output of `v3dg build` in a copy of the published code's folders.
-        built = os.path.join("..", "_3dgs-assets", kind, name, os.path.splitext(suffix)[0] + ".v3dg")
+        built = os.path.join(
+            "..", "_3dgs-assets", kind, name, os.path.splitext(suffix)[0] + ".v3dg"
+        )
         candidates.setdefault(name, (fields["asset_name"], [f"{name}.v3dg", built]))
         instances_of_assets.append((name, fields["instances"]))
     _open_bundles(candidates, folder, opened)
@@ -268,19 +290,24 @@ def _read_layouts(root: Node, folder: Path, opened: dict[str, Bundle]) -> tuple[
     return _scene_of(instances), _read_blender_cameras(top["cameras"].items(), keys)
 
 
-def _read_flat_layout(root: Node, folder: Path, opened: dict[str, Bundle]) -> tuple[Scene, dict[str, Camera]]:
+def _read_flat_layout(
+    root: Node, folder: Path, opened: dict[str, Bundle]
+) -> tuple[Scene, dict[str, Camera]]:
     """Read a published layout of one asset, which has shorter names for the fields."""
     top = root.fields(("asset", "instances", "cameras"), ("name", "convention"))
     asset = top["asset"].text()
     _open_bundles({asset: (top["asset"], [os.path.splitext(asset)[0] + ".v3dg"])}, folder, opened)
     required = ("position", "quaternion", "scale")
-    instances = [_instance(opened[asset], node.fields(required)) for node in top["instances"].items()]
+    instances = [
+        _instance(opened[asset], node.fields(required)) for node in top["instances"].items()
+    ]
     keys = ("name", "width", "height", "fov_x", "fov_y")
     return _scene_of(instances), _read_blender_cameras(top["cameras"].items(), keys)
 
 
 def _read_blender_cameras(nodes: Iterable[Node], keys: tuple[str, ...]) -> dict[str, Camera]:
-    """Cameras in Blender's convention by name; if names repeat, each is prefixed with its number."""
+    """Cameras in Blender's convention by name; if names repeat, each is prefixed with
+    its number."""
     names = []
     cameras = []
     for node in nodes:
@@ -304,7 +331,8 @@ def _read_blender_cameras(nodes: Iterable[Node], keys: tuple[str, ...]) -> dict[
 def _open_bundles(
     candidates: dict[str, tuple[Node, list[str]]], folder: Path, opened: dict[str, Bundle]
 ) -> None:
-    """Add bundles to ``opened``: for each key the first of its paths, relative to the folder, that exists."""
+    """Add bundles to ``opened``: for each key the first of its paths, relative to the
+    folder, that exists."""
     files: dict[str, Path] = {}
     for key, (node, names) in candidates.items():
         if key in opened:
@@ -313,7 +341,9 @@ def _open_bundles(
         file = next((path for path in paths if path.is_file()), None)
         if file is None:
             tried = " or ".join(map(str, paths))
-            problem = node.problem(f"expected a bundle at {tried}, found none; build it with `v3dg build`")
+            problem = node.problem(
+                f"expected a bundle at {tried}, found none; build it with `v3dg build`"
+            )
             raise FileNotFoundError(str(problem))
         files[key] = file
     opened.update(zip(files, Bundle.open_all(files.values()), strict=True))

@@ -15,9 +15,12 @@ from v3dg.cameras import AXES, Axis, Camera
 from v3dg.gaussians import Array, Gaussians
 from v3dg.rotations import normalised, rotation_from_quaternion
 
-# Held during every change of a scene. Also held during fork(), so that it is never locked in the child.
+# Held during every change of a scene. Also held during fork(), so that it is never
+# locked in the child.
 _lock = threading.RLock()
-os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)
+os.register_at_fork(
+    before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release
+)
 
 
 class _State(NamedTuple):
@@ -33,15 +36,17 @@ class _State(NamedTuple):
 
 
 class Scene:
-    """Instances of bundles: each bundle is stored once, an instance takes p to scale * rotation p + position.
+    """Instances of bundles: each bundle is stored once, an instance takes p to scale *
+    rotation p + position.
 
-    Instances are numbered from 0 in the order in which they were added; `remove` closes the gaps. Changes are
-    visible in the next picture. Any thread may change a scene and draw it: each change is atomic. A copy has
-    the same bundles, and later changes of one do not affect the other.
+    Instances are numbered from 0 in the order in which they were added; `remove` closes
+    the gaps. Changes are visible in the next picture. Any thread may change a scene and
+    draw it: each change is atomic. A copy has the same bundles, and later changes of
+    one do not affect the other.
 
-    Poses may be NumPy arrays, or torch tensors on the host or on a CUDA device. Those on a device stay there
-    and their values are not checked: an instance whose pose is not finite, or whose scale is not positive, is
-    not drawn.
+    Poses may be NumPy arrays, or torch tensors on the host or on a CUDA device. Those
+    on a device stay there and their values are not checked: an instance whose pose is
+    not finite, or whose scale is not positive, is not drawn.
     """
 
     _up: Axis | None = None
@@ -64,7 +69,8 @@ class Scene:
 
     @classmethod
     def of(cls, subject: "Scene | Bundle") -> "Scene":
-        """Return a scene as it is, and a bundle as a scene of one instance at the origin."""
+        """Return a scene as it is, and a bundle as a scene of one instance at the
+        origin."""
         if isinstance(subject, Scene):
             return subject
         check_type("subject", subject, Bundle, "a Scene or a Bundle")
@@ -79,8 +85,11 @@ class Scene:
 
         return read_scene(path)[0]
 
-    def save(self, path: str | os.PathLike[str], cameras: Mapping[str, Camera] | None = None) -> None:
-        """Write the scene as `v3dg.write_scene` does; bundles stay in the files they were opened from."""
+    def save(
+        self, path: str | os.PathLike[str], cameras: Mapping[str, Camera] | None = None
+    ) -> None:
+        """Write the scene as `v3dg.write_scene` does; bundles stay in the files they
+        were opened from."""
         from v3dg.scene.file import write_scene
 
         write_scene(path, self, cameras=cameras)
@@ -98,10 +107,11 @@ class Scene:
         Args:
             bundle: One for all, also by its file, or a sequence of I.
             positions: (I, 3), or (3,) for one instance; world units.
-            quaternions: (I, 4) or (4,) w x y z of any length but zero; no rotation if None.
+            quaternions: (I, 4) or (4,) w x y z of any length but zero; no rotation if
+                None.
             scales: (I,) or one number for all, > 0; 1 if None.
-            importance: (I,) or one number for all, > 0. An instance of importance 4 is drawn as if the
-                tolerance were a quarter.
+            importance: (I,) or one number for all, > 0. An instance of importance 4 is
+                drawn as if the tolerance were a quarter.
 
         Raises:
             TypeError: ``bundle`` is not a bundle.
@@ -138,7 +148,8 @@ class Scene:
         with _lock:
             state = self._state
             number_of = {
-                item: number for number, item in enumerate(dict.fromkeys((*state.bundles, *bundles)))
+                item: number
+                for number, item in enumerate(dict.fromkeys((*state.bundles, *bundles)))
             }
             numbers = np.array([number_of[item] for item in bundles], np.int32)
             first = len(self)
@@ -154,7 +165,8 @@ class Scene:
         return range(first, first + count)
 
     def remove(self, ids: Array | npt.ArrayLike) -> None:
-        """Remove instances; the ids of those that follow decrease, as in `numpy.delete`."""
+        """Remove instances; the ids of those that follow decrease, as in
+        `numpy.delete`."""
         with _lock:
             state = self._state
             is_left = np.ones(len(self), bool)
@@ -201,8 +213,11 @@ class Scene:
                 state = state._replace(**{name: values})
             self._publish(state, moves=1)
 
-    def set_importance(self, importance: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None) -> None:
-        """Give instances another importance, as in `add`; all of them if ``ids`` is None."""
+    def set_importance(
+        self, importance: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None
+    ) -> None:
+        """Give instances another importance, as in `add`; all of them if ``ids`` is
+        None."""
         with _lock:
             rows = self._ids(ids)
             values = _rows(importance, "importance", len(rows))
@@ -210,14 +225,16 @@ class Scene:
             self._publish(state, changes=1)
 
     def _publish(self, state: _State, changes: int = 0, moves: int = 0, removals: int = 0) -> None:
-        """Replace the state in one step and count the revision up; the lock must be held."""
+        """Replace the state in one step and count the revision up; the lock must be
+        held."""
         num_changes, num_moves, num_removals = self.revision
         revision = (num_changes + changes, num_moves + moves, num_removals + removals)
         self._state = _read_only(state._replace(revision=revision))
 
     @property
     def up(self) -> Axis | None:
-        """The axis that is up; None if it is not known, so that viewers and exports may guess it."""
+        """The axis that is up; None if it is not known, so that viewers and exports may
+        guess it."""
         return self._up
 
     @up.setter
@@ -233,9 +250,11 @@ class Scene:
 
     @property
     def revision(self) -> tuple[int, int, int]:
-        """Numbers of changes so far: instances added, removed or given another importance; moves; removals.
+        """Numbers of changes so far: instances added, removed or given another
+        importance; moves; removals.
 
-        A program that caches something of the scene compares them to find out when it is stale.
+        A program that caches something of the scene compares them to find out when it
+        is stale.
         """
         return self._state.revision
 
@@ -251,7 +270,8 @@ class Scene:
 
     @property
     def positions(self) -> Floats:
-        """(I, 3) float64, world units; a copy if they are on a device. Use `move` to change them."""
+        """(I, 3) float64, world units; a copy if they are on a device. Use `move` to
+        change them."""
         return _device.to_host(self._state.positions)
 
     @property
@@ -261,7 +281,9 @@ class Scene:
         if isinstance(rows, np.ndarray):
             return rows
         quaternions = normalised(_device.to_host(rows))
-        quaternions[~quaternions.any(axis=1)] = np.nan  # an instance with a zero quaternion is not drawn
+        quaternions[~quaternions.any(axis=1)] = (
+            np.nan
+        )  # an instance with a zero quaternion is not drawn
         return quaternions
 
     @property
@@ -276,7 +298,8 @@ class Scene:
 
     @property
     def poses(self) -> tuple[Array, Array, Array]:
-        """Positions, quaternions and scales, not copied: NumPy arrays, or tensors on a CUDA device."""
+        """Positions, quaternions and scales, not copied: NumPy arrays, or tensors on a
+        CUDA device."""
         state = self._state
         return state.positions, state.quaternions, state.scales
 
@@ -324,7 +347,8 @@ def _read_only(state: _State) -> _State:
 
 
 def _rows(values: Array, name: str, count: int) -> Array:
-    """A contiguous (count, ...) copy of a column; one row stands for all, except of positions."""
+    """A contiguous (count, ...) copy of a column; one row stands for all, except of
+    positions."""
     row = _ROW[name]
     is_on_device = getattr(values, "is_cuda", False) and name != "importance"
     if is_on_device:
@@ -358,7 +382,8 @@ def _rows(values: Array, name: str, count: int) -> Array:
 
 
 def _on_device_of(array: Array, values: Array) -> Array:
-    """The values as a tensor on the device of ``array``; unchanged if that is a NumPy array."""
+    """The values as a tensor on the device of ``array``; unchanged if that is a NumPy
+    array."""
     if isinstance(array, np.ndarray):
         return values
     import torch
@@ -369,7 +394,8 @@ def _on_device_of(array: Array, values: Array) -> Array:
 
 
 def _on_one_device(first: Array, second: Array) -> tuple[Array, Array]:
-    """Both arrays on the device of either that is a tensor; on the host if neither is."""
+    """Both arrays on the device of either that is a tensor; on the host if neither
+    is."""
     target = first
     if isinstance(first, np.ndarray):
         target = second

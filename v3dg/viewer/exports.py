@@ -1,4 +1,5 @@
-"""What a tab does that takes long, such as files that it saves, and the thread that it is done in."""
+"""What a tab does that takes long, such as files that it saves, and the thread that it
+is done in."""
 
 import contextlib
 import os
@@ -13,7 +14,8 @@ from v3dg.scene import Scene
 
 
 def bundle_names(scene: Scene) -> list[str]:
-    """Return where the scene's bundles, which must be files, are in the folder that all of them lie below."""
+    """Return where the scene's bundles, which must be files, are in the folder that all
+    of them lie below."""
     paths = [os.path.abspath(bundle.path or "") for bundle in scene.bundles]
     folder = os.path.commonpath([os.path.dirname(path) for path in paths] or ["/"])
     return [os.path.relpath(path, folder) for path in paths]
@@ -42,7 +44,8 @@ class Exporter:
         self._stop = _core.Stop()
 
     def begin(self, work: Callable[[_core.Stop], None]) -> None:
-        """Start work that ends when it is asked to, and whose errors become notices, unless there is some."""
+        """Start work that ends when it is asked to, and whose errors become notices,
+        unless there is some."""
         with self._lock:
             if self._is_closed:
                 return
@@ -53,7 +56,11 @@ class Exporter:
                 )
                 self._thread.start()
                 return
-        self._run(lambda _: self._tell({"type": "notice", "text": "Still at work: stop it first, or wait."}))
+        self._run(
+            lambda _: self._tell(
+                {"type": "notice", "text": "Still at work: stop it first, or wait."}
+            )
+        )
 
     def _run(self, work: Callable[[_core.Stop], None]) -> None:
         answer = {"type": "done"}
@@ -76,7 +83,8 @@ class Exporter:
         self._stop.request()
 
     def close(self, seconds: float) -> bool:
-        """Stop for good; returns whether the thread has ended, waiting so long for it."""
+        """Stop for good; returns whether the thread has ended, waiting so long for
+        it."""
         with self._lock:
             self._is_closed = True
         self.stop()

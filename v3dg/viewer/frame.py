@@ -48,13 +48,16 @@ class Settings:
     """What a picture shows, and how finely.
 
     Attributes:
-        shows: The colours, those of a level or a cluster, the error, which is the screen area that a gaussian
-            of a coarser cluster stands for, expected depth, alpha, how many gaussians a pixel is blended of,
-            or the difference to the picture of all gaussians.
-        tolerance, budget, min_level, fade: As in `v3dg.render`, but that a tolerance is always given.
+        shows: The colours, those of a level or a cluster, the error, which is the
+            screen area that a gaussian of a coarser cluster stands for, expected depth,
+            alpha, how many gaussians a pixel is blended of, or the difference to the
+            picture of all gaussians.
+        tolerance, budget, min_level, fade: As in `v3dg.render`, but that a tolerance is
+            always given.
         gain: What a difference is multiplied by.
         split: Share of the width, from the left, that shows all gaussians; 0 for none.
-        frozen: The view that the cut is chosen for; None for the one that is looked from.
+        frozen: The view that the cut is chosen for; None for the one that is looked
+            from.
     """
 
     shows: Shows = "appearance"
@@ -73,11 +76,14 @@ class Frame:
 
     Attributes:
         pixels: (H, W, 3).
-        figures: What it cost; times are those of the whole picture, all else is the cut's.
+        figures: What it cost; times are those of the whole picture, all else is the
+            cut's.
         shows: As in its settings.
-        value_range: The values of the darkest and the brightest colour, where colours are values.
+        value_range: The values of the darkest and the brightest colour, where colours
+            are values.
         view: From where it is seen.
-        distance: How deep what is in its middle mostly is, world units; None where nothing is, or not known.
+        distance: How deep what is in its middle mostly is, world units; None where
+            nothing is, or not known.
     """
 
     pixels: Pixels
@@ -96,7 +102,8 @@ class _Job(NamedTuple):
     """How a picture is drawn.
 
     Attributes:
-        chooser: The camera that the cut is selected for; None for the one that the picture is seen from.
+        chooser: The camera that the cut is selected for; None for the one that the
+            picture is seen from.
         edge: The column at which the picture is split, px.
     """
 
@@ -129,7 +136,8 @@ class _Drawn(NamedTuple):
 
     Attributes:
         color, alpha, depth: As in `_Planes`, of the part to the right of the split.
-        whole: Colours of all gaussians, from the left edge on, to compare with; None if nothing is compared.
+        whole: Colours of all gaussians, from the left edge on, to compare with; None if
+            nothing is compared.
         figures: What drawing cost.
     """
 
@@ -156,10 +164,12 @@ class SceneView:
     """Draws pictures of one scene, for any number of threads.
 
     Args:
-        subject: A scene, a bundle, or an asset, which is split into clusters but gets no coarser levels.
+        subject: A scene, a bundle, or an asset, which is split into clusters but gets
+            no coarser levels.
         device: Where to draw: "cpu", "cuda", or "auto", which is CUDA where that works.
-        memory: As in `v3dg.Renderer`. With a pool, one picture is drawn at a time, and what is compared
-            with is the finest that it has room for, of the cut's camera; on CUDA nothing is.
+        memory: As in `v3dg.Renderer`. With a pool, one picture is drawn at a time, and
+            what is compared with is the finest that it has room for, of the cut's
+            camera; on CUDA nothing is.
 
     Attributes:
         scene: The subject as a scene.
@@ -185,7 +195,9 @@ class SceneView:
         self.center, self.radius = _bounds(self.scene)
         self.near = min(0.01, 1e-3 * self.radius)
         self.num_levels = max((bundle.num_levels for bundle in self.scene.bundles), default=1)
-        sizes = [bundle.clusters.offset[bundle.level_range(0).stop] for bundle in self.scene.bundles]
+        sizes = [
+            bundle.clusters.offset[bundle.level_range(0).stop] for bundle in self.scene.bundles
+        ]
         self.num_gaussians = int(np.array(sizes, np.int64)[self.scene.instance_bundle].sum())
 
     @property
@@ -194,7 +206,8 @@ class SceneView:
         return self.device.is_cuda or self.num_gaussians <= _FEW_GAUSSIANS
 
     def explain(self, error: Exception) -> str:
-        """Return an error's line, in which bundles go by names, not paths: the tab may be somebody else's."""
+        """Return an error's line, in which bundles go by names, not paths: the tab may
+        be somebody else's."""
         text = " ".join(str(error).split())
         for path in (bundle.path for bundle in self.scene.bundles):
             if path:
@@ -207,11 +220,14 @@ class SceneView:
         """What can be shown."""
         if self.pool is not None and self.device.is_cuda:
             return _MODES_OF_POOLS_ON_CUDA
-        return tuple(mode for mode in get_args(Shows) if self.pool is not None or mode != "residency")
+        return tuple(
+            mode for mode in get_args(Shows) if self.pool is not None or mode != "residency"
+        )
 
     @property
     def shows_cuts(self) -> bool:
-        """Whether cuts can be frozen, split and picked from: a pool on CUDA draws its own as they are."""
+        """Whether cuts can be frozen, split and picked from: a pool on CUDA draws its
+        own as they are."""
         return self.pool is None or not self.device.is_cuda
 
     def frame(
@@ -223,13 +239,15 @@ class SceneView:
         steps: _core.BudgetSteps | None = None,
         patience: float = 0.0,
     ) -> Frame:
-        """Draw a picture of ``size`` (width, height) px; with ``steps``, one that follows others.
+        """Draw a picture of ``size`` (width, height) px; with ``steps``, one that
+        follows others.
 
         It waits so many seconds for pages that a pool lacks.
 
         Raises:
             Stopped: ``stop`` was requested; it is raised soon after.
-            ValueError: The budget is too small for any cut, or a page that a pool lacks is damaged.
+            ValueError: The budget is too small for any cut, or a page that a pool lacks
+                is damaged.
         """
         _check(stop)
         if self.pool is not None and self.device.is_cuda:  # the settings of a link may ask for more
@@ -262,8 +280,11 @@ class SceneView:
         pixels = to_8bit(picture)
         return Frame(pixels, figures, settings.shows, painting.value_range, view, painting.distance)
 
-    def pick(self, view: View, size: tuple[int, int], x: int, y: int, settings: Settings) -> Pick | None:
-        """Return what a pixel of a picture shows most of, of what is resident where there is a pool."""
+    def pick(
+        self, view: View, size: tuple[int, int], x: int, y: int, settings: Settings
+    ) -> Pick | None:
+        """Return what a pixel of a picture shows most of, of what is resident where
+        there is a pool."""
         camera = view.camera(*size, self.near)
         with self._drawing:
             return pick(
@@ -278,7 +299,8 @@ class SceneView:
             )
 
     def _draw_pool(self, job: _Job, pool: Renderer, patience: float) -> _Drawn:
-        """Draw from a pool, and what is compared with: the finest cut that the pool has room for.
+        """Draw from a pool, and what is compared with: the finest cut that the pool has
+        room for.
 
         Both are drawn from the pages of the finer cut.
         """
@@ -292,7 +314,9 @@ class SceneView:
             settled_request = request
             if compares:
                 settled_request = finest
-            pool_frame.settle(self.scene, job.chooser or job.camera, settled_request, seconds=patience)
+            pool_frame.settle(
+                self.scene, job.chooser or job.camera, settled_request, seconds=patience
+            )
 
         def draw(cut: CutRequest, look: PoolLook, steps: _core.BudgetSteps | None) -> RenderedImage:
             image = pool_frame.draw(
@@ -354,7 +378,8 @@ class SceneView:
     def _draw(
         self, cut: Selection, camera: Camera, window: Window, shows: Shows, stop: _core.Stop | None
     ) -> _Planes:
-        """Draw a window of the picture of a cut on the device, or on the CPU what only that draws."""
+        """Draw a window of the picture of a cut on the device, or on the CPU what only
+        that draws."""
         if not self.device.is_cuda or shows in ("count", "error"):
             return self._draw_on_cpu(cut, camera, window, shows, stop)
         image = render(
@@ -398,7 +423,8 @@ class SceneView:
 
 
 def _color_by(shows: Shows) -> ColorBy:
-    """The colours that gaussians are drawn with, from which `_paint` makes those of the other modes."""
+    """The colours that gaussians are drawn with, from which `_paint` makes those of the
+    other modes."""
     if shows in ("level", "cluster", "residency"):
         return shows
     return "appearance"
@@ -439,7 +465,8 @@ def _paint(drawn: _Drawn, settings: Settings) -> _Painting:
 
 
 def _distance_in_middle(alpha: _Float32, depth: _Float32) -> float | None:
-    """The median depth of the covered pixels around the middle; None if there are none."""
+    """The median depth of the covered pixels around the middle; None if there are
+    none."""
     middle = tuple(slice(side * 3 // 8, side * 5 // 8 + 1) for side in alpha.shape)
     covered = depth[middle][alpha[middle] > 0.5]
     if not covered.size:
@@ -448,7 +475,8 @@ def _distance_in_middle(alpha: _Float32, depth: _Float32) -> float | None:
 
 
 def _depth_range(alpha: _Float32, depth: _Float32) -> tuple[float, float]:
-    """The depths of the nearest and the farthest colour; percentiles, which few far gaussians do not move."""
+    """The depths of the nearest and the farthest colour; percentiles, which few far
+    gaussians do not move."""
     covered = depth[alpha > 0.5]
     if not covered.size:
         return 0.0, 1.0
@@ -462,7 +490,8 @@ def _check(stop: _core.Stop | None) -> None:
 
 
 def _bounds(scene: Scene) -> tuple[npt.NDArray[np.floating], float]:
-    """Centre and radius of a ball around nearly all of the scene: trained assets have a few far outliers."""
+    """Centre and radius of a ball around nearly all of the scene: trained assets have a
+    few far outliers."""
     corners: list[Floats] = [np.zeros((0, 3))]
     for number, bundle in enumerate(scene.bundles):
         is_of_bundle = scene.instance_bundle == number

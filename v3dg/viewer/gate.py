@@ -1,9 +1,11 @@
-"""Who may talk to the viewer's server: what a request has to say of where it comes from.
+"""Who may talk to the viewer's server: what a request has to say of where it comes
+from.
 
-Any web page can have its visitor's browser connect to this machine. The browser then says which name it
-looked up (Host), whose page asks (Origin, which the pictures, scripts and links of a page leave out) and how
-that page is related to the server (Sec-Fetch-Site, which browsers leave out where the server is another
-machine and the connection is not encrypted). No page can change any of them.
+Any web page can have its visitor's browser connect to this machine. The browser then
+says which name it looked up (Host), whose page asks (Origin, which the pictures,
+scripts and links of a page leave out) and how that page is related to the server
+(Sec-Fetch-Site, which browsers leave out where the server is another machine and the
+connection is not encrypted). No page can change any of them.
 """
 
 import errno
@@ -16,11 +18,13 @@ import socket
 from websockets.http11 import Request
 
 _MOST_PORTS = 1000
-# A name or an address, and perhaps a port, as browsers write them: without a user, in lower case.
+# A name or an address, and perhaps a port, as browsers write them: without a user, in
+# lower case.
 _HOST = re.compile(
     r"(?:\[(?P<address>[0-9a-f:.]+(?:%[a-z0-9._~-]+)?)\]|(?P<name>[a-z0-9._-]+))(?::[0-9]{0,5})?"
 )
-# Sec-Fetch-Site of the viewer's own page, and of an address that a person typed or opened from a bookmark.
+# Sec-Fetch-Site of the viewer's own page, and of an address that a person typed or
+# opened from a bookmark.
 _OWN_SITES = ("same-origin", "none")
 # Paths of the page, which links of other sites may open.
 _PAGE_PATHS = ("/", "/index.html")
@@ -36,8 +40,8 @@ class Gate:
     Attributes:
         socket: Which listens there.
         port: The one that was free.
-        url: What a browser is to open. Where other machines can connect, a secret that lets in who has it
-            follows the port.
+        url: What a browser is to open. Where other machines can connect, a secret that
+            lets in who has it follows the port.
         is_secret: Whether it does.
 
     Raises:
@@ -49,7 +53,8 @@ class Gate:
         self.port = int(self.socket.getsockname()[1])
         address = ipaddress.ip_address(self.socket.getsockname()[0].partition("%")[0])
         self._names = {"localhost", host.lower(), str(address)}
-        # Those of a machine that listens everywhere are not known: there the token alone decides.
+        # Those of a machine that listens everywhere are not known: there the token
+        # alone decides.
         self._has_any_name = address.is_unspecified
         self._token = ""
         if not address.is_loopback:
@@ -65,7 +70,8 @@ class Gate:
             self.url += f"/{self._token}/"
 
     def refusal(self, request: Request) -> str | None:
-        """Why a request gets no answer; the token is taken off the path of one that does."""
+        """Why a request gets no answer; the token is taken off the path of one that
+        does."""
         headers = request.headers
         texts = (request.path, *(value for _, value in headers.raw_items()))
         if not all(text.isascii() for text in texts):
@@ -88,7 +94,8 @@ class Gate:
         return None
 
     def _knows(self, host: str) -> bool:
-        """Whether a Host is loopback or was asked for: other names can be led here by those who own them."""
+        """Whether a Host is loopback or was asked for: other names can be led here by
+        those who own them."""
         match = _HOST.fullmatch(host)
         if match is None:
             return False
@@ -102,7 +109,8 @@ class Gate:
 
 
 def _opens_the_page(request: Request) -> bool:
-    """Whether a request is of a tab that a link leads to the page; frames have another destination."""
+    """Whether a request is of a tab that a link leads to the page; frames have another
+    destination."""
     headers = request.headers
     is_navigation = headers.get_all("Sec-Fetch-Mode") == ["navigate"]
     is_tab = headers.get_all("Sec-Fetch-Dest") == ["document"]
@@ -117,5 +125,7 @@ def _listening_socket(host: str, port: int) -> socket.socket:
             return socket.create_server((host, candidate), family=family)
         except OSError as error:
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
-                raise ValueError(f"host: expected an address of this machine, got {host}") from error
+                raise ValueError(
+                    f"host: expected an address of this machine, got {host}"
+                ) from error
     raise ValueError(f"port: expected a free one among {ports[0]} to {ports[-1]}, got none")

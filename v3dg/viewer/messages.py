@@ -1,4 +1,5 @@
-"""What a page may say to the viewer: JSON of these kinds, with numbers in bounds, and nothing else."""
+"""What a page may say to the viewer: JSON of these kinds, with numbers in bounds, and
+nothing else."""
 
 import math
 from typing import Annotated, Literal
@@ -109,7 +110,8 @@ class Move(msgspec.Struct, tag="move", forbid_unknown_fields=True):
 
 
 class Save(msgspec.Struct, tag="save", forbid_unknown_fields=True):
-    """Asks for a file; or, to play it, for the views of a path: stops with the seconds to each."""
+    """Asks for a file; or, to play it, for the views of a path: stops with the seconds
+    to each."""
 
     output: Literal["picture", "film", "cameras", "scene", "play"] = msgspec.field(name="what")
     look: Look

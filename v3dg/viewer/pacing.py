@@ -1,4 +1,5 @@
-"""How large to draw, and when: small while things move, larger step by step once they rest."""
+"""How large to draw, and when: small while things move, larger step by step once they
+rest."""
 
 import contextlib
 import math
@@ -15,11 +16,13 @@ from v3dg.viewer.view import View
 
 Size = tuple[int, int]
 
-# Of one picture while the camera moves; a drag then has an answer in less than twice that.
+# Of one picture while the camera moves; a drag then has an answer in less than twice
+# that.
 TARGET_MS = 60.0
 # Without a change for so long, a larger picture is begun.
 REST_SECONDS = 0.15
-# What a picture at rest waits for pages; another one follows as long as some are missing.
+# What a picture at rest waits for pages; another one follows as long as some are
+# missing.
 PAGES_SECONDS = 0.1
 # A draft that has taken so long is given up for what is asked for now.
 PATIENCE_SECONDS = 4e-3 * TARGET_MS
@@ -31,7 +34,8 @@ _STEPS_AN_OCTAVE = 4
 
 
 class Draft(NamedTuple):
-    """How to draw what passes by: its size in px, and what the tolerance is multiplied by."""
+    """How to draw what passes by: its size in px, and what the tolerance is multiplied
+    by."""
 
     size: Size
     coarser: float = 1.0
@@ -40,8 +44,9 @@ class Draft(NamedTuple):
 class Pacer:
     """Chooses how to draw a picture in time, from how long earlier ones took.
 
-    Time is taken to be proportional to work, pixels over the factor of the tolerance, measured with the
-    picture that was drawn last: where it is not, the choice still settles at the one that takes the target.
+    Time is taken to be proportional to work, pixels over the factor of the tolerance,
+    measured with the picture that was drawn last: where it is not, the choice still
+    settles at the one that takes the target.
     """
 
     def __init__(self, target_ms: float = TARGET_MS) -> None:
@@ -49,7 +54,8 @@ class Pacer:
         self._work_per_ms = 0.0
 
     def draft(self, full: Size) -> Draft:
-        """Return a size with about the shape of ``full``, not larger, at first a quarter of its width."""
+        """Return a size with about the shape of ``full``, not larger, at first a
+        quarter of its width."""
         whole = math.prod(full)
         share = (self._target_ms * self._work_per_ms or whole / 16) / whole
         # A little more, so that rounding refuses no step that fits.
@@ -67,7 +73,8 @@ class Pacer:
         self._work_per_ms += share * (speed - self._work_per_ms)
 
     def rested(self) -> None:
-        """Take half the work for the next: a browser on these cores has a large picture to move then."""
+        """Take half the work for the next: a browser on these cores has a large picture
+        to move then."""
         self._work_per_ms /= 2
 
 
@@ -76,7 +83,8 @@ def scaled(full: Size, scale: float) -> Size:
 
 
 def finer_sizes(drawn: Size, full: Size) -> list[Size]:
-    """Return the sizes to go on with, each twice the one before, to ``full``; empty where that is drawn."""
+    """Return the sizes to go on with, each twice the one before, to ``full``; empty
+    where that is drawn."""
     sizes = []
     width = drawn[0]
     while width < full[0]:
@@ -90,7 +98,8 @@ def finer_sizes(drawn: Size, full: Size) -> list[Size]:
 
 
 class Request(NamedTuple):
-    """What a tab wants to see: a view, full size in px, settings; and the number by which it knows that."""
+    """What a tab wants to see: a view, full size in px, settings; and the number by
+    which it knows that."""
 
     view: View
     size: Size
@@ -99,15 +108,17 @@ class Request(NamedTuple):
 
 
 class RenderLoop:
-    """Draws what one tab asked for last, in a thread of its own, as often and as large as time allows.
+    """Draws what one tab asked for last, in a thread of its own, as often and as large
+    as time allows.
 
-    A request is answered by a small picture; after a rest larger ones follow, up to the full size. A new
-    request ends a larger picture at once, and a small one that has taken too long, after which the next is
-    smaller; the smallest is always finished, so that something is seen.
+    A request is answered by a small picture; after a rest larger ones follow, up to the
+    full size. A new request ends a larger picture at once, and a small one that has
+    taken too long, after which the next is smaller; the smallest is always finished, so
+    that something is seen.
 
     Args:
-        send: Called with each picture, whether it is the final one, and the request's number; in the loop's
-            thread.
+        send: Called with each picture, whether it is the final one, and the request's
+            number; in the loop's thread.
         fail: Called with what could not be drawn or sent; in the loop's thread.
     """
 
@@ -140,7 +151,8 @@ class RenderLoop:
             self._changed.notify()
 
     def close(self, seconds: float) -> bool:
-        """Draw nothing more; returns whether the thread has ended, waiting so long for it."""
+        """Draw nothing more; returns whether the thread has ended, waiting so long for
+        it."""
         with self._changed:
             self._is_closed = True
             self._stop.request()
@@ -160,7 +172,8 @@ class RenderLoop:
                 self._draw(request)
             except Stopped:
                 pass
-            except Exception as error:  # a tab that shows the reason is better than one that stands still
+            except Exception as error:
+                # a tab that shows the reason is better than one that stands still
                 with contextlib.suppress(Exception):
                     self._fail(error)
 
@@ -182,7 +195,9 @@ class RenderLoop:
         if is_larger:
             steps = None
         for size in sizes:
-            frame = self._scene_view.frame(request.view, size, request.settings, self._begin(0.0), steps)
+            frame = self._scene_view.frame(
+                request.view, size, request.settings, self._begin(0.0), steps
+            )
             if self._has_news():
                 return
             self._send(frame, size == sizes[-1] and not has_pool, request.number)
@@ -216,11 +231,14 @@ class RenderLoop:
             self._send(frame, is_complete, request.number)
 
     def _draw_until_settled(self, request: Request, tolerance: float) -> None:
-        """Draw pictures until the tolerance of a budget, which changes in steps, stays the same."""
+        """Draw pictures until the tolerance of a budget, which changes in steps, stays
+        the same."""
         is_settled = False
         while not is_settled:
             stop = self._begin(0.0)
-            frame = self._scene_view.frame(request.view, request.size, request.settings, stop, self._steps)
+            frame = self._scene_view.frame(
+                request.view, request.size, request.settings, stop, self._steps
+            )
             self._send(frame, True, request.number)
             is_settled = frame.figures.tolerance == tolerance
             tolerance = frame.figures.tolerance
@@ -239,7 +257,8 @@ class RenderLoop:
         return self._is_closed or self._request is not None
 
     def _begin(self, patience: float) -> _core.Stop:
-        """Return what ends the next picture once something new is asked for, after so many seconds."""
+        """Return what ends the next picture once something new is asked for, after so
+        many seconds."""
         with self._changed:
             self._stop = _core.Stop()
             self._patience_ends = time.monotonic() + patience

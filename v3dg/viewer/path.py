@@ -14,7 +14,8 @@ from v3dg.viewer.view import View
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Views, each with the seconds that it comes after the one before; those of the first do not count."""
+    """Views, each with the seconds that it comes after the one before; those of the
+    first do not count."""
 
     stops: Sequence[tuple[float, View]] = ()
 
@@ -27,16 +28,19 @@ class CameraPath:
         return np.cumsum([0.0, *(seconds for seconds, _ in self.stops[1:])])
 
     def views_at(self, seconds: Floats) -> list[View]:
-        """Return the views so long after the first, on a smooth curve through all of them.
+        """Return the views so long after the first, on a smooth curve through all of
+        them.
 
-        Positions, rotations and fields of view follow cubic Hermite curves whose slopes are those of
-        Catmull-Rom for uneven times; rotations are normalised. Before the first and after the last time it
-        stays.
+        Positions, rotations and fields of view follow cubic Hermite curves whose slopes
+        are those of Catmull-Rom for uneven times; rotations are normalised. Before the
+        first and after the last time it stays.
 
         Raises:
             ValueError: The path is empty.
         """
-        check("path", self.stops, "at least one view, got none; add this one, or record while you fly")
+        check(
+            "path", self.stops, "at least one view, got none; add this one, or record while you fly"
+        )
         times = self.times
         views = [view for _, view in self.stops]
         if len(views) == 1:
@@ -57,7 +61,8 @@ class CameraPath:
         return [View(tuple(row[:4]), tuple(row[4:7]), row[7], row[8]) for row in curve.tolist()]
 
     def film(self, fps: int) -> list[View]:
-        """Return the views of a film: the first, the last, and those between at ``fps`` a second."""
+        """Return the views of a film: the first, the last, and those between at ``fps``
+        a second."""
         seconds = self.times[-1]
         return self.views_at(np.linspace(0.0, seconds, max(round(seconds * fps), 1) + 1))
 
@@ -69,7 +74,8 @@ class CameraPath:
 
 
 def _rows(views: list[View]) -> Floats:
-    """(K, 9): quaternion of the sign that is next to the one before, position, field of view, aspect."""
+    """(K, 9): quaternion of the sign that is next to the one before, position, field of
+    view, aspect."""
     rows = np.array([(*v.wxyz, *v.position, v.fov_y, v.aspect) for v in views], np.float64)
     rows[:, :4] = normalised(rows[:, :4])
     for previous, row in itertools.pairwise(rows):

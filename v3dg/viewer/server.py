@@ -1,4 +1,5 @@
-"""The viewer's web server: it hands out the page, and gives every browser tab a connection of its own."""
+"""The viewer's web server: it hands out the page, and gives every browser tab a
+connection of its own."""
 
 from __future__ import annotations
 
@@ -36,17 +37,27 @@ if TYPE_CHECKING:
 _FOV_Y = math.radians(45)
 # What is still at work after so long is left behind.
 _CLOSE_SECONDS = 1.0
-# Of the longer side of photographs, at most, by the folder that the page asks for them in.
+# Of the longer side of photographs, at most, by the folder that the page asks for them
+# in.
 _PHOTOGRAPH_PIXELS = {"photograph": 1600, "thumbnail": 240}
-# What goes wrong in a connection is its client's fault: for those who set up logging, not for the terminal.
+# What goes wrong in a connection is its client's fault: for those who set up logging,
+# not for the terminal.
 _LOG = logging.getLogger(__name__)
 _LOG.addHandler(logging.NullHandler())
-_KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
-# Of every answer, refusals and errors too. The page is shown in no other page, runs nothing but its own
-# files, and talks to no other server; other pages show nothing of it, and have no handle on its window.
+_KINDS = {
+    ".html": "text/html",
+    ".css": "text/css",
+    ".js": "text/javascript",
+    ".svg": "image/svg+xml",
+}
+# Of every answer, refusals and errors too. The page is shown in no other page, runs
+# nothing but its own files, and talks to no other server; other pages show nothing of
+# it, and have no handle on its window.
 _HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
-    "img-src 'self' blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+        "img-src 'self' blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
     "X-Frame-Options": "DENY",
@@ -63,7 +74,8 @@ class Site:
         name: Title of the tabs, and of the files that they save.
         cameras: Named cameras to jump to.
         photographs: Files of the pictures that cameras took, by the cameras' names.
-        host, port: As of its `Gate`, whose port and URL it has, and whose errors it raises.
+        host, port: As of its `Gate`, whose port and URL it has, and whose errors it
+            raises.
         tolerance, budget: What a tab begins with.
         up: (3,) direction in the world.
         asks_up: Whether that is but assumed, so that the page asks.
@@ -127,12 +139,15 @@ class Site:
         self._closing = asyncio.Event()
         is_serving = threading.Event()
         serving = self._serve(is_serving)
-        self._thread = threading.Thread(target=asyncio.run, args=(serving,), name="v3dg viewer", daemon=True)
+        self._thread = threading.Thread(
+            target=asyncio.run, args=(serving,), name="v3dg viewer", daemon=True
+        )
         self._thread.start()
         is_serving.wait()
 
     def close(self) -> bool:
-        """End all tabs and the server in about two seconds; returns whether all their threads have ended."""
+        """End all tabs and the server in about two seconds; returns whether all their
+        threads have ended."""
         with contextlib.suppress(RuntimeError):  # it is closed already
             self._loop.call_soon_threadsafe(self._closing.set)
         self._thread.join(3 * _CLOSE_SECONDS)
@@ -254,9 +269,12 @@ def start_view(scene_view: SceneView, up: VectorLike, aspect: float = 16 / 9) ->
     """Return the view that a tab begins with: all of the scene, from a little above."""
     axis = np.asarray(up, np.float64)
     axis = axis / np.linalg.norm(axis)
-    # Of the world's axes the one that comes after the upright one, so that no two are parallel.
+    # Of the world's axes the one that comes after the upright one, so that no two are
+    # parallel.
     aside = np.roll(np.eye(3)[int(np.abs(axis).argmax())], 1)
     aside = aside - (aside @ axis) * axis
     direction = math.cos(0.45) * aside / np.linalg.norm(aside) + math.sin(0.45) * axis
     distance = 0.95 * scene_view.radius / math.sin(_FOV_Y / 2)
-    return look_at(scene_view.center + distance * direction, scene_view.center, axis, _FOV_Y, aspect)
+    return look_at(
+        scene_view.center + distance * direction, scene_view.center, axis, _FOV_Y, aspect
+    )

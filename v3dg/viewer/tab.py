@@ -1,4 +1,5 @@
-"""A browser tab: what its page asks for, the loop that draws it, and what the page is told."""
+"""A browser tab: what its page asks for, the loop that draws it, and what the page is
+told."""
 
 import contextlib
 import copy
@@ -54,7 +55,8 @@ class Tab:
     Args:
         scene_view: What it shows, until a file is dropped onto it.
         name: Of the files that it saves.
-        send: Sends text or bytes to the page; waits until they are away, but not in the server's thread.
+        send: Sends text or bytes to the page; waits until they are away, but not in the
+            server's thread.
         moved: Called with a scene view of which an instance has another pose.
     """
 
@@ -74,7 +76,8 @@ class Tab:
         self._missing_bytes = 0
 
     def close(self, seconds: float) -> bool:
-        """Stop drawing and saving; returns whether the threads have ended, waiting so long for each."""
+        """Stop drawing and saving; returns whether the threads have ended, waiting so
+        long for each."""
         has_ended = all([self._loop.close(seconds), self._exporter.close(seconds)])
         if has_ended and self._folder is not None:
             self._folder.cleanup()
@@ -86,7 +89,8 @@ class Tab:
             self._loop.ask(self._look.request())
 
     def take(self, data: str | bytes) -> None:
-        """Do what a message says; ValueError and its like where it is none of `messages`."""
+        """Do what a message says; ValueError and its like where it is none of
+        `messages`."""
         if isinstance(data, bytes):
             self._take_bytes(data)
             return
@@ -96,7 +100,9 @@ class Tab:
             self.ask_again()
         elif isinstance(message, messages.Pick):
             if self._picking.acquire(blocking=False):  # one at a time
-                threading.Thread(target=self._pick, args=(message,), name="v3dg pick", daemon=True).start()
+                threading.Thread(
+                    target=self._pick, args=(message,), name="v3dg pick", daemon=True
+                ).start()
         elif isinstance(message, messages.Move):
             self.scene_view.scene.move(
                 [message.instance],
@@ -106,7 +112,9 @@ class Tab:
             )
             self._moved(self.scene_view)
         elif isinstance(message, messages.Save):
-            self._exporter.begin(functools.partial(getattr(self, f"_save_{message.output}"), message))
+            self._exporter.begin(
+                functools.partial(getattr(self, f"_save_{message.output}"), message)
+            )
         elif isinstance(message, messages.Stop):
             self._exporter.stop()
         else:
@@ -133,7 +141,8 @@ class Tab:
         }
 
     def _tell(self, message: Mapping[str, object], data: bytes = b"") -> None:
-        """Send a message; with bytes, as the length of the message, the message, and the bytes."""
+        """Send a message; with bytes, as the length of the message, the message, and
+        the bytes."""
         text = msgspec.json.encode(message)
         if data:
             self._send(len(text).to_bytes(4, "little") + text + data)
@@ -147,7 +156,9 @@ class Tab:
             quality = _FINAL_QUALITY
             subsampling = _WHOLE_COLORS
         picture = io.BytesIO()
-        Image.fromarray(frame.pixels).save(picture, "jpeg", quality=quality, subsampling=subsampling)
+        Image.fromarray(frame.pixels).save(
+            picture, "jpeg", quality=quality, subsampling=subsampling
+        )
         message = {
             "type": "picture",
             "final": is_final,
@@ -205,7 +216,9 @@ class Tab:
 
     def _save_picture(self, message: messages.Save, stop: _core.Stop) -> None:
         request = message.look.request()
-        frame = self.scene_view.frame(request.view, request.size, request.settings, stop, patience=math.inf)
+        frame = self.scene_view.frame(
+            request.view, request.size, request.settings, stop, patience=math.inf
+        )
         self._exporter.save(f"{self._name}.png", Image.fromarray(frame.pixels).save)
 
     def _save_play(self, message: messages.Save, _: _core.Stop) -> None:
@@ -232,7 +245,9 @@ class Tab:
                 )
                 yield frame.pixels
 
-        self._exporter.save(f"{self._name}.mp4", lambda file: write_video(file, pictures(), fps=_FPS))
+        self._exporter.save(
+            f"{self._name}.mp4", lambda file: write_video(file, pictures(), fps=_FPS)
+        )
 
     def _save_cameras(self, message: messages.Save, _: _core.Stop) -> None:
         size = message.look.request().size
@@ -240,7 +255,8 @@ class Tab:
         self._exporter.save("transforms.json", lambda file: write_cameras(file, cameras))
 
     def _save_scene(self, message: messages.Save, _: _core.Stop) -> None:
-        """Save the instances as they are now, the axis that is up, and the cameras of a path, if any."""
+        """Save the instances as they are now, the axis that is up, and the cameras of a
+        path, if any."""
         width, height = message.look.request().size
         path = message.camera_path()
         cameras: dict[str, Camera] = {}
@@ -249,10 +265,13 @@ class Tab:
         scene = copy.copy(self.scene_view.scene)
         scene.up = message.up
         names = bundle_names(scene)
-        self._exporter.save(f"{self._name}.json", lambda file: write_scene(file, scene, names, cameras))
+        self._exporter.save(
+            f"{self._name}.json", lambda file: write_scene(file, scene, names, cameras)
+        )
 
     def _begin_file(self, message: messages.Open) -> None:
-        """Keep the bytes that come now, until they are all there, in a folder that goes with the tab."""
+        """Keep the bytes that come now, until they are all there, in a folder that goes
+        with the tab."""
         self._folder = self._folder or tempfile.TemporaryDirectory(prefix="v3dg_")
         if self._dropped is not None:
             self._dropped.close()

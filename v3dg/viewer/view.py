@@ -1,4 +1,5 @@
-"""From where a tab looks: what a browser knows of its camera, and the pinhole camera that it makes."""
+"""From where a tab looks: what a browser knows of its camera, and the pinhole camera
+that it makes."""
 
 import math
 from dataclasses import dataclass, replace
@@ -14,7 +15,8 @@ class View:
     """A camera without a size in pixels.
 
     Attributes:
-        wxyz: Rotation from camera (x right, y down, z forward) to world, a quaternion of any length but zero.
+        wxyz: Rotation from camera (x right, y down, z forward) to world, a quaternion
+            of any length but zero.
         position: The eye, world units.
         fov_y: Vertical field of view in radians.
         aspect: Width over height.
@@ -27,14 +29,16 @@ class View:
 
     @classmethod
     def of_camera(cls, camera: Camera) -> "View":
-        """Take over pose and field of view; a principal point off the middle is lost."""
+        """Take over pose and field of view; a principal point off the middle is
+        lost."""
         half_x = camera.width / 2 / camera.fx
         half_y = camera.height / 2 / camera.fy
         wxyz = quaternion_from_rotation(camera.viewmat[:3, :3].T)
         return cls(wxyz, tuple(camera.position.tolist()), 2 * math.atan(half_y), half_x / half_y)
 
     def camera(self, width: int, height: int, near: float) -> Camera:
-        """Return the camera whose picture of that size fills the view; its pixels need not be square."""
+        """Return the camera whose picture of that size fills the view; its pixels need
+        not be square."""
         quaternion = in_range(np.asarray(self.wxyz, np.float64))
         rotation = rotation_from_quaternion(quaternion / np.linalg.norm(quaternion)).T
         viewmat = rigid(rotation, np.asarray(self.position, np.float64))
@@ -45,7 +49,9 @@ class View:
         return Camera(viewmat, K, width, height, near)
 
 
-def look_at(eye: VectorLike, target: VectorLike, up: VectorLike, fov_y: float, aspect: float) -> View:
+def look_at(
+    eye: VectorLike, target: VectorLike, up: VectorLike, fov_y: float, aspect: float
+) -> View:
     """Return the view at ``eye`` with ``target`` in the middle and ``up`` upwards."""
     of_camera = View.of_camera(Camera.look_at(eye, target, up, width=1, height=1))
     return replace(of_camera, fov_y=fov_y, aspect=aspect)

@@ -1,9 +1,10 @@
 """The parts of the evaluation, a module each.
 
-A part has a TITLE, a sentence or two ABOUT what it asks, and three functions: run(evaluation) measures and
-returns what JSON can hold, or yields it again each time that it knows more; tables(result) gives that as
-Markdown; summary(result) says in a sentence or two where we win and where we do not. Where there is something
-to plot, plot(result, figure) draws it.
+A part has a TITLE, a sentence or two ABOUT what it asks, and three functions:
+run(evaluation) measures and returns what JSON can hold, or yields it again each time
+that it knows more; tables(result) gives that as Markdown; summary(result) says in a
+sentence or two where we win and where we do not. Where there is something to plot,
+plot(result, figure) draws it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Rasterizer, split, selection and build alone: time, share of the machine's limit, growth with size."""
+"""Rasterizer, split, selection and build alone: time, share of the machine's limit,
+growth with size."""
 
 from __future__ import annotations
 
@@ -31,10 +32,10 @@ from v3dg.select import DEFAULT_TOLERANCE, select
 
 TITLE = "Rasterizer, split, selection, build alone"
 ABOUT = (
-    "Random gaussians of the sizes that training leaves. Share is that of the machine's speed of copying "
-    "memory, if every input were read and every output written once; the rasterizer's picture is checked "
-    "against double precision (a small one on the CPU) or against gsplat, in the same run, before its time "
-    "counts."
+    "Random gaussians of the sizes that training leaves. Share is that of the machine's speed of "
+    "copying memory, if every input were read and every output written once; the rasterizer's "
+    "picture is checked against double precision (a small one on the CPU) or against gsplat, in "
+    "the same run, before its time counts."
 )
 
 _COPIED_BYTES = 256 << 20
@@ -87,10 +88,13 @@ def rasterize_row(evaluation: Evaluation, count: int, bandwidth: float) -> Row:
     elif evaluation.device == "cpu":
         row["psnr_to_float64"] = psnr_to_float64(gaussians, camera, picture.color)
     renderer = Renderer(gaussians, device=evaluation.device)  # takes over the asset once
-    timed = time_ms(lambda: renderer.render(camera).stats, evaluation.device, evaluation.settings.repeats)
+    timed = time_ms(
+        lambda: renderer.render(camera).stats, evaluation.device, evaluation.settings.repeats
+    )
     row |= timed.row("frame")
     num_bytes = 4 * (
-        sum(math.prod(getattr(gaussians, f.name).shape) for f in fields(gaussians)) + 5 * width * height
+        sum(math.prod(getattr(gaussians, f.name).shape) for f in fields(gaussians))
+        + 5 * width * height
     )
     row |= {"bytes": num_bytes, "share": round(num_bytes / (timed.median / 1e3) / bandwidth, 4)}
     return row
@@ -113,7 +117,9 @@ def psnr_to_float64(gaussians: Gaussians, camera: Camera, color: Any) -> float:
 def _checked_psnr(expected: Any, color: Any) -> float:
     found = psnr(*(to_8bit(c).astype(np.float32) / 255 for c in (expected, color)))
     if not found >= _LEAST_PSNR:
-        raise RuntimeError(f"picture: expected at least {_LEAST_PSNR:g} dB to the reference, got {found:.1f}")
+        raise RuntimeError(
+            f"picture: expected at least {_LEAST_PSNR:g} dB to the reference, got {found:.1f}"
+        )
     return round(min(found, 99.0), 2)
 
 
@@ -138,10 +144,16 @@ def split_row(evaluation: Evaluation, count: int, bandwidth: float) -> Row:
         on_device = torch.from_numpy(means).to(evaluation.device)
         if count <= 1_000_000:
             order, _ = _core.median_split(on_device, ends, depth)
-            if not np.array_equal(_device.to_host(order), _core.median_split(means, ends, depth)[0]):
-                raise RuntimeError("median_split: expected the same order on both devices, got another")
+            if not np.array_equal(
+                _device.to_host(order), _core.median_split(means, ends, depth)[0]
+            ):
+                raise RuntimeError(
+                    "median_split: expected the same order on both devices, got another"
+                )
     timed = time_ms(
-        lambda: _core.median_split(on_device, ends, depth), evaluation.device, evaluation.settings.repeats
+        lambda: _core.median_split(on_device, ends, depth),
+        evaluation.device,
+        evaluation.settings.repeats,
     )
     num_bytes = (12 + 8) * count
     share = num_bytes / (timed.median / 1e3) / bandwidth
@@ -149,7 +161,8 @@ def split_row(evaluation: Evaluation, count: int, bandwidth: float) -> Row:
 
 
 def select_row(evaluation: Evaluation, count: int) -> Row:
-    """A scene of so many gaussians, of instances of the asset, from where about half is coarse."""
+    """A scene of so many gaussians, of instances of the asset, from where about half is
+    coarse."""
     bundle = evaluation.build().bundle
     instances = max(1, count // len(evaluation.asset))
     rng = np.random.default_rng(evaluation.seed)
@@ -187,12 +200,15 @@ def build_row(evaluation: Evaluation, count: int) -> Row:
         "levels": bundle.num_levels,
         "seconds": round(seconds, 3),
         "gaussians_a_second": round(count / seconds),
-        "mean_color_error": round(float(bundle.groups.error[:, 0].mean()), 5) if len(bundle.groups) else None,
+        "mean_color_error": round(float(bundle.groups.error[:, 0].mean()), 5)
+        if len(bundle.groups)
+        else None,
     }
 
 
-# A process a number of threads: OpenMP reads it once. Prints milliseconds of a split and of a frame. It looks
-# for modules where this process does: the folder that it starts in may hold a v3dg of its own.
+# A process a number of threads: OpenMP reads it once. Prints milliseconds of a split
+# and of a frame. It looks for modules where this process does: the folder that it
+# starts in may hold a v3dg of its own.
 _SCRIPT = """
 import json, sys
 sys.path[:] = json.loads(sys.argv[1])
@@ -291,8 +307,9 @@ def summary(result: dict[str, Any]) -> Summary:
         if "gsplat_ms" in row:
             out.judge(
                 row["frame_ms"] < row["gsplat_ms"],
-                f"{count_text(row['gaussians'])} random gaussians take {row['frame_ms']:.2f} ms, gsplat "
-                f"{row['gsplat_ms']:.2f} ms; the pictures are {row['psnr_to_gsplat']:.0f} dB apart",
+                f"{count_text(row['gaussians'])} random gaussians take {row['frame_ms']:.2f} ms, "
+                f"gsplat {row['gsplat_ms']:.2f} ms; the pictures are {row['psnr_to_gsplat']:.0f} "
+                "dB apart",
             )
     return out
 
@@ -307,7 +324,12 @@ def plot(result: dict[str, Any], figure: Any) -> None:
     ):
         rows = [row for row in result[name] if key in row]
         if rows:
-            axes.plot([r[count] for r in rows], [r[key] for r in rows], "o-", label=key.removesuffix("_ms"))
+            axes.plot(
+                [r[count] for r in rows],
+                [r[key] for r in rows],
+                "o-",
+                label=key.removesuffix("_ms"),
+            )
     axes.set(xlabel="gaussians", ylabel="ms", xscale="log", yscale="log")
     axes.legend()
     axes.grid(alpha=0.3)

@@ -1,4 +1,5 @@
-"""Against clipping: leaving out what is small on screen, as gsplat's `radius_clip` does, at equal counts."""
+"""Against clipping: leaving out what is small on screen, as gsplat's `radius_clip`
+does, at equal counts."""
 
 from __future__ import annotations
 
@@ -14,8 +15,8 @@ from v3dg.select import select
 
 TITLE = "Against clipping what is small"
 ABOUT = (
-    "gsplat's `radius_clip` leaves out gaussians whose radius on screen is small. The clip that leaves as "
-    "many in the frustum as our cut has, by gsplat's rule, both drawn by our rasterizer."
+    "gsplat's `radius_clip` leaves out gaussians whose radius on screen is small. The clip that "
+    "leaves as many in the frustum as our cut has, by gsplat's rule, both drawn by our rasterizer."
 )
 
 _TOLERANCES = (3.0, 8.0, 16.0)
@@ -43,7 +44,9 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
             )
             pictures.append((ours.picture, picture))
     pairs = [
-        (evaluation.truth(row["view"]), p) for row, both in zip(rows, pictures, strict=True) for p in both
+        (evaluation.truth(row["view"]), p)
+        for row, both in zip(rows, pictures, strict=True)
+        for p in both
     ]
     errors = iter(evaluation.judge.errors(pairs))
     for row in rows:
@@ -71,14 +74,17 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def clipped(evaluation: Evaluation, view: View, count: int) -> tuple[float, int, Picture]:
-    """The clip that leaves at most so many of the full scene's gaussians in the picture, and the picture."""
+    """The clip that leaves at most so many of the full scene's gaussians in the
+    picture, and the picture."""
     everything = select(evaluation.full_scene, view.camera, tolerance=0.0, device="cpu").gaussians(
         device=evaluation.device
     )
     radii = screen_radii(everything, view.camera)
     clip = clip_radius_for(radii, count)
     kept = radii > clip
-    left = everything.subset(kept.nonzero()[0] if evaluation.device == "cpu" else kept.nonzero()[:, 0])
+    left = everything.subset(
+        kept.nonzero()[0] if evaluation.device == "cpu" else kept.nonzero()[:, 0]
+    )
     return clip, int(kept.sum()), to_8bit(rasterize(left, view.camera).color)
 
 
@@ -104,7 +110,7 @@ def summary(result: dict[str, Any]) -> Summary:
     row = max(result["rows"], key=lambda row: (row["distance"], row["tolerance"]))
     out.judge(
         row["ours_flip"] < row["clipped_flip"],
-        f"with {row['ours_in_frustum']:,} gaussians in the frustum, clipping small gaussians has FLIP "
-        f"{row['clipped_flip']:.4f}, our cut {row['ours_flip']:.4f}",
+        f"with {row['ours_in_frustum']:,} gaussians in the frustum, clipping small gaussians has "
+        f"FLIP {row['clipped_flip']:.4f}, our cut {row['ours_flip']:.4f}",
     )
     return out

@@ -1,4 +1,5 @@
-"""Composed scenes (figures 6 and 7): the full assets against our cut, from near to far."""
+"""Composed scenes (figures 6 and 7): the full assets against our cut, from near to
+far."""
 
 from __future__ import annotations
 
@@ -17,9 +18,9 @@ from v3dg.select import DEFAULT_TOLERANCE
 
 TITLE = "Composed scenes"
 ABOUT = (
-    "Every gaussian at one sample a pixel against our cut at the default tolerance, same rasterizer. A row "
-    "is a distance: the mean over directions and elevations; FLIP and PSNR over those of the first "
-    "direction, against the full scene at twice the resolution, box-averaged."
+    "Every gaussian at one sample a pixel against our cut at the default tolerance, same "
+    "rasterizer. A row is a distance: the mean over directions and elevations; FLIP and PSNR over "
+    "those of the first direction, against the full scene at twice the resolution, box-averaged."
 )
 
 
@@ -33,14 +34,20 @@ def run(evaluation: Evaluation) -> Iterator[dict[str, Any]]:
             len(bundle.level_gaussians(0)) * int((scene.instance_bundle == b).sum())
             for b, bundle in enumerate(scene.bundles)
         )
-        scenes.append({"scene": name, "instances": len(scene), "gaussians": gaussians, "views": rows})
+        scenes.append(
+            {"scene": name, "instances": len(scene), "gaussians": gaussians, "views": rows}
+        )
         yield {"tolerance": DEFAULT_TOLERANCE, "scenes": scenes}
     if not scenes:
-        raise ValueError(f"--scenes: expected names of composed scenes, got {' '.join(evaluation.scenes)}")
+        raise ValueError(
+            f"--scenes: expected names of composed scenes, got {' '.join(evaluation.scenes)}"
+        )
 
 
 def measure(evaluation: Evaluation, scene: Scene, views: list[View]) -> tuple[list[Row], Picture]:
-    azimuths = sorted({round(view.azimuth, 1) for view in views})[: evaluation.settings.judged_directions]
+    azimuths = sorted({round(view.azimuth, 1) for view in views})[
+        : evaluation.settings.judged_directions
+    ]
     rows: list[Row] = []
     judged: list[tuple[int, Picture, Picture, Picture]] = []
     for view in views:
@@ -60,7 +67,9 @@ def measure(evaluation: Evaluation, scene: Scene, views: list[View]) -> tuple[li
     return rows, strips(rows, judged, evaluation.settings.panel)
 
 
-def strips(rows: list[Row], judged: list[tuple[int, Picture, Picture, Picture]], side: int) -> Picture:
+def strips(
+    rows: list[Row], judged: list[tuple[int, Picture, Picture, Picture]], side: int
+) -> Picture:
     """Near, middle and far: truth, full, ours."""
     middle = sorted({rows[index]["elevation"] for index, *_ in judged})
     wanted = middle[len(middle) // 2]
@@ -75,7 +84,8 @@ def strips(rows: list[Row], judged: list[tuple[int, Picture, Picture, Picture]],
                 (f"truth, distance {row['distance']:.3g}", crop(truth, side)),
                 *(
                     (
-                        f"{name}: {count_text(row[f'{name}_in_frustum'])}, FLIP {row[f'{name}_flip']:.4f}",
+                        f"{name}: {count_text(row[f'{name}_in_frustum'])}, FLIP "
+                        f"{row[f'{name}_flip']:.4f}",
                         crop(p, side),
                     )
                     for name, p in (("full", full), ("ours", ours))
@@ -122,10 +132,10 @@ def tables(result: dict[str, Any]) -> str:
 
 
 OVERVIEW = (
-    "Full is every gaussian at one sample a pixel, ours the cut at the default tolerance, both drawn by the "
-    "same rasterizer. Mean is over all distances from near to far, far is the farthest. FLIP is the error "
-    "against the full scene at twice the resolution: how different two pictures look to someone who flips "
-    "between them, from 0 (not at all) to 1."
+    "Full is every gaussian at one sample a pixel, ours the cut at the default tolerance, both "
+    "drawn by the same rasterizer. Mean is over all distances from near to far, far is the "
+    "farthest. FLIP is the error against the full scene at twice the resolution: how different two "
+    "pictures look to someone who flips between them, from 0 (not at all) to 1."
 )
 _OVERVIEW_COLUMNS = (
     Column("scene", "scene"),
@@ -144,7 +154,9 @@ def overview(result: dict[str, Any]) -> str:
     table = []
     for scene in result["scenes"]:
         rows = by_distance(scene)
-        means = mean_of(rows, *(f"{who}_{key}" for who in ("full", "ours") for key in ("ms", "flip")))
+        means = mean_of(
+            rows, *(f"{who}_{key}" for who in ("full", "ours") for key in ("ms", "flip"))
+        )
         table.append(
             {"scene": scene["scene"], "gaussians": scene["gaussians"]}
             | {f"mean_{key}": value for key, value in means.items()}
@@ -159,25 +171,26 @@ def summary(result: dict[str, Any]) -> Summary:
         rows = by_distance(scene)
         far = rows[-1]
         text = (
-            f"{scene['scene']} from its farthest camera: {far['ours_ms']:.2f} ms a frame instead of "
-            f"{far['full_ms']:.2f} ({far['full_ms'] / far['ours_ms']:.1f} x) with FLIP "
+            f"{scene['scene']} from its farthest camera: {far['ours_ms']:.2f} ms a frame instead "
+            f"of {far['full_ms']:.2f} ({far['full_ms'] / far['ours_ms']:.1f} x) with FLIP "
             f"{far['ours_flip']:.4f} instead of {far['full_flip']:.4f}"
         )
         out.judge(far["ours_ms"] < far["full_ms"] and far["ours_flip"] <= far["full_flip"], text)
         blurred = max(rows, key=lambda row: row["ours_flip"] - row["full_flip"])
         if blurred["ours_flip"] > 1.02 * blurred["full_flip"]:
             out.losses.append(
-                f"{scene['scene']} at distance {blurred['distance']:.3g}: FLIP {blurred['ours_flip']:.4f} "
-                f"against {blurred['full_flip']:.4f} without levels ({blurred['ours_ms']:.2f} ms against "
-                f"{blurred['full_ms']:.2f})"
+                f"{scene['scene']} at distance {blurred['distance']:.3g}: FLIP "
+                f"{blurred['ours_flip']:.4f} against {blurred['full_flip']:.4f} without levels "
+                f"({blurred['ours_ms']:.2f} ms against {blurred['full_ms']:.2f})"
             )
         # By the quickest frames, which other work on the machine disturbs least.
         slower = [row for row in rows if row["ours_least_ms"] > 1.02 * row["full_least_ms"]]
         if slower:
             worst = max(slower, key=lambda row: row["ours_least_ms"] / row["full_least_ms"])
             out.losses.append(
-                f"{scene['scene']} at distance {worst['distance']:.3g}: {worst['ours_least_ms']:.2f} ms "
-                f"against {worst['full_least_ms']:.2f} without levels"
+                f"{scene['scene']} at distance {worst['distance']:.3g}: "
+                f"{worst['ours_least_ms']:.2f} ms against {worst['full_least_ms']:.2f} without "
+                "levels"
             )
     return out
 
@@ -192,7 +205,9 @@ def plot(result: dict[str, Any], figure: Any) -> None:
             axes[0].plot(x, [row[f"{who}_in_frustum"] for row in rows], style, label=who)
             axes[1].plot(x, [1e3 / row[f"{who}_ms"] for row in rows], style, label=who)
             axes[2].plot(x, [row[f"{who}_flip"] for row in rows], style, label=who)
-        for panel, label in zip(axes, ("gaussians in frustum", "frames a second", "FLIP"), strict=True):
+        for panel, label in zip(
+            axes, ("gaussians in frustum", "frames a second", "FLIP"), strict=True
+        ):
             panel.set(xlabel="distance", ylabel=label, ylim=(0, None), title=scene["scene"])
             panel.grid(alpha=0.3)
         axes[0].legend()

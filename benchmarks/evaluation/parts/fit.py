@@ -1,4 +1,5 @@
-"""Local splatting (table 1, upper half): what the fit of the levels gives, for its steps."""
+"""Local splatting (table 1, upper half): what the fit of the levels gives, for its
+steps."""
 
 from __future__ import annotations
 
@@ -13,8 +14,9 @@ from v3dg.select import DEFAULT_TOLERANCE
 
 TITLE = "What the fit gives"
 ABOUT = (
-    "Levels fitted with so many steps of Adam; \\*0 is the paper's start without growing scales. The "
-    "paper's settings at its tolerance of 2048, ours at the default; build time is of the one asset."
+    "Levels fitted with so many steps of Adam; \\*0 is the paper's start without growing scales. "
+    "The paper's settings at its tolerance of 2048, ours at the default; build time is of the one "
+    "asset."
 )
 
 
@@ -22,9 +24,13 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
     steps = evaluation.settings.steps
     rows = [
         full_row(evaluation),
-        build_row(evaluation, "paper, *0", BuildConfig.paper(steps=0, prune_growth=1.0), PAPER_TOLERANCE),
+        build_row(
+            evaluation, "paper, *0", BuildConfig.paper(steps=0, prune_growth=1.0), PAPER_TOLERANCE
+        ),
     ]
-    rows += [build_row(evaluation, "paper", BuildConfig.paper(steps=n), PAPER_TOLERANCE) for n in steps]
+    rows += [
+        build_row(evaluation, "paper", BuildConfig.paper(steps=n), PAPER_TOLERANCE) for n in steps
+    ]
     ours = (*steps, BuildConfig().steps)
     rows += [build_row(evaluation, "ours", BuildConfig(steps=n), DEFAULT_TOLERANCE) for n in ours]
     return {"rows": rows}
@@ -56,7 +62,9 @@ def plot(result: dict[str, Any], figure: Any) -> None:
     axes = figure.subplots()
     for name, style in (("paper", "s--"), ("ours", "o-")):
         rows = [row for row in result["rows"] if row["levels"] == name]
-        axes.plot([r["build_seconds"] for r in rows], [r["drawn_flip"] for r in rows], style, label=name)
+        axes.plot(
+            [r["build_seconds"] for r in rows], [r["drawn_flip"] for r in rows], style, label=name
+        )
         for r in rows:
             axes.annotate(f"{r['steps']}", (r["build_seconds"], r["drawn_flip"]), fontsize=7)
     axes.axhline(result["rows"][0]["drawn_flip"], color="gray", linestyle=":", label="full")

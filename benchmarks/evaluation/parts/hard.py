@@ -1,4 +1,5 @@
-"""What is hard for level of detail: hair-thin lines, a sky of huge soft gaussians, a dense tree."""
+"""What is hard for level of detail: hair-thin lines, a sky of huge soft gaussians, a
+dense tree."""
 
 from __future__ import annotations
 
@@ -25,9 +26,9 @@ from v3dg.select import DEFAULT_TOLERANCE
 
 TITLE = "Thin structures, sky, foliage"
 ABOUT = (
-    "One asset alone, from near and from far (the sky from within). The first row of a view is the default "
-    "tolerance; the others compare our fitted levels with merging alone at equal counts. Full is every "
-    "gaussian, one sample a pixel; the truth has eight samples a side."
+    "One asset alone, from near and from far (the sky from within). The first row of a view is the "
+    "default tolerance; the others compare our fitted levels with merging alone at equal counts. "
+    "Full is every gaussian, one sample a pixel; the truth has eight samples a side."
 )
 
 _SHARES = (0.5, 0.25, 0.1)
@@ -54,7 +55,8 @@ def cameras_around(evaluation: Evaluation, asset: Gaussians) -> dict[str, Camera
     direction = np.array([0.2, -0.8, 0.55])
 
     def camera(factor: float) -> Camera:
-        # As many px² a gaussian as from so far away, without the empty rest of the picture.
+        # As many px² a gaussian as from so far away, without the empty rest of the
+        # picture.
         side = max(_LEAST_PX, round(evaluation.settings.panel / factor))
         eye = center + factor * distance * direction
         return Camera.look_at(
@@ -80,7 +82,9 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
         for where, camera in cameras.items():
             truth = draw_truth(fitted, camera, evaluation.device, _SUPERSAMPLING)
 
-            def draw(scene: Scene, tolerance: float, camera: Camera = camera) -> tuple[Picture, int]:
+            def draw(
+                scene: Scene, tolerance: float, camera: Camera = camera
+            ) -> tuple[Picture, int]:
                 image = render(scene, camera, tolerance=tolerance, device=evaluation.device)
                 return to_8bit(image.color), image.stats.gaussians_in_frustum
 
@@ -88,18 +92,29 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
             strip = [("truth", truth), ("full", full)]
             for share in (None, *_SHARES):
                 wanted = int(count * (share or 1))
-                tolerance = DEFAULT_TOLERANCE if share is None else tolerance_for(fitted, camera, wanted)
+                tolerance = (
+                    DEFAULT_TOLERANCE if share is None else tolerance_for(fitted, camera, wanted)
+                )
                 (ours, ours_count), (theirs, _) = draw(fitted, tolerance), draw(merged, tolerance)
                 jobs += [(truth, full), (truth, ours), (truth, theirs)]
-                row = {"asset": name, "view": where, "share": share, "tolerance": round(tolerance, 3)}
+                row = {
+                    "asset": name,
+                    "view": where,
+                    "share": share,
+                    "tolerance": round(tolerance, 3),
+                }
                 rows.append(row | {"full_in_frustum": count, "ours_in_frustum": ours_count})
                 if share in (None, _SHARES[-1]) or ours_count > wanted:
                     text = f"{ours_count / count:.0%}"
                     strip += [(f"ours, {text}", ours), (f"merged, {text}", theirs)]
-                if ours_count > wanted:  # as coarse as it gets: the eye is inside the balls of what is left
+                if (
+                    ours_count > wanted
+                ):  # as coarse as it gets: the eye is inside the balls of what is left
                     break
             strip[0] = f"{name}, {where}: truth", truth
-            strips.append([(text, enlarged(picture, evaluation.settings.panel)) for text, picture in strip])
+            strips.append(
+                [(text, enlarged(picture, evaluation.settings.panel)) for text, picture in strip]
+            )
     errors = iter(evaluation.judge.errors(jobs))
     for row in rows:
         for who in ("full", "ours", "merged"):
@@ -142,6 +157,7 @@ def summary(result: dict[str, Any]) -> Summary:
             out.losses.append(f"{what}: FLIP {row['ours_flip']:.4f}, of all {row['full_flip']:.4f}")
         if row["ours_flip"] > row["merged_flip"] + _NOTICED_FLIP:
             out.losses.append(
-                f"{what}: FLIP {row['ours_flip']:.4f} fitted, {row['merged_flip']:.4f} merely merged"
+                f"{what}: FLIP {row['ours_flip']:.4f} fitted, {row['merged_flip']:.4f} merely "
+                "merged"
             )
     return out

@@ -1,4 +1,5 @@
-"""Against a hierarchy of single gaussians (H3DG; table 2 and figure 9), at equal numbers of gaussians."""
+"""Against a hierarchy of single gaussians (H3DG; table 2 and figure 9), at equal
+numbers of gaussians."""
 
 from __future__ import annotations
 
@@ -16,10 +17,11 @@ from v3dg.rasterize import rasterize
 
 TITLE = "Against a hierarchy of single gaussians"
 ABOUT = (
-    "Kerbl et al. 2024, from the published description, without the optimisation against photographs; a "
-    "part of the main scene. Its cut for several sizes on screen, ours with at most as many gaussians; both "
-    "cuts as plain arrays through the same rasterizer. Its selection and interpolation are array operations "
-    "here, not a kernel, so compare the rasterizer's times first."
+    "Kerbl et al. 2024, from the published description, without the optimisation against "
+    "photographs; a part of the main scene. Its cut for several sizes on screen, ours with at most "
+    "as many gaussians; both cuts as plain arrays through the same rasterizer. Its selection and "
+    "interpolation are array operations here, not a kernel, so compare the rasterizer's times "
+    "first."
 )
 
 _TARGETS_PX = (1.0, 2.0, 4.0, 8.0, 16.0)
@@ -49,7 +51,11 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
             repeats,
         )
         rows.append(
-            {"target_px": target_px, "tolerance": round(tolerance, 4), "theirs_selected": len(chosen)}
+            {
+                "target_px": target_px,
+                "tolerance": round(tolerance, 4),
+                "theirs_selected": len(chosen),
+            }
             | raster.row("theirs_raster")
             | whole.row("theirs")
             | {"ours_raster_ms": round(ours.stats.draw_ms, 3)}
@@ -70,7 +76,9 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
                     (f"hierarchy, FLIP {row['theirs_flip']:.4f}", crop(their_picture, side)),
                     (f"ours, FLIP {row['ours_flip']:.4f}", crop(our_picture, side)),
                 ]
-                for row, (their_picture, our_picture) in list(zip(rows, pictures, strict=True))[1::2]
+                for row, (their_picture, our_picture) in list(zip(rows, pictures, strict=True))[
+                    1::2
+                ]
             ]
         ),
     )
@@ -118,8 +126,8 @@ def summary(result: dict[str, Any]) -> Summary:
     )
     out.judge(
         result["ours_build_seconds"] <= result["theirs_build_seconds"],
-        f"a hierarchy of single gaussians is built in {result['theirs_build_seconds']:.1f} s, our bundle in "
-        f"{result['ours_build_seconds']:.1f} s",
+        f"a hierarchy of single gaussians is built in {result['theirs_build_seconds']:.1f} s, our "
+        f"bundle in {result['ours_build_seconds']:.1f} s",
     )
     return out
 

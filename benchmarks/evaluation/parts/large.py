@@ -19,8 +19,8 @@ from v3dg.select import DEFAULT_TOLERANCE
 
 TITLE = "One large asset"
 ABOUT = (
-    "Copies of the asset side by side, turned and scaled at random, built and drawn as one asset; seen from "
-    "ever farther away, at the default tolerance."
+    "Copies of the asset side by side, turned and scaled at random, built and drawn as one asset; "
+    "seen from ever farther away, at the default tolerance."
 )
 
 _ELEVATION = 45.0
@@ -74,8 +74,8 @@ def _direction(elevation: float) -> Any:
 
 def tables(result: dict[str, Any]) -> str:
     return (
-        f"{count_text(result['gaussians'])} gaussians, built in {result['build_seconds']:.1f} s with "
-        f"{result['steps']} steps.\n\n"
+        f"{count_text(result['gaussians'])} gaussians, built in {result['build_seconds']:.1f} s "
+        f"with {result['steps']} steps.\n\n"
         + markdown(composed.COLUMNS, composed.by_distance(result["scenes"][0]))
     )
 

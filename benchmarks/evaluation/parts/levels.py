@@ -1,4 +1,5 @@
-"""Levels side by side (figure 10): every level of the asset, for several numbers of steps of the fit."""
+"""Levels side by side (figure 10): every level of the asset, for several numbers of
+steps of the fit."""
 
 from __future__ import annotations
 
@@ -14,8 +15,8 @@ from v3dg.rasterize import rasterize
 
 TITLE = "Levels side by side"
 ABOUT = (
-    "Each level alone, at one size, which is far larger than the coarse ones are meant for: what they look "
-    "like, not how well they do. FLIP is against the asset itself."
+    "Each level alone, at one size, which is far larger than the coarse ones are meant for: what "
+    "they look like, not how well they do. FLIP is against the asset itself."
 )
 
 _MOST_LEVELS = 7
@@ -28,7 +29,8 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
     builds = [("paper, *0", BuildConfig.paper(steps=0, prune_growth=1.0))]
     builds += [(f"paper, {n}", BuildConfig.paper(steps=n)) for n in evaluation.settings.steps]
     builds += [
-        (f"ours, {n}", BuildConfig(steps=n)) for n in (*evaluation.settings.steps, BuildConfig().steps)
+        (f"ours, {n}", BuildConfig(steps=n))
+        for n in (*evaluation.settings.steps, BuildConfig().steps)
     ]
     rows: list[Row] = []
     strips = []

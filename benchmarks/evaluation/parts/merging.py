@@ -1,11 +1,13 @@
-"""Against levels that are only merged: pairs by their moments, and what other tools make of the same asset.
+"""Against levels that are only merged: pairs by their moments, and what other tools
+make of the same asset.
 
-Other tools run beforehand, on the asset that the evaluation is given; what they write is read from the folder
-of peers, as <asset>_<tool>_<percent>.ply:
+Other tools run beforehand, on the asset that the evaluation is given; what they write
+is read from the folder of peers, as <asset>_<tool>_<percent>.ply:
 
     splat-transform -g cpu -w donut.ply -d 50% peers/donut_splat-transform_50.ply
-    splat-transform -g cpu -w donut.ply --decimate-adaptive 50% peers/donut_adaptive_50.ply
-    node benchmarks/studies/spark_levels.mjs donut.ply peers 50 25 12.5 6.25 1
+    splat-transform -g cpu -w donut.ply --decimate-adaptive 50%
+    peers/donut_adaptive_50.ply node benchmarks/studies/spark_levels.mjs donut.ply peers
+    50 25 12.5 6.25 1
 
 and seconds.json there has what each took, {"splat-transform": {"50": 1.0}}.
 """
@@ -38,9 +40,10 @@ from v3dg.select import DEFAULT_TOLERANCE, select
 
 TITLE = "Against merging alone"
 ABOUT = (
-    "Levels of which each is the one below, merged in pairs by their moments (our own start, not fitted), "
-    "and the same tree fitted: equal counts at every tolerance. Where other tools' files are given, also "
-    "those, one asset alone: at the size at which our cut has as many gaussians as they left, and enlarged."
+    "Levels of which each is the one below, merged in pairs by their moments (our own start, not "
+    "fitted), and the same tree fitted: equal counts at every tolerance. Where other tools' files "
+    "are given, also those, one asset alone: at the size at which our cut has as many gaussians as "
+    "they left, and enlarged."
 )
 
 _TOLERANCES = (1.0, 3.0, 8.0, 16.0)
@@ -84,11 +87,13 @@ def peer_rows(evaluation: Evaluation) -> list[Row]:
 
 
 def view_camera(bundle: Bundle, view: int, footprint_px2: float | None) -> Camera:
-    """A camera around the asset: the large picture, or one in which its ball covers so many px²."""
+    """A camera around the asset: the large picture, or one in which its ball covers so
+    many px²."""
     means = bundle.level_gaussians(0).means
     center = (means.min(axis=0) + means.max(axis=0)).astype(np.float64) / 2
     radius = float(np.linalg.norm(means - center, axis=1).max())
-    # Directions spread over the sphere between 50 degrees below and above the horizon, a spiral.
+    # Directions spread over the sphere between 50 degrees below and above the horizon,
+    # a spiral.
     z = 0.77 * (2 * (view + 0.5) / _VIEWS - 1)
     angle = math.pi * (3 - math.sqrt(5)) * view
     side = math.sqrt(1 - z * z)
@@ -105,30 +110,42 @@ def view_camera(bundle: Bundle, view: int, footprint_px2: float | None) -> Camer
 
 
 def footprint_of_cut(bundle: Bundle, count: int) -> float:
-    """Footprint of the asset's ball at which the default cut has so many gaussians, averaged over views."""
+    """Footprint of the asset's ball at which the default cut has so many gaussians,
+    averaged over views."""
     scene = Scene.of(bundle)
     low, high = 1.0, 64.0 * count
     for _ in range(24):
         middle = math.sqrt(low * high)
         cameras = [view_camera(bundle, view, middle) for view in range(_VIEWS)]
         mean = np.mean(
-            [select(scene, c, tolerance=DEFAULT_TOLERANCE, device="cpu").num_gaussians for c in cameras]
+            [
+                select(scene, c, tolerance=DEFAULT_TOLERANCE, device="cpu").num_gaussians
+                for c in cameras
+            ]
         )
         low, high = (middle, high) if mean <= count else (low, middle)
     return low
 
 
-def compare(evaluation: Evaluation, bundle: Bundle, theirs: Any, footprint_px2: float | None) -> Row:
-    """Means over the views of FLIP and PSNR, of all gaussians, theirs, and our cut with at most as many."""
+def compare(
+    evaluation: Evaluation, bundle: Bundle, theirs: Any, footprint_px2: float | None
+) -> Row:
+    """Means over the views of FLIP and PSNR, of all gaussians, theirs, and our cut with
+    at most as many."""
     scene = Scene.of(bundle)
     coarser = bundle.level_range(1)[0] if bundle.num_levels > 1 else 0
-    own_filter = float(bundle.clusters.filter_px2[coarser]), bool(bundle.clusters.antialiased[coarser])
+    own_filter = (
+        float(bundle.clusters.filter_px2[coarser]),
+        bool(bundle.clusters.antialiased[coarser]),
+    )
     pairs: list[tuple[Picture, Picture]] = []
     counts = []
     for view in range(_VIEWS):
         camera = view_camera(bundle, view, footprint_px2)
         truth = draw_truth(bundle, camera, "cpu")
-        ours = render(bundle, camera, tolerance=tolerance_for(scene, camera, len(theirs)), device="cpu")
+        ours = render(
+            bundle, camera, tolerance=tolerance_for(scene, camera, len(theirs)), device="cpu"
+        )
         counts.append(ours.stats.gaussians_selected)
         # Theirs as the asset is drawn, or with our filter where that suits it better.
         drawn = [
@@ -141,7 +158,9 @@ def compare(evaluation: Evaluation, bundle: Bundle, theirs: Any, footprint_px2: 
     errors = evaluation.judge.errors(pairs)
     row: Row = {"size_px": camera.width, "ours_gaussians": float(np.mean(counts))}
     for k, who in enumerate(("full", "theirs", "ours")):
-        row |= {f"{who}_{key}": value for key, value in mean_of(errors[k::3], "flip", "psnr").items()}
+        row |= {
+            f"{who}_{key}": value for key, value in mean_of(errors[k::3], "flip", "psnr").items()
+        }
     return row
 
 
@@ -188,8 +207,8 @@ def summary(result: dict[str, Any]) -> Summary:
     )
     out.judge(
         ours["drawn_flip"] < merged["drawn_flip"],
-        f"at tolerance 8, levels that are only merged have FLIP {merged['drawn_flip']:.4f}, fitted ones "
-        f"with as many gaussians {ours['drawn_flip']:.4f}; the fit costs "
+        f"at tolerance 8, levels that are only merged have FLIP {merged['drawn_flip']:.4f}, fitted "
+        f"ones with as many gaussians {ours['drawn_flip']:.4f}; the fit costs "
         f"{ours['build_seconds'] - merged['build_seconds']:.1f} s of build",
     )
     for tool in sorted({row["tool"] for row in result["peers"]}):
@@ -201,9 +220,13 @@ def summary(result: dict[str, Any]) -> Summary:
             won = [row for row in rows if row[f"{where}_ours_flip"] < row[f"{where}_theirs_flip"]]
             lost = [row for row in rows if row not in won]
             if won:
-                out.wins.append(f"against {tool}, {text}: our FLIP is lower with {percents(won)} kept")
+                out.wins.append(
+                    f"against {tool}, {text}: our FLIP is lower with {percents(won)} kept"
+                )
             if lost:
-                out.losses.append(f"against {tool}, {text}: our FLIP is higher with {percents(lost)} kept")
+                out.losses.append(
+                    f"against {tool}, {text}: our FLIP is higher with {percents(lost)} kept"
+                )
     return out
 
 
@@ -215,7 +238,12 @@ def plot(result: dict[str, Any], figure: Any) -> None:
     axes = figure.subplots()
     for name, style in (("merged", "s--"), ("ours", "o-")):
         rows = [row for row in result["rows"] if row["levels"] == name]
-        axes.plot([r["drawn_in_frustum"] for r in rows], [r["drawn_flip"] for r in rows], style, label=name)
+        axes.plot(
+            [r["drawn_in_frustum"] for r in rows],
+            [r["drawn_flip"] for r in rows],
+            style,
+            label=name,
+        )
     full = result["rows"][0]
     axes.plot(full["drawn_in_frustum"], full["drawn_flip"], "*", markersize=12, label="full")
     axes.set(xlabel="gaussians in frustum", ylabel="FLIP", xscale="log")

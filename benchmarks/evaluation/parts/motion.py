@@ -1,4 +1,5 @@
-"""Steadiness: a zoom through the scene, and how much more a frame differs from the next than it has to."""
+"""Steadiness: a zoom through the scene, and how much more a frame differs from the next
+than it has to."""
 
 from __future__ import annotations
 
@@ -20,14 +21,15 @@ from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE
 
 TITLE = "A zoom through the scene, and popping"
 ABOUT = (
-    "The camera comes nearer by half a per cent a frame. FLIP between a frame and the next, less that of "
-    "the true pictures: what flickers or pops. The full scene at one sample a pixel flickers by aliasing "
-    "alone. This mean over whole pictures cannot see a single cluster that is replaced at once; "
-    "docs/fades.md measures that."
+    "The camera comes nearer by half a per cent a frame. FLIP between a frame and the next, less "
+    "that of the true pictures: what flickers or pops. The full scene at one sample a pixel "
+    "flickers by aliasing alone. This mean over whole pictures cannot see a single cluster that is "
+    "replaced at once; docs/fades.md measures that."
 )
 _DRIFT = (
-    "The camera comes nearer by a twentieth of a per cent a frame. Of each frame and the next the tile of "
-    "16 px in which the error changes most, root mean square in 255ths: what is seen of a cluster's exchange."
+    "The camera comes nearer by a twentieth of a per cent a frame. Of each frame and the next the "
+    "tile of 16 px in which the error changes most, root mean square in 255ths: what is seen of a "
+    "cluster's exchange."
 )
 
 _NEARER = 0.995
@@ -37,7 +39,9 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
     scene = evaluation.place(evaluation.build().bundle)
     start = evaluation.camera_sweep[-1]
     views = [
-        orbit_view(start.azimuth, start.elevation, start.distance * _NEARER**k, evaluation.settings.size)
+        orbit_view(
+            start.azimuth, start.elevation, start.distance * _NEARER**k, evaluation.settings.size
+        )
         for k in range(evaluation.settings.motion_frames)
     ]
     frames: dict[str, list[Picture]] = {
@@ -52,7 +56,10 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
         name: [e["flip"] for e in evaluation.judge.errors(itertools.pairwise(p))]
         for name, p in frames.items()
     }
-    rows = [steps_row(name, steps[name], steps["truth"], steps["full"]) for name in ("truth", "full", "ours")]
+    rows = [
+        steps_row(name, steps[name], steps["truth"], steps["full"])
+        for name in ("truth", "full", "ours")
+    ]
     worst = int(np.argmax(np.array(steps["ours"]) - np.array(steps["truth"])))
     side = evaluation.settings.panel
     evaluation.save(
@@ -132,7 +139,8 @@ def summary(result: dict[str, Any]) -> Summary:
     out.judge(
         ours["above_truth"] <= full["above_truth"],
         f"in a zoom, the FLIP between consecutive frames differs from the truth's by "
-        f"{ours['above_truth']:+.4f} for our cut and by {full['above_truth']:+.4f} for the full scene",
+        f"{ours['above_truth']:+.4f} for our cut and by {full['above_truth']:+.4f} for the full "
+        "scene",
     )
     return out
 

@@ -1,4 +1,5 @@
-"""Tolerances (table 1, lower half): milliseconds against FLIP, the paper's levels and ours on one curve."""
+"""Tolerances (table 1, lower half): milliseconds against FLIP, the paper's levels and
+ours on one curve."""
 
 from __future__ import annotations
 
@@ -16,9 +17,9 @@ from v3dg.select import select
 
 TITLE = "Tolerance: time against error"
 ABOUT = (
-    "The same scene, views and rasterizer for both bundles: the paper's settings (4,096 gaussians a "
-    "cluster, its tolerances) and ours. A row is a mean over the distances; full is every gaussian, one "
-    "sample a pixel."
+    "The same scene, views and rasterizer for both bundles: the paper's settings (4,096 gaussians "
+    "a cluster, its tolerances) and ours. A row is a mean over the distances; full is every "
+    "gaussian, one sample a pixel."
 )
 
 _PAPER_TAUS = (512, 1024, 2048, 4096, 8192)
@@ -43,7 +44,11 @@ def gsplat_row(evaluation: Evaluation) -> Row:
     import torch
 
     every_one = select(
-        evaluation.full_scene, evaluation.camera_sweep[0].camera, tolerance=0.0, cull=False, device="cpu"
+        evaluation.full_scene,
+        evaluation.camera_sweep[0].camera,
+        tolerance=0.0,
+        cull=False,
+        device="cpu",
     )
     placed = every_one.gaussians(device="cuda")
     pictures, rows = [], []
@@ -80,14 +85,17 @@ def summary(result: dict[str, Any]) -> Summary:
             f"{best['drawn_flip']:.4f} against {full['drawn_flip']:.4f}",
         )
     else:
-        out.judge(False, f"no tolerance of ours reaches the FLIP of all gaussians, {full['drawn_flip']:.4f}")
+        out.judge(
+            False,
+            f"no tolerance of ours reaches the FLIP of all gaussians, {full['drawn_flip']:.4f}",
+        )
     for paper in by_name["paper"]:
         rivals = [row for row in by_name["ours"] if row["drawn_flip"] <= paper["drawn_flip"]]
         if paper["tolerance"] == paper_tolerance(2048):
             quickest = min(rivals, key=lambda row: row["drawn_ms"], default=None)
             text = (
-                f"the paper's levels at its tolerance of 2048 take {paper['drawn_ms']:.2f} ms at FLIP "
-                f"{paper['drawn_flip']:.4f}"
+                f"the paper's levels at its tolerance of 2048 take {paper['drawn_ms']:.2f} ms at "
+                f"FLIP {paper['drawn_flip']:.4f}"
             )
             if quickest is None:
                 out.judge(False, f"{text}, which no tolerance of ours reaches")

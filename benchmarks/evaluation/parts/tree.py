@@ -1,4 +1,5 @@
-"""Tree or DAG (table 3): gaussians a cluster and clusters a group, 8,192 gaussians a group throughout."""
+"""Tree or DAG (table 3): gaussians a cluster and clusters a group, 8,192 gaussians a
+group throughout."""
 
 from __future__ import annotations
 
@@ -13,8 +14,8 @@ from v3dg.select import DEFAULT_TOLERANCE
 
 TITLE = "Tree or DAG"
 ABOUT = (
-    "The paper's settings with smaller clusters and larger groups (a DAG, where groups mix clusters of "
-    "several branches), at its tolerance; and our default, a tree of small clusters."
+    "The paper's settings with smaller clusters and larger groups (a DAG, where groups mix "
+    "clusters of several branches), at its tolerance; and our default, a tree of small clusters."
 )
 
 _SHAPES = ((256, 32), (512, 16), (1024, 8), (2048, 4), (4096, 2))
@@ -29,7 +30,9 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
             min_clusters=group_size,
             steps=evaluation.settings.tree_steps,
         )
-        rows.append(build_row(evaluation, f"{cluster_size} x {group_size}", config, PAPER_TOLERANCE))
+        rows.append(
+            build_row(evaluation, f"{cluster_size} x {group_size}", config, PAPER_TOLERANCE)
+        )
     ours = BuildConfig()
     name = f"ours, {ours.cluster_size} x {ours.group_size}"
     rows.append(build_row(evaluation, name, ours, DEFAULT_TOLERANCE))
@@ -50,7 +53,8 @@ def summary(result: dict[str, Any]) -> Summary:
     out.judge(
         ours["drawn_flip"] < rival["drawn_flip"],
         f"tree or DAG makes little difference to the paper's settings (FLIP {min(flips):.4f} to "
-        f"{max(flips):.4f}); its tree has FLIP {rival['drawn_flip']:.4f} and {rival['drawn_psnr']:.1f} dB, "
-        f"ours with as many gaussians {ours['drawn_flip']:.4f} and {ours['drawn_psnr']:.1f} dB",
+        f"{max(flips):.4f}); its tree has FLIP {rival['drawn_flip']:.4f} and "
+        f"{rival['drawn_psnr']:.1f} dB, ours with as many gaussians {ours['drawn_flip']:.4f} and "
+        f"{ours['drawn_psnr']:.1f} dB",
     )
     return out

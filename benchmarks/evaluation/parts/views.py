@@ -1,4 +1,5 @@
-"""Original views (table 5): the close views for which an asset was trained; nothing may be lost there."""
+"""Original views (table 5): the close views for which an asset was trained; nothing may
+be lost there."""
 
 from __future__ import annotations
 
@@ -17,9 +18,9 @@ from v3dg.select import DEFAULT_TOLERANCE
 
 TITLE = "Original views"
 ABOUT = (
-    "Assets that fill the picture, as in the views that assets are trained for, from all sides: our "
-    "cut against the full asset, of which it should be no different, and both against the asset at twice "
-    "the resolution."
+    "Assets that fill the picture, as in the views that assets are trained for, from all sides: "
+    "our cut against the full asset, of which it should be no different, and both against the "
+    "asset at twice the resolution."
 )
 
 _ELEVATION = 30.0
@@ -49,7 +50,9 @@ def row_of(evaluation: Evaluation, name: str, bundle: Bundle) -> Row:
     rows = []
     for camera in cameras:
         view = View(0.0, _ELEVATION, distance, camera)
-        full, ours = (evaluation.shoot(bundle, view, tolerance) for tolerance in (0.0, DEFAULT_TOLERANCE))
+        full, ours = (
+            evaluation.shoot(bundle, view, tolerance) for tolerance in (0.0, DEFAULT_TOLERANCE)
+        )
         truth = draw_truth(bundle, camera, evaluation.device)
         same, of_full, of_ours = evaluation.judge.errors(
             ((full.picture, ours.picture), (truth, full.picture), (truth, ours.picture))
@@ -102,8 +105,9 @@ def summary(result: dict[str, Any]) -> Summary:
     worst = max(result["rows"], key=_drop)
     out.judge(
         _drop(worst) <= _NOTICED_DB,
-        f"in close views, {min(row['share'] for row in result['rows']):.0%} or more of an asset's gaussians "
-        f"are drawn; PSNR falls by at most {max(0.0, _drop(worst)):.2f} dB ({worst['asset']})",
+        f"in close views, {min(row['share'] for row in result['rows']):.0%} or more of an asset's "
+        f"gaussians are drawn; PSNR falls by at most {max(0.0, _drop(worst)):.2f} dB "
+        f"({worst['asset']})",
     )
     return out
 

@@ -1,7 +1,8 @@
-"""Bodies of round cones that are joined smoothly: the layers of a standing, dressed person.
+"""Bodies of round cones that are joined smoothly: the layers of a standing, dressed
+person.
 
-Lengths in metres for a person of middle height, who is scaled as a whole; x is to the person's left, the face
-looks along -y, the soles are at z = 0.
+Lengths in metres for a person of middle height, who is scaled as a whole; x is to the
+person's left, the face looks along -y, the soles are at z = 0.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ _SIDES = (-1.0, 1.0)
 
 @dataclass(frozen=True)
 class _Cone:
-    """Spheres of radius a at p to radius b at q, and all between them; ``flat`` squeezes it along y."""
+    """Spheres of radius a at p to radius b at q, and all between them; ``flat``
+    squeezes it along y."""
 
     p: Array
     q: Array
@@ -41,7 +43,8 @@ class Shape:
     blend: float  # how far joints are rounded, in metres
 
     def distance(self, points: Array) -> tuple[Array, Array]:
-        """Signed distance, nearly, negative inside, and the direction in which it grows, (n,) and (n,3)."""
+        """Signed distance, nearly, negative inside, and the direction in which it
+        grows, (n,) and (n,3)."""
         total, gradient = np.zeros(len(points)), np.zeros((len(points), 3))
         for cone in self.cones:
             axis = cone.q - cone.p
@@ -50,7 +53,9 @@ class Shape:
             t = np.clip(away @ axis / max(float(axis @ axis), 1e-12), 0, 1)
             away = away - t[:, None] * axis
             length = np.maximum(np.sqrt(np.einsum("ij,ij->i", away, away)), 1e-9)
-            weight = np.exp(np.clip((cone.a + (cone.b - cone.a) * t - length) / self.blend, -40, 40))
+            weight = np.exp(
+                np.clip((cone.a + (cone.b - cone.a) * t - length) / self.blend, -40, 40)
+            )
             total += weight
             gradient += (weight / length)[:, None] * away * squeeze
         return -self.blend * np.log(total), unit(gradient)
@@ -67,7 +72,9 @@ class Shape:
         many = int(1.6 * n) + 64
         which = rng.choice(len(areas), many, p=areas / areas.sum())
         p, q = (np.stack([getattr(c, name) for c in self.cones])[which] for name in "pq")
-        a, b, flat = (np.array([getattr(c, name) for c in self.cones])[which] for name in ("a", "b", "flat"))
+        a, b, flat = (
+            np.array([getattr(c, name) for c in self.cones])[which] for name in ("a", "b", "flat")
+        )
         length = np.linalg.norm(q - p, axis=1)
         reach = rng.uniform(-a, length + b)
         axis = unit(np.where(length[:, None] > 1e-6, q - p, UP))
@@ -159,7 +166,8 @@ def random_figure(rng: np.random.Generator) -> Figure:
 
     def scaled(cones: Sequence[_Cone], blend: float) -> Shape:
         return Shape(
-            tuple(_Cone(size * c.p, size * c.q, size * c.a, size * c.b, c.flat) for c in cones), blend
+            tuple(_Cone(size * c.p, size * c.q, size * c.a, size * c.b, c.flat) for c in cones),
+            blend,
         )
 
     face = _face(head)
@@ -170,7 +178,9 @@ def random_figure(rng: np.random.Generator) -> Figure:
         shirt=scaled([*shirt, *sleeves[0], *sleeves[1]], 0.016),
         trousers=scaled([*trousers, *belt], 0.014),
         shoes=scaled(shoes, 0.006),
-        scalp=scaled([face[0], _cone(back, back + np.array([0.0, 0.010, -0.055]), 0.083, 0.062)], 0.006),
+        scalp=scaled(
+            [face[0], _cone(back, back + np.array([0.0, 0.010, -0.055]), 0.083, 0.062)], 0.006
+        ),
         head=size * head,
         hips=size * _HIPS,
         shirt_hem=size * (_HIPS - 0.06),
@@ -193,7 +203,10 @@ def _leg(build: _Build, side: float) -> list[_Cone]:
 
 def _trouser(build: _Build, side: float) -> list[_Cone]:
     hip, knee, ankle = _joints(build, side)
-    return [_cone(hip, knee, 0.094 * build.stout, 0.072), _cone(knee, (*ankle[:2], 0.07), 0.072, 0.062)]
+    return [
+        _cone(hip, knee, 0.094 * build.stout, 0.072),
+        _cone(knee, (*ankle[:2], 0.07), 0.072, 0.062),
+    ]
 
 
 def _shoe(build: _Build, side: float) -> list[_Cone]:
@@ -208,7 +221,9 @@ def _arm(build: _Build, which: int) -> tuple[list[_Cone], list[_Cone]]:
     shoulder = np.array([side * build.shoulder, 0.0, _NECK - 0.105])
     out = np.array([side * np.sin(raised), 0.03, -np.cos(raised)])
     elbow = shoulder + 0.295 * out
-    fore = unit(np.array([side * (0.6 * np.sin(raised) - 0.15 * bent), -np.sin(bent), -np.cos(bent)]))
+    fore = unit(
+        np.array([side * (0.6 * np.sin(raised) - 0.15 * bent), -np.sin(bent), -np.cos(bent)])
+    )
     wrist, palm = elbow + 0.25 * fore, elbow + 0.325 * fore
     across = unit(np.cross(fore, [1.0, 0.0, 0.0]))
     arm = [
@@ -220,10 +235,15 @@ def _arm(build: _Build, which: int) -> tuple[list[_Cone], list[_Cone]]:
     for finger in range(4):
         root = palm + across * (0.020 * (finger - 1.5)) + 0.015 * fore
         curl = np.array([-0.02 * side, 0.0, 0.0])
-        arm.append(_cone(root, root + fore * (0.075 - 0.012 * abs(finger - 1.3)) + curl, 0.0095, 0.0075))
+        arm.append(
+            _cone(root, root + fore * (0.075 - 0.012 * abs(finger - 1.3)) + curl, 0.0095, 0.0075)
+        )
     if not build.long_sleeves:
         return arm, [_cone(shoulder, shoulder + 0.19 * out, 0.066, 0.062)]
-    return arm, [_cone(shoulder, elbow, 0.066, 0.056), _cone(elbow, wrist - 0.01 * fore, 0.055, 0.042)]
+    return arm, [
+        _cone(shoulder, elbow, 0.066, 0.056),
+        _cone(elbow, wrist - 0.01 * fore, 0.055, 0.042),
+    ]
 
 
 def _torso(build: _Build) -> list[_Cone]:
@@ -233,7 +253,13 @@ def _torso(build: _Build) -> list[_Cone]:
         _cone((-hip, 0, _HIPS), (hip, 0, _HIPS), wide, wide, 0.9),
         _cone((0, 0, _HIPS), (0, 0, _WAIST), build.waist + 0.02, build.waist, 0.8),
         _cone((0, 0, _WAIST), (0, 0, _CHEST), build.waist, build.chest, 0.78),
-        _cone((-0.55 * shoulder, 0, _CHEST + 0.03), (0.55 * shoulder, 0, _CHEST + 0.03), 0.085, 0.085, 0.95),
+        _cone(
+            (-0.55 * shoulder, 0, _CHEST + 0.03),
+            (0.55 * shoulder, 0, _CHEST + 0.03),
+            0.085,
+            0.085,
+            0.95,
+        ),
     ]
     for side in _SIDES:
         torso.append(_cone(collar, (side * 0.8 * shoulder, 0, _NECK - 0.115), 0.060, 0.042))
@@ -244,12 +270,17 @@ def _torso(build: _Build) -> list[_Cone]:
 
 
 def _face(head: Array) -> list[_Cone]:
-    """The skull first, then the face, the ears and the neck; places relative to the head's centre."""
+    """The skull first, then the face, the ears and the neck; places relative to the
+    head's centre."""
 
-    def cone(p: Sequence[float], q: Sequence[float], a: float, b: float, flat: float = 1.0) -> _Cone:
+    def cone(
+        p: Sequence[float], q: Sequence[float], a: float, b: float, flat: float = 1.0
+    ) -> _Cone:
         return _cone(head + p, head + q, a, b, flat)
 
-    ears = [cone((s * 0.088, 0.022, -0.010), (s * 0.092, 0.030, 0.020), 0.011, 0.014) for s in _SIDES]
+    ears = [
+        cone((s * 0.088, 0.022, -0.010), (s * 0.092, 0.030, 0.020), 0.011, 0.014) for s in _SIDES
+    ]
     return [
         cone((0, 0.018, 0.022), (0, 0.012, 0.028), 0.094, 0.092, 1.05),
         cone((0, -0.012, -0.020), (0, -0.038, -0.085), 0.070, 0.036),  # jaw

@@ -1,7 +1,9 @@
-"""Light for assets made of parts: one sun, a sky and the ground's bounce, kept as spherical harmonics.
+"""Light for assets made of parts: one sun, a sky and the ground's bounce, kept as
+spherical harmonics.
 
-Shadows come from the gaussians themselves. Seen from each of a few directions they are binned into a grid
-whose cells hold how much light they stop; sums along the direction tell how much arrives at each gaussian.
+Shadows come from the gaussians themselves. Seen from each of a few directions they are
+binned into a grid whose cells hold how much light they stop; sums along the direction
+tell how much arrives at each gaussian.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ _LOBE = 0.30  # width of a highlight; narrower would ring at degree 3
 
 
 def sh_basis(directions: Array, degree: int) -> Array:
-    """Evaluate the real spherical harmonics of 3DGS at unit directions (n,3): (n, (degree+1)²)."""
+    """Evaluate the real spherical harmonics of 3DGS at unit directions (n,3): (n,
+    (degree+1)²)."""
     x, y, z = directions.T
     columns = [np.full(len(directions), SH_C0)]
     if degree >= 1:
@@ -59,14 +62,17 @@ def display(linear: Array) -> Array:
 
 
 def _arriving(part: Part, directions: Array, rng: np.random.Generator) -> Array:
-    """Share of the light from each of D directions that arrives at each gaussian, (D,n)."""
+    """Share of the light from each of D directions that arrives at each gaussian,
+    (D,n)."""
     # What a gaussian stops, seen from anywhere: its two longest axes make its shadow.
     stops = np.pi * part.scales[:, 0] * part.scales[:, 1] * part.opacities
     means = part.means.astype(np.float32)
     sides = np.ptp(means, axis=0).astype(np.float64)
     cell = max(float(np.prod(sides) / _CELLS) ** (1 / 3), float(sides.max()) / 256)
     # Solid gaussians look from above their surface, else they would shade themselves.
-    lift = part.normals * (1.5 * (1 - part.translucency))[:, None] + rng.uniform(-0.4, 0.4, means.shape)
+    lift = part.normals * (1.5 * (1 - part.translucency))[:, None] + rng.uniform(
+        -0.4, 0.4, means.shape
+    )
     lifted = means + np.float32(cell) * lift.astype(np.float32)
     result = np.empty((len(directions), len(means)))
     for row, toward in zip(result, directions, strict=True):
@@ -76,11 +82,14 @@ def _arriving(part: Part, directions: Array, rng: np.random.Generator) -> Array:
         first = place.min(axis=1) - 2
         shape = np.ceil(place.max(axis=1) - first).astype(np.int32) + 3
         look[2] += 2
-        cells = [np.clip((p - first[:, None]).astype(np.int32), 0, shape[:, None] - 1) for p in (place, look)]
+        cells = [
+            np.clip((p - first[:, None]).astype(np.int32), 0, shape[:, None] - 1)
+            for p in (place, look)
+        ]
         at, seen = ((c[0] * shape[1] + c[1]) * shape[2] + c[2] for c in cells)
-        depth = np.bincount(at, stops, int(np.prod(shape))).astype(np.float32).reshape(shape) / np.float32(
-            cell**2
-        )
+        depth = np.bincount(at, stops, int(np.prod(shape))).astype(np.float32).reshape(
+            shape
+        ) / np.float32(cell**2)
         for axis in (0, 1):  # softer edges
             depth = 0.5 * depth + 0.25 * (np.roll(depth, 1, axis) + np.roll(depth, -1, axis))
         above = np.exp(-np.cumsum(depth[:, :, ::-1], axis=2)[:, :, ::-1])
@@ -93,18 +102,23 @@ def _sky_directions() -> Array:
     azimuth = np.arange(5) * (2 * np.pi / 5) + 0.4
     height = np.where(np.arange(5) % 2, 0.45, 0.75)
     flat = np.sqrt(1 - height**2)
-    return np.concatenate([[UP], np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], -1)])
+    return np.concatenate(
+        [[UP], np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], -1)]
+    )
 
 
 def light(part: Part, degree: int, rng: np.random.Generator, *, even: float = 0.0) -> Array:
-    """Light gaussians that shade each other and express their colours as spherical harmonics.
+    """Light gaussians that shade each other and express their colours as spherical
+    harmonics.
 
     Args:
-        even: Share of the light that comes from all around, for assets that will lie any way up.
+        even: Share of the light that comes from all around, for assets that will lie
+            any way up.
 
     Returns:
-        (n, (degree+1)², 3). Beyond degree 0: highlights and the sky's mirror image on what is glossy, light
-        that shines through what is translucent, and a little noise, as training leaves it.
+        (n, (degree+1)², 3). Beyond degree 0: highlights and the sky's mirror image on
+        what is glossy, light that shines through what is translucent, and a little
+        noise, as training leaves it.
     """
     n, thin = part.normals, part.translucency
     directions = _sky_directions()
@@ -118,15 +132,18 @@ def light(part: Part, degree: int, rng: np.random.Generator, *, even: float = 0.
     sky = (0.10 + 2 / len(directions) * sky) * part.occlusion
     direct = sunlit * ((1 - thin) * np.maximum(facing, 0) + thin * (0.40 + 0.50 * np.abs(facing)))
     bounce = (
-        np.array([0.11, 0.12, 0.07]) * ((1 - n[:, 2]) * part.occlusion * (0.3 + 0.7 * arriving[1]))[:, None]
+        np.array([0.11, 0.12, 0.07])
+        * ((1 - n[:, 2]) * part.occlusion * (0.3 + 0.7 * arriving[1]))[:, None]
     )
-    lit = (1 - even) * (direct[:, None] * SUN + sky[:, None] * SKY + bounce) + even * part.occlusion[:, None]
+    lit = (1 - even) * (
+        direct[:, None] * SUN + sky[:, None] * SKY + bounce
+    ) + even * part.occlusion[:, None]
     linear = part.albedo * lit
     colour = display(linear)
 
-    # The colour that an eye in direction v sees is a sum of lobes around directions; the lobe around r has
-    # the coefficients w_l Y_lm(r) of a smoothed point, scaled to rise 1 above its mean. Y is taken at the
-    # direction from the eye, which is -v.
+    # The colour that an eye in direction v sees is a sum of lobes around directions;
+    # the lobe around r has the coefficients w_l Y_lm(r) of a smoothed point, scaled to
+    # rise 1 above its mean. Y is taken at the direction from the eye, which is -v.
     bands = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
     smooth = np.exp(-0.5 * _LOBE**2 * bands * (bands + 1))
 
@@ -137,7 +154,8 @@ def light(part: Part, degree: int, rng: np.random.Generator, *, even: float = 0.
     top = smooth[1:].sum() / (4 * np.pi)
 
     def add(rows: NDArray[np.int64], around: Array, strength: Array) -> None:
-        """Add lobes of ``strength`` (m,3) around unit directions (m,3), without changing the mean colour."""
+        """Add lobes of ``strength`` (m,3) around unit directions (m,3), without
+        changing the mean colour."""
         coefficients = smooth[1:] / top * sh_basis(-around, degree)[:, 1:]
         sh[rows, 1:] += coefficients[:, :, None] * strength[:, None, :]
 
@@ -157,8 +175,11 @@ def light(part: Part, degree: int, rng: np.random.Generator, *, even: float = 0.
     return sh
 
 
-def gaussians_of(part: Part, degree: int, rng: np.random.Generator, *, even: float = 0.0) -> Gaussians:
-    """Light a part and turn it into gaussians in random order: files of trained assets have none either."""
+def gaussians_of(
+    part: Part, degree: int, rng: np.random.Generator, *, even: float = 0.0
+) -> Gaussians:
+    """Light a part and turn it into gaussians in random order: files of trained assets
+    have none either."""
     order = rng.permutation(len(part.means))
     sh = light(part, degree, rng, even=even)
     quats = quaternions(part.tangents, part.normals)

@@ -115,7 +115,8 @@ class Surface:
 
 
 def revolve(profile: Callable[[Array], tuple[Array, Array]], n: int) -> Surface:
-    """Spread points in a golden-angle spiral, equal area each; ``profile`` maps [0,1] to radius, height."""
+    """Spread points in a golden-angle spiral, equal area each; ``profile`` maps [0,1]
+    to radius, height."""
     t = np.linspace(0, 1, 513)
     radius, height = profile(t)
     step = np.hypot(np.diff(radius), np.diff(height))
@@ -148,9 +149,9 @@ def strips(
 ) -> tuple[Part, Array, Array]:
     """K leaves of ``rows`` × ``columns`` gaussians: blades of grass, petals, leaflets.
 
-    A leaf starts at ``base``, runs ``along`` and bends away from ``up`` by ``bend``; ``outline`` maps [0,1]
-    to its half width relative to ``width``. Also returns where each gaussian is: along its leaf in [0,1],
-    across it in [-1,1].
+    A leaf starts at ``base``, runs ``along`` and bends away from ``up`` by ``bend``;
+    ``outline`` maps [0,1] to its half width relative to ``width``. Also returns where
+    each gaussian is: along its leaf in [0,1], across it in [-1,1].
     """
     k = len(base)
     t = (np.arange(rows) + 0.5) / rows
@@ -191,7 +192,8 @@ def strips(
 
 
 def quaternions(tangents: Array, normals: Array) -> Array:
-    """Rotations (w,x,y,z) that take x to the tangent and z to the normal, as near as both can be had."""
+    """Rotations (w,x,y,z) that take x to the tangent and z to the normal, as near as
+    both can be had."""
     z = unit(normals)
     x = tangents - z * np.sum(tangents * z, 1, keepdims=True)
     stray = np.linalg.norm(x, axis=1) < 1e-6
@@ -225,7 +227,8 @@ def quaternions(tangents: Array, normals: Array) -> Array:
 
 
 def allot(weights: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Which of the weighted things each of n gaussians is for, in order, as evenly as the weights allow."""
+    """Which of the weighted things each of n gaussians is for, in order, as evenly as
+    the weights allow."""
     ends = np.cumsum(weights)
     at = (np.arange(n) + rng.random(n)) / max(n, 1) * ends[-1]
     return np.asarray(np.minimum(np.searchsorted(ends, at, side="right"), len(weights) - 1))
@@ -313,13 +316,14 @@ def cover(
 ) -> Part:
     """Flat gaussians that together cover a surface whose points lie ``spacing`` apart.
 
-    Sizes, shapes and opacities are spread as measured on a trained asset (docs/worlds.md): the mean size is
-    lognormal, the ratios of neighbouring axes are exponentials of gamma variates, logits of opacities are
-    normal with deviation 2.3 about ``opacity``. The long axes lie in the surface in all directions, or with
-    ``aligned`` = 1 along the tangents. What would stick out is shortened, as training does: by ``bend``, the
-    surface's smallest radius of curvature (with ``aligned``, that across the tangents), and by ``room``
-    (n,2), the distances to its borders along and across the tangents; beside a border, long axes lie along
-    it.
+    Sizes, shapes and opacities are spread as measured on a trained asset
+    (docs/worlds.md): the mean size is lognormal, the ratios of neighbouring axes are
+    exponentials of gamma variates, logits of opacities are normal with deviation 2.3
+    about ``opacity``. The long axes lie in the surface in all directions, or with
+    ``aligned`` = 1 along the tangents. What would stick out is shortened, as training
+    does: by ``bend``, the surface's smallest radius of curvature (with ``aligned``,
+    that across the tangents), and by ``room`` (n,2), the distances to its borders along
+    and across the tangents; beside a border, long axes lie along it.
     """
     n = len(points)
     spacing = np.broadcast_to(np.asarray(spacing, dtype=np.float64), n)
@@ -355,7 +359,13 @@ def cover(
         turned,
         unit(normals + tilt * rng.standard_normal((n, 3))),
         np.stack([long, middle, np.minimum(long, middle) / thin_ratio], -1),
-        1 / (1 + np.exp(-(np.where(base, 4.5, opacity) + np.where(base, 1.0, 2.3) * rng.standard_normal(n)))),
+        1
+        / (
+            1
+            + np.exp(
+                -(np.where(base, 4.5, opacity) + np.where(base, 1.0, 2.3) * rng.standard_normal(n))
+            )
+        ),
         albedo,
         np.broadcast_to(np.asarray(gloss, dtype=np.float64), n).copy(),
         np.broadcast_to(np.asarray(translucency, dtype=np.float64), n).copy(),

@@ -1,4 +1,5 @@
-"""A glazed donut with sprinkles; its tube's axis is the circle of radius ``RING`` around the origin."""
+"""A glazed donut with sprinkles; its tube's axis is the circle of radius ``RING``
+around the origin."""
 
 from __future__ import annotations
 
@@ -33,25 +34,31 @@ _SPRINKLE_COLOURS = np.array(
         [0.30, 0.07, 0.45],
     ]
 )
-_ICINGS = np.array([[0.66, 0.11, 0.27], [0.13, 0.045, 0.02], [0.88, 0.80, 0.62], [0.72, 0.28, 0.05]])
+_ICINGS = np.array(
+    [[0.66, 0.11, 0.27], [0.13, 0.045, 0.02], [0.88, 0.80, 0.62], [0.72, 0.28, 0.05]]
+)
 
 
 def _on_tube(around: Array, along: Array, radius: Array) -> Array:
-    """Points at angles ``around`` the donut's axis and ``along`` the tube's section, 0 outside, pi/2 up."""
+    """Points at angles ``around`` the donut's axis and ``along`` the tube's section, 0
+    outside, pi/2 up."""
     r = RING + radius * np.cos(along)
     return np.stack([r * np.cos(around), r * np.sin(around), radius * np.sin(along)], -1)
 
 
 def make_donut(num_gaussians: int = 45_624, *, seed: int = 0, sh_degree: int = 3) -> Gaussians:
-    """Make a donut: baked dough, icing that drips over its rim, sprinkles of six colours.
+    """Make a donut: baked dough, icing that drips over its rim, sprinkles of six
+    colours.
 
     Args:
-        num_gaussians: How many gaussians, exactly; the default is what the V3DG paper's donut has.
+        num_gaussians: How many gaussians, exactly; the default is what the V3DG paper's
+            donut has.
         seed: The same seed gives the same gaussians. Every fourth has pink icing.
         sh_degree: 0 to 3; the icing is glossy from 1 on, sharpest at 3.
 
     Returns:
-        NumPy gaussians; z is up, the origin in the middle of the hole, the donut is 0.22 across.
+        NumPy gaussians; z is up, the origin in the middle of the hole, the donut is
+        0.22 across.
 
     Raises:
         ValueError: ``num_gaussians`` is below 1,000.
@@ -82,14 +89,18 @@ def make_donut(num_gaussians: int = 45_624, *, seed: int = 0, sh_degree: int = 3
         outer, inner = rim(around)
         rounded = np.clip(1 - (2 * v - 1) ** 2, 0, 1)
         thick = (TUBE - _DOUGH + 0.0005) * np.minimum(1.0, 3.2 * rounded) ** 0.5
-        beads = 1 + 0.25 * np.exp(-((rounded - 0.12) ** 2) / 0.01)  # thicker where it stopped running
+        beads = 1 + 0.25 * np.exp(
+            -((rounded - 0.12) ** 2) / 0.01
+        )  # thicker where it stopped running
         return _on_tube(around, outer + v * (inner - outer), _DOUGH - 0.0005 + thick * beads)
 
     def dough(u: Array, v: Array) -> Array:
         around = 2 * np.pi * u
         outer, inner = rim(around)
         along = inner - 0.15 + v * (2 * np.pi - (inner - outer) + 0.3)
-        pinch = 1 - 0.02 * np.exp(-((np.cos(along) - 1) ** 2) / 0.02)  # the pale line where it floated
+        pinch = 1 - 0.02 * np.exp(
+            -((np.cos(along) - 1) ** 2) / 0.02
+        )  # the pale line where it floated
         return _on_tube(around, along, _DOUGH * pinch)
 
     n_sprinkle = int(0.30 * num_gaussians) // _SPRINKLES
@@ -97,14 +108,25 @@ def make_donut(num_gaussians: int = 45_624, *, seed: int = 0, sh_degree: int = 3
     n_icing = num_gaussians - n_dough - n_sprinkle * _SPRINKLES
 
     crust = sample(dough, n_dough, rng, closed="u")
-    section = np.arctan2(crust.points[:, 2], np.hypot(crust.points[:, 0], crust.points[:, 1]) - RING)
+    section = np.arctan2(
+        crust.points[:, 2], np.hypot(crust.points[:, 0], crust.points[:, 1]) - RING
+    )
     grain, blotch = noise(crust.points, 260.0), noise(crust.points + 3, 45.0)
     pale = np.exp(-((section / 0.30) ** 2)) * (0.75 + 0.5 * blotch)
-    brown = mix([0.33, 0.12, 0.022], [0.52, 0.23, 0.05], np.clip(0.9 * blotch + 0.5 * (grain - 0.5), 0, 1))
+    brown = mix(
+        [0.33, 0.12, 0.022], [0.52, 0.23, 0.05], np.clip(0.9 * blotch + 0.5 * (grain - 0.5), 0, 1)
+    )
     brown = brown * (1 - pale[:, None]) + pale[:, None] * np.array([0.70, 0.46, 0.19])
     brown *= (0.88 + 0.24 * grain)[:, None]
     body = cover(
-        crust.points, crust.normals, crust.tangents, crust.spacing, brown, rng, gloss=0.08, bend=_DOUGH
+        crust.points,
+        crust.normals,
+        crust.tangents,
+        crust.spacing,
+        brown,
+        rng,
+        gloss=0.08,
+        bend=_DOUGH,
     )
 
     glaze = sample(icing, n_icing, rng, closed="u")
@@ -153,7 +175,9 @@ def _sprinkles(icing: SurfaceMap, n: int, rng: np.random.Generator) -> Part:
         return np.asarray(np.einsum("kij,nj->kni", frames, vectors).reshape(-1, 3))
 
     centres = np.repeat(seats.points + 0.6 * radius * seats.normals, n, axis=0)
-    colours = np.repeat(_SPRINKLE_COLOURS[rng.integers(len(_SPRINKLE_COLOURS), size=_SPRINKLES)], n, axis=0)
+    colours = np.repeat(
+        _SPRINKLE_COLOURS[rng.integers(len(_SPRINKLE_COLOURS), size=_SPRINKLES)], n, axis=0
+    )
     along = placed(np.broadcast_to([0.0, 0.0, 1.0], (n, 3)))
     part = cover(
         placed(shape.points) + centres,

@@ -12,7 +12,13 @@ from benchmarks.worlds.procedural._parts import UP, Array, Noise, Part, cover, m
 from v3dg.gaussians import Gaussians
 
 _SKINS = np.array(
-    [[0.62, 0.36, 0.24], [0.48, 0.26, 0.16], [0.30, 0.15, 0.085], [0.14, 0.065, 0.038], [0.70, 0.44, 0.32]]
+    [
+        [0.62, 0.36, 0.24],
+        [0.48, 0.26, 0.16],
+        [0.30, 0.15, 0.085],
+        [0.14, 0.065, 0.038],
+        [0.70, 0.44, 0.32],
+    ]
 )
 _HAIRS = np.array(
     [
@@ -52,12 +58,14 @@ def make_person(num_gaussians: int = 343_274, *, seed: int = 0, sh_degree: int =
     """Make a standing person in shirt, trousers or skirt, and shoes.
 
     Args:
-        num_gaussians: How many gaussians, exactly; the default is the mean of the V3DG paper's persons.
+        num_gaussians: How many gaussians, exactly; the default is the mean of the V3DG
+            paper's persons.
         seed: Another person: build, pose, skin, hair and clothes.
         sh_degree: 0 to 3.
 
     Returns:
-        NumPy gaussians; z is up, the soles are at z = 0, the face looks along -y; lengths in metres.
+        NumPy gaussians; z is up, the soles are at z = 0, the face looks along -y;
+        lengths in metres.
 
     Raises:
         ValueError: ``num_gaussians`` is below 2,000.
@@ -102,7 +110,9 @@ def _seen(figure: Figure, points: Array, *, behind: Sequence[Shape]) -> Array:
     """Which points no other layer hides."""
     free = np.ones(len(points), bool)
     for shape in behind:
-        near = np.flatnonzero(free & ((points[:, 2] > figure.shirt_hem) | (shape is not figure.shirt)))
+        near = np.flatnonzero(
+            free & ((points[:, 2] > figure.shirt_hem) | (shape is not figure.shirt))
+        )
         d, _ = shape.distance(points[near])
         free[near[d < 0]] = False
     return free
@@ -120,7 +130,9 @@ def _enough(
     return points[chosen], normals[chosen], spacing * float(np.sqrt(max(len(seen) / n, 1.0)))
 
 
-def _skin(figure: Figure, n: int, skin: Array, hair: Array, noise: Noise, rng: np.random.Generator) -> Part:
+def _skin(
+    figure: Figure, n: int, skin: Array, hair: Array, noise: Noise, rng: np.random.Generator
+) -> Part:
     n_face = int(0.55 * n)
     clothes = (figure.shirt, figure.trousers, figure.shoes)
     parts = []
@@ -167,7 +179,9 @@ def _face(at: Array, tone: Array, hair: Array) -> Array:
     tone = paint(tone, ellipse(0.032, 0.0136, 0.0165, 0.0024), [0.02, 0.014, 0.012])
     arch = 0.031 - 3.0 * (x - 0.034) ** 2
     tone = paint(
-        tone, 0.85 * ellipse(0.034, 0.0, 0.022, 9.0) * smoothstep(0.0055, 0.002, np.abs(z - arch)), hair * 1.2
+        tone,
+        0.85 * ellipse(0.034, 0.0, 0.022, 9.0) * smoothstep(0.0055, 0.002, np.abs(z - arch)),
+        hair * 1.2,
     )
     lips = ellipse(0.0, -0.061, 0.025, 0.0085)
     tone = paint(tone, 0.8 * lips, tone * [1.0, 0.60, 0.60])
@@ -184,7 +198,8 @@ def _cloth(
     noise: Noise,
     rng: np.random.Generator,
 ) -> Part:
-    """Woven cloth with folds, in one colour, in stripes across or along, or in checks."""
+    """Woven cloth with folds, in one colour, in stripes across or along, or in
+    checks."""
     on_top = shape is figure.shirt
     points, normals, spacing = _enough(shape, n, figure, () if on_top else (figure.shirt,), rng)
     # Cut at the hem, where the round cones end in balls.
@@ -194,9 +209,14 @@ def _cloth(
     folded = points * [1.0, 1.0, 0.38]
     crease = noise(folded, 11.0, 2) - 0.5
     e = 2e-3
-    slope = np.stack([noise(folded + e * np.eye(3)[i], 11.0, 2) - 0.5 - crease for i in range(3)], -1) / e
+    slope = (
+        np.stack([noise(folded + e * np.eye(3)[i], 11.0, 2) - 0.5 - crease for i in range(3)], -1)
+        / e
+    )
     depth = 0.020 * smoothstep(0.0, 0.25, figure.hips + 0.45 - np.abs(points[:, 2] - figure.hips))
-    normals = unit(normals - depth[:, None] * (slope - normals * np.sum(slope * normals, 1, keepdims=True)))
+    normals = unit(
+        normals - depth[:, None] * (slope - normals * np.sum(slope * normals, 1, keepdims=True))
+    )
     points = points + normals * (depth * crease)[:, None]
     weave = 0.88 + 0.24 * noise(points, 220.0, 1)
     first, second = colours
@@ -210,7 +230,15 @@ def _cloth(
         colour *= (1 - 0.5 * np.maximum(collar, placket))[:, None]
     tangents = unit(np.cross(normals, [0.9, 0.3, 0.1]))
     return cover(
-        points, normals, tangents, spacing, np.clip(colour, 0, 1), rng, gloss=0.03, bend=0.05, opacity=1.3
+        points,
+        normals,
+        tangents,
+        spacing,
+        np.clip(colour, 0, 1),
+        rng,
+        gloss=0.03,
+        bend=0.05,
+        opacity=1.3,
     )
 
 
@@ -244,9 +272,13 @@ def _hair(figure: Figure, n: int, hair: Array, noise: Noise, rng: np.random.Gene
     roots, normals, at = roots[grows], normals[grows], at[grows]
     lock = noise(roots + 3, 26.0, 2)
     strand = length * (0.65 + 0.7 * lock) * np.exp(0.15 * rng.standard_normal(k))
-    comb = np.stack([np.sign(at[:, 0] - parting) * 0.6, 0.45 + 0.3 * at[:, 1] / 0.1, np.full(k, -0.6)], -1)
+    comb = np.stack(
+        [np.sign(at[:, 0] - parting) * 0.6, 0.45 + 0.3 * at[:, 1] / 0.1, np.full(k, -0.6)], -1
+    )
     comb -= normals * np.sum(comb * normals, 1, keepdims=True)  # along the scalp
-    stray = 0.10 * rng.standard_normal((k, 3)) + 0.8 * (lock - 0.5)[:, None] * np.roll(normals, 1, axis=1)
+    stray = 0.10 * rng.standard_normal((k, 3)) + 0.8 * (lock - 0.5)[:, None] * np.roll(
+        normals, 1, axis=1
+    )
     heading = unit(unit(comb) + 0.10 * normals + stray)
     points, means, tangents = roots.copy(), [], []
     for _ in range(rows):
@@ -262,12 +294,18 @@ def _hair(figure: Figure, n: int, hair: Array, noise: Noise, rng: np.random.Gene
             d, out = shape.distance(points)
             inside = np.maximum(skirt - d, 0)
             points = points + out * inside[:, None]
-            heading = unit(heading - out * (np.minimum(np.sum(heading * out, 1), 0) * (inside > 0))[:, None])
+            heading = unit(
+                heading - out * (np.minimum(np.sum(heading * out, 1), 0) * (inside > 0))[:, None]
+            )
     mean, tangent = np.concatenate(means), unit(np.concatenate(tangents))
     t = np.repeat(np.arange(rows) / (rows - 1), k)
     count = len(mean)
-    shade = np.tile(0.55 + 0.9 * noise(roots, 90.0, 2), rows) * np.exp(0.15 * rng.standard_normal(count))
-    wide = 0.0016 * np.sqrt(58_000 / max(count, 1)) ** 0.8 * np.exp(0.3 * rng.standard_normal(count))
+    shade = np.tile(0.55 + 0.9 * noise(roots, 90.0, 2), rows) * np.exp(
+        0.15 * rng.standard_normal(count)
+    )
+    wide = (
+        0.0016 * np.sqrt(58_000 / max(count, 1)) ** 0.8 * np.exp(0.3 * rng.standard_normal(count))
+    )
     along = 0.40 * np.tile(strand, rows) / rows
     logits = 1.8 - 2.2 * t**2 + 1.2 * rng.standard_normal(count)
     part = Part(

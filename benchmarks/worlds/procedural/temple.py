@@ -1,4 +1,5 @@
-"""A Doric temple of weathered marble, with a tiled roof, grass in its steps and ivy on a wall."""
+"""A Doric temple of weathered marble, with a tiled roof, grass in its steps and ivy on
+a wall."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ from benchmarks.worlds.procedural._parts import (
 )
 from v3dg.gaussians import Gaussians
 
-# Lengths in metres. Columns stand on a rectangle of 6 x 11; x is across the front, which looks along -y.
+# Lengths in metres. Columns stand on a rectangle of 6 x 11; x is across the front,
+# which looks along -y.
 _COLUMNS_X, _COLUMNS_Y, _PITCH = 6, 11, 2.35
 _HALF_X, _HALF_Y = (_COLUMNS_X - 1) * _PITCH / 2, (_COLUMNS_Y - 1) * _PITCH / 2
 _STEP, _TREAD = 0.38, 0.42
@@ -51,8 +53,11 @@ class _Face:
     closed: str = ""
 
 
-def _quad(a: Sequence[float], b: Sequence[float], c: Sequence[float], d: Sequence[float]) -> SurfaceMap:
-    """The bilinear patch with corners a, b along u, and d, c opposite; it faces (b - a) x (d - a)."""
+def _quad(
+    a: Sequence[float], b: Sequence[float], c: Sequence[float], d: Sequence[float]
+) -> SurfaceMap:
+    """The bilinear patch with corners a, b along u, and d, c opposite; it faces (b - a)
+    x (d - a)."""
     corners = (np.array(x, dtype=np.float64) for x in (a, b, c, d))
     p, q, r, s = corners
 
@@ -63,7 +68,9 @@ def _quad(a: Sequence[float], b: Sequence[float], c: Sequence[float], d: Sequenc
     return surface
 
 
-def _box(low: Sequence[float], high: Sequence[float], material: str, sides: str = "xXyYzZ") -> list[_Face]:
+def _box(
+    low: Sequence[float], high: Sequence[float], material: str, sides: str = "xXyYzZ"
+) -> list[_Face]:
     """The named faces of a box: small letters at ``low``, capitals at ``high``."""
     (x, y, z), (X, Y, Z) = low, high
     corners = {
@@ -85,7 +92,8 @@ def _flat(corners: Sequence[Sequence[float]], material: str) -> _Face:
 def _ring(
     half_x: float, half_y: float, width: float, bottom: float, top: float, material: str
 ) -> list[_Face]:
-    """A beam around a rectangle whose outer sides are at the half lengths, seen from all sides."""
+    """A beam around a rectangle whose outer sides are at the half lengths, seen from
+    all sides."""
     outer = _box((-half_x, -half_y, bottom), (half_x, half_y, top), material, "xXyY")
     inside = (half_x - width, half_y - width)
     a, b = inside
@@ -115,7 +123,9 @@ def _column(x: float, y: float) -> list[_Face]:
         radius = _RADIUS * (1 - 0.22 * v + 0.035 * np.sin(np.pi * v))  # entasis
         flute = np.abs(np.cos(10 * angle))  # 20 flutes that meet in edges
         radius = radius * (1 - 0.055 * (1 - flute**2))
-        return np.stack([x + radius * np.cos(angle), y + radius * np.sin(angle), _FLOOR + _SHAFT * v], -1)
+        return np.stack(
+            [x + radius * np.cos(angle), y + radius * np.sin(angle), _FLOOR + _SHAFT * v], -1
+        )
 
     def cushion(u: Array, v: Array) -> Array:
         angle = 2 * np.pi * u
@@ -133,7 +143,8 @@ def _column(x: float, y: float) -> list[_Face]:
 
 
 def _frieze() -> list[_Face]:
-    """Triglyphs, one over each column and one between two, and the plain slabs behind them."""
+    """Triglyphs, one over each column and one between two, and the plain slabs behind
+    them."""
     faces = _ring(_HALF_X + 0.50, _HALF_Y + 0.50, 1.0, _FRIEZE, _CORNICE, "metope")
     width, step = 0.50, 0.065
     for half, other, count, along in (
@@ -219,7 +230,12 @@ def _faces() -> tuple[_Face, ...]:
         faces += _box((-x, -y, i * _STEP), (x, y, (i + 1) * _STEP), "step", "xXyY")
         z, a, b = (i + 1) * _STEP, x - _TREAD, y - _TREAD
         if i < 2:
-            for low, high in (((-x, -y), (x, -b)), ((-x, b), (x, y)), ((-x, -b), (-a, b)), ((a, -b), (x, b))):
+            for low, high in (
+                ((-x, -y), (x, -b)),
+                ((-x, b), (x, y)),
+                ((-x, -b), (-a, b)),
+                ((a, -b), (x, b)),
+            ):
                 faces += _box((*low, z), (*high, z), "step", "Z")
         else:
             faces += _box((-x, -y, z), (x, y, z), "floor", "Z")
@@ -227,7 +243,8 @@ def _faces() -> tuple[_Face, ...]:
         for j in range(_COLUMNS_Y):
             if i in (0, _COLUMNS_X - 1) or j in (0, _COLUMNS_Y - 1):
                 faces += _column(-_HALF_X + i * _PITCH, -_HALF_Y + j * _PITCH)
-    # The cella: walls seen from both sides, a doorway in the front one, and its ceiling.
+    # The cella: walls seen from both sides, a doorway in the front one, and its
+    # ceiling.
     a, b, door, lintel = _HALF_X - 2.1, _HALF_Y - 2.6, 1.15, _FLOOR + 3.9
     faces += _box((-a, -b, _FLOOR), (a, b, _BEAM), "wall", "xXY")
     faces += _box((-a, -b, _FLOOR), (-door, -b, _BEAM), "wall", "y")
@@ -236,11 +253,21 @@ def _faces() -> tuple[_Face, ...]:
     inner_a, inner_b = a - 0.5, b - 0.5
     faces += [
         _flat(
-            ((-door, -b, _FLOOR), (-door, -inner_b, _FLOOR), (-door, -inner_b, lintel), (-door, -b, lintel)),
+            (
+                (-door, -b, _FLOOR),
+                (-door, -inner_b, _FLOOR),
+                (-door, -inner_b, lintel),
+                (-door, -b, lintel),
+            ),
             "wall",
         ),
         _flat(
-            ((door, -inner_b, _FLOOR), (door, -b, _FLOOR), (door, -b, lintel), (door, -inner_b, lintel)),
+            (
+                (door, -inner_b, _FLOOR),
+                (door, -b, _FLOOR),
+                (door, -b, lintel),
+                (door, -inner_b, lintel),
+            ),
             "wall",
         ),
         _flat(
@@ -262,7 +289,8 @@ def _faces() -> tuple[_Face, ...]:
     return (*faces, *_roof())
 
 
-# How many gaussians a material gets on equal areas, and whether they run along the surface's first direction.
+# How many gaussians a material gets on equal areas, and whether they run along the
+# surface's first direction.
 _DENSITY = {
     "column": 1.3,
     "tile": 1.0,
@@ -278,14 +306,14 @@ def make_temple(num_gaussians: int = 1_350_487, *, seed: int = 0, sh_degree: int
     """Make a Doric temple of 6 x 11 columns.
 
     Args:
-        num_gaussians: How many gaussians, exactly; the default is what the V3DG paper's temple has. From
-            about 50,000 on it looks like what it is.
+        num_gaussians: How many gaussians, exactly; the default is what the V3DG paper's
+            temple has. From about 50,000 on it looks like what it is.
         seed: Weathers and overgrows it differently.
         sh_degree: 0 to 3.
 
     Returns:
-        NumPy gaussians; z is up, the ground is at z = 0, the origin below the middle; lengths in metres: 15 x
-        27, 10 high.
+        NumPy gaussians; z is up, the ground is at z = 0, the origin below the middle;
+        lengths in metres: 15 x 27, 10 high.
 
     Raises:
         ValueError: ``num_gaussians`` is below 5,000: there are about a thousand faces.
@@ -310,7 +338,9 @@ def make_temple(num_gaussians: int = 1_350_487, *, seed: int = 0, sh_degree: int
     return gaussians_of(Part.concatenate([*parts, *plants]), sh_degree, rng)
 
 
-def _stone(material: str, patches: list[tuple[Patch, float]], noise: Noise, rng: np.random.Generator) -> Part:
+def _stone(
+    material: str, patches: list[tuple[Patch, float]], noise: Noise, rng: np.random.Generator
+) -> Part:
     """Gaussians that cover patches of one material, worn and coloured."""
     points, normals, tangents, room = (
         np.concatenate([getattr(patch, name) for patch, _ in patches])
@@ -319,7 +349,10 @@ def _stone(material: str, patches: list[tuple[Patch, float]], noise: Noise, rng:
     counts = [len(patch.u) for patch, _ in patches]
     spacing = np.repeat([patch.spacing for patch, _ in patches], counts)
     bend = np.repeat([bend for _, bend in patches], counts)
-    colour = _material_colour(material, points, noise) * _joints(material, points, normals, noise)[:, None]
+    colour = (
+        _material_colour(material, points, noise)
+        * _joints(material, points, normals, noise)[:, None]
+    )
     if material == "pediment":
         figures = smoothstep(0.46, 0.62, noise(points * [1.0, 0.0, 1.0] + 5, 1.9))
         points = points + normals * (0.30 * figures)[:, None]
@@ -349,12 +382,15 @@ def _material_colour(material: str, points: Array, noise: Noise) -> Array:
         return mix([0.05, 0.028, 0.014], [0.16, 0.09, 0.045], noise(points * [6, 0.6, 6], 1.0))
     cloud = np.clip(0.75 * noise(points + 31, 0.55) + 0.55 * grain - 0.1, 0, 1)
     marble = mix([0.50, 0.40, 0.27], [0.86, 0.80, 0.69], cloud)
-    paint = {"metope": [0.62, 0.30, 0.22], "pediment": [0.50, 0.56, 0.66]}.get(material, [1.0, 1.0, 1.0])
+    paint = {"metope": [0.62, 0.30, 0.22], "pediment": [0.50, 0.56, 0.66]}.get(
+        material, [1.0, 1.0, 1.0]
+    )
     return np.asarray(marble * np.array(paint))
 
 
 def _joints(material: str, points: Array, normals: Array, noise: Noise) -> Array:
-    """How bright the joints are, and each stone: courses on walls, slabs on floors, drums of columns."""
+    """How bright the joints are, and each stone: courses on walls, slabs on floors,
+    drums of columns."""
     x, y, z = points.T
     if material == "column":
         return 1 - 0.55 * smoothstep(0.02, 0.005, _to_joint(z - _FLOOR, _SHAFT / 5))
@@ -362,7 +398,9 @@ def _joints(material: str, points: Array, normals: Array, noise: Noise) -> Array
         return np.ones(len(points))
     tall, long = (0.52, 1.24) if material == "wall" else (1.1, 1.3)
     height = np.where(np.abs(normals[:, 2]) > 0.7, y, z)
-    along = x if material == "floor" else np.where(np.abs(normals[:, 0]) > np.abs(normals[:, 1]), y, x)
+    along = (
+        x if material == "floor" else np.where(np.abs(normals[:, 0]) > np.abs(normals[:, 1]), y, x)
+    )
     course = np.floor(height / tall)
     shifted = along + 0.5 * long * course
     joint = np.minimum(_to_joint(height, tall), _to_joint(shifted, long))
@@ -379,7 +417,9 @@ def _weathered(material: str, points: Array, normals: Array, colour: Array, nois
     colour = colour * (1 - stain[:, None] * np.array([0.55, 0.58, 0.62]))
     if material == "wall":
         return colour
-    lichen = smoothstep(0.62, 0.72, noise(points + 71, 3.1)) * (0.25 + 0.75 * (np.abs(normals[:, 2]) > 0.7))
+    lichen = smoothstep(0.62, 0.72, noise(points + 71, 3.1)) * (
+        0.25 + 0.75 * (np.abs(normals[:, 2]) > 0.7)
+    )
     return mix(colour, [0.36, 0.34, 0.08], 0.6 * lichen)
 
 
@@ -430,7 +470,8 @@ def _grass(n: int, rng: np.random.Generator) -> Part:
 
 
 def _ivy(n: int, noise: Noise, rng: np.random.Generator) -> Part:
-    """Leaves that climb from the ground up the columns of one corner and over the beams."""
+    """Leaves that climb from the ground up the columns of one corner and over the
+    beams."""
     rows, columns = 3, 2
     k = max(n // (rows * columns), 1)
     many = 6 * k
@@ -445,7 +486,9 @@ def _ivy(n: int, noise: Noise, rng: np.random.Generator) -> Part:
     )
     beam = rng.random(many) < 0.25
     y = -_HALF_Y - 0.5 + 9.0 * rng.random(many) ** 1.3
-    over = np.stack([np.full(many, _HALF_X + 0.53), y, _BEAM + (_CORNICE - _BEAM) * rng.random(many)], -1)
+    over = np.stack(
+        [np.full(many, _HALF_X + 0.53), y, _BEAM + (_CORNICE - _BEAM) * rng.random(many)], -1
+    )
     base[beam], out[beam] = over[beam], [1.0, 0.0, 0.0]
     reach = 1.25 - 0.16 * (base[:, 1] + _HALF_Y) - 0.035 * (base[:, 2] - _FLOOR)
     kept = np.argsort(noise(base * [1, 1, 0.5] + 43, 0.9) - 0.55 * reach)[:k]
@@ -464,7 +507,9 @@ def _ivy(n: int, noise: Noise, rng: np.random.Generator) -> Part:
         rng,
     )
     shade = np.repeat(rng.random(k), rows * columns)
-    part.albedo = mix([0.020, 0.065, 0.012], [0.10, 0.19, 0.03], shade) * (1.25 - 0.5 * np.abs(s))[:, None]
+    part.albedo = (
+        mix([0.020, 0.065, 0.012], [0.10, 0.19, 0.03], shade) * (1.25 - 0.5 * np.abs(s))[:, None]
+    )
     part.translucency[:] = 0.4
     part.gloss[:] = 0.25
     return part

@@ -1,9 +1,11 @@
-"""A 3DGS asset that needs no download: toadstools on a mossy tuft, and a meadow to place it in.
+"""A 3DGS asset that needs no download: toadstools on a mossy tuft, and a meadow to
+place it in.
 
-The gaussians are spread as training spreads them: thin discs that cover surfaces, needles along blades of
-grass, a wide range of sizes and opacities, colour that depends on the view where something shines or lets
-light through. What is simulated is only as much light as makes a picture pleasant: one sun with soft shadows,
-a sky, some occlusion.
+The gaussians are spread as training spreads them: thin discs that cover surfaces,
+needles along blades of grass, a wide range of sizes and opacities, colour that depends
+on the view where something shines or lets light through. What is simulated is only as
+much light as makes a picture pleasant: one sun with soft shadows, a sky, some
+occlusion.
 
 Axes: z is up, the ground is near z = 0, the tuft's radius is about 1.
 """
@@ -49,13 +51,16 @@ def _discs(
 ) -> Part:
     """Thin discs that together cover a surface whose points lie ``spacing`` apart.
 
-    ``stretch`` lengthens them along their tangents at equal area; ``opacity`` is the middle of a spread of
-    logits, of which a sixth is much fainter, as training leaves them.
+    ``stretch`` lengthens them along their tangents at equal area; ``opacity`` is the
+    middle of a spread of logits, of which a sixth is much fainter, as training leaves
+    them.
     """
     n = len(points)
     size = overlap * spacing * np.exp(0.22 * rng.standard_normal(n))
     long = np.sqrt(stretch) * np.exp(np.abs(0.25 * rng.standard_normal(n)))
-    scales = np.stack([size * long, size / long, 0.12 * size * np.exp(0.5 * rng.standard_normal(n))], -1)
+    scales = np.stack(
+        [size * long, size / long, 0.12 * size * np.exp(0.5 * rng.standard_normal(n))], -1
+    )
     logits = opacity + 1.1 * rng.standard_normal(n) - 3.4 * (rng.random(n) < 1 / 6)
     return Part(
         points + 0.06 * spacing * rng.standard_normal((n, 3)),
@@ -71,7 +76,8 @@ def _discs(
 
 
 def _ground_height(points: Array, noise: Noise) -> Array:
-    """Height of the tuft's soil above a point, a low mound that falls away at its rim."""
+    """Height of the tuft's soil above a point, a low mound that falls away at its
+    rim."""
     r = np.hypot(points[:, 0], points[:, 1])
     flat = np.stack([points[:, 0], points[:, 1], np.zeros(len(points))], -1)
     return 0.13 * (1 - r**2) + 0.07 * (noise(flat, 2.5, 2) - 0.5) - 0.03 * smoothstep(0.85, 1.05, r)
@@ -110,14 +116,17 @@ def _ground(n: int, noise: Noise, rng: np.random.Generator) -> Part:
     size = 0.022 * np.sqrt(30000 / max(n_fur, 1)) ** 0.5 * (0.55 + 0.9 * cushion)
     height = rng.random(n_fur) * (0.01 + 0.08 * cushion**2)
     fresh = np.clip(
-        0.55 * noise(root + 9, 4.0) + 0.6 * height / 0.05 - 0.1 + 0.22 * rng.standard_normal(n_fur), 0, 1
+        0.55 * noise(root + 9, 4.0) + 0.6 * height / 0.05 - 0.1 + 0.22 * rng.standard_normal(n_fur),
+        0,
+        1,
     )
     fur = Part(
         root + grow * (height + 0.3 * size)[:, None],
         grow,
         unit(np.cross(grow, rng.standard_normal((n_fur, 3)))),
         size[:, None] * [0.75, 0.22, 0.14] * np.exp(0.3 * rng.standard_normal((n_fur, 3))),
-        1 / (1 + np.exp(-(1.4 + 1.3 * rng.standard_normal(n_fur) - 3.0 * (rng.random(n_fur) < 0.3)))),
+        1
+        / (1 + np.exp(-(1.4 + 1.3 * rng.standard_normal(n_fur) - 3.0 * (rng.random(n_fur) < 0.3)))),
         mix([0.055, 0.120, 0.018], [0.42, 0.50, 0.060], fresh),
         np.zeros(n_fur),
         np.full(n_fur, 0.35),
@@ -128,7 +137,8 @@ def _ground(n: int, noise: Noise, rng: np.random.Generator) -> Part:
 
 @dataclass
 class _Toadstool:
-    """Where a toadstool stands and how it is grown. Lengths relative to the tuft's radius."""
+    """Where a toadstool stands and how it is grown. Lengths relative to the tuft's
+    radius."""
 
     foot: Array  # (3,)
     lean: Array  # (3,3)
@@ -156,7 +166,11 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
         """Irregular growth: the cap is not quite round and its rim waves."""
         a = np.arctan2(points[:, 1], points[:, 0])
         r = np.hypot(points[:, 0], points[:, 1]) / radius
-        wave = np.sin(3 * a + offset[0]) + 0.6 * np.sin(5 * a + offset[1]) + 0.4 * np.sin(9 * a + offset[2])
+        wave = (
+            np.sin(3 * a + offset[0])
+            + 0.6 * np.sin(5 * a + offset[1])
+            + 0.4 * np.sin(9 * a + offset[2])
+        )
         out: Array = points.copy()
         out[:, :2] *= (1 + 0.018 * wave * r)[:, None]
         out[:, 2] += 0.03 * radius * wave * r**3
@@ -164,13 +178,19 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
 
     n_warts, n_gills, n_stem, n_skirt = int(0.22 * n), int(0.17 * n), int(0.17 * n), int(0.07 * n)
     cap = revolve(cap_profile, n - n_warts - n_gills - n_stem - n_skirt)
-    streak = noise(np.stack([6 * cap.angle % (2 * np.pi), 2.0 * cap.along, cap.angle * 0], -1) + offset, 1.2)
+    streak = noise(
+        np.stack([6 * cap.angle % (2 * np.pi), 2.0 * cap.along, cap.angle * 0], -1) + offset, 1.2
+    )
     blotch = noise(cap.points + offset, 3.0 / radius)
-    red = mix([0.36, 0.004, 0.008], [0.66, 0.016, 0.010], np.clip(blotch + 0.5 * (streak - 0.5), 0, 1))
+    red = mix(
+        [0.36, 0.004, 0.008], [0.66, 0.016, 0.010], np.clip(blotch + 0.5 * (streak - 0.5), 0, 1)
+    )
     rim = smoothstep(0.62, 0.98, cap.along + 0.25 * (streak - 0.5))
     red = red * (1 - 0.8 * rim[:, None]) + 0.8 * rim[:, None] * np.array([0.78, 0.105, 0.012])
     meridian = np.cross(cap.normals, cap.around)
-    skin = _discs(wobble(cap.points), cap.normals, meridian, cap.spacing, red, rng, stretch=1.5, gloss=1.0)
+    skin = _discs(
+        wobble(cap.points), cap.normals, meridian, cap.spacing, red, rng, stretch=1.5, gloss=1.0
+    )
     skin.scales[:, 0] *= 1 - 0.45 * smoothstep(0.85, 1.0, cap.along)  # a clean edge, not a fringe
     parts = [skin]
 
@@ -192,14 +212,20 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
         points[:, 2] += 0.06 * size * rng.standard_normal(m)
         side = unit(np.cross(normal, [0.3, 0.2, 0.93]))
         frame = np.stack([side, np.cross(normal, side), normal], -1)
-        cream = mix([0.62, 0.50, 0.33], [0.95, 0.90, 0.78], lump.points[:, 2] * 0.8 + 0.5 * rng.random(m))
-        discs = _discs(points, lump.normals, lump.around, lump.spacing * size, np.clip(cream, 0, 1), rng)
+        cream = mix(
+            [0.62, 0.50, 0.33], [0.95, 0.90, 0.78], lump.points[:, 2] * 0.8 + 0.5 * rng.random(m)
+        )
+        discs = _discs(
+            points, lump.normals, lump.around, lump.spacing * size, np.clip(cream, 0, 1), rng
+        )
         discs.occlusion[:] = 0.6 + 0.4 * np.clip(lump.points[:, 2] / 0.4, 0, 1)
         wart = discs.moved(frame, spot - 0.1 * size * normal)
         parts.append(wart)
 
     # Gills: the underside, in narrow bright and dark rays.
-    gill = revolve(lambda t: (radius * (0.12 + 0.82 * t), 0.10 * dome * (1 - t) ** 2 - 0.05 * dome), n_gills)
+    gill = revolve(
+        lambda t: (radius * (0.12 + 0.82 * t), 0.10 * dome * (1 - t) ** 2 - 0.05 * dome), n_gills
+    )
     rays = 0.5 + 0.5 * np.sin(gill.angle * 46 + 3 * noise(gill.points + offset, 4.0))
     parts.append(
         _discs(
@@ -224,14 +250,20 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
         return radius * 0.20 * (1 + 0.25 * (1 - z) + bulb), height * z * 1.0
 
     stem = revolve(stem_profile, n_stem)
-    fibre = noise(np.stack([9 * np.cos(stem.angle), 9 * np.sin(stem.angle), stem.points[:, 2] * 5], -1), 1.0)
+    fibre = noise(
+        np.stack([9 * np.cos(stem.angle), 9 * np.sin(stem.angle), stem.points[:, 2] * 5], -1), 1.0
+    )
     cream = mix([0.55, 0.45, 0.30], [0.93, 0.88, 0.76], np.clip(fibre * 1.5 - 0.15, 0, 1))
-    part = _discs(stem.points, stem.normals, np.tile(UP, (n_stem, 1)), stem.spacing, cream, rng, stretch=3.0)
+    part = _discs(
+        stem.points, stem.normals, np.tile(UP, (n_stem, 1)), stem.spacing, cream, rng, stretch=3.0
+    )
     part.occlusion[:] = 0.55 + 0.45 * smoothstep(0, 0.3, stem.points[:, 2] / height)
     parts.append(part)
 
     # Skirt: a thin torn veil around the stem.
-    skirt = revolve(lambda t: (radius * (0.20 + 0.19 * t**0.8), height * (0.80 - 0.13 * t**1.3)), n_skirt)
+    skirt = revolve(
+        lambda t: (radius * (0.20 + 0.19 * t**0.8), height * (0.80 - 0.13 * t**1.3)), n_skirt
+    )
     points = skirt.points.copy()
     points[:, 2] += 0.05 * radius * np.sin(9 * skirt.angle + offset[0]) * skirt.along**2
     veil = _discs(
@@ -245,7 +277,9 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
         translucency=0.5,
     )
     veil.scales[:, 0] *= 1 - 0.5 * skirt.along**3
-    veil.opacities *= 1 - 0.5 * smoothstep(0.8, 1.0, skirt.along + 0.3 * (noise(points, 20.0) - 0.5))
+    veil.opacities *= 1 - 0.5 * smoothstep(
+        0.8, 1.0, skirt.along + 0.3 * (noise(points, 20.0) - 0.5)
+    )
     parts.append(veil)
 
     # The cap sits on the stem; everything leans together.
@@ -269,7 +303,10 @@ def _grass(n: int, noise: Noise, rng: np.random.Generator) -> Part:
     k = n // rows
     base = _on_ground(k, noise, rng, 0.1, 1.03)
     r = np.hypot(base[:, 0], base[:, 1])
-    lean = unit(np.stack([base[:, 0], base[:, 1], 0 * r], -1) + 0.8 * rng.standard_normal((k, 3)) * [1, 1, 0])
+    lean = unit(
+        np.stack([base[:, 0], base[:, 1], 0 * r], -1)
+        + 0.8 * rng.standard_normal((k, 3)) * [1, 1, 0]
+    )
     tall = noise(base + 3, 3.0, 2)
     length = (0.16 + 0.40 * tall**1.5) * np.exp(0.25 * rng.standard_normal(k)) * (0.75 + 0.35 * r)
     along = unit(UP + lean * rng.uniform(0.1, 0.7, k)[:, None])
@@ -317,7 +354,9 @@ class _Flower:
 
 
 _DAISY = _Flower(15, 5, 2, 60, 14, 0.105, 0.16, 0.22, 0.46, (0.90, 0.90, 0.92), (0.85, 0.42, 0.60))
-_FORGET_ME_NOT = _Flower(5, 3, 2, 6, 6, 0.036, 0.42, 0.10, 0.26, (0.12, 0.24, 0.80), (0.30, 0.48, 0.95))
+_FORGET_ME_NOT = _Flower(
+    5, 3, 2, 6, 6, 0.036, 0.42, 0.10, 0.26, (0.12, 0.24, 0.80), (0.30, 0.48, 0.95)
+)
 
 
 def _flowers(kind: _Flower, n: int, noise: Noise, rng: np.random.Generator) -> Part:
@@ -335,7 +374,9 @@ def _flowers(kind: _Flower, n: int, noise: Noise, rng: np.random.Generator) -> P
     other = np.cross(face, side)
     a = np.arange(kind.petals) * 2 * np.pi / kind.petals + rng.uniform(0, 6, (k, 1))
     a = a + rng.uniform(-0.6, 0.6, a.shape) / kind.petals
-    ray = (side[:, None] * np.cos(a)[..., None] + other[:, None] * np.sin(a)[..., None]).reshape(-1, 3)
+    ray = (side[:, None] * np.cos(a)[..., None] + other[:, None] * np.sin(a)[..., None]).reshape(
+        -1, 3
+    )
     faces, heads, sizes = (np.repeat(x, kind.petals, 0) for x in (face, head, size))
     lift = rng.uniform(-0.1, 0.25, (len(ray), 1))
     part, t, s = strips(
@@ -350,7 +391,9 @@ def _flowers(kind: _Flower, n: int, noise: Noise, rng: np.random.Generator) -> P
         lambda t: np.sqrt(np.clip(1 - (2 * t - 1.1) ** 2, 0.08, 1)) * (0.5 + 0.5 * t),
         rng,
     )
-    tinge = np.clip((t - 0.45) * np.repeat(rng.uniform(-0.3, 1.3, k), kind.petals * per_petal), 0, 0.6)
+    tinge = np.clip(
+        (t - 0.45) * np.repeat(rng.uniform(-0.3, 1.3, k), kind.petals * per_petal), 0, 0.6
+    )
     part.albedo = mix(kind.petal, kind.tip, tinge) * (1 - 0.12 * np.abs(s))[:, None]
     part.translucency[:] = 0.45
     part.occlusion = 0.75 + 0.25 * t
@@ -361,7 +404,13 @@ def _flowers(kind: _Flower, n: int, noise: Noise, rng: np.random.Generator) -> P
         radius = 0.30 * size[i]
         yellow = mix([0.78, 0.36, 0.01], [0.95, 0.66, 0.03], rng.random(kind.heart))
         bump = _discs(
-            dome.points * radius, dome.normals, dome.around, dome.spacing * radius, yellow, rng, overlap=0.65
+            dome.points * radius,
+            dome.normals,
+            dome.around,
+            dome.spacing * radius,
+            yellow,
+            rng,
+            overlap=0.65,
         )
         bump.occlusion[:] = 0.55 + 0.45 * (1 - dome.along)
         parts.append(bump.moved(np.stack([side[i], other[i], face[i]], -1), head[i]))
@@ -389,7 +438,9 @@ def _clover(n: int, noise: Noise, rng: np.random.Generator) -> Part:
     head = base + UP * height[:, None] + 0.02 * rng.standard_normal((k, 3))
     side = unit(np.cross(face, [0.6, 0.8, 0.1]))
     a = np.arange(3) * 2 * np.pi / 3 + rng.uniform(0, 6, (k, 1))
-    ray = side[:, None] * np.cos(a)[..., None] + np.cross(face, side)[:, None] * np.sin(a)[..., None]
+    ray = (
+        side[:, None] * np.cos(a)[..., None] + np.cross(face, side)[:, None] * np.sin(a)[..., None]
+    )
     size = rng.uniform(0.055, 0.10, k)
     part, t, s = strips(
         np.repeat(head, 3, 0),
@@ -419,7 +470,9 @@ def _pebbles(n: int, noise: Noise, rng: np.random.Generator) -> Part:
     for place in _on_ground(k, noise, rng, 0.5, 0.92):
         m = n // k
         ball = revolve(lambda t: (np.sin(np.pi * t), np.cos(np.pi * t)), m)
-        axes = rng.uniform(0.05, 0.12) * np.array([rng.uniform(0.8, 1.4), 1.0, rng.uniform(0.5, 0.75)])
+        axes = rng.uniform(0.05, 0.12) * np.array(
+            [rng.uniform(0.8, 1.4), 1.0, rng.uniform(0.5, 0.75)]
+        )
         bulge = 0.85 + 0.3 * noise(ball.points + place * 7, 1.6, 2)
         grain = noise(ball.points + place * 5, 6.0)
         grey = mix([0.16, 0.15, 0.15], [0.52, 0.50, 0.47], grain) * rng.uniform(0.7, 1.2)
@@ -438,7 +491,8 @@ def _pebbles(n: int, noise: Noise, rng: np.random.Generator) -> Part:
 
 
 def _shadow(points: Array, caps: Sequence[_Toadstool]) -> Array:
-    """Share of the sun that caps let through to each point: caps are ellipsoids with soft edges."""
+    """Share of the sun that caps let through to each point: caps are ellipsoids with
+    soft edges."""
     light = np.ones(len(points))
     for shape in caps:
         axes = np.array([1, 1, shape.dome]) * shape.radius
@@ -464,7 +518,8 @@ def _under_caps(points: Array, caps: Sequence[_Toadstool]) -> Array:
 
 
 def _lit(part: Part, caps: Sequence[_Toadstool]) -> Array:
-    """Light the gaussians and express their colour as spherical harmonics of degree 1, (n,4,3)."""
+    """Light the gaussians and express their colour as spherical harmonics of degree 1,
+    (n,4,3)."""
     facing = part.normals @ TO_SUN
     thin = part.translucency
     sunlit = _shadow(part.means, caps)
@@ -472,13 +527,16 @@ def _lit(part: Part, caps: Sequence[_Toadstool]) -> Array:
     front = np.maximum(facing, 0)
     leaf = 0.45 + 0.55 * np.abs(facing)
     direct = sunlit * ((1 - thin) * front + thin * leaf) * (0.35 + 0.65 * part.occlusion)
-    bounce = np.array([0.10, 0.13, 0.05]) * (1 - part.normals[:, 2])[:, None] * part.occlusion[:, None]
+    bounce = (
+        np.array([0.10, 0.13, 0.05]) * (1 - part.normals[:, 2])[:, None] * part.occlusion[:, None]
+    )
     linear = part.albedo * (direct[:, None] * SUN + sky[:, None] * SKY + bounce)
     colour = display(linear)
 
-    # What depends on the view, linear in the direction v to the eye: the sky's mirror image is brighter the
-    # higher the mirrored direction 2 (n.v) n - v points; the sun's highlight leans towards the sun's mirrored
-    # direction; thin things glow when the sun is behind them.
+    # What depends on the view, linear in the direction v to the eye: the sky's mirror
+    # image is brighter the higher the mirrored direction 2 (n.v) n - v points; the
+    # sun's highlight leans towards the sun's mirrored direction; thin things glow when
+    # the sun is behind them.
     n = part.normals
     shine = part.gloss[:, None]
     mirrored_sky = 2 * n[:, 2:] * n - UP
@@ -487,12 +545,15 @@ def _lit(part: Part, caps: Sequence[_Toadstool]) -> Array:
     white = shine * (0.05 * mirrored_sky + 0.42 * highlight * mirrored_sun)  # (n,3): weight of v
     glow = (thin * sunlit * part.occlusion)[:, None] * -0.22 * TO_SUN
     tint = colour / np.maximum(colour.max(1, keepdims=True), 1e-3)
-    gradient = white[:, :, None] * np.array([1.0, 0.98, 0.94]) + glow[:, :, None] * tint[:, None] * 0.5
+    gradient = (
+        white[:, :, None] * np.array([1.0, 0.98, 0.94]) + glow[:, :, None] * tint[:, None] * 0.5
+    )
     colour = colour + shine * (0.02 - 0.12 * highlight)
 
     sh = np.empty((len(n), 4, 3))
     sh[:, 0] = (colour - 0.5) / SH_C0
-    # The basis functions of degree 1 are -y, z, -x of the direction from the eye, which is -v.
+    # The basis functions of degree 1 are -y, z, -x of the direction from the eye, which
+    # is -v.
     sh[:, 1] = gradient[:, 1] / SH_C1
     sh[:, 2] = -gradient[:, 2] / SH_C1
     sh[:, 3] = gradient[:, 0] / SH_C1
@@ -503,8 +564,9 @@ def make_asset(num_gaussians: int = 60_000, *, seed: int = 0) -> Gaussians:
     """Make a tuft of moss with toadstools, grass, daisies, clover and pebbles.
 
     Args:
-        num_gaussians: How many gaussians, exactly; fewer means fewer blades and larger gaussians. From about
-            10,000 on it looks like what it is. seed: The same seed gives the same gaussians.
+        num_gaussians: How many gaussians, exactly; fewer means fewer blades and larger
+            gaussians. From about 10,000 on it looks like what it is. seed: The same
+            seed gives the same gaussians.
 
     Returns:
         NumPy gaussians with SH degree 1; z is up, the ground's radius is about 1.
@@ -551,13 +613,14 @@ def make_asset(num_gaussians: int = 60_000, *, seed: int = 0) -> Gaussians:
 
 
 def place_field(count: int = 2000, *, seed: int = 0) -> tuple[Array, Array, Array]:
-    """Place tufts on a round hill, so close that moss covers it, each turned and sized differently.
+    """Place tufts on a round hill, so close that moss covers it, each turned and sized
+    differently.
 
     The first stands at the origin, upright. Toadstools of two tufts seldom meet.
 
     Returns:
-        Positions (count,3), quaternions (count,4) w,x,y,z and scales (count,), float64; from the middle
-        outwards.
+        Positions (count,3), quaternions (count,4) w,x,y,z and scales (count,), float64;
+        from the middle outwards.
 
     Raises:
         ValueError: ``count`` is below 1.
@@ -567,7 +630,9 @@ def place_field(count: int = 2000, *, seed: int = 0) -> tuple[Array, Array, Arra
     rng = np.random.default_rng(seed)
     spacing = 1.68  # of a hexagonal grid: discs of radius 1 cover the plane up to 1.73
     reach = int(np.ceil(np.sqrt(count))) + 2
-    i, j = (x.ravel() for x in np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1)))
+    i, j = (
+        x.ravel() for x in np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1))
+    )
     plane = spacing * np.stack([i + 0.5 * j, np.sqrt(0.75) * j], -1)
     plane = plane[np.argsort(np.hypot(plane[:, 0], plane[:, 1]), kind="stable")[:count]]
     plane[1:] += rng.uniform(-0.2, 0.2, (count - 1, 2))

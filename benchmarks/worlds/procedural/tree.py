@@ -1,4 +1,5 @@
-"""Trees of eight kinds: a trunk that branches in levels, bark, and thin leaves that let light through."""
+"""Trees of eight kinds: a trunk that branches in levels, bark, and thin leaves that let
+light through."""
 
 from __future__ import annotations
 
@@ -34,7 +35,9 @@ class _Level:
 
     children: int  # on each
     start: float  # where along the parent the first springs, in [0,1]
-    angle: tuple[float, float]  # from the parent's direction, rad: at the first child and at the last
+    angle: tuple[
+        float, float
+    ]  # from the parent's direction, rad: at the first child and at the last
     length: tuple[float, float]  # relative to the parent's: at the first child and at the last
     bulge: float  # how much longer children in the middle are
     wander: float  # how crooked
@@ -192,15 +195,23 @@ class _Branches:
 
 
 def _grow(
-    base: Array, direction: Array, lengths: Array, radii: Array, level: _Level, rng: np.random.Generator
+    base: Array,
+    direction: Array,
+    lengths: Array,
+    radii: Array,
+    level: _Level,
+    rng: np.random.Generator,
 ) -> _Branches:
-    """Grow branches from ``base``, crookedly, tapering to a quarter of their first radius."""
+    """Grow branches from ``base``, crookedly, tapering to a quarter of their first
+    radius."""
     points = np.empty((len(base), _STEPS + 1, 3))
     points[:, 0], heading = base, unit(direction)
     for step in range(_STEPS):
         points[:, step + 1] = points[:, step] + heading * (lengths / _STEPS)[:, None]
         points[:, step + 1, 2] = np.maximum(points[:, step + 1, 2], _CLEARANCE)
-        heading = unit(heading + level.wander * rng.standard_normal(heading.shape) + level.rise * UP)
+        heading = unit(
+            heading + level.wander * rng.standard_normal(heading.shape) + level.rise * UP
+        )
     taper = 1 - 0.78 * np.linspace(0, 1, _STEPS + 1) ** 0.9
     return _Branches(points, lengths, radii[:, None] * taper)
 
@@ -222,11 +233,17 @@ def _branch_out(parents: _Branches, level: _Level, rng: np.random.Generator) -> 
     share = np.tile((np.arange(k) + 0.5) / k, count) + rng.uniform(-0.4, 0.4, count * k) / k
     t = level.start + (1 - level.start) * share
     base, along, thick = _at(parents, which, t)
-    turn = np.tile(np.arange(k) * GOLDEN_ANGLE, count) + np.repeat(rng.uniform(0, 2 * np.pi, count), k)
+    turn = np.tile(np.arange(k) * GOLDEN_ANGLE, count) + np.repeat(
+        rng.uniform(0, 2 * np.pi, count), k
+    )
     turn += 0.35 * rng.standard_normal(count * k)
     side = unit(np.cross(along, [0.31, 0.22, 0.92]) + 1e-9)
     aside = side * np.cos(turn)[:, None] + np.cross(along, side) * np.sin(turn)[:, None]
-    angle = level.angle[0] + (level.angle[1] - level.angle[0]) * share + 0.10 * rng.standard_normal(count * k)
+    angle = (
+        level.angle[0]
+        + (level.angle[1] - level.angle[0]) * share
+        + 0.10 * rng.standard_normal(count * k)
+    )
     direction = along * np.cos(angle)[:, None] + aside * np.sin(angle)[:, None]
     relative = level.length[0] + (level.length[1] - level.length[0]) * share
     relative = (relative + level.bulge * np.sin(np.pi * share)) * np.exp(
@@ -243,14 +260,15 @@ def make_tree(
     """Make a tree: bark on branches of four levels, leaves or needles on the last.
 
     Args:
-        num_gaussians: How many gaussians, exactly; the default is the mean of the V3DG paper's trees. Fewer
-            means fewer and larger leaves.
+        num_gaussians: How many gaussians, exactly; the default is the mean of the V3DG
+            paper's trees. Fewer means fewer and larger leaves.
         kind: One of ``TREE_KINDS``.
         seed: Another tree of the same kind.
         sh_degree: 0 to 3; from 1 on leaves glow where the sun is behind them.
 
     Returns:
-        NumPy gaussians; z is up, the foot of the trunk is at the origin; lengths in metres.
+        NumPy gaussians; z is up, the foot of the trunk is at the origin; lengths in
+        metres.
 
     Raises:
         ValueError: ``num_gaussians`` is below 1,000, or there is no such kind.
@@ -264,7 +282,9 @@ def make_tree(
     noise = Noise(rng)
     height = shape.height * rng.uniform(0.9, 1.1)
     lean = UP + 0.04 * rng.standard_normal(3)
-    trunk = _grow(np.zeros((1, 3)), lean[None], np.array([height]), np.array([shape.girth]), shape.trunk, rng)
+    trunk = _grow(
+        np.zeros((1, 3)), lean[None], np.array([height]), np.array([shape.girth]), shape.trunk, rng
+    )
     levels = [trunk]
     for level in shape.levels:
         levels.append(_branch_out(levels[-1], level, rng))
@@ -273,13 +293,18 @@ def make_tree(
     bark = _bark(levels, n_bark, shape, noise, rng)
     n_leaves = num_gaussians - len(bark.means)
     foliage = (
-        _needles(levels, n_leaves, shape, rng) if shape.needles else _leaves(levels, n_leaves, shape, rng)
+        _needles(levels, n_leaves, shape, rng)
+        if shape.needles
+        else _leaves(levels, n_leaves, shape, rng)
     )
     return gaussians_of(Part.concatenate([bark, foliage]), sh_degree, rng)
 
 
-def _bark(levels: list[_Branches], n: int, shape: _Kind, noise: Noise, rng: np.random.Generator) -> Part:
-    """n gaussians around all branches: flat ones on what is thick, needles along what is thin."""
+def _bark(
+    levels: list[_Branches], n: int, shape: _Kind, noise: Noise, rng: np.random.Generator
+) -> Part:
+    """n gaussians around all branches: flat ones on what is thick, needles along what
+    is thin."""
     start = np.concatenate([b.points[:, :-1].reshape(-1, 3) for b in levels])
     end = np.concatenate([b.points[:, 1:].reshape(-1, 3) for b in levels])
     r0 = np.concatenate([b.radii[:, :-1].ravel() for b in levels])
@@ -307,7 +332,9 @@ def _bark(levels: list[_Branches], n: int, shape: _Kind, noise: Noise, rng: np.r
         band = noise(points * [3.5, 3.5, 16.0] + 3, 1.0)
         stripe = np.clip((band - 0.53) * 9, 0, 1) * shape.bands
         colour = mix(np.ones(3), [0.06, 0.055, 0.05], stripe) * colour
-    mossy = np.clip(noise(points + 11, 1.5) - 0.45, 0, 1) * np.exp(-np.maximum(points[:, 2], 0) / 1.2)
+    mossy = np.clip(noise(points + 11, 1.5) - 0.45, 0, 1) * np.exp(
+        -np.maximum(points[:, 2], 0) / 1.2
+    )
     colour = colour + mossy[:, None] * np.array([0.05, 0.10, 0.0])
     spacing = np.sqrt(area[which] / here)
     part = cover(
@@ -324,16 +351,21 @@ def _bark(levels: list[_Branches], n: int, shape: _Kind, noise: Noise, rng: np.r
     limit = 0.30 * radius
     part.scales[:, 1] = np.minimum(part.scales[:, 1], np.maximum(limit, 0.0015))
     part.scales[:, 2] = np.minimum(part.scales[:, 2], part.scales[:, 1])
-    part.scales[:, 0] = np.clip(part.scales[:, 0], part.scales[:, 1], np.maximum(0.30 * length[which], 0.002))
+    part.scales[:, 0] = np.clip(
+        part.scales[:, 0], part.scales[:, 1], np.maximum(0.30 * length[which], 0.002)
+    )
     above = np.maximum(points[:, 2], 0)  # none reaches far below the ground
-    part.scales[:, 0] = np.minimum(part.scales[:, 0], np.maximum(0.3 * above + 0.02, part.scales[:, 1]))
+    part.scales[:, 0] = np.minimum(
+        part.scales[:, 0], np.maximum(0.3 * above + 0.02, part.scales[:, 1])
+    )
     return part
 
 
 def _seats(
     levels: list[_Branches], k: int, rng: np.random.Generator
 ) -> tuple[Array, Array, NDArray[np.int64]]:
-    """k places on the outer branches, in proportion to length, their directions, and which they are."""
+    """k places on the outer branches, in proportion to length, their directions, and
+    which they are."""
     twigs, limbs = levels[-1], levels[-2]
     points = np.concatenate([twigs.points, limbs.points])
     lengths = np.concatenate([twigs.lengths, 0.4 * limbs.lengths])
@@ -379,8 +411,13 @@ def _leaves(levels: list[_Branches], n: int, shape: _Kind, rng: np.random.Genera
     )
     part.albedo = np.repeat(_leaf_colours(shape, which, rng), each, axis=0)
     part.albedo *= (1.12 - 0.25 * np.abs(s))[:, None]
-    # The rim lets the background through, and training leaves some much fainter than others.
-    logits = np.log(part.opacities / (1 - part.opacities)) - 1.2 * t * t + 1.6 * rng.standard_normal(k * each)
+    # The rim lets the background through, and training leaves some much fainter than
+    # others.
+    logits = (
+        np.log(part.opacities / (1 - part.opacities))
+        - 1.2 * t * t
+        + 1.6 * rng.standard_normal(k * each)
+    )
     part.opacities = 1 / (1 + np.exp(-logits))
     part.scales[:, 2] *= np.exp(0.6 * rng.standard_normal(k * each))
     part.translucency[:] = 0.6

@@ -1,4 +1,5 @@
-"""Small files that would cost much to read: each gives a `Good` that is none, and what must become of it."""
+"""Small files that would cost much to read: each gives a `Good` that is none, and what
+must become of it."""
 
 import functools
 import gzip
@@ -27,7 +28,9 @@ from v3dg.formats import sog
 @functools.cache
 def constant_webp(side):
     stream = io.BytesIO()
-    Image.new("RGBA", (side, side), (7, 8, 9, 252)).save(stream, "WEBP", lossless=True, exact=True, method=0)
+    Image.new("RGBA", (side, side), (7, 8, 9, 252)).save(
+        stream, "WEBP", lossless=True, exact=True, method=0
+    )
     return stream.getvalue()
 
 
@@ -36,12 +39,16 @@ def constant_png(width, height, mode=6):
     """Zeros, packed row by row, so that making it costs no memory."""
 
     def chunk(name, body):
-        return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        return (
+            struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        )
 
     packer, row = zlib.compressobj(9), bytes(1 + width * (4 if mode == 6 else 3))
     packed = b"".join([*(packer.compress(row) for _ in range(height)), packer.flush()])
     header = struct.pack(">IIBBBBB", width, height, 8, mode, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", packed) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", packed) + chunk(b"IEND", b"")
+    )
 
 
 @functools.cache
@@ -50,7 +57,8 @@ def small_sog():
 
 
 def sog_of_large_pictures(rng):
-    """Constant pictures cost few bytes and many pixels; padding makes a file look as if it justified them."""
+    """Constant pictures cost few bytes and many pixels; padding makes a file look as if
+    it justified them."""
     side = rng.choice((2048, 3000, 4096))
     picture = rng.choice((constant_webp, lambda side: constant_png(side, side)))(side)
     files = dict(small_sog())
@@ -81,7 +89,10 @@ def sog_with_one_picture_for_all(rng):
 
 
 def sog_of_many_entries(rng):
-    entries = [*small_sog().items(), *((f"{i}.webp", b"") for i in range(rng.choice((1000, 40_000))))]
+    entries = [
+        *small_sog().items(),
+        *((f"{i}.webp", b"") for i in range(rng.choice((1000, 40_000)))),
+    ]
     return "sog", {"a.sog": zip_bytes(entries)}
 
 
@@ -152,7 +163,10 @@ def spz_of_long_frames(rng):
     )
     table = b"".join(struct.pack("<QQ", len(packed), size) for packed, size in streams)
     return "spz", {
-        "a.spz": header + table + b"".join(packed for packed, _ in streams) + bytes(rng.choice((0, 1 << 20)))
+        "a.spz": header
+        + table
+        + b"".join(packed for packed, _ in streams)
+        + bytes(rng.choice((0, 1 << 20)))
     }
 
 
@@ -167,7 +181,9 @@ def _tensors(rng, count=None):
         "shN": (rng.choice((0, 15)), 3),
     }
     return {
-        name: torch.ones(()).expand(count, *(((rest,) if rest else ()) if isinstance(rest, int) else rest))
+        name: torch.ones(()).expand(
+            count, *(((rest,) if rest else ()) if isinstance(rest, int) else rest)
+        )
         for name, rest in shapes.items()
     }
 
@@ -252,7 +268,10 @@ def scene_of_bundles_in_turn(rng):
     instances = [{"bundle": "abcde"[i % 5], "position": [i, 0, 0]} for i in range(count)]
     document = {"format": "v3dg-scene", "version": 1, "bundles": names, "instances": instances}
     bundle = bundle_bytes()
-    return "scene", {"scene.json": json.dumps(document).encode(), **{f"{n}.v3dg": bundle for n in "abcde"}}
+    return "scene", {
+        "scene.json": json.dumps(document).encode(),
+        **{f"{n}.v3dg": bundle for n in "abcde"},
+    }
 
 
 def scene_of_many_bundles(rng):
@@ -265,7 +284,12 @@ def scene_of_many_bundles(rng):
 
 def cameras_of_many_frames(rng):
     frame = {"file_path": "a", "transform_matrix": np.eye(4).tolist()}
-    document = {"camera_angle_x": 0.8, "w": 64, "h": 48, "frames": [frame] * rng.choice((1000, 20_000))}
+    document = {
+        "camera_angle_x": 0.8,
+        "w": 64,
+        "h": 48,
+        "frames": [frame] * rng.choice((1000, 20_000)),
+    }
     return "cameras", {"transforms.json": json.dumps(document).encode()}
 
 
@@ -295,12 +319,13 @@ def picture_that_claims(rng):
 
 
 def picture_of_another_program(rng):
-    """What Pillow hands on to other programs, or reads with plugins that nobody asked for."""
-    eps = (
-        b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n0 0 8 8 rectfill showpage\n%%EOF\n"
-    )
+    """What Pillow hands on to other programs, or reads with plugins that nobody asked
+    for."""
+    eps = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n0 0 8 8 rectfill showpage\n%%EOF\n"
     frames, stream = [Image.new("RGB", (8, 8), c) for c in ("red", "blue")], io.BytesIO()
-    frames[0].save(stream, rng.choice(("PNG", "GIF", "TIFF")), save_all=True, append_images=frames[1:])
+    frames[0].save(
+        stream, rng.choice(("PNG", "GIF", "TIFF")), save_all=True, append_images=frames[1:]
+    )
     others = (
         eps,
         stream.getvalue(),

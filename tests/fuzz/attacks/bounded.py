@@ -1,7 +1,9 @@
-"""SIGKILL at random moments of a build of several files that do not fit in memory; as kills.py for the rest.
+"""SIGKILL at random moments of a build of several files that do not fit in memory; as
+kills.py for the rest.
 
-The file is not there, as it was, or whole, and a build that goes on gives the bytes of one that ran through.
-The program tells itself that memory is small, and units with it: as a machine's would have to be for a city.
+The file is not there, as it was, or whole, and a build that goes on gives the bytes of
+one that ran through. The program tells itself that memory is small, and units with it:
+as a machine's would have to be for a city.
 """
 
 import sys
@@ -35,5 +37,8 @@ def prepare(shared):
 
 
 class Attack(kills.Attack):
-    kinds, weights = {"build in bounded memory": ([sys.executable, "-c", PROGRAM], "out.v3dg")}, (1,)
+    kinds, weights = (
+        {"build in bounded memory": ([sys.executable, "-c", PROGRAM], "out.v3dg")},
+        (1,),
+    )
     files = ("tile_1.ply", "tile_2.ply")

@@ -9,9 +9,45 @@ from fuzz.attacks.good_files import zip_entries
 from fuzz.mutations import changed_json
 from fuzz.targets import parts_of, with_fitting_hashes, zip_bytes
 
-INTEGERS = (0, 1, 2, 3, 0x7F, 0x80, 0xFF, 0x100, 0x7FFF, 0xFFFF, 1 << 16, 1 << 20, (1 << 24) - 1, 1 << 30)
-INTEGERS += ((1 << 31) - 1, 1 << 31, (1 << 32) - 1, 1 << 32, 1 << 40, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
-FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-38, 1e-45, 3e38, 1e300, float("inf"), float("-inf"), float("nan"))
+INTEGERS = (
+    0,
+    1,
+    2,
+    3,
+    0x7F,
+    0x80,
+    0xFF,
+    0x100,
+    0x7FFF,
+    0xFFFF,
+    1 << 16,
+    1 << 20,
+    (1 << 24) - 1,
+    1 << 30,
+)
+INTEGERS += (
+    (1 << 31) - 1,
+    1 << 31,
+    (1 << 32) - 1,
+    1 << 32,
+    1 << 40,
+    (1 << 63) - 1,
+    1 << 63,
+    (1 << 64) - 1,
+)
+FLOATS = (
+    0.0,
+    -0.0,
+    1.0,
+    -1.0,
+    1e-38,
+    1e-45,
+    3e38,
+    1e300,
+    float("inf"),
+    float("-inf"),
+    float("nan"),
+)
 WORDS = (
     b"0",
     b"-1",
@@ -58,7 +94,8 @@ def overwritten(data, rng, _):
 
 
 def numbers_changed(data, rng, _):
-    """Whole numbers and floats in the places that they often have, set to extremes or multiplied."""
+    """Whole numbers and floats in the places that they often have, set to extremes or
+    multiplied."""
     out = bytearray(data)
     reach = rng.choice((len(out), min(len(out), 64), min(len(out), 512)))
     for _ in range(rng.choice((1, 1, 2, 4))):
@@ -107,7 +144,9 @@ def bytes_changed(data, rng, other):
 def words_changed(data, rng, _):
     """Numbers and lines of a text, as a .ply's header is."""
     lines = data.split(b"\n")
-    end = next((i for i, line in enumerate(lines) if line.startswith(b"end_header")), len(lines) - 1)
+    end = next(
+        (i for i, line in enumerate(lines) if line.startswith(b"end_header")), len(lines) - 1
+    )
     for _ in range(rng.choice((1, 1, 2, 3))):
         i = rng.randrange(end + 1) if rng.random() < 0.8 else rng.randrange(len(lines))
         action = rng.randrange(6)
@@ -158,7 +197,17 @@ def zip_changed(data, rng, other):
         entries.append((name, rng.choice(entries)[1]))
     elif action == 6:
         entries[i] = (
-            rng.choice((*(n for n, _ in entries), "", "../x", "/etc/passwd", "a\\b", "x" * 60_000, "\u202e")),
+            rng.choice(
+                (
+                    *(n for n, _ in entries),
+                    "",
+                    "../x",
+                    "/etc/passwd",
+                    "a\\b",
+                    "x" * 60_000,
+                    "\u202e",
+                )
+            ),
             content,
         )
     elif action == 7:
@@ -169,11 +218,23 @@ def zip_changed(data, rng, other):
 
 
 def tables_changed(data, rng):
-    """Sizes, CRCs, methods and places in the headers of a zip's entries and in its directory."""
+    """Sizes, CRCs, methods and places in the headers of a zip's entries and in its
+    directory."""
     out = bytearray(data)
     # Signature: places and sizes of the fields after it.
     fields = {
-        b"PK\1\2": ((6, 2), (8, 2), (10, 2), (16, 4), (20, 4), (24, 4), (28, 2), (30, 2), (32, 2), (42, 4)),
+        b"PK\1\2": (
+            (6, 2),
+            (8, 2),
+            (10, 2),
+            (16, 4),
+            (20, 4),
+            (24, 4),
+            (28, 2),
+            (30, 2),
+            (32, 2),
+            (42, 4),
+        ),
         b"PK\3\4": ((4, 2), (6, 2), (8, 2), (14, 4), (18, 4), (22, 4), (26, 2), (28, 2)),
         b"PK\5\6": ((4, 2), (8, 2), (10, 2), (12, 4), (16, 4), (20, 2)),
     }
@@ -200,7 +261,9 @@ def bundle_changed(data, rng, other):
         out = bytearray(data)
         first, last = start + pages_end, start + hash_end - 20
         for _ in range(rng.randrange(1, 4)):
-            kind, values = rng.choice((("<i", (0, 1, 2, 3, -1, 4096, 1 << 30, -(1 << 31))), ("<f", FLOATS)))
+            kind, values = rng.choice(
+                (("<i", (0, 1, 2, 3, -1, 4096, 1 << 30, -(1 << 31))), ("<f", FLOATS))
+            )
             values = [v for v in values if kind == "<i" or not 3.4e38 < abs(v) < float("inf")]
             struct.pack_into(kind, out, rng.randrange(first, last) // 4 * 4, rng.choice(values))
         data = bytes(out)

@@ -1,4 +1,5 @@
-"""A child of pool.py: does the tries whose numbers come on stdin, and says on stdout what came of them.
+"""A child of pool.py: does the tries whose numbers come on stdin, and says on stdout
+what came of them.
 
 child.py KIND SEED SHARED          prepares, and prints the seconds that a try may take
 child.py KIND SEED SHARED WORK     does tries

@@ -1,4 +1,5 @@
-"""Random command lines: each ends by itself, with 0, or with 1 or 2 and one line that says why."""
+"""Random command lines: each ends by itself, with 0, or with 1 or 2 and one line that
+says why."""
 
 import os
 import signal
@@ -150,7 +151,14 @@ OPTIONS = {
         **VIEWS,
     },
     "view": {"--host": "w", "--port": "n", "--up": "w", "--no-browser": "", **CUT, "--device": "w"},
-    "compare": {"-o": "o", "--pictures": "w", **CUT, "--supersample": "n", "--device": "w", **VIEWS},
+    "compare": {
+        "-o": "o",
+        "--pictures": "w",
+        **CUT,
+        "--supersample": "n",
+        "--device": "w",
+        **VIEWS,
+    },
     "convert": {"--level": "n", **CUT, "--outside": "w", **VIEWS},
     "export": {"-o": "o", "--chunk": "n", "--up": "w", "--overwrite": ""},
     "demo": {
@@ -217,7 +225,9 @@ def prepare(shared):
 
     bundle = v3dg.Bundle.open(odd / "a.v3dg")
     made_with = {**bundle.config, "dropped": 5, "seed": "\x1b]0;owned\x07", "é\n\x9b": [None] * 3}
-    v3dg.Bundle(bundle.clusters, bundle.groups, bundle.gaussians, made_with).write(odd / "lying.v3dg")
+    v3dg.Bundle(bundle.clusters, bundle.groups, bundle.gaussians, made_with).write(
+        odd / "lying.v3dg"
+    )
 
 
 class Attack:
@@ -276,7 +286,9 @@ def _arguments(rng, command):
     kinds = {**OPTIONS[command], **COMMON}
     if rng.random() < 0.9:
         kinds = {name: kinds[name] for name in kinds if name not in LACKING.get(command, ())}
-    if command in ("demo", "render", "compare") and "b.png" not in arguments:  # small, unless asked otherwise
+    if (
+        command in ("demo", "render", "compare") and "b.png" not in arguments
+    ):  # small, unless asked otherwise
         arguments += (
             ["--size", "24", "20"]
             if command != "demo"
@@ -290,7 +302,9 @@ def _arguments(rng, command):
                 arguments.append(rng.choice(FITTING[name]))
             elif kind == "n":
                 arguments.append(
-                    rng.choice(("0", "1", "2", "5.5", "100") if fits and name not in FITTING else NUMBERS)
+                    rng.choice(
+                        ("0", "1", "2", "5.5", "100") if fits and name not in FITTING else NUMBERS
+                    )
                 )
             elif kind in "op":
                 arguments.append(rng.choice(OUTPUTS if kind == "o" else SUBJECTS + ODD_SUBJECTS))
@@ -318,7 +332,8 @@ def _change_outputs(rng, work, arguments):
 
 
 def _interrupt_server(process, out):
-    """When it says where it listens; where its stdout leads nowhere, when it has had the time to."""
+    """When it says where it listens; where its stdout leads nowhere, when it has had
+    the time to."""
     end = time.monotonic() + 10
     while is_running(process) and time.monotonic() < end and b"http://" not in out.read_bytes():
         time.sleep(0.02)

@@ -1,4 +1,5 @@
-"""Damage that must be noticed, and odd files that must be read: what other programs write, or break."""
+"""Damage that must be noticed, and odd files that must be read: what other programs
+write, or break."""
 
 import functools
 import io
@@ -17,7 +18,8 @@ from v3dg.formats import sog
 
 
 def damaged(rng):
-    """Kind, what was done, files, what becomes of them ("read", "refused", "any"), and with which arrays."""
+    """Kind, what was done, files, what becomes of them ("read", "refused", "any"), and
+    with which arrays."""
     make = rng.choice(DAMAGES)
     kind, files, must, *arrays = make(rng)
     return kind, make.__name__, files, must, arrays[0] if arrays else None
@@ -41,7 +43,9 @@ def _checkpoint():
         path = Path(folder) / "a.pt"
         path.write_bytes(content)
         asset = v3dg.read_asset(path)
-    return content, [getattr(asset, name) for name in ("means", "quats", "scales", "opacities", "sh")]
+    return content, [
+        getattr(asset, name) for name in ("means", "quats", "scales", "opacities", "sh")
+    ]
 
 
 def _with_entries(change, compression=0):
@@ -54,7 +58,9 @@ def storage_cut_short(rng):
     number, share = rng.randrange(5), rng.random()
 
     def cut(name, content):
-        return name, content[: int(share * len(content))] if name.endswith(f"/data/{number}") else content
+        return name, content[: int(share * len(content))] if name.endswith(
+            f"/data/{number}"
+        ) else content
 
     return "checkpoint", _with_entries(cut), "refused"
 
@@ -63,20 +69,29 @@ def other_byte_order(_):
     def swapped(name, content):
         if name.endswith("byteorder"):
             return name, b"big"
-        return name, np.frombuffer(content, "<f4").byteswap().tobytes() if "/data/" in name else content
+        return name, np.frombuffer(
+            content, "<f4"
+        ).byteswap().tobytes() if "/data/" in name else content
 
     return "checkpoint", _with_entries(swapped), "any", _checkpoint()[1]
 
 
 def unknown_byte_order(rng):
     def other(name, content):
-        return name, rng.choice((b"", b"middle", b"big\0")) if name.endswith("byteorder") else content
+        return name, rng.choice((b"", b"middle", b"big\0")) if name.endswith(
+            "byteorder"
+        ) else content
 
     return "checkpoint", _with_entries(other), "any", _checkpoint()[1]
 
 
 def zipped_anew(_):
-    return "checkpoint", _with_entries(lambda *entry: entry, zipfile.ZIP_DEFLATED), "any", _checkpoint()[1]
+    return (
+        "checkpoint",
+        _with_entries(lambda *entry: entry, zipfile.ZIP_DEFLATED),
+        "any",
+        _checkpoint()[1],
+    )
 
 
 def storage_changed(rng):
@@ -117,9 +132,12 @@ def _compressed_without(names):
 
 
 def bounds_missing(rng):
-    """Some, not all, of a compressed .ply's bounds of colours, or one of its positions or scales."""
+    """Some, not all, of a compressed .ply's bounds of colours, or one of its positions
+    or scales."""
     colors = [f"{end}_{axis}" for end in ("min", "max") for axis in "rgb"]
-    others = [f"{end}{kind}_{axis}" for end in ("min", "max") for kind in ("", "_scale") for axis in "xyz"]
+    others = [
+        f"{end}{kind}_{axis}" for end in ("min", "max") for kind in ("", "_scale") for axis in "xyz"
+    ]
     names = rng.sample(colors, rng.randrange(1, 6)) if rng.random() < 0.7 else [rng.choice(others)]
     return "compressed", _compressed_without(names), "refused"
 
@@ -171,10 +189,26 @@ def value_of_another_type(rng):
     files = dict(sog.encode(_asset()))
     meta = json.loads(files["meta.json"])
     holder, key = rng.choice(
-        [(meta, key) for key in meta] + [(v, k) for v in meta.values() if isinstance(v, dict) for k in v]
+        [(meta, key) for key in meta]
+        + [(v, k) for v in meta.values() if isinstance(v, dict) for k in v]
     )
     holder[key] = rng.choice(
-        (None, True, -1, 1.5, 1e400, 1 << 64, "", "1", [], [[]], {}, [None] * 256, ["/etc/passwd"] * 2, "\n")
+        (
+            None,
+            True,
+            -1,
+            1.5,
+            1e400,
+            1 << 64,
+            "",
+            "1",
+            [],
+            [[]],
+            {},
+            [None] * 256,
+            ["/etc/passwd"] * 2,
+            "\n",
+        )
     )
     files["meta.json"] = json.dumps(meta).encode()
     return "sog", {"a.sog": zip_bytes(files.items())}, "any"
@@ -191,19 +225,30 @@ def digits_of_a_camera(rng):
     value = rng.choice((5e-324, 1e-310, 3.141592653589793, 1e308, -0.0, 1 << 70, "0.8", True, None))
     target = rng.choice((document, document["frames"][0]))
     target[
-        rng.choice(("camera_angle_x", "camera_angle_y", "w", "h", "fl_x", "fl_y", "cx", "cy", "near", "k1"))
+        rng.choice(
+            ("camera_angle_x", "camera_angle_y", "w", "h", "fl_x", "fl_y", "cx", "cy", "near", "k1")
+        )
     ] = value
     return "cameras", {"transforms.json": json.dumps(document).encode()}, "any"
 
 
 def digits_of_a_scene(rng):
     value = rng.choice((5e-324, 1e-310, 1e39, 1e308, 3.2, -0.0, 1 << 70, "1", True, None))
-    camera = {"name": "a", "width": 64, "height": 48, "eye": [0, -8, 2], "target": [0, 0, 0], "fov_x": 1.0}
+    camera = {
+        "name": "a",
+        "width": 64,
+        "height": 48,
+        "eye": [0, -8, 2],
+        "target": [0, 0, 0],
+        "fov_x": 1.0,
+    }
     instance = {"bundle": "a", "position": [0, 0, 0], "scale": 1.0, "importance": 1.0}
     target = rng.choice((camera, instance))
     target[
         rng.choice(
-            ("fov_x", "width", "near", "eye") if target is camera else ("scale", "importance", "position")
+            ("fov_x", "width", "near", "eye")
+            if target is camera
+            else ("scale", "importance", "position")
         )
     ] = value
     document = {

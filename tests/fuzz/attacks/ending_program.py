@@ -2,8 +2,8 @@
 
 ending_program.py WORK ENDING NUM_THREADS SECONDS GAP
 
-It says on stdout when it begins to end, in seconds of the monotonic clock. Work is done in the folder that
-it is started in, which has a.ply and a.v3dg.
+It says on stdout when it begins to end, in seconds of the monotonic clock. Work is done
+in the folder that it is started in, which has a.ply and a.v3dg.
 """
 
 import atexit
@@ -16,14 +16,17 @@ import threading
 import time
 
 if __name__ == "__main__":
-    atexit.register(lambda: draw_last())  # handlers run in reverse: this one after all of the package's
+    atexit.register(
+        lambda: draw_last()
+    )  # handlers run in reverse: this one after all of the package's
 
 import numpy as np
 
 import v3dg
 
 CAMERAS = [
-    v3dg.Camera.look_at((9 * np.cos(k), 9 * np.sin(k), 2), (0, 0, 0), width=120, height=90) for k in range(16)
+    v3dg.Camera.look_at((9 * np.cos(k), 9 * np.sin(k), 2), (0, 0, 0), width=120, height=90)
+    for k in range(16)
 ]
 QUICK = v3dg.BuildConfig(steps=1, num_views=2, cluster_size=64)
 MEMORY = 64 << 10
@@ -162,13 +165,16 @@ def render_once():
 
 
 def end(how, work, gap):
-    """End in a way; what returns from here is followed by the end of the main module."""
+    """End in a way; what returns from here is followed by the end of the main
+    module."""
     if how == "handler renders":
         atexit.register(render_once)
     if how == "handler starts threads":
 
         def start():
-            with contextlib.suppress(RuntimeError):  # since Python 3.12 there are no threads any more
+            with contextlib.suppress(
+                RuntimeError
+            ):  # since Python 3.12 there are no threads any more
                 threading.Thread(target=go_on, args=(work,), daemon=True).start()
                 time.sleep(gap)
 

@@ -1,4 +1,5 @@
-"""Programs that end in every way while daemon threads are in every call: with the right code, and soon."""
+"""Programs that end in every way while daemon threads are in every call: with the right
+code, and soon."""
 
 import re
 import signal
@@ -17,7 +18,8 @@ from random_bundle import random_gaussians
 LIMIT_S = 120
 SOON_S = 15  # on a machine with much else to do
 PROGRAM = [sys.executable, str(Path(__file__).with_name("ending_program.py"))]
-# Exit codes by how a program ends. An interrupt that comes in an exit handler is printed and forgotten.
+# Exit codes by how a program ends. An interrupt that comes in an exit handler is
+# printed and forgotten.
 ENDINGS = {
     "return": {0},
     "sys.exit": {3},
@@ -30,7 +32,13 @@ ENDINGS = {
     "last handler renders": {0},
     "thread that is waited for": {0},
 }
-ABORTS = ("terminate called", "FATAL: exception", "Fatal Python error", "Segmentation", "pybind11::handle")
+ABORTS = (
+    "terminate called",
+    "FATAL: exception",
+    "Fatal Python error",
+    "Segmentation",
+    "pybind11::handle",
+)
 
 
 def prepare(shared):
@@ -63,7 +71,9 @@ class Attack:
 def ended(folder, work, ending, num_threads, seconds, gap):
     """The outcome of a program in a folder with the files of `prepare`."""
     arguments = [work, ending, str(num_threads), str(seconds), str(gap)]
-    several = environment() | {"OMP_NUM_THREADS": "2"}  # threads of OpenMP work while the program ends, too
+    several = environment() | {
+        "OMP_NUM_THREADS": "2"
+    }  # threads of OpenMP work while the program ends, too
     end = run(arguments, folder, program=PROGRAM, limit_s=60, environment=several)
     now = time.monotonic()
     said = re.search(r"^ends ([\d.]+)$", end.out, re.MULTILINE)

@@ -1,8 +1,10 @@
-"""Exports into strange folders: nothing of others is touched, and what was there is whole after a failure.
+"""Exports into strange folders: nothing of others is touched, and what was there is
+whole after a failure.
 
-A folder has files and folders of somebody, links, other names of files elsewhere, earlier exports, perhaps
-changed, records that claim what is not theirs, and perhaps the bundle that is exported. All that is below the
-work folder is compared before and after, by kinds, permissions, targets of links and hashes.
+A folder has files and folders of somebody, links, other names of files elsewhere,
+earlier exports, perhaps changed, records that claim what is not theirs, and perhaps the
+bundle that is exported. All that is below the work folder is compared before and after,
+by kinds, permissions, targets of links and hashes.
 """
 
 import contextlib
@@ -27,8 +29,22 @@ RECORD = "v3dg-export.json"
 WRITERS = {"sog": write_streamed_sog, "site": write_site, "tiles": write_tiles}
 ERRORS = (ValueError, OSError, RuntimeError)
 # Names that exports use, and others.
-OURS = ("index.html", "lod-meta.json", "site.json", "tileset.json", "settings.json", "playcanvas.min.mjs")
-BELOW = ("0_0/meta.json", "0_0/sh0.webp", "1_0/meta.json", "a/tileset.json", "a/0_0.glb", "a/asset.glb")
+OURS = (
+    "index.html",
+    "lod-meta.json",
+    "site.json",
+    "tileset.json",
+    "settings.json",
+    "playcanvas.min.mjs",
+)
+BELOW = (
+    "0_0/meta.json",
+    "0_0/sh0.webp",
+    "1_0/meta.json",
+    "a/tileset.json",
+    "a/0_0.glb",
+    "a/asset.glb",
+)
 OTHERS = (
     ".git/HEAD",
     ".git/objects/ab/cd",
@@ -111,7 +127,9 @@ class Attack:
         kind = rng.choice(list(WRITERS if subject.suffix == ".v3dg" else ("site", "tiles")))
         overwrite = rng.random() < 0.4
         output = self._output(rng, work, folder)
-        way = rng.choices(("call", "command", "stopped", "failing", "two at once"), (4, 4, 3, 3, 1))[0]
+        way = rng.choices(
+            ("call", "command", "stopped", "failing", "two at once"), (4, 4, 3, 3, 1)
+        )[0]
         moment = rng.randrange(1, 40)
         written = self._reference(kind, subject, work)
         what = f"{way}, {kind}{', overwriting' if overwrite else ''}"
@@ -127,14 +145,17 @@ class Attack:
             fault = fault_of(before, after, recorded, written, error, overwrite)
             if fault is None and isinstance(error, str) and "\n" in error:
                 fault = f"an error of several lines: {error!a}"
-            is_stopped = error is not None and ("KeyboardInterrupt" in error or os.strerror(28) in error)
+            is_stopped = error is not None and (
+                "KeyboardInterrupt" in error or os.strerror(28) in error
+            )
             name = "stopped" if is_stopped else "refused" if error else "exported"
             return Outcome("fault" if fault else name, fault)
 
         return what, do
 
     def _subject(self, rng, work, folder):
-        """What is exported, in a folder of its own or in the one that is exported to."""
+        """What is exported, in a folder of its own or in the one that is exported
+        to."""
         (work / "cwd").mkdir()
         place = folder / rng.choice(("", "0_0", "data")) if rng.random() < 0.1 else work / "input"
         place.mkdir(parents=True, exist_ok=True)
@@ -143,7 +164,8 @@ class Attack:
         return place / rng.choice(("a.v3dg", "b.v3dg", "town.json"))
 
     def _fill(self, rng, work, folder):
-        """Put things into the folder; returns what exports wrote and nobody changed, by name."""
+        """Put things into the folder; returns what exports wrote and nobody changed, by
+        name."""
         if rng.random() < 0.1 and not folder.exists():
             return {}
         recorded = {}
@@ -153,7 +175,9 @@ class Attack:
         if rng.random() < 0.7:
             with contextlib.suppress(*ERRORS):
                 kind = rng.choice(list(WRITERS))
-                WRITERS[kind](v3dg.Bundle.open(self._shared / rng.choice(("a.v3dg", "b.v3dg"))), folder)
+                WRITERS[kind](
+                    v3dg.Bundle.open(self._shared / rng.choice(("a.v3dg", "b.v3dg"))), folder
+                )
                 recorded = {name: entry for name, entry in snapshot(folder).items()}
         for _ in range(rng.choice((0, 0, 1, 2, 8))):
             rng.choice(acts)(rng, work, folder)
@@ -344,9 +368,14 @@ def _stopped(way, moment):
 
 
 def fault_of(before, after, recorded, written, error, overwrite):
-    """What is wrong with all that is below the work folder after an export, which may have ended or not."""
+    """What is wrong with all that is below the work folder after an export, which may
+    have ended or not."""
     files = {name: entry for name, entry in written.items() if is_file(entry) and name != RECORD}
-    missing = [name for name, entry in files.items() if after.get(f"project/{name}", (0, ""))[1] != entry[1]]
+    missing = [
+        name
+        for name, entry in files.items()
+        if after.get(f"project/{name}", (0, ""))[1] != entry[1]
+    ]
     changes = _differs(before, after)
     has_ended = error is None or (error == "KeyboardInterrupt" and not missing)
     if not has_ended:
@@ -359,13 +388,18 @@ def fault_of(before, after, recorded, written, error, overwrite):
 
 
 def fault_of_changes(before, after, recorded, written, overwrite):
-    """Whether anything of others was touched, or anything is new that is not of the export."""
+    """Whether anything of others was touched, or anything is new that is not of the
+    export."""
     for path in _differs(before, after):
         name = path.removeprefix("project/") if path.startswith("project/") else None
         old, new = before.get(path), after.get(path)
         is_new = old is None and (name in written or path == "project")
         is_replaced = (
-            overwrite and name in written and None not in (old, new) and is_file(old) and is_file(new)
+            overwrite
+            and name in written
+            and None not in (old, new)
+            and is_file(old)
+            and is_file(new)
         )
         if not (is_new or is_replaced or name in recorded):
             return f"touched {path!a}: {old} is now {new}"
@@ -373,4 +407,6 @@ def fault_of_changes(before, after, recorded, written, overwrite):
 
 
 def _differs(before, after):
-    return sorted(name for name in before.keys() | after.keys() if before.get(name) != after.get(name))
+    return sorted(
+        name for name in before.keys() | after.keys() if before.get(name) != after.get(name)
+    )

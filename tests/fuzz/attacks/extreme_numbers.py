@@ -1,9 +1,10 @@
-"""Gaussians, cameras and poses of extreme numbers: zeros, denormal and huge ones, infinite ones and NaN.
+"""Gaussians, cameras and poses of extreme numbers: zeros, denormal and huge ones,
+infinite ones and NaN.
 
-Pictures are finite, whatever is drawn, and gradients are numbers where float32 can hold them. Pictures of
-sizes, distances and lengths of quaternions over many decades are the float64 reference's within the bounds of
-docs/numerics.md. Cuts are the same with every instruction set: a process for each of the others answers with
-digests.
+Pictures are finite, whatever is drawn, and gradients are numbers where float32 can hold
+them. Pictures of sizes, distances and lengths of quaternions over many decades are the
+float64 reference's within the bounds of docs/numerics.md. Cuts are the same with every
+instruction set: a process for each of the others answers with digests.
 """
 
 import dataclasses
@@ -61,7 +62,8 @@ class Attack:
 
 
 class Other:
-    """A process that chooses cuts with another instruction set; none where the machine lacks that."""
+    """A process that chooses cuts with another instruction set; none where the machine
+    lacks that."""
 
     def __init__(self, name):
         self.name = name
@@ -88,18 +90,24 @@ def answer_with_digests():
 
 
 def camera_of(rng):
-    """A camera somewhere near the origin, of any focal length that a picture can have."""
+    """A camera somewhere near the origin, of any focal length that a picture can
+    have."""
     eye = rng.normal(size=3) * 3
     width = int(rng.integers(1, 40))
     height = int(rng.integers(1, 40))
     fov_x = float(rng.choice((0.1, 0.3, 1.0, 2.5)))
-    return v3dg.Camera.look_at(eye, eye + rng.normal(size=3), width=width, height=height, fov_x=fov_x)
+    return v3dg.Camera.look_at(
+        eye, eye + rng.normal(size=3), width=width, height=height, fov_x=fov_x
+    )
 
 
 def usual_arrays(rng, count, camera):
     """Gaussians in front of the camera, as (N, ...) arrays of doubles."""
     to_world = camera.viewmat[:3, :3].T
-    slopes = rng.uniform(-0.6, 0.6, (count, 2)) * [camera.width / camera.fx, camera.height / camera.fy]
+    slopes = rng.uniform(-0.6, 0.6, (count, 2)) * [
+        camera.width / camera.fx,
+        camera.height / camera.fy,
+    ]
     depths = np.linspace(1.0, 4.0, count)
     rays = np.column_stack([slopes, np.ones(count)]) * depths[:, None]
     size_px = np.exp(rng.uniform(math.log(0.3), math.log(8.0), (count, 1)))
@@ -118,7 +126,8 @@ def gaussians_of(arrays):
 
 
 def extreme_fault(seed):
-    """What is not finite in a picture of gaussians with extreme values, or in its gradients."""
+    """What is not finite in a picture of gaussians with extreme values, or in its
+    gradients."""
     rng = np.random.default_rng(seed)
     camera = camera_of(rng)
     arrays = usual_arrays(rng, 50, camera)
@@ -148,7 +157,8 @@ def extreme_fault(seed):
 
 
 def reference_fault(seed):
-    """How a picture of gaussians over many decades differs from the float64 reference's."""
+    """How a picture of gaussians over many decades differs from the float64
+    reference's."""
     rng = np.random.default_rng(seed)
     camera = camera_of(rng)
     arrays = usual_arrays(rng, 30, camera)

@@ -1,7 +1,8 @@
-"""Broken files for every reader: each is read, or refused in one line that names it, at a bounded cost.
+"""Broken files for every reader: each is read, or refused in one line that names it, at
+a bounded cost.
 
-Most tries change a good file: its bytes, what is packed in it, or the file itself while it is read. The
-others are made to cost much, or damaged in a way that must be noticed.
+Most tries change a good file: its bytes, what is packed in it, or the file itself while
+it is read. The others are made to cost much, or damaged in a way that must be noticed.
 """
 
 import contextlib
@@ -24,11 +25,13 @@ from fuzz.attacks.pool import Outcome
 from v3dg.cli import main
 
 LIMIT_S = 60  # a hang
-# The bounds of docs/robustness.md, beyond what was held before: MB, and bytes for each byte on the disk,
-# gaussian and byte of JSON; of a picture that is compared, for each pixel.
+# The bounds of docs/robustness.md, beyond what was held before: MB, and bytes for each
+# byte on the disk, gaussian and byte of JSON; of a picture that is compared, for each
+# pixel.
 MOST_MB, A_BYTE, A_GAUSSIAN, A_BYTE_OF_JSON, A_PIXEL = 100, 8, 400, 40, 250
 BELIEVED = 1 << 18  # gaussians of a file of any size; beyond them one for each of its bytes
-# Seconds of one core, which other work on the machine makes slower: and for each million bytes and gaussians.
+# Seconds of one core, which other work on the machine makes slower: and for each
+# million bytes and gaussians.
 MOST_SECONDS, A_MILLION = 5, 3
 ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 
@@ -51,7 +54,9 @@ def compare_picture(path):
     said = io.StringIO()
     beside = path.with_name("b.png")
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
-        code = main(["compare", str(path), str(beside), "-o", str(path.with_name("out.png")), "--quiet"])
+        code = main(
+            ["compare", str(path), str(beside), "-o", str(path.with_name("out.png")), "--quiet"]
+        )
     if code:
         raise ValueError(re.sub("^v3dg: error: ", "", said.getvalue().rstrip("\n")))
     return []
@@ -82,7 +87,12 @@ def read_cameras(path):
     return [camera.viewmat for camera in v3dg.read_cameras(path, size=(64, 48)).values()]
 
 
-READERS = {"bundle": read_bundle, "scene": read_scene, "cameras": read_cameras, "picture": read_picture}
+READERS = {
+    "bundle": read_bundle,
+    "scene": read_scene,
+    "cameras": read_cameras,
+    "picture": read_picture,
+}
 
 
 class Attack:
@@ -123,7 +133,9 @@ class Attack:
             return f"{kind}: {what}", self._reading(kind, work, files, must=must, arrays=arrays)
         arrays = self._known(kind, index, work)
         if action < 0.22:
-            return f"{kind}: changed while it is read", self._while_it_is_changed(rng, kind, index, work)
+            return f"{kind}: changed while it is read", self._while_it_is_changed(
+                rng, kind, index, work
+            )
         other = rng.choice(rng.choice([*self._good.values()])).content
         own = changes.OWN.get(kind, changes.bytes_changed)
         change = own if rng.random() < 0.5 else rng.choice(changes.BYTES)
@@ -135,10 +147,24 @@ class Attack:
                 del files[name]
         else:
             files = good.with_content(change(good.content, rng, other)).files
-        is_noticed = good.is_hashed and change in (changes.flipped, changes.truncated, changes.overwritten)
+        is_noticed = good.is_hashed and change in (
+            changes.flipped,
+            changes.truncated,
+            changes.overwritten,
+        )
         if rng.random() < 0.03:  # by a name of another kind
             name = rng.choice(
-                ("a.ply", "a.spz", "a.splat", "a.ksplat", "a.sog", "a.pt", "meta.json", "A.PLY", "a.v3dg")
+                (
+                    "a.ply",
+                    "a.spz",
+                    "a.splat",
+                    "a.ksplat",
+                    "a.sog",
+                    "a.pt",
+                    "meta.json",
+                    "A.PLY",
+                    "a.v3dg",
+                )
             )
             kind = "bundle" if name.endswith("v3dg") else "ply"
             files, is_noticed = {name: files[good.name], **files}, False
@@ -170,7 +196,12 @@ class Attack:
                 fault = f"was refused, and should be read: {text}"
             if fault is None and count is not None and len(found[0]) != count:
                 fault = f"expected {count} gaussians, got {len(found[0])}"
-            if fault is None and arrays is not None and found is not None and not _are_same(found, arrays):
+            if (
+                fault is None
+                and arrays is not None
+                and found is not None
+                and not _are_same(found, arrays)
+            ):
                 fault = "was read, but not as it was before the damage"
             if self._started.exists():
                 self._started.unlink()
@@ -181,17 +212,21 @@ class Attack:
         return do
 
     def _while_it_is_changed(self, rng, kind, index, work):
-        """At one of the calls that reading makes, the file is cut, grown, written to, replaced or removed."""
+        """At one of the calls that reading makes, the file is cut, grown, written to,
+        replaced or removed."""
         good = self._good[kind][index]
         path = _put(work, good.files)
-        # What stands there afterwards may be a pipe, which our own look at its size would wait for.
+        # What stands there afterwards may be a pipe, which our own look at its size
+        # would wait for.
         read = compare_picture if kind == "picture" else _reader(kind)
         if (kind, index) not in self._num_calls:
             with _at_call(None, lambda: None) as calls:
                 read(path)
             self._num_calls[kind, index] = max(1, calls[0])
         call = rng.randrange(self._num_calls[kind, index])
-        victim = path.with_name(Path(rng.choice(list(good.files))).name) if rng.random() < 0.2 else path
+        victim = (
+            path.with_name(Path(rng.choice(list(good.files))).name) if rng.random() < 0.2 else path
+        )
         size = rng.randrange(len(good.content))
         action = rng.choice(
             (
@@ -216,7 +251,8 @@ class Attack:
 
 @contextlib.contextmanager
 def _at_call(number, action):
-    """Does something at the call of that number, of those that follow, in Python or from it."""
+    """Does something at the call of that number, of those that follow, in Python or
+    from it."""
     calls = [0]
 
     def count(*_):
@@ -276,5 +312,6 @@ _OS_ERRORS = (OSError, FileNotFoundError, IsADirectoryError, NotADirectoryError,
 
 def _are_same(found, arrays):
     return len(found) == len(arrays) and all(
-        a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in zip(found, arrays, strict=True)
+        a.shape == b.shape and a.tobytes() == b.tobytes()
+        for a, b in zip(found, arrays, strict=True)
     )

@@ -1,4 +1,5 @@
-"""One small good file of each kind that is read, to be changed: its place, and what else lies beside it."""
+"""One small good file of each kind that is read, to be changed: its place, and what
+else lies beside it."""
 
 import dataclasses
 import io
@@ -24,7 +25,8 @@ class Good:
 
     kind: str
     files: dict
-    # What detects every change of its bytes: no other content may come of them than what was there.
+    # What detects every change of its bytes: no other content may come of them than
+    # what was there.
     is_hashed: bool = False
 
     @property
@@ -71,7 +73,9 @@ def _formats(folder):
         (1, ".sog"),
     ):
         path = folder / f"good{suffix}"
-        v3dg.write_asset(path, random_gaussians(np.random.default_rng(degree), 300 // (degree + 1), degree))
+        v3dg.write_asset(
+            path, random_gaussians(np.random.default_rng(degree), 300 // (degree + 1), degree)
+        )
         kind = suffix[1:].replace("compressed.ply", "compressed")
         yield Good(kind, {f"a{suffix}": path.read_bytes()}, is_hashed=suffix in (".spz", ".sog"))
     for path in sorted(FIXTURES.iterdir()):
@@ -89,7 +93,10 @@ def streamed(num_folders, names=None, **more):
     parts = sog.encode(random_gaussians(np.random.default_rng(2), 40, 0))
     names = names or [f"{i}/meta.json" for i in range(num_folders)]
     box = {"min": [-9.0] * 3, "max": [9.0] * 3}
-    leaves = [{"bound": box, "lods": {"0": {"file": i, "offset": 0, "count": 40}}} for i in range(len(names))]
+    leaves = [
+        {"bound": box, "lods": {"0": {"file": i, "offset": 0, "count": 40}}}
+        for i in range(len(names))
+    ]
     index = {
         "version": 1,
         "filenames": names,
@@ -111,7 +118,9 @@ def _checkpoints():
     tensors = gsplat_tensors(random_gaussians(np.random.default_rng(3), 50, 1))
     yield Good("checkpoint", {"a.pt": checkpoint_bytes(tensors)}, is_hashed=True)
     names = {"sh0": "features_dc", "shN": "features_rest"}
-    values = {f"_model.gauss_params.{names.get(name, name)}": tensor for name, tensor in tensors.items()}
+    values = {
+        f"_model.gauss_params.{names.get(name, name)}": tensor for name, tensor in tensors.items()
+    }
     stream = io.BytesIO()
     torch.save({"pipeline": values}, stream)
     yield Good("checkpoint", {"a.ckpt": stream.getvalue()}, is_hashed=True)
@@ -120,7 +129,9 @@ def _checkpoints():
 def _bundles(folder):
     for seed, levels in ((0, 1), (1, 3), (2, 4)):
         path = folder / "good.v3dg"
-        random_bundle(seed, num_levels=levels, sh_degree=seed % 2, config={"seed": seed}).write(path)
+        random_bundle(seed, num_levels=levels, sh_degree=seed % 2, config={"seed": seed}).write(
+            path
+        )
         yield Good("bundle", {"a.v3dg": path.read_bytes()}, is_hashed=True)
 
 
@@ -145,8 +156,21 @@ def _documents():
         "bundles": {"a": "a.v3dg", "b": "sub/b.v3dg"},
         "instances": [{"bundle": "a", **pose}, {"bundle": "b", "position": [0, 0, 0]}],
         "cameras": [
-            {"name": "eye", **size, "eye": [0, -8, 2], "target": [0, 0, 0], "up": [0, 0, 1], "fov_x": 1},
-            {"name": "matrices", **size, "near": 0.1, "viewmat": matrix, "K": np.diag([50, 50, 1]).tolist()},
+            {
+                "name": "eye",
+                **size,
+                "eye": [0, -8, 2],
+                "target": [0, 0, 0],
+                "up": [0, 0, 1],
+                "fov_x": 1,
+            },
+            {
+                "name": "matrices",
+                **size,
+                "near": 0.1,
+                "viewmat": matrix,
+                "K": np.diag([50, 50, 1]).tolist(),
+            },
         ],
     }
     flat = {
@@ -156,13 +180,34 @@ def _documents():
         "instances": [pose],
         "cameras": [{"name": "0", **size, "fov_x": 0.8, "fov_y": 0.6, "transform_matrix": matrix}],
     }
-    camera = {"camera_name": "0", "camera_width": 64, "camera_height": 48, "transform_matrix": matrix}
+    camera = {
+        "camera_name": "0",
+        "camera_width": 64,
+        "camera_height": 48,
+        "transform_matrix": matrix,
+    }
     angles = {"camera_angle_x": 0.8, "camera_angle_y": 0.6}
     instance = {"positions": [1, 2, 3], "quaternions": [1, 0, 0, 0], "scale": 2}
-    asset = {"asset_kind": "k", "asset_name": "a", "ply_suffix": "p/fused.ply", "instances": [instance]}
-    layouts = {"layouts": [{"layout_name": "0", "assets": [asset], "cameras": [{**camera, **angles}] * 2}]}
+    asset = {
+        "asset_kind": "k",
+        "asset_name": "a",
+        "ply_suffix": "p/fused.ply",
+        "instances": [instance],
+    }
+    layouts = {
+        "layouts": [{"layout_name": "0", "assets": [asset], "cameras": [{**camera, **angles}] * 2}]
+    }
     frames = [{"file_path": f"{i}.png", "transform_matrix": matrix} for i in range(2)]
-    lens = {"camera_model": "OPENCV", "fl_x": 50, "fl_y": 60, "cx": 32, "cy": 24, "w": 64, "h": 48, "k1": 0}
+    lens = {
+        "camera_model": "OPENCV",
+        "fl_x": 50,
+        "fl_y": 60,
+        "cx": 32,
+        "cy": 24,
+        "w": 64,
+        "h": 48,
+        "k1": 0,
+    }
     documents = (scene, flat, layouts, {**lens, "frames": frames}, {**angles, "frames": frames})
     yield from (json.dumps(document).encode() for document in documents)
 

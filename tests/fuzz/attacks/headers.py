@@ -1,8 +1,9 @@
 """Requests to the viewer whose headers say odd things of where they come from.
 
-An answer is the page, a connection, or a refusal of a client's fault, never an error of the server's, and it
-tells browsers to show it to no other page. What is let in names this machine and no other page. Where a
-request is no HTTP at all, the connection is closed without an answer.
+An answer is the page, a connection, or a refusal of a client's fault, never an error of
+the server's, and it tells browsers to show it to no other page. What is let in names
+this machine and no other page. Where a request is no HTTP at all, the connection is
+closed without an answer.
 """
 
 import ipaddress
@@ -23,12 +24,52 @@ _SECONDS = 20
 _ANSWERS = (101, 200, 400, 403, 404, 426)
 _LET_IN = (101, 200, 404)
 
-_HOSTS = ("127.0.0.1:{port}", "localhost:{port}", "LOCALHOST", "[::1]:{port}", "127.8.7.6:9999", "[::1]")
-_OTHER_HOSTS = ("evil.example", "[", "[]", "]", "[::1", "::1]", "[[::1]]", "127.0.0.1@evil.example", "")
-_OTHER_HOSTS += ("evil.example@127.0.0.1", "127.0.0.1:evil", "[v1.a]", "[fe80::1%25eth0]", "2130706433", ":")
-_OTHER_HOSTS += ("localhost.", "0x7f.1", "127.1", "[::ffff:127.0.0.1]", "192.0.2.1", "//127.0.0.1", "\\\\a")
+_HOSTS = (
+    "127.0.0.1:{port}",
+    "localhost:{port}",
+    "LOCALHOST",
+    "[::1]:{port}",
+    "127.8.7.6:9999",
+    "[::1]",
+)
+_OTHER_HOSTS = (
+    "evil.example",
+    "[",
+    "[]",
+    "]",
+    "[::1",
+    "::1]",
+    "[[::1]]",
+    "127.0.0.1@evil.example",
+    "",
+)
+_OTHER_HOSTS += (
+    "evil.example@127.0.0.1",
+    "127.0.0.1:evil",
+    "[v1.a]",
+    "[fe80::1%25eth0]",
+    "2130706433",
+    ":",
+)
+_OTHER_HOSTS += (
+    "localhost.",
+    "0x7f.1",
+    "127.1",
+    "[::ffff:127.0.0.1]",
+    "192.0.2.1",
+    "//127.0.0.1",
+    "\\\\a",
+)
 _ORIGINS = ("http://{host}", "https://{host}", "HTTP://{host}")
-_OTHER_ORIGINS = ("null", "", "http://", "http://[", "http://evil.example", "http://evil@{host}", "{host}")
+_OTHER_ORIGINS = (
+    "null",
+    "",
+    "http://",
+    "http://[",
+    "http://evil.example",
+    "http://evil@{host}",
+    "{host}",
+)
 _OTHER_ORIGINS += (
     "http://{host}.evil.example",
     "http://{host}/",
@@ -36,10 +77,40 @@ _OTHER_ORIGINS += (
     "blob:http://{host}",
     "http://]",
 )
-_SITES = ("same-origin", "none", "same-site", "cross-site", "Same-Origin", "same-origin, none", "", "?1")
+_SITES = (
+    "same-origin",
+    "none",
+    "same-site",
+    "cross-site",
+    "Same-Origin",
+    "same-origin, none",
+    "",
+    "?1",
+)
 _MODES = ("navigate", "no-cors", "cors", "websocket", "same-origin", "nested-navigate", "")
-_DESTINATIONS = ("document", "image", "script", "iframe", "frame", "embed", "object", "empty", "worker", "")
-_PATHS = ("/", "/index.html", "/main.js", "/connection", "/photograph/0", "/thumbnail/0", "/?a=[", "//", "*")
+_DESTINATIONS = (
+    "document",
+    "image",
+    "script",
+    "iframe",
+    "frame",
+    "embed",
+    "object",
+    "empty",
+    "worker",
+    "",
+)
+_PATHS = (
+    "/",
+    "/index.html",
+    "/main.js",
+    "/connection",
+    "/photograph/0",
+    "/thumbnail/0",
+    "/?a=[",
+    "//",
+    "*",
+)
 _UPGRADE = (
     ("Upgrade", "websocket"),
     ("Connection", "Upgrade"),
@@ -80,9 +151,12 @@ class Attack:
         return "requests", do
 
     def _answer(self, path, headers):
-        """All that the server says before it closes the connection, or begins to speak of the scene."""
+        """All that the server says before it closes the connection, or begins to speak
+        of the scene."""
         lines = [b"GET " + path + b" HTTP/1.1", *(name + b": " + value for name, value in headers)]
-        with socket.create_connection(("127.0.0.1", self._site.port), timeout=_SECONDS) as connection:
+        with socket.create_connection(
+            ("127.0.0.1", self._site.port), timeout=_SECONDS
+        ) as connection:
             connection.sendall(b"\r\n".join(lines) + b"\r\n\r\n")
             said = b""
             while b"\r\n\r\n" not in said:
@@ -94,7 +168,8 @@ class Attack:
 
 
 def _request(rng, port):
-    """A path and headers: of a browser, with some of them exchanged, damaged, left out or there twice."""
+    """A path and headers: of a browser, with some of them exchanged, damaged, left out
+    or there twice."""
     host = rng.choice(_HOSTS if rng.random() < 0.7 else _OTHER_HOSTS).format(port=port)
     headers = [("Host", host)]
     if rng.random() < 0.5:
@@ -123,7 +198,8 @@ def _request(rng, port):
 
 
 def _damaged(rng, value):
-    """The text with a few bytes more, fewer or others; no line ends, which would begin another header."""
+    """The text with a few bytes more, fewer or others; no line ends, which would begin
+    another header."""
     damaged = bytearray(value)
     for _ in range(rng.choice((1, 1, 2, 5))):
         place = rng.randrange(len(damaged) + 1)
@@ -156,7 +232,9 @@ def _fault_of(answer, path, headers):
     if any(origin.lower() not in origins for origin in fields.get(b"origin", ())):
         return f"expected a refusal of the origin, got {status}"
     is_own = all(site in (b"same-origin", b"none") for site in fields.get(b"sec-fetch-site", ()))
-    is_tab = fields.get(b"sec-fetch-mode") == [b"navigate"] and fields.get(b"sec-fetch-dest") == [b"document"]
+    is_tab = fields.get(b"sec-fetch-mode") == [b"navigate"] and fields.get(b"sec-fetch-dest") == [
+        b"document"
+    ]
     is_page = path.partition(b"?")[0] in (b"/", b"/index.html") and status == 200
     if not is_own and not (is_tab and is_page):
         return f"expected a refusal of another site, got {status}"

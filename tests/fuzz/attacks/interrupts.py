@@ -1,7 +1,8 @@
-"""Ctrl-C at a random moment of every command, once or twice, to one process or to all of the terminal's.
+"""Ctrl-C at a random moment of every command, once or twice, to one process or to all
+of the terminal's.
 
-The command ends soon, with one line and 130 unless it had finished, leaves no process behind, and of each
-file that it writes all or nothing.
+The command ends soon, with one line and 130 unless it had finished, leaves no process
+behind, and of each file that it writes all or nothing.
 """
 
 import contextlib
@@ -33,7 +34,8 @@ from random_bundle import random_gaussians
 
 LIMIT_S = 100
 PACKAGE = os.path.dirname(v3dg.__file__) + os.sep
-# What runs before Ctrl-C is heard is Python's start and the import of one small module of ours.
+# What runs before Ctrl-C is heard is Python's start and the import of one small module
+# of ours.
 OURS = re.compile(re.escape(PACKAGE) + r"(?!__init__\.py\", line 3, |_start\.py)")
 SOON_S = 15  # on a machine with much else to do
 
@@ -124,7 +126,8 @@ class Attack:
         return name, do
 
     def _of_nothing(self, name, work):
-        """The seconds of a command that nothing interrupts, and the files that it writes."""
+        """The seconds of a command that nothing interrupts, and the files that it
+        writes."""
         place = work.parent / f"{work.name}_whole"
         place.mkdir()
         before = names_in(copied(self._shared, place))
@@ -153,7 +156,8 @@ class Attack:
 
 
 def _wait_for(process, out, moment, name, connections):
-    """Until the moment comes; of the viewer, often after it has begun to listen, with others connected."""
+    """Until the moment comes; of the viewer, often after it has begun to listen, with
+    others connected."""
     end = time.monotonic() + moment
     if name == "view, connected":
         port, patience = None, time.monotonic() + 20
@@ -166,7 +170,9 @@ def _wait_for(process, out, moment, name, connections):
             )
             time.sleep(0.02)
         if port is not None:
-            connections.enter_context(contextlib.closing(socket.create_connection(("127.0.0.1", int(port)))))
+            connections.enter_context(
+                contextlib.closing(socket.create_connection(("127.0.0.1", int(port))))
+            )
             with contextlib.suppress(ImportError):
                 from viewer_client import Tab
 
@@ -182,7 +188,9 @@ def _fault(ended: Ended, name):
     if ended.code == -signal.SIGINT and not ended.err:
         return f"left behind: {ended.left}" if ended.left else None  # before Python listened to it
     if "KeyboardInterrupt" in ended.err and ERROR not in ended.err and not OURS.search(ended.err):
-        return f"left behind: {ended.left}" if ended.left else None  # before any of our code was there
+        return (
+            f"left behind: {ended.left}" if ended.left else None
+        )  # before any of our code was there
     is_view = name.startswith("view")
     fault = fault_of(ended, codes=(0, 130), is_heard=not is_view)
     lines = [line for line in shown_lines(ended.err) if not PROGRESS.match(line)]

@@ -1,6 +1,8 @@
-"""SIGKILL at a random moment of a build, a save and a conversion: the file is not there, as it was, or whole.
+"""SIGKILL at a random moment of a build, a save and a conversion: the file is not
+there, as it was, or whole.
 
-A build that is resumed afterwards, perhaps of another asset by then, gives the bytes of one that ran through.
+A build that is resumed afterwards, perhaps of another asset by then, gives the bytes of
+one that ran through.
 """
 
 import os
@@ -22,7 +24,17 @@ LIMIT_S = 200
 SAVE = "import sys, v3dg; v3dg.Bundle.open(sys.argv[1]).write(sys.argv[2])"
 KINDS = {
     "build": (
-        [*COMMAND, "build", "asset.ply", "-o", "out.v3dg", "--quiet", "--device", "cpu", "--resume"],
+        [
+            *COMMAND,
+            "build",
+            "asset.ply",
+            "-o",
+            "out.v3dg",
+            "--quiet",
+            "--device",
+            "cpu",
+            "--resume",
+        ],
         "out.v3dg",
     ),
     "save": ([sys.executable, "-c", SAVE, "large.v3dg", "out.v3dg"], "out.v3dg"),
@@ -40,7 +52,9 @@ def prepare(shared):
         v3dg.write_asset(shared / name, random_gaussians(np.random.default_rng(seed), count, 1))
     config = v3dg.BuildConfig(steps=0)
     asset = v3dg.read_asset(shared / "large.ply")
-    v3dg.build_bundle(asset, config=config, device="cpu", progress=False).write(shared / "large.v3dg")
+    v3dg.build_bundle(asset, config=config, device="cpu", progress=False).write(
+        shared / "large.v3dg"
+    )
 
 
 class Attack:
@@ -60,7 +74,8 @@ class Attack:
         if is_replaced:
             (work / name).write_bytes(b"before")
         moments = [rng.uniform(0, 1.05 * seconds) for _ in range(rng.choice((1, 1, 2, 4)))]
-        # Another asset takes the place of the one that is built, perhaps with its date or an older one.
+        # Another asset takes the place of the one that is built, perhaps with its date
+        # or an older one.
         swaps = what.startswith("build") and rng.random() < 0.4
         date = rng.choice((None, 0, os.stat(work / "asset.ply").st_mtime_ns))
 
@@ -69,7 +84,9 @@ class Attack:
             for moment in moments:
                 ended = run([], work, program=program, limit_s=60, meddle=partial(_kill, moment))
                 if ended.code not in (0, -signal.SIGKILL):
-                    return outcome(ended, fault_of(ended) or f"code {ended.code}: {ended.err[-200:]!a}")
+                    return outcome(
+                        ended, fault_of(ended) or f"code {ended.code}: {ended.err[-200:]!a}"
+                    )
                 found = f" from {_left(work, name)}" if _left(work, name) else ""
                 fault = _fault_of_files(work, before, name, whole, is_replaced)
                 if fault is not None:
@@ -86,9 +103,7 @@ class Attack:
             fault = fault_of(ended, codes=(0,))
             expected = self._of_nothing(what, "other.ply" if swaps else "asset.ply", work)[1]
             if fault is None and (work / name).read_bytes() != expected:
-                fault = (
-                    f"not the bytes of one that nothing stopped{', but of the asset before' if swaps else ''}"
-                )
+                fault = f"not the bytes of one that nothing stopped{', but of the asset before' if swaps else ''}"
             if fault is None and _left(work, name):
                 fault = f"{_left(work, name)} is left beside a whole bundle"
             result = outcome(ended, fault)
@@ -129,7 +144,8 @@ def _kill(moment, process, _):
 
 
 def _fault_of_files(work, before, name, whole, is_replaced):
-    """Whether the file is as it was or whole, and beside it is only what is known to be no file yet."""
+    """Whether the file is as it was or whole, and beside it is only what is known to be
+    no file yet."""
     for path in names_in(work) - before - {name, f"{name}.partial"}:
         if path.startswith(f"{name}.scratch"):  # gone after the next that ends
             continue
@@ -138,4 +154,8 @@ def _fault_of_files(work, before, name, whole, is_replaced):
         (work / path).unlink()
     if not (work / name).exists():
         return f"{name} has gone" if is_replaced else None
-    return None if (work / name).read_bytes() in whole else f"{name} is neither what was there nor whole"
+    return (
+        None
+        if (work / name).read_bytes() in whole
+        else f"{name} is neither what was there nor whole"
+    )

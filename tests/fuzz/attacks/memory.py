@@ -1,4 +1,5 @@
-"""Commands with a limit on memory at a random height, set once their modules are there: done, or one line."""
+"""Commands with a limit on memory at a random height, set once their modules are there:
+done, or one line."""
 
 import resource
 import sys
@@ -8,10 +9,11 @@ from fuzz.attacks.pool import Outcome
 from fuzz.attacks.program import copied, fault_of, make_files, outcome, run
 
 LIMIT_S = 120
-# Modules are loaded, OpenMP's threads are started and the stack has grown before the limit is set: what fails
-# there ends a process without a word. So does NumPy where it finds no memory for the buffers of an operation,
-# 64 kB each (PyErr_NoMemory of npyiter_allocate_buffers, without the GIL, 2.4): they are made small. Pillow
-# would not say why it knows no format whose module could not be loaded.
+# Modules are loaded, OpenMP's threads are started and the stack has grown before the
+# limit is set: what fails there ends a process without a word. So does NumPy where it
+# finds no memory for the buffers of an operation, 64 kB each (PyErr_NoMemory of
+# npyiter_allocate_buffers, without the GIL, 2.4): they are made small. Pillow would not
+# say why it knows no format whose module could not be loaded.
 PROGRAM = """
 import contextlib, importlib, json, pkgutil, resource, sys
 import numpy, PIL.Image, zstandard
@@ -56,7 +58,9 @@ class Attack:
         program = [sys.executable, "-c", PROGRAM, str(more)]
 
         def do():
-            ended = run(COMMANDS[name], work, program=program, limit_s=90, most=resource.RLIM_INFINITY)
+            ended = run(
+                COMMANDS[name], work, program=program, limit_s=90, most=resource.RLIM_INFINITY
+            )
             if (
                 "memory for thread-local data" in ended.err
             ):  # the C library, which no program can ask to go on

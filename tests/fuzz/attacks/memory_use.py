@@ -1,4 +1,5 @@
-"""How much memory a piece of work held, and a limit so that no try takes the machine's."""
+"""How much memory a piece of work held, and a limit so that no try takes the
+machine's."""
 
 import ctypes
 import resource

@@ -1,7 +1,9 @@
-"""The public functions with wrong, odd or extreme arguments, and writes to arrays that are handed out.
+"""The public functions with wrong, odd or extreme arguments, and writes to arrays that
+are handed out.
 
-A call gives a result, or a ValueError, TypeError, RuntimeError or OSError, in one line that names the fault.
-Where that is Python's own word on a value of another kind, it is low.
+A call gives a result, or a ValueError, TypeError, RuntimeError or OSError, in one line
+that names the fault. Where that is Python's own word on a value of another kind, it is
+low.
 """
 
 import inspect
@@ -18,11 +20,22 @@ from fuzz.attacks.pool import Outcome
 from random_bundle import random_bundle, random_gaussians
 
 LIMIT_S = 30
-ERRORS = {"ValueError", "TypeError", "RuntimeError", "IndexError", "ImportError", "MemoryError", "OSError"}
+ERRORS = {
+    "ValueError",
+    "TypeError",
+    "RuntimeError",
+    "IndexError",
+    "ImportError",
+    "MemoryError",
+    "OSError",
+}
 ERRORS |= {"FileNotFoundError", "IsADirectoryError", "NotADirectoryError", "PermissionError"}
-# What Python and NumPy say where a value of another kind is used: no more is promised for those.
+# What Python and NumPy say where a value of another kind is used: no more is promised
+# for those.
 PYTHONS = {"AttributeError", "UnicodeEncodeError", "UFuncTypeError"}
-NOT_OURS = re.compile("Unable to cast|incompatible function|incompatible constructor|std::|vector::|C\\+\\+")
+NOT_OURS = re.compile(
+    "Unable to cast|incompatible function|incompatible constructor|std::|vector::|C\\+\\+"
+)
 
 NUMBERS = (
     0,
@@ -134,7 +147,9 @@ class Attack:
         if rng.random() < 0.02:
             arguments["frobnicate"] = 1
         texts = {key: _text(value) for key, value in wrong.items()}
-        (work / "call.txt").write_text(f"{name}: {texts}", encoding="utf-8", errors="backslashreplace")
+        (work / "call.txt").write_text(
+            f"{name}: {texts}", encoding="utf-8", errors="backslashreplace"
+        )
 
         def do():
             names = {*wrong, "frobnicate", *(set(good) - set(arguments))}
@@ -143,7 +158,8 @@ class Attack:
         return name, do
 
     def _writing(self, rng):
-        """An array that is handed out is read-only, or can be written to without harm."""
+        """An array that is handed out is read-only, or can be written to without
+        harm."""
         bundle = v3dg.Bundle.open(self._shared / "a.v3dg")
         camera = v3dg.Camera.look_at((0, -9, 0), (0, 0, 0), width=8, height=6)
         scene = v3dg.Scene.of(bundle)
@@ -186,7 +202,8 @@ class Attack:
 
 
 def _calls(shared, work):
-    """Each public function with arguments that are right: what is changed are some of them."""
+    """Each public function with arguments that are right: what is changed are some of
+    them."""
     rng = np.random.default_rng(0)
     asset, bundle = random_gaussians(rng, 30, 1), random_bundle(1, num_levels=3, sh_degree=1)
     scene = v3dg.Scene()
@@ -198,7 +215,9 @@ def _calls(shared, work):
     scene.add(bundle, **poses)
     camera = v3dg.Camera.look_at((0, -9, 0), (0, 0, 0), width=8, height=6)
     cut = v3dg.select(scene, camera, tolerance=1.0, device="cpu")
-    arrays = {name: getattr(asset, name) for name in ("means", "quats", "scales", "opacities", "sh")}
+    arrays = {
+        name: getattr(asset, name) for name in ("means", "quats", "scales", "opacities", "sh")
+    }
     choice = {"tolerance": 1.0, "budget": 1000, "min_level": 0}
     drawing = {**choice, "fade": 1.05, "background": (0.0, 0.5, 1.0)}
     view = {"width": 8, "height": 6, "near": 0.01}
@@ -206,7 +225,14 @@ def _calls(shared, work):
     clusters = {f: getattr(bundle.clusters, f) for f in bundle.clusters.__dataclass_fields__}
     groups = {f: getattr(bundle.groups, f) for f in bundle.groups.__dataclass_fields__}
     fields = {f.name: f.default for f in v3dg.BuildConfig.__dataclass_fields__.values()}
-    quick = {**fields, "steps": 1, "num_views": 2, "image_size": 8, "cluster_size": 8, "supersample": 1}
+    quick = {
+        **fields,
+        "steps": 1,
+        "num_views": 2,
+        "image_size": 8,
+        "cluster_size": 8,
+        "supersample": 1,
+    }
 
     def built(**values):
         config = v3dg.BuildConfig(**values)
@@ -240,7 +266,9 @@ def _calls(shared, work):
             name: kind[name](**{f: values[f"{name}.{f}"] for f in made})
             for name, made in (("clusters", clusters), ("groups", groups))
         }
-        v3dg.render(v3dg.Bundle(**mine, gaussians=bundle.gaussians), camera, tolerance=1.0, device="cpu")
+        v3dg.render(
+            v3dg.Bundle(**mine, gaussians=bundle.gaussians), camera, tolerance=1.0, device="cpu"
+        )
 
     all_tables = {
         **{f"clusters.{f}": a for f, a in clusters.items()},
@@ -273,7 +301,10 @@ def _calls(shared, work):
         "Bundle.write": (bundle.write, {"path": work / "out.v3dg"}),
         "Bundle.level_gaussians": (bundle.level_gaussians, {"level": 0}),
         "Bundle.level_range": (bundle.level_range, {"level": 0}),
-        "Bundle.cluster_gaussians": (bundle.cluster_gaussians, _first_named(bundle.cluster_gaussians, 0)),
+        "Bundle.cluster_gaussians": (
+            bundle.cluster_gaussians,
+            _first_named(bundle.cluster_gaussians, 0),
+        ),
         "Camera": (rendered_from, {"viewmat": camera.viewmat, "K": camera.K, **view}),
         "Camera.look_at": (looked_from, looking),
         "Camera.from_blender": (
@@ -318,7 +349,10 @@ def _calls(shared, work):
             v3dg.render,
             {"subject": asset, "camera": camera, "background": (0.0, 0.0, 0.0), "device": "cpu"},
         ),
-        "render a cut": (v3dg.render, {"subject": scene, "camera": camera, "cut": cut, "device": "cpu"}),
+        "render a cut": (
+            v3dg.render,
+            {"subject": scene, "camera": camera, "cut": cut, "device": "cpu"},
+        ),
         "Renderer": (v3dg.Renderer, {"subject": scene, "color_by": "cluster", "device": "cpu"}),
         "Renderer.render": (drawn_again, {"camera": camera, **drawing}),
         "select": (
@@ -338,11 +372,19 @@ def _calls(shared, work):
         "Scene.move": (changed("move"), {"ids": [0, 1, 2, 3], **poses}),
         "Scene.move all": (changed("move"), dict(poses)),
         "Scene.remove": (changed("remove"), {"ids": [0, 2]}),
-        "Scene.set_importance": (changed("set_importance"), {"importance": [1.0, 2.0], "ids": [0, 3]}),
+        "Scene.set_importance": (
+            changed("set_importance"),
+            {"importance": [1.0, 2.0], "ids": [0, 3]},
+        ),
         "read_asset": (v3dg.read_asset, {"path": shared / "a.ply"}),
         "read_cameras": (
             v3dg.read_cameras,
-            {"path": camera_file, "size": (8, 6), "distortion": "ignore", "applied_transform": "undo"},
+            {
+                "path": camera_file,
+                "size": (8, 6),
+                "distortion": "ignore",
+                "applied_transform": "undo",
+            },
         ),
         "read_scene": (v3dg.read_scene, {"path": scene_file, "bundles": {"a.v3dg": bundle}}),
         "write_asset": (
@@ -350,10 +392,18 @@ def _calls(shared, work):
             {"path": work / "out.ply", "gaussians": asset, "encoding": "ascii"},
         ),
         "write_asset, packed": (v3dg.write_asset, {"path": work / "out.sog", "gaussians": asset}),
-        "write_cameras": (v3dg.write_cameras, {"path": work / "out.json", "cameras": {"a": camera}}),
+        "write_cameras": (
+            v3dg.write_cameras,
+            {"path": work / "out.json", "cameras": {"a": camera}},
+        ),
         "write_scene": (
             v3dg.write_scene,
-            {"path": work / "out.json", "scene": scene, "bundle_paths": ["a.v3dg"], "cameras": {"a": camera}},
+            {
+                "path": work / "out.json",
+                "scene": scene,
+                "bundle_paths": ["a.v3dg"],
+                "cameras": {"a": camera},
+            },
         ),
     }
 
@@ -447,7 +497,9 @@ def _changed(rng, value):
         lambda: np.broadcast_to(array.reshape(-1)[:1], array.shape),
         lambda: _read_only(array),
         lambda: np.empty((1 << 40, *array.shape[1:]), np.uint8) if array.ndim > 1 else array[:0],
-        lambda: np.lib.stride_tricks.as_strided(array, (1 << 40, *array.shape[1:]), (0, *array.strides[1:])),
+        lambda: np.lib.stride_tricks.as_strided(
+            array, (1 << 40, *array.shape[1:]), (0, *array.strides[1:])
+        ),
         lambda: torch.from_numpy(array),
         lambda: torch.from_numpy(array).double().requires_grad_(),
         lambda: torch.from_numpy(array).to("meta"),
@@ -498,12 +550,17 @@ def _outcome_of_call(function, arguments, wrong, told):
             if not is_ours and name not in PYTHONS:
                 return Outcome("fault", fault)
             is_told = name in ERRORS and (isinstance(error, MemoryError) or _names(text, wrong))
-            return Outcome(name) if is_told else Outcome(f"{name} that names nothing", fault, is_low=True)
+            return (
+                Outcome(name)
+                if is_told
+                else Outcome(f"{name} that names nothing", fault, is_low=True)
+            )
     return Outcome("result")
 
 
 def _names(text, wrong):
-    """Whether a text says which argument it is about: by its name, or as our messages begin."""
+    """Whether a text says which argument it is about: by its name, or as our messages
+    begin."""
     return bool(re.match(r"[\w.\[\], ()'/-]+: ", text)) or any(
         re.sub(r".*\.", "", name) in text for name in wrong
     )

@@ -1,9 +1,11 @@
-"""Tries of one kind in child processes: a crash, a hang or a fault is one try's, and the others go on.
+"""Tries of one kind in child processes: a crash, a hang or a fault is one try's, and
+the others go on.
 
-A kind is a module with LIMIT_S, the seconds that a try may take, `prepare(shared)`, which puts into a folder
-what all children read, and a class `Attack(shared)`. Its `plan(rng, work)` prepares a try in the empty folder
-`work` and returns what it is in a few words, by which findings are counted together, and a function that does
-it and returns an `Outcome`.
+A kind is a module with LIMIT_S, the seconds that a try may take, `prepare(shared)`,
+which puts into a folder what all children read, and a class `Attack(shared)`. Its
+`plan(rng, work)` prepares a try in the empty folder `work` and returns what it is in a
+few words, by which findings are counted together, and a function that does it and
+returns an `Outcome`.
 """
 
 import collections
@@ -41,7 +43,9 @@ class Outcome:
 
 def environment():
     """Of a child: v3dg, the tests and no more threads than children."""
-    given = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+    given = [
+        os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path
+    ]
     paths = [*given, TESTS, TESTS / "support", TESTS.parent if has_module() else None]
     return os.environ | {
         "PYTHONPATH": os.pathsep.join(str(path) for path in paths if path),
@@ -50,7 +54,8 @@ def environment():
 
 
 def has_module():
-    """Whether the compiled module lies beside the sources; else the installed package is attacked."""
+    """Whether the compiled module lies beside the sources; else the installed package
+    is attacked."""
     return any((TESTS.parent / "v3dg").glob("_core.*.so"))
 
 
@@ -58,7 +63,14 @@ class Child:
     """A process that does tries, and is started anew when one ends it."""
 
     def __init__(self, kind, seed, shared, work, limit_s):
-        self._command = [sys.executable, str(HERE / "child.py"), kind, str(seed), str(shared), str(work)]
+        self._command = [
+            sys.executable,
+            str(HERE / "child.py"),
+            kind,
+            str(seed),
+            str(shared),
+            str(work),
+        ]
         self._limit_s, self._log = limit_s, Path(f"{work}.log")
         self._process = None
 
@@ -76,7 +88,9 @@ class Child:
         log = self._log.read_text(errors="replace")
         if not what:
             raise RuntimeError(f"try {number} could not be prepared: {log}")
-        code = self._process.wait() if self._process.poll() is not None or self._has_ended() else None
+        code = (
+            self._process.wait() if self._process.poll() is not None or self._has_ended() else None
+        )
         self.close()
         hangs = code is None or "Timeout (" in log
         name = "hang" if hangs else "crash" if code and code < 0 else "end"
@@ -88,7 +102,11 @@ class Child:
             else f"code {code}"
         )
         place = re.findall(r'File "([^"]+)", line (\d+) in (\w+)', _stack_of(log))
-        at = " in " + " < ".join(f"{Path(f).name}:{n} {w}" for f, n, w in place[:3]) if place else log[-200:]
+        at = (
+            " in " + " < ".join(f"{Path(f).name}:{n} {w}" for f, n, w in place[:3])
+            if place
+            else log[-200:]
+        )
         return {
             "what": what,
             "outcome": name,
@@ -135,26 +153,35 @@ class Child:
 
 
 def _quick_folder():
-    """In memory, where there is enough: each try writes files, and waits for a disk where there is one."""
+    """In memory, where there is enough: each try writes files, and waits for a disk
+    where there is one."""
     shared = "/dev/shm"
     return shared if os.path.isdir(shared) and shutil.disk_usage(shared).free > 2 << 30 else None
 
 
 def _stack_of(log):
-    """Of the thread that did it; where none is said to have, of the main one, which is the last."""
-    log = log.rsplit("Current thread ", 1)[-1] if "Current thread " in log else log.rsplit("Thread 0x", 1)[-1]
+    """Of the thread that did it; where none is said to have, of the main one, which is
+    the last."""
+    log = (
+        log.rsplit("Current thread ", 1)[-1]
+        if "Current thread " in log
+        else log.rsplit("Thread 0x", 1)[-1]
+    )
     return log.split("\n\n", 1)[0]
 
 
 def attack(kind, numbers, *, seconds, seed=0, kept=None, children=None):
-    """Try what has these numbers until the time is up, and summarise it as JSON values."""
+    """Try what has these numbers until the time is up, and summarise it as JSON
+    values."""
     start = time.monotonic()
     children = children or max(2, len(os.sched_getaffinity(0)))
     with tempfile.TemporaryDirectory(prefix="v3dg-attack-", dir=_quick_folder()) as folder:
         shared = Path(folder) / "shared"
         shared.mkdir()
         prepared = [sys.executable, str(HERE / "child.py"), kind, str(seed), str(shared)]
-        limit_s = float(subprocess.run(prepared, env=environment(), check=True, capture_output=True).stdout)
+        limit_s = float(
+            subprocess.run(prepared, env=environment(), check=True, capture_output=True).stdout
+        )
         todo, lock, records = iter(numbers), threading.Lock(), queue.Queue()
         results = _Results(kind, seed, kept)
 
@@ -195,7 +222,9 @@ class _Results:
         self._tries += 1
         self._outcomes[record["outcome"]] += 1
         self._most = max(self._most, (round(record["megabytes"], 1), f"{number}: {record['what']}"))
-        self._longest = max(self._longest, (round(record["seconds"], 2), f"{number}: {record['what']}"))
+        self._longest = max(
+            self._longest, (round(record["seconds"], 2), f"{number}: {record['what']}")
+        )
         if record["fault"] is None:
             return
         sort = re.sub(r"[\d.]+", "0", f"{record['what']}: {record['fault'].split(QUOTE)[0][:60]}")
@@ -212,7 +241,9 @@ class _Results:
             return
         folder = Path(self._kept) / self._kind / f"{self._seed}-{number}"
         shutil.rmtree(folder, ignore_errors=True)
-        shutil.copytree(work, folder / "files", symlinks=True, ignore=_what_is_no_file, dirs_exist_ok=True)
+        shutil.copytree(
+            work, folder / "files", symlinks=True, ignore=_what_is_no_file, dirs_exist_ok=True
+        )
         again = f"python tests/fuzz/attack.py {self._kind} --seed {self._seed} --only {number}"
         text = json.dumps({**record, "again": again}, indent=1)
         (folder / "record.json").write_text(text, encoding="utf-8")
@@ -234,5 +265,7 @@ class _Results:
 def _what_is_no_file(folder, names):
     paths = {name: os.path.join(folder, name) for name in names}
     return [
-        name for name, p in paths.items() if not (os.path.isfile(p) or os.path.isdir(p) or os.path.islink(p))
+        name
+        for name, p in paths.items()
+        if not (os.path.isfile(p) or os.path.isdir(p) or os.path.islink(p))
     ]

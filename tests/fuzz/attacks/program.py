@@ -1,4 +1,5 @@
-"""The command line as users start it: what it is given, how it ends, what it leaves, what is wrong there."""
+"""The command line as users start it: what it is given, how it ends, what it leaves,
+what is wrong there."""
 
 import contextlib
 import dataclasses
@@ -21,8 +22,8 @@ from random_bundle import random_gaussians
 
 COMMAND = [sys.executable, "-m", "v3dg"]
 MOST_BYTES = 8 << 30  # of addresses: more is the machine's end, not the program's
-# What is no error: OpenMP's runtime on what it was told, assets that a command goes through, bars, and that
-# there was no memory for the thread that watches these.
+# What is no error: OpenMP's runtime on what it was told, assets that a command goes
+# through, bars, and that there was no memory for the thread that watches these.
 PROGRESS = re.compile(r"libgomp: |v3dg: warning: tqdm:|\[\d+/\d+\] |failed: |.*: \d+ %$|$")
 ERROR = "v3dg: error: "
 
@@ -39,7 +40,9 @@ def make_files(folder):
     scene = v3dg.Scene()
     scene.add(bundle, positions=rng.normal(size=(5, 3)) * 3)
     eyes = {name: (0, -9 - i, 2) for i, name in enumerate(("left", "right", "far"))}
-    cameras = {name: v3dg.Camera.look_at(eye, (0, 0, 0), width=40, height=30) for name, eye in eyes.items()}
+    cameras = {
+        name: v3dg.Camera.look_at(eye, (0, 0, 0), width=40, height=30) for name, eye in eyes.items()
+    }
     v3dg.write_scene(folder / "scene.json", scene, ["a.v3dg"], cameras)
     v3dg.write_cameras(folder / "cameras.json", cameras)
     odd = ("a/b", "a:b", "a_b", "../x", "é\u202e", "x" * 300, " ", ".", "A/B")
@@ -79,9 +82,11 @@ def run(
     out=None,
     most=MOST_BYTES,
 ):
-    """Start a program in a session of its own, let `meddle` do something to it, and see how it ends.
+    """Start a program in a session of its own, let `meddle` do something to it, and see
+    how it ends.
 
-    What takes longer than the limit is interrupted as by Ctrl-C, and killed when that does not help.
+    What takes longer than the limit is interrupted as by Ctrl-C, and killed when that
+    does not help.
     """
     logs = [folder.parent / f"{folder.name}.{end}" for end in ("out", "err")]
     files = [log.open("wb") for log in logs]
@@ -141,7 +146,8 @@ def is_running(process):
 
 
 def _in_session(leader, patience_s=2):
-    """Processes of a session whose first one has ended, when they had a moment to end, too."""
+    """Processes of a session whose first one has ended, when they had a moment to end,
+    too."""
     end = time.monotonic() + patience_s
     while True:
         found = {}
@@ -168,7 +174,14 @@ def fault_of(ended, *, codes=(0, 1, 2), is_heard=True):
         return f"no end, and Ctrl-C did not help: {ended.err[-200:]!a}"
     if ended.code < 0:
         return f"crash {signal.Signals(-ended.code).name}: {ended.err[-300:]!a}"
-    for word in ("Traceback", "Warning", "Exception ignored", "Error in sys", "terminate called", "Fatal"):
+    for word in (
+        "Traceback",
+        "Warning",
+        "Exception ignored",
+        "Error in sys",
+        "terminate called",
+        "Fatal",
+    ):
         if word in ended.err:
             return f"{word}: {' '.join(ended.err.split())[-250:]!a}"
     if ended.was_long:

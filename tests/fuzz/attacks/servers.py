@@ -1,9 +1,11 @@
-"""Web servers that lie, go on without end, stop, or send elsewhere, and commands that read files from them.
+"""Web servers that lie, go on without end, stop, or send elsewhere, and commands that
+read files from them.
 
-Whatever a server does, a command ends soon, with a right result or one line that says what is wrong. It takes
-no more from the server than was asked for, holds little memory, leaves nothing in the folder for temporary
-files, and prints no password and no signature. The number of a try chooses the server: those of `BEHAVIOURS`
-one after another.
+Whatever a server does, a command ends soon, with a right result or one line that says
+what is wrong. It takes no more from the server than was asked for, holds little memory,
+leaves nothing in the folder for temporary files, and prints no password and no
+signature. The number of a try chooses the server: those of `BEHAVIOURS` one after
+another.
 """
 
 import contextlib
@@ -33,7 +35,8 @@ MOST_UNKNOWN_BYTES = 16 << 20  # as well
 MOST_SENT = 12 << 20  # beyond the file: what lies in buffers of sockets, of several requests
 MOST_MEGABYTES = 500
 MOST_ADDRESSES = 6 << 30
-# What goes on between the bytes of a file ends with the patience alone; nothing of it is held.
+# What goes on between the bytes of a file ends with the patience alone; nothing of it
+# is held.
 OUTSIDE_OF_BODIES = ("100 without end", "chunk's extension without end", "trailers without end")
 SECRETS = ("hunter2", "s1gnature", "Zm9v")
 TB = 1 << 40
@@ -66,7 +69,9 @@ class Connection:
         head, _, self._buffer = self._buffer.partition(b"\r\n\r\n")
         first, *lines = head.decode("latin-1").split("\r\n")
         self.method, self.path, _ = first.split(" ", 2)
-        self.headers = {name.lower(): value.strip() for name, _, value in (x.partition(":") for x in lines)}
+        self.headers = {
+            name.lower(): value.strip() for name, _, value in (x.partition(":") for x in lines)
+        }
         match = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("range", ""))
         self.part = (int(match[1]), int(match[2]) + 1) if match else None
         self.server.requests.append((self.path, self.headers))
@@ -250,12 +255,16 @@ def to_localhost(c):
     if c.headers["host"].startswith("localhost"):
         c.good()
     else:
-        c.answer("302 Found", b"", Location=f"http://localhost:{c.server.port}{c.path.partition('?')[0]}")
+        c.answer(
+            "302 Found", b"", Location=f"http://localhost:{c.server.port}{c.path.partition('?')[0]}"
+        )
 
 
 def chunked(*chunks, end=b"0\r\n\r\n", endless=None):
     def behaviour(c):
-        c.range_head(Transfer_Encoding="chunked") if c.part else c.head("200 OK", Transfer_Encoding="chunked")
+        c.range_head(Transfer_Encoding="chunked") if c.part else c.head(
+            "200 OK", Transfer_Encoding="chunked"
+        )
         for chunk in chunks:
             c.send(chunk)
         if endless:
@@ -356,7 +365,8 @@ def tagged(c):
 ENDLESS_HEADER = b"HTTP/1.1 200 OK\r\n"
 RIGHT, WRONG, EITHER = "right", "wrong", "either"
 
-# What a server does: the kind of file that is asked for, how that has to end, and the function that does it.
+# What a server does: the kind of file that is asked for, how that has to end, and the
+# function that does it.
 BEHAVIOURS = {
     "honest": ("v3dg", RIGHT, lambda c: c.good()),
     "honest asset": ("ply", RIGHT, lambda c: c.good()),
@@ -382,7 +392,11 @@ BEHAVIOURS = {
     "claims 100 000": ("v3dg", WRONG, claims_honest_parts(100_000)),
     "asset longer than said": ("ply", WRONG, at_get(claims(TB))),
     "asset without end": ("ply", WRONG, at_get(of_unknown_size(endless=True))),
-    "asset shorter than said": ("ply", WRONG, at_get(lambda c: c.answer("200 OK", c.server.body[:900]))),
+    "asset shorter than said": (
+        "ply",
+        WRONG,
+        at_get(lambda c: c.answer("200 OK", c.server.body[:900])),
+    ),
     "asset ends early": ("ply", WRONG, at_get(lambda c: half(c, lambda c: c.stream.close()))),
     "forged tables of 1 GB": ("v3dg", WRONG, forged(20_000_000, 0)),
     "forged tables of 4 TB": ("v3dg", WRONG, forged(50_000_000_000, 2 * TB)),
@@ -421,7 +435,11 @@ BEHAVIOURS = {
     },
     "404 without end": ("v3dg", WRONG, endless_error("404 Not Found")),
     "500 without end": ("v3dg", WRONG, endless_error("500 Internal Server Error")),
-    "100 without end": ("v3dg", WRONG, raw(b"", lambda c: c.endless(b"HTTP/1.1 100 Continue\r\n\r\n" * 99))),
+    "100 without end": (
+        "v3dg",
+        WRONG,
+        raw(b"", lambda c: c.endless(b"HTTP/1.1 100 Continue\r\n\r\n" * 99)),
+    ),
     "reset": ("v3dg", WRONG, lambda c: c.reset()),
     "reset of the body": ("v3dg", WRONG, at_get(lambda c: half(c, Connection.reset))),
     "closed": ("v3dg", WRONG, raw(b"")),
@@ -448,9 +466,17 @@ BEHAVIOURS = {
     ),
     "redirects far": ("v3dg", WRONG, redirect_to("/" + "x" * 500_000)),
     "header without end": ("v3dg", WRONG, raw(ENDLESS_HEADER, lambda c: c.endless(b"x" * 65536))),
-    "headers without end": ("v3dg", WRONG, raw(ENDLESS_HEADER, lambda c: c.endless(b"X: y\r\n" * 9999))),
+    "headers without end": (
+        "v3dg",
+        WRONG,
+        raw(ENDLESS_HEADER, lambda c: c.endless(b"X: y\r\n" * 9999)),
+    ),
     "cookies": ("v3dg", RIGHT, lambda c: c.good(Set_Cookie="sig=s1gnature; Domain=127.0.0.1")),
-    "NUL in the head": ("v3dg", WRONG, raw(b"HTTP/1.1 200 OK\r\nX\0: \0\r\nContent-Length: 5\r\n\r\n")),
+    "NUL in the head": (
+        "v3dg",
+        WRONG,
+        raw(b"HTTP/1.1 200 OK\r\nX\0: \0\r\nContent-Length: 5\r\n\r\n"),
+    ),
     "no HTTP": ("v3dg", WRONG, raw(bytes(range(256)) * 40)),
     "no HTTP without end": ("v3dg", WRONG, raw(b"", lambda c: c.endless(b"SSH-2.0-x"))),
     "HTTP/0.9": ("v3dg", WRONG, raw(b"<html>hunter2</html>")),
@@ -458,7 +484,11 @@ BEHAVIOURS = {
     "chunk without a size": ("v3dg", WRONG, chunked(b"zz\r\nabc\r\n")),
     "chunk's extension without end": ("v3dg", WRONG, chunked(b"5;", endless=b"x=y;" * 9999)),
     "chunks without end": ("v3dg", WRONG, chunked(endless=b"10\r\n" + bytes(16) + b"\r\n")),
-    "trailers without end": ("v3dg", WRONG, chunked(b"5\r\nabcde\r\n0\r\n", endless=b"X: y\r\n" * 9999)),
+    "trailers without end": (
+        "v3dg",
+        WRONG,
+        chunked(b"5\r\nabcde\r\n0\r\n", endless=b"X: y\r\n" * 9999),
+    ),
     "no last chunk": ("v3dg", WRONG, chunked(b"5\r\nabcde\r\n", end=b"")),
     "killed": ("ply kill", EITHER, at_get(lambda c: half(c, waits))),
     "interrupted": ("ply interrupt", EITHER, at_get(lambda c: half(c, waits))),
@@ -508,7 +538,18 @@ class Attack:
 
 def _command(how, url, as_json):
     if "render" in how:
-        command = ["render", url, "--size", "16", "16", "--device", "cpu", "--tolerance", "0", "--quiet"]
+        command = [
+            "render",
+            url,
+            "--size",
+            "16",
+            "16",
+            "--device",
+            "cpu",
+            "--tolerance",
+            "0",
+            "--quiet",
+        ]
     else:
         command = ["info", url]
     return [*command, *(["--json"] if as_json else [])]

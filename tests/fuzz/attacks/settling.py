@@ -1,9 +1,11 @@
-"""Views that settle in pools, on a loaded machine: the next picture misses nothing and has the right bits.
+"""Views that settle in pools, on a loaded machine: the next picture misses nothing and
+has the right bits.
 
-Pictures are compared bit for bit with those of the same scene all of which is resident, at the tolerance
-that they say they were drawn with. Between settled pictures are others that wait for nothing, so that earlier
-views are decided about, pages arrive and leave, and tolerances adapt while a view settles. The environment
-variable V3DG_ATTACK_DEVICE names another device than the CPU.
+Pictures are compared bit for bit with those of the same scene all of which is resident,
+at the tolerance that they say they were drawn with. Between settled pictures are others
+that wait for nothing, so that earlier views are decided about, pages arrive and leave,
+and tolerances adapt while a view settles. The environment variable V3DG_ATTACK_DEVICE
+names another device than the CPU.
 """
 
 import contextlib
@@ -49,7 +51,10 @@ class Attack:
         for codec in ("float32", "quantized"):
             rng = np.random.default_rng(1)
             scene = v3dg.Scene()
-            poses = {"positions": 2 * rng.normal(size=(3, 3)), "quaternions": rng.normal(size=(3, 4))}
+            poses = {
+                "positions": 2 * rng.normal(size=(3, 3)),
+                "quaternions": rng.normal(size=(3, 4)),
+            }
             scene.add(v3dg.Bundle.open(Path(shared) / f"{codec}.v3dg"), **poses)
             self._scenes[codec] = scene
         self._expected = Expected()
@@ -102,7 +107,9 @@ class Trial:
 
     def camera(self, number):
         rng = np.random.default_rng(number)
-        return v3dg.Camera.look_at(4 * rng.normal(size=3), rng.normal(size=3), (0, 0, 1), width=40, height=32)
+        return v3dg.Camera.look_at(
+            4 * rng.normal(size=3), rng.normal(size=3), (0, 0, 1), width=40, height=32
+        )
 
     def fault_of(self, number, image):
         """What is wrong with the picture of a settled view, or None."""
@@ -121,7 +128,9 @@ class Trial:
 
 def digest(image):
     planes = host((image.color, image.alpha))
-    return hashlib.sha256(b"".join(np.ascontiguousarray(plane).tobytes() for plane in planes)).hexdigest()
+    return hashlib.sha256(
+        b"".join(np.ascontiguousarray(plane).tobytes() for plane in planes)
+    ).hexdigest()
 
 
 @contextlib.contextmanager
@@ -149,7 +158,8 @@ def busy_threads(count):
 
 
 def after_settling(trial):
-    """Right after each `settle`, in a flight with pictures that wait for nothing in between."""
+    """Right after each `settle`, in a flight with pictures that wait for nothing in
+    between."""
     renderer = v3dg.Renderer(trial.scene, device=DEVICE, memory=trial.memory)
     for _ in range(NUM_SETTLED):
         for number in trial.rng.integers(0, NUM_CAMERAS, int(trial.rng.integers(0, 3))):
@@ -179,12 +189,15 @@ def stills_of_threads(trial):
 
     num_threads = int(trial.rng.integers(2, 9))
     numbers = [int(number) for number in trial.rng.integers(0, NUM_CAMERAS, NUM_STILLS)]
-    in_threads([lambda mine=numbers[t::num_threads]: draw(mine) for t in range(num_threads)], faults)
+    in_threads(
+        [lambda mine=numbers[t::num_threads]: draw(mine) for t in range(num_threads)], faults
+    )
     return faults[0] if faults else None
 
 
 def forks(trial):
-    """Children of a process whose threads draw: what they may share is right, and the rest a clear error."""
+    """Children of a process whose threads draw: what they may share is right, and the
+    rest a clear error."""
     faults = []
     ends = threading.Event()
     renderer = v3dg.Renderer(trial.scene, device=DEVICE, memory=trial.memory)
@@ -237,7 +250,8 @@ def in_child(trial, renderer, number):
 
 
 def fault_of_child(work):
-    """What work() returns in a child of a fork; a child that does not end is a fault."""
+    """What work() returns in a child of a fork; a child that does not end is a
+    fault."""
     with tempfile.TemporaryFile() as report:
         pid = os.fork()
         if pid == 0:

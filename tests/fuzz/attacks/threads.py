@@ -1,4 +1,5 @@
-"""Threads that change a scene while others draw, select and copy it: all see it as it was or as it is.
+"""Threads that change a scene while others draw, select and copy it: all see it as it
+was or as it is.
 
 Pictures are compared bit for bit with those of scenes that stand still.
 """
@@ -49,7 +50,9 @@ def _poses(rng, count):
 def _drawn(scene):
     image = v3dg.render(scene, CAMERA, tolerance=1.0, depth=True, device="cpu")
     planes = (image.color, image.alpha, image.depth)
-    return hashlib.sha256(b"".join(np.ascontiguousarray(plane).tobytes() for plane in planes)).hexdigest()
+    return hashlib.sha256(
+        b"".join(np.ascontiguousarray(plane).tobytes() for plane in planes)
+    ).hexdigest()
 
 
 def _selected(scene):
@@ -210,7 +213,8 @@ def copied_while_it_changes(rng, bundles):
 
 
 def copies_are_apart(rng, bundles):
-    """A change of a copy does not change the scene; a selection goes through a pickle with its scene."""
+    """A change of a copy does not change the scene; a selection goes through a pickle
+    with its scene."""
     poses = _poses(rng, 20)
     scene = _scene(bundles, poses)
     before, cut = _drawn(scene), _selected(scene)
