@@ -1,13 +1,13 @@
-// Draws a small scene with the core alone, without Python: two instances of a bundle of one level, chosen and
-// drawn in one call, as a .ppm. Built by `cmake --build build/cpu --target draw_scene`.
+// Draws a small scene with the core alone, without Python: two instances of a bundle of one level,
+// chosen and drawn in one call, as a .ppm. Built by `cmake --build build/cpu --target draw_scene`.
 
 #include <cmath>
 #include <cstdio>
 #include <vector>
 
-#include "math/sh.h"
 #include "draw/model.h"
 #include "draw/scene_frame.h"
+#include "math/sh.h"
 
 using namespace v3dg;
 
@@ -32,7 +32,8 @@ struct Globe {
         }
     }
     GaussianRows<const float> rows() const {
-        return {means.data(), quats.data(), scales.data(), opacities.data(), sh.data(), kGaussians, 0};
+        return {
+            means.data(), quats.data(), scales.data(), opacities.data(), sh.data(), kGaussians, 0};
     }
 };
 
@@ -46,7 +47,8 @@ int main(int num_arguments, char** arguments) {
     const std::vector<float> filters(kClusters, 0.0f);
     const std::vector<uint8_t> antialiased(kClusters, 0);
     std::vector<int64_t> offset;
-    for (size_t c = 0; c <= kClusters; ++c) offset.push_back(static_cast<int64_t>(c * kClusterSize));
+    for (size_t c = 0; c <= kClusters; ++c)
+        offset.push_back(static_cast<int64_t>(c * kClusterSize));
     ClusterTable given{};
     given.own_group = {no_group.data(), kClusters};
     given.parent_group = {no_group.data(), kClusters};
@@ -89,7 +91,8 @@ int main(int num_arguments, char** arguments) {
     SelectRule rule{};
     rule.tolerance_px2 = 3.0f;
     const SceneFrameCounts counts = cpu::draw_scene(scene, camera, rule, {&picture, 1});
-    std::printf("%lld gaussians selected, %llu in the frustum\n", static_cast<long long>(counts.gaussians),
+    std::printf("%lld gaussians selected, %llu in the frustum\n",
+                static_cast<long long>(counts.gaussians),
                 static_cast<unsigned long long>(counts.render.in_frustum));
 
     std::FILE* file = std::fopen(num_arguments > 1 ? arguments[1] : "draw_scene.ppm", "wb");

@@ -1,11 +1,12 @@
-// What a pool of pages costs the thread that draws, and the one that decides, with about 40,000 pages in
-// view:
+// What a pool of pages costs the thread that draws, and the one that decides, with about 40,000
+// pages in view:
 //
 //   cmake --preset cpu && cmake --build build/cpu --target page_policy && build/cpu/page_policy
 //
-// A row of 169 made bundles, 1.4 million pages, of which a window is needed and another one around it nearly;
-// it moves by 150 pages a frame, and then to the other end. Nothing is drawn or read from a disk. Times are
-// of the processor: of the thread that draws, and, without threads of the pool's own, of all that is decided.
+// A row of 169 made bundles, 1.4 million pages, of which a window is needed and another one around
+// it nearly; it moves by 150 pages a frame, and then to the other end. Nothing is drawn or read
+// from a disk. Times are of the processor: of the thread that draws, and, without threads of the
+// pool's own, of all that is decided.
 
 #include <algorithm>
 #include <chrono>
@@ -102,8 +103,8 @@ class Flight {
             return us_[static_cast<size_t>(share * double(us_.size() - 1))];
         };
         std::printf("%s %s: %zu frames, us median %.0f, p99 %.0f, worst %.0f\n",
-                    reads_ ? "all that is decided" : "the thread that draws", what, us_.size(), at(0.5),
-                    at(0.99), at(1));
+                    reads_ ? "all that is decided" : "the thread that draws", what, us_.size(),
+                    at(0.5), at(0.99), at(1));
         us_.clear();
     }
 
@@ -113,7 +114,8 @@ class Flight {
         for (size_t k = 0; k < kNeeds; ++k) {
             const size_t page = first + k;
             const bool is_needed = k >= kNearly && k < kNeeds - kNearly;
-            needs.list[k] = {static_cast<uint32_t>(page / kPages), static_cast<uint32_t>(page % kPages),
+            needs.list[k] = {static_cast<uint32_t>(page / kPages),
+                             static_cast<uint32_t>(page % kPages),
                              is_needed ? 1.5f + 0.1f * static_cast<float>(k % 7) : 0.7f};
         }
         for (size_t k = 0; k + 64 <= kNeeds; k += 64)
@@ -135,7 +137,8 @@ void fly(unsigned num_threads) {
     const Tree tree;
     std::vector<PagedBundle> bundles;
     for (int32_t b = 0; b < kBundles; ++b)
-        bundles.push_back({tree.table(), std::make_shared<NoPages>(tree.table(), 0, PageCodec::quantized)});
+        bundles.push_back(
+            {tree.table(), std::make_shared<NoPages>(tree.table(), 0, PageCodec::quantized)});
     PoolLimits limits{};
     limits.memory = {kSlots * 2 * kRows + kBundles * kRows, 1, 0};
     limits.num_threads = num_threads;

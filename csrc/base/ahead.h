@@ -16,12 +16,17 @@
 
 namespace v3dg {
 
-// Makes things number 0 to count - 1, which are used one after the other. Number i is made by thread
-// i % num_threads, with one thread of OpenMP, and is the only one in place i % num_places until it was used.
+// Makes things number 0 to count - 1, which are used one after the other. Number i is made by
+// thread i % num_threads, with one thread of OpenMP, and is the only one in place i % num_places
+// until it was used.
 class Ahead {
   public:
-    Ahead(uint64_t count, unsigned num_threads, unsigned num_places, std::function<void(uint64_t)> make)
-        : count_(count), num_places_(num_places), make_(std::move(make)), is_made_(num_places, false) {
+    Ahead(uint64_t count, unsigned num_threads, unsigned num_places,
+          std::function<void(uint64_t)> make)
+        : count_(count),
+          num_places_(num_places),
+          make_(std::move(make)),
+          is_made_(num_places, false) {
         try {
             for (unsigned t = 0; t < num_threads; ++t)
                 threads_.emplace_back([this, t, num_threads] { make_all(t, num_threads); });

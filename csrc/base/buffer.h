@@ -1,6 +1,7 @@
 #pragma once
 
-// Memory on the host that grows by forgetting what it held. On a device that is DeviceBuffer (device.h).
+// Memory on the host that grows by forgetting what it held. On a device that is DeviceBuffer
+// (device.h).
 
 #include <sys/mman.h>
 
@@ -12,8 +13,8 @@
 
 namespace v3dg {
 
-// Memory that begins at a cache line, or null; much of it in huge pages where the system has them, because
-// what is read here and there would wait for the table of pages.
+// Memory that begins at a cache line, or null; much of it in huge pages where the system has them,
+// because what is read here and there would wait for the table of pages.
 inline void* allocate_pages(size_t bytes) {
     constexpr size_t kHugePage = size_t(2) << 20;
     const size_t alignment = bytes < 2 * kHugePage ? 64 : kHugePage;
@@ -32,7 +33,8 @@ class Buffer {
     Buffer() = default;
     explicit Buffer(size_t size) { reserve(size); }
     Buffer(Buffer&& other) noexcept
-        : data_(std::exchange(other.data_, nullptr)), capacity_(std::exchange(other.capacity_, 0)) {}
+        : data_(std::exchange(other.data_, nullptr)),
+          capacity_(std::exchange(other.capacity_, 0)) {}
     Buffer& operator=(Buffer&& other) noexcept {
         std::swap(data_, other.data_);
         std::swap(capacity_, other.capacity_);

@@ -12,7 +12,8 @@ namespace cuda {
 void check(cudaError_t error, const char* what) {
     if (error == cudaSuccess) return;
     cudaGetLastError();  // a later call must not report this error again
-    throw std::runtime_error(std::string("cuda: ") + what + " failed: " + cudaGetErrorString(error));
+    throw std::runtime_error(std::string("cuda: ") + what +
+                             " failed: " + cudaGetErrorString(error));
 }
 
 int num_devices() {
@@ -39,7 +40,8 @@ unsigned num_multiprocessors() {
 
 size_t shared_memory_of_multiprocessor() {
     int bytes = 0;
-    check(cudaDeviceGetAttribute(&bytes, cudaDevAttrMaxSharedMemoryPerMultiprocessor, current_device()),
+    check(cudaDeviceGetAttribute(&bytes, cudaDevAttrMaxSharedMemoryPerMultiprocessor,
+                                 current_device()),
           "cudaDeviceGetAttribute");
     return static_cast<size_t>(bytes);
 }
@@ -52,13 +54,15 @@ void allow_shared_memory(const void* kernel, size_t bytes, const char* name) {
     const std::lock_guard<std::mutex> lock(mutex);
     size_t& allowed = allowed_bytes[{device, kernel}];
     if (bytes <= allowed) return;
-    check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(bytes)),
+    check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize,
+                               static_cast<int>(bytes)),
           name);
     allowed = bytes;
 }
 
 bool can_start_early(const void* kernel) {
-    constexpr int kFirst = 90;  // of the architectures whose kernels can wait for the one before them
+    constexpr int kFirst =
+        90;  // of the architectures whose kernels can wait for the one before them
     static std::mutex mutex;
     static std::map<std::pair<int, const void*>, bool> known;
     const int device = current_device();
@@ -66,8 +70,8 @@ bool can_start_early(const void* kernel) {
     const auto [found, is_new] = known.try_emplace({device, kernel}, false);
     if (is_new) {
         cudaFuncAttributes attributes{};
-        found->second =
-            cudaFuncGetAttributes(&attributes, kernel) == cudaSuccess && attributes.ptxVersion >= kFirst;
+        found->second = cudaFuncGetAttributes(&attributes, kernel) == cudaSuccess &&
+                        attributes.ptxVersion >= kFirst;
         cudaGetLastError();
     }
     return found->second;
@@ -87,7 +91,8 @@ static cudaMemPool_t pool_of_current_device() {
         properties.location.id = device;
         cudaMemPool_t pool;
         check(cudaMemPoolCreate(&pool, &properties), "cudaMemPoolCreate");
-        // What is given back stays ours until somebody runs out; mapping it anew costs milliseconds.
+        // What is given back stays ours until somebody runs out; mapping it anew costs
+        // milliseconds.
         uint64_t keep = uint64_t(1) << 30;
         check(cudaMemPoolSetAttribute(pool, cudaMemPoolAttrReleaseThreshold, &keep),
               "cudaMemPoolSetAttribute");
@@ -124,8 +129,8 @@ void* allocate(size_t bytes, cudaStream_t stream) {
 void release(void* pointer, int device, cudaStream_t stream) noexcept {
     if (pointer == nullptr) return;
     int current = device;
-    const bool is_elsewhere =
-        cudaGetDevice(&current) == cudaSuccess && current != device && cudaSetDevice(device) == cudaSuccess;
+    const bool is_elsewhere = cudaGetDevice(&current) == cudaSuccess && current != device &&
+                              cudaSetDevice(device) == cudaSuccess;
     // At exit the driver may be gone before us, and then so is the memory.
     if (cudaFreeAsync(pointer, stream) != cudaSuccess) cudaGetLastError();
     if (is_elsewhere && cudaSetDevice(current) != cudaSuccess) cudaGetLastError();
@@ -136,7 +141,8 @@ PoolBytes pool_bytes() {
     uint64_t reserved = 0, used = 0;
     check(cudaMemPoolGetAttribute(pool, cudaMemPoolAttrReservedMemCurrent, &reserved),
           "cudaMemPoolGetAttribute");
-    check(cudaMemPoolGetAttribute(pool, cudaMemPoolAttrUsedMemCurrent, &used), "cudaMemPoolGetAttribute");
+    check(cudaMemPoolGetAttribute(pool, cudaMemPoolAttrUsedMemCurrent, &used),
+          "cudaMemPoolGetAttribute");
     return {reserved, used};
 }
 
@@ -149,7 +155,8 @@ bool is_capturing(cudaStream_t stream) {
 void refuse_capture(cudaStream_t stream) {
     if (is_capturing(stream))
         throw std::runtime_error(
-            "cuda: no memory can be had while a graph is captured; draw it once before the capture");
+            "cuda: no memory can be had while a graph is captured; draw it once before the "
+            "capture");
 }
 
 StreamMutex::StreamMutex() {
@@ -157,11 +164,13 @@ StreamMutex::StreamMutex() {
 }
 
 StreamMutex::~StreamMutex() {
-    if (cudaEventDestroy(done_) != cudaSuccess) cudaGetLastError();  // at exit the driver may be gone
+    if (cudaEventDestroy(done_) != cudaSuccess)
+        cudaGetLastError();  // at exit the driver may be gone
 }
 
 void StreamMutex::wait() const noexcept {
-    if (cudaEventSynchronize(done_) != cudaSuccess) cudaGetLastError();  // at exit the driver may be gone
+    if (cudaEventSynchronize(done_) != cudaSuccess)
+        cudaGetLastError();  // at exit the driver may be gone
 }
 
 StreamLock::StreamLock(StreamMutex& mutex, cudaStream_t stream)

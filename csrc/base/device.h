@@ -1,8 +1,8 @@
 #pragma once
 
-// Memory and errors of the CUDA half. A DeviceBuffer frees itself into a pool of its device, trim_pool()
-// gives what the pool keeps to the driver. v3dg/residency.py says when what stays on a device is freed.
-// Sources that include it are built only with CUDA.
+// Memory and errors of the CUDA half. A DeviceBuffer frees itself into a pool of its device,
+// trim_pool() gives what the pool keeps to the driver. v3dg/residency.py says when what stays on a
+// device is freed. Sources that include it are built only with CUDA.
 
 #include <cuda_runtime.h>
 
@@ -17,8 +17,8 @@
 namespace v3dg {
 namespace cuda {
 
-// The device has no room; what() names what was asked for and what was free. Python gets a MemoryError, as of
-// every std::bad_alloc.
+// The device has no room; what() names what was asked for and what was free. Python gets a
+// MemoryError, as of every std::bad_alloc.
 class OutOfMemory : public std::bad_alloc {
   public:
     explicit OutOfMemory(std::string text) : text_(std::move(text)) {}
@@ -40,17 +40,17 @@ unsigned num_multiprocessors();
 // Bytes of shared memory that one of them has.
 size_t shared_memory_of_multiprocessor();
 
-// Lets the kernel have `bytes` of dynamic shared memory on the current device, which has to be asked for
-// where it is more than 48 KiB with what the kernel declares. The driver's limit is one for all threads, so
-// it is only ever raised: a lower one could come between another thread's asking and its launch. `name` goes
-// into errors.
+// Lets the kernel have `bytes` of dynamic shared memory on the current device, which has to be
+// asked for where it is more than 48 KiB with what the kernel declares. The driver's limit is one
+// for all threads, so it is only ever raised: a lower one could come between another thread's
+// asking and its launch. `name` goes into errors.
 void allow_shared_memory(const void* kernel, size_t bytes, const char* name);
 
 // Whether what the current device runs of the kernel is code that waits for the kernel before it.
 bool can_start_early(const void* kernel);
 
-// Stream-ordered memory of the current device, from a pool that keeps what is given back for the next caller.
-// Throws OutOfMemory.
+// Stream-ordered memory of the current device, from a pool that keeps what is given back for the
+// next caller. Throws OutOfMemory.
 void* allocate(size_t bytes, cudaStream_t stream);
 // Of memory and a stream of `device`, whichever is current.
 void release(void* pointer, int device, cudaStream_t stream) noexcept;
@@ -72,7 +72,8 @@ class StreamMutex {
   public:
     StreamMutex();
     ~StreamMutex();
-    // Waits until the device is done with what was enqueued under the last lock, and so with all before it.
+    // Waits until the device is done with what was enqueued under the last lock, and so with all
+    // before it.
     void wait() const noexcept;
     StreamMutex(const StreamMutex&) = delete;
     StreamMutex& operator=(const StreamMutex&) = delete;
@@ -84,9 +85,9 @@ class StreamMutex {
     cudaStream_t last_ = nullptr;
 };
 
-// While it lives, the memory belongs to one thread, and what that enqueues on the stream runs after what was
-// enqueued under the lock before. It does not order what a graph captures: whoever replays the graph does
-// that.
+// While it lives, the memory belongs to one thread, and what that enqueues on the stream runs after
+// what was enqueued under the lock before. It does not order what a graph captures: whoever replays
+// the graph does that.
 class StreamLock {
   public:
     StreamLock(StreamMutex& mutex, cudaStream_t stream);
@@ -101,8 +102,8 @@ class StreamLock {
     bool is_captured_;
 };
 
-// Owned elements of a plain type, not initialised, on the device that is current when it grows. Grows by
-// forgetting what it held. Whoever uses it on several streams orders them.
+// Owned elements of a plain type, not initialised, on the device that is current when it grows.
+// Grows by forgetting what it held. Whoever uses it on several streams orders them.
 template <class T>
 class DeviceBuffer {
   public:
@@ -134,7 +135,8 @@ class DeviceBuffer {
     T* copy_from(Span<const T> host, cudaStream_t stream) {
         reserve(host.size, stream);
         if (host.size > 0)
-            check(cudaMemcpyAsync(data_, host.data, host.size * sizeof(T), cudaMemcpyHostToDevice, stream),
+            check(cudaMemcpyAsync(data_, host.data, host.size * sizeof(T), cudaMemcpyHostToDevice,
+                                  stream),
                   "cudaMemcpyAsync to the device");
         return data_;
     }

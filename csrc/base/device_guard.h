@@ -5,8 +5,8 @@
 namespace v3dg {
 namespace cuda {
 
-// Makes a device the current one of this thread for as long as it lives. Streams that are used meanwhile
-// belong to that device.
+// Makes a device the current one of this thread for as long as it lives. Streams that are used
+// meanwhile belong to that device.
 class DeviceGuard {
   public:
     explicit DeviceGuard(int device) : device_(device), before_(current_device()) {

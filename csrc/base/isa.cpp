@@ -43,7 +43,8 @@ static Isa choose_isa() {
                                      ", its widest is " + isa_name(widest));
         return isa;
     }
-    throw std::runtime_error(std::string("V3DG_ISA: expected baseline, avx2 or avx512, got ") + wanted);
+    throw std::runtime_error(std::string("V3DG_ISA: expected baseline, avx2 or avx512, got ") +
+                             wanted);
 }
 
 Isa active_isa() {

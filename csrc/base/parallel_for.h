@@ -9,8 +9,9 @@
 
 namespace v3dg {
 
-// Calls body(i) for every i < count on all threads; `chunk` neighbours go to one thread together. Results may
-// not depend on which thread runs a body. What bodies throw, mostly for lack of memory, goes to the caller.
+// Calls body(i) for every i < count on all threads; `chunk` neighbours go to one thread together.
+// Results may not depend on which thread runs a body. What bodies throw, mostly for lack of memory,
+// goes to the caller.
 template <class Body>
 void parallel_for(size_t count, size_t chunk, const Body& body) {
     FirstError error;

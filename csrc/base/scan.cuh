@@ -1,14 +1,15 @@
 #pragma once
 
-// Prefix sums: over the lanes of a warp, over a block's threads, and over parts that any number of blocks
-// take in turn.
+// Prefix sums: over the lanes of a warp, over a block's threads, and over parts that any number of
+// blocks take in turn.
 
 #include "base/launch.cuh"
 
 namespace v3dg {
 namespace cuda {
 
-// Sum of x over the lanes up to and including this one, in each part of kWidth lanes; for a whole warp.
+// Sum of x over the lanes up to and including this one, in each part of kWidth lanes; for a whole
+// warp.
 template <unsigned kWidth = 32, class T>
 __device__ inline T warp_prefix(T x) {
 #pragma unroll
@@ -19,8 +20,8 @@ __device__ inline T warp_prefix(T x) {
     return x;
 }
 
-// Sum of x over the threads before this one; `total` is that of all. For every thread of a block of whole
-// warps.
+// Sum of x over the threads before this one; `total` is that of all. For every thread of a block of
+// whole warps.
 template <class T>
 __device__ inline T block_prefix(T x, T& total) {
     __shared__ T warp_total[32];
@@ -48,14 +49,16 @@ __device__ inline unsigned take_ticket(unsigned* counter) {
     return taken;
 }
 
-// Sum of the parts before `part`, whose own is `sum` (below 2^62); for a whole warp, once a part. `state` is
-// zero at first, a word a part. Parts must be begun in ascending order: take them by ticket.
+// Sum of the parts before `part`, whose own is `sum` (below 2^62); for a whole warp, once a part.
+// `state` is zero at first, a word a part. Parts must be begun in ascending order: take them by
+// ticket.
 //
 // Source: Merrill and Garland, Single-pass Parallel Prefix Scan with Decoupled Look-back, 2016.
 __device__ inline unsigned long long prefix_of_part(unsigned long long* state, size_t part,
                                                     unsigned long long sum) {
     constexpr unsigned long long kOwn = 1ull << 62, kAll = 2ull << 62, kValue = kOwn - 1;
-    constexpr unsigned kEach = 4;  // parts that a lane looks at together, for each look takes a while
+    constexpr unsigned kEach =
+        4;  // parts that a lane looks at together, for each look takes a while
     volatile unsigned long long* word = state;
     const unsigned lane = threadIdx.x % 32;
     if (part == 0) {

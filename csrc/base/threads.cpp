@@ -11,13 +11,13 @@ namespace v3dg {
 namespace {
 
 constexpr int kMostThreads = 1024;
-// What a thread may have as its stack: with 64 KiB the median split overflows it, and more than the most is
-// address space that a machine with many processors does not have.
+// What a thread may have as its stack: with 64 KiB the median split overflows it, and more than the
+// most is address space that a machine with many processors does not have.
 constexpr double kLeastStackBytes = double(256 << 10);
 constexpr double kMostStackBytes = double(1 << 30);
 
-// Bytes in a text such as "512", "64 k" or "2M" of OpenMP, without a letter KiB; 0 where it is none of those,
-// which OpenMP ignores.
+// Bytes in a text such as "512", "64 k" or "2M" of OpenMP, without a letter KiB; 0 where it is none
+// of those, which OpenMP ignores.
 double stack_bytes_of(const char* text) {
     char* end = nullptr;
     const double value = std::strtod(text, &end);

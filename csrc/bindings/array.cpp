@@ -12,7 +12,8 @@ namespace {
 
 constexpr const char* kInterface = "__cuda_array_interface__";
 #if !V3DG_WITH_CUDA
-constexpr const char* kWithoutCuda = "v3dg was built without CUDA; install it again where nvcc is found";
+constexpr const char* kWithoutCuda =
+    "v3dg was built without CUDA; install it again where nvcc is found";
 #endif
 
 std::string text_of(const py::handle& value) { return py::str(value).cast<std::string>(); }
@@ -31,8 +32,8 @@ py::object interface_of(const py::handle& array) {
     return py::none();
 }
 
-// What is asked of torch for every frame, looked up once. It stays to the end of the process, which may come
-// after Python's.
+// What is asked of torch for every frame, looked up once. It stays to the end of the process, which
+// may come after Python's.
 struct Torch {
     py::object empty, current_stream;  // the stream as a number
 
@@ -87,7 +88,8 @@ void refuse_kind(const char* name, const std::string& expected, const py::handle
 std::string shape_text(Shape shape) {
     std::string text;
     for (const py::ssize_t length : shape)
-        text += (text.empty() ? "" : ", ") + (length < 0 ? std::string("N") : std::to_string(length));
+        text +=
+            (text.empty() ? "" : ", ") + (length < 0 ? std::string("N") : std::to_string(length));
     return "(" + text + (shape.size() == 1 ? ",)" : ")");
 }
 
@@ -108,19 +110,22 @@ Device device_of(const py::handle& array, const char* name) {
     const auto pointer = py::dict(face)["data"].cast<py::tuple>()[0].cast<uintptr_t>();
     cudaPointerAttributes attributes{};
     if (pointer != 0 &&
-        cudaPointerGetAttributes(&attributes, reinterpret_cast<const void*>(pointer)) == cudaSuccess &&
+        cudaPointerGetAttributes(&attributes, reinterpret_cast<const void*>(pointer)) ==
+            cudaSuccess &&
         attributes.type == cudaMemoryTypeDevice)
         return {attributes.device};
     cudaGetLastError();
-    // An array of no elements has no memory. Torch knows where it is all the same; any other is as good as on
-    // the current device.
-    const py::object index = py::getattr(py::getattr(array, "device", py::none()), "index", py::none());
+    // An array of no elements has no memory. Torch knows where it is all the same; any other is as
+    // good as on the current device.
+    const py::object index =
+        py::getattr(py::getattr(array, "device", py::none()), "index", py::none());
     if (py::isinstance<py::int_>(index)) return {index.cast<int>()};
     int current = 0;
     if (cudaGetDevice(&current) != cudaSuccess) cudaGetLastError();
     return {current};
 #else
-    throw std::runtime_error(std::string(name) + ": expected a NumPy array, got one on a CUDA device, and " +
+    throw std::runtime_error(std::string(name) +
+                             ": expected a NumPy array, got one on a CUDA device, and " +
                              kWithoutCuda);
 #endif
 }
@@ -134,14 +139,15 @@ void* host_memory(const py::handle& array, const char* name, const py::dtype& dt
     if (!fits_shape(lengths_of(got), shape))
         refuse(name, "expected shape " + shape_text(shape) + ", got " + shape_text(got));
     if (!(got.flags() & py::array::c_style))
-        refuse(name, "expected a C-contiguous array, got a strided one; call numpy.ascontiguousarray");
+        refuse(name,
+               "expected a C-contiguous array, got a strided one; call numpy.ascontiguousarray");
     if (is_written && !got.writeable()) refuse(name, "expected an array that can be written to");
     size = static_cast<size_t>(got.size());
     return const_cast<void*>(got.data());
 }
 
-void* device_memory(const py::handle& array, const char* name, const std::string& typestr, Shape shape,
-                    size_t& size) {
+void* device_memory(const py::handle& array, const char* name, const std::string& typestr,
+                    Shape shape, size_t& size) {
     const py::object found = interface_of(array);
     if (found.is_none()) refuse_kind(name, "an array on a CUDA device", array);
     const py::dict face(found);
@@ -192,7 +198,8 @@ struct Work::Guard {
 Work::Work(Device device) : device_(device) {
     if (device.is_host()) return;
     guard_ = std::make_unique<Guard>(device.number);
-    stream_ = reinterpret_cast<cuda::Stream>(Torch::get().current_stream(device.number).cast<uintptr_t>());
+    stream_ = reinterpret_cast<cuda::Stream>(
+        Torch::get().current_stream(device.number).cast<uintptr_t>());
 }
 
 #else

@@ -1,7 +1,8 @@
 #pragma once
 
-// Arrays that users hold: NumPy's on the host; on a CUDA device whatever has __cuda_array_interface__, such
-// as torch's tensors. They are borrowed after checks of kind, dtype, shape and layout, never copied.
+// Arrays that users hold: NumPy's on the host; on a CUDA device whatever has
+// __cuda_array_interface__, such as torch's tensors. They are borrowed after checks of kind, dtype,
+// shape and layout, never copied.
 
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
@@ -40,22 +41,23 @@ T& held(const py::handle& object, const char* name) {
 // The shape of an array on either side; TypeError where there is none.
 std::vector<py::ssize_t> shape_of(const py::handle& array, const char* name);
 
-// Where an array is. TypeError where it is neither NumPy's nor on a CUDA device, RuntimeError where that
-// needs a v3dg built with CUDA.
+// Where an array is. TypeError where it is neither NumPy's nor on a CUDA device, RuntimeError where
+// that needs a v3dg built with CUDA.
 Device device_of(const py::handle& array, const char* name);
 
 // Memory after checks that it is an array on the host, or on a device, of this dtype and shape.
 void* host_memory(const py::handle& array, const char* name, const py::dtype& dtype, Shape shape,
                   bool is_written, size_t& size);
-void* device_memory(const py::handle& array, const char* name, const std::string& typestr, Shape shape,
-                    size_t& size);
+void* device_memory(const py::handle& array, const char* name, const std::string& typestr,
+                    Shape shape, size_t& size);
 
 // Borrows an array on the host; T is const where it is only read.
 template <class T>
 Span<T> span_of(const py::handle& array, const char* name, Shape shape) {
     using Value = std::remove_const_t<T>;
     size_t size = 0;
-    void* data = host_memory(array, name, py::dtype::of<Value>(), shape, !std::is_const<T>::value, size);
+    void* data =
+        host_memory(array, name, py::dtype::of<Value>(), shape, !std::is_const<T>::value, size);
     return {static_cast<T*>(data), size};
 }
 
@@ -63,7 +65,8 @@ Span<T> span_of(const py::handle& array, const char* name, Shape shape) {
 template <class T>
 Span<T> device_span_of(const py::handle& array, const char* name, Shape shape) {
     using Value = std::remove_const_t<T>;
-    static const std::string typestr = py::dtype::of<Value>().attr("str").template cast<std::string>();
+    static const std::string typestr =
+        py::dtype::of<Value>().attr("str").template cast<std::string>();
     size_t size = 0;
     void* data = device_memory(array, name, typestr, shape, size);
     return {static_cast<T*>(data), size};
@@ -81,8 +84,8 @@ Span<T> span_on(Device device, const py::handle& array, const char* name, Shape 
     return span;
 }
 
-// A new array, not initialised: NumPy's on the host, a torch tensor on a device. Too little memory there is a
-// MemoryError.
+// A new array, not initialised: NumPy's on the host, a torch tensor on a device. Too little memory
+// there is a MemoryError.
 py::object new_array(Device device, const py::dtype& dtype, const std::vector<py::ssize_t>& shape);
 
 // The same, borrowed to be filled in.
@@ -104,9 +107,9 @@ struct NewArray {
     }
 };
 
-// Work on a device, on the stream that torch uses there; that device is the current one meanwhile. Made and
-// destroyed with Python's lock, which the work itself is done without. RuntimeError where there is no such
-// device.
+// Work on a device, on the stream that torch uses there; that device is the current one meanwhile.
+// Made and destroyed with Python's lock, which the work itself is done without. RuntimeError where
+// there is no such device.
 class Work {
   public:
     explicit Work(Device device);

@@ -15,7 +15,8 @@ namespace {
 
 int halvings(int64_t count, int64_t cluster_size) {
     if (cluster_size < 1)
-        throw py::value_error("cluster_size: expected at least 1, got " + std::to_string(cluster_size));
+        throw py::value_error("cluster_size: expected at least 1, got " +
+                              std::to_string(cluster_size));
     return num_halvings(static_cast<size_t>(count), static_cast<size_t>(cluster_size));
 }
 
@@ -32,14 +33,16 @@ py::tuple median_split(const py::object& means, const py::array& offset, int dep
     const Span<const float> values = span_on<const float>(device, means, "means", {-1, 3});
     const Span<const Point> points{reinterpret_cast<const Point*>(values.data), values.size / 3};
     if (points.size > 0xffffffffu)
-        throw py::value_error("means: expected fewer than 2^32 rows, got " + std::to_string(points.size));
+        throw py::value_error("means: expected fewer than 2^32 rows, got " +
+                              std::to_string(points.size));
     const Span<const int64_t> offsets = offsets_of(offset, points.size);
     if (depth < 0 || depth > kDeepest)
         throw py::value_error("depth: expected 0 to 32, got " + std::to_string(depth));
     if (device.is_host()) check_finite(values);
     const Work work(device);
     const NewArray<int64_t> order(device, {static_cast<py::ssize_t>(points.size)});
-    const NewArray<int64_t> leaf_offset({}, {static_cast<py::ssize_t>(((offsets.size - 1) << depth) + 1)});
+    const NewArray<int64_t> leaf_offset(
+        {}, {static_cast<py::ssize_t>(((offsets.size - 1) << depth) + 1)});
     {
         const Unlocked unlocked;
         V3DG_DISPATCH(work, median_split, points, offsets, depth, order.span, leaf_offset.span);
@@ -50,7 +53,8 @@ py::tuple median_split(const py::object& means, const py::array& offset, int dep
 py::object findings_of(const Rows& gaussians) {
     const GaussianRows<const float> rows = gaussians.read<float>();
     if (!gaussians.device().is_host())
-        throw py::value_error("gaussians: expected arrays on the host, got others; bring them there");
+        throw py::value_error(
+            "gaussians: expected arrays on the host, got others; bring them there");
     const NewArray<uint16_t> findings({}, {static_cast<py::ssize_t>(rows.size)});
     {
         const Unlocked unlocked;
@@ -90,7 +94,8 @@ py::object bound_by_boxes(const Rows& gaussians, const py::array& offset) {
     const GaussianRows<const float> rows = gaussians.read<float>();
     const BoxInput in{rows.means, rows.quats, rows.scales, offsets_of(offset, rows.size)};
     const Work work(gaussians.device());
-    const NewArray<float> box(gaussians.device(), {static_cast<py::ssize_t>(in.offset.size - 1), 2, 3});
+    const NewArray<float> box(gaussians.device(),
+                              {static_cast<py::ssize_t>(in.offset.size - 1), 2, 3});
     const Span<Box> out{reinterpret_cast<Box*>(box.span.data), in.offset.size - 1};
     {
         const Unlocked unlocked;
@@ -99,10 +104,12 @@ py::object bound_by_boxes(const Rows& gaussians, const py::array& offset) {
     return box.object;
 }
 
-void check_bundle_tables(const py::array& offset, const py::array& level, const py::array& own_group,
-                         const py::array& parent_group, const py::array& box, const py::array& filter_px2,
-                         const py::array& antialiased, const py::array& ball, const py::array& weight,
-                         const py::array& parent, const py::array& group_level, const py::array& error,
+void check_bundle_tables(const py::array& offset, const py::array& level,
+                         const py::array& own_group, const py::array& parent_group,
+                         const py::array& box, const py::array& filter_px2,
+                         const py::array& antialiased, const py::array& ball,
+                         const py::array& weight, const py::array& parent,
+                         const py::array& group_level, const py::array& error,
                          int64_t num_gaussians) {
     const py::ssize_t c = level.size(), g = parent.size();
     const Span<const float> boxes = span_of<const float>(box, "clusters.box", {c, 2, 3}),
@@ -139,7 +146,8 @@ void check_bundle_tables(const py::array& offset, const py::array& level, const 
         };
         const auto found = arrays.find(fault.table);
         const py::int_ row(fault.row);
-        const py::object got = found == arrays.end() ? py::object(row) : found->second[row].attr("tolist")();
+        const py::object got =
+            found == arrays.end() ? py::object(row) : found->second[row].attr("tolist")();
         const py::str message =
             py::str("{}[{}]: expected {}, got {}").format(fault.table, row, fault.expected, got);
         throw py::value_error(message.cast<std::string>());
@@ -156,18 +164,20 @@ void bind_cluster(py::module_& m) {
           "Why gaussians on the host cannot be drawn: (N,) uint16 of bits, 0 where they can.");
     m.def("num_halvings", &halvings, "count"_a, "cluster_size"_a,
           "How often points are halved until no part holds more than cluster_size.");
-    m.def(
-        "median_split", &median_split, "means"_a, "offset"_a, "depth"_a,
-        "Perfect binary tree of each segment's points: (order (N,) int64, leaf_offset (L + 1,) int64, which "
-        "is on the host).");
+    m.def("median_split", &median_split, "means"_a, "offset"_a, "depth"_a,
+          "Perfect binary tree of each segment's points: (order (N,) int64, leaf_offset (L + 1,) "
+          "int64, which "
+          "is on the host).");
     m.def("morton_order", &order_along_curve, "means"_a,
           "Indices (N,) that put points on the host along a curve that keeps neighbours together.");
     m.def("bound_spheres", &bound_spheres, "spheres"_a, "offset"_a,
-          "Ball (S, 4) around each segment of spheres (N, 4), with the margin that keeps balls nested.");
-    m.def("check_tables", &check_bundle_tables, "offset"_a, "level"_a, "own_group"_a, "parent_group"_a,
-          "box"_a, "filter_px2"_a, "antialiased"_a, "ball"_a, "weight"_a, "parent"_a, "group_level"_a,
-          "error"_a, py::kw_only(), "num_gaussians"_a,
-          "Raise ValueError unless the tables of a bundle fit each other, and its cuts will be exact.");
+          "Ball (S, 4) around each segment of spheres (N, 4), with the margin that keeps balls "
+          "nested.");
+    m.def("check_tables", &check_bundle_tables, "offset"_a, "level"_a, "own_group"_a,
+          "parent_group"_a, "box"_a, "filter_px2"_a, "antialiased"_a, "ball"_a, "weight"_a,
+          "parent"_a, "group_level"_a, "error"_a, py::kw_only(), "num_gaussians"_a,
+          "Raise ValueError unless the tables of a bundle fit each other, and its cuts will be "
+          "exact.");
     m.def("bound_by_boxes", &bound_by_boxes, "gaussians"_a, "offset"_a,
           "Lower and upper corner of what each cluster draws: (C, 2, 3).");
 }

@@ -44,8 +44,8 @@ Rows blackened(const Rows& gaussians) {
 }
 
 py::array first_selected(const Rows& leaves, const Rows& level, const py::array& leaf_offset,
-                         const py::array& group_offset, const py::array& ball, double leaf_filter_px2,
-                         bool leaf_antialiased, double level_filter_px2) {
+                         const py::array& group_offset, const py::array& ball,
+                         double leaf_filter_px2, bool leaf_antialiased, double level_filter_px2) {
     const Device device = leaves.device();
     const auto num_leaves = static_cast<py::ssize_t>(leaves.size());
     const Span<const int64_t> of_leaves = offsets_of(leaf_offset, leaves.size()),
@@ -56,7 +56,8 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
     const Span<const float> balls = span_of<const float>(ball, "ball", {num_groups, 4});
     const py::object means = on_host(leaves.arrays()[0], device);
     FirstSelected measured(span_of<const float>(means, "means", {num_leaves, 3}),
-                           {reinterpret_cast<const Ball*>(balls.data), size_t(num_groups)}, of_level);
+                           {reinterpret_cast<const Ball*>(balls.data), size_t(num_groups)},
+                           of_level);
     const Rows black = blackened(leaves);
     const Look own{leaf_filter_px2, leaf_antialiased, kWhite, false},
         coarse{level_filter_px2, true, kWhite, false};
@@ -66,18 +67,21 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
     for (size_t picture = 0; picture < FirstSelected::num_pictures(); ++picture) {
         if (PyErr_CheckSignals() != 0) throw py::error_already_set();
         const Camera camera = measured.camera(picture);
-        const auto width = static_cast<size_t>(camera.width), height = static_cast<size_t>(camera.height);
+        const auto width = static_cast<size_t>(camera.width),
+                   height = static_cast<size_t>(camera.height);
         const Colors truth(leaves, enlarged(camera, FirstSelected::kSamples), own),
             by_leaves(leaves, camera, own), by_level(level, camera, coarse);
         const NewArray<float> losses({}, {py::ssize_t(height), py::ssize_t(width), 3});
         {
             const Unlocked unlocked;
-            losses_of_pixels({by_leaves.span, by_level.span, truth.span}, width, height, losses.span);
+            losses_of_pixels({by_leaves.span, by_level.span, truth.span}, width, height,
+                             losses.span);
         }
-        // The gradient of the sum of what the leaves show of the losses, by their colours, is their share.
+        // The gradient of the sum of what the leaves show of the losses, by their colours, is their
+        // share.
         const py::object tape = rasterize(black, {{}, camera}, in_black, false, true)[4];
-        const py::tuple gradients = tape.cast<Tape&>().backward(on_device(losses.object, device), py::none(),
-                                                                py::none(), {false, false});
+        const py::tuple gradients = tape.cast<Tape&>().backward(
+            on_device(losses.object, device), py::none(), py::none(), {false, false});
         const py::object shares = on_host(py::object(gradients[4]), device);
         measured.add(picture, span_of<const float>(shares, "sh", {num_leaves, 1, 3}), of_leaves);
     }
@@ -85,7 +89,8 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
     return py::array_t<float>(num_groups, growth.data());
 }
 
-// Balls of each level after those of level 1 have grown: those above contain them. Those of level 0 stay.
+// Balls of each level after those of level 1 have grown: those above contain them. Those of level 0
+// stay.
 py::list grown_balls(const py::list& balls, const py::array& growth) {
     py::list grown;
     std::vector<Ball> below;
@@ -99,17 +104,19 @@ py::list grown_balls(const py::list& balls, const py::array& growth) {
         const Span<Ball> here{reinterpret_cast<Ball*>(array.span.data), given.size / 4};
         if (below.empty()) {
             std::copy(given.begin(), given.end(), array.span.begin());
-            const Span<const float> times = span_of<const float>(growth, "growth", {py::ssize_t(here.size)});
+            const Span<const float> times =
+                span_of<const float>(growth, "growth", {py::ssize_t(here.size)});
             for (size_t g = 0; g < here.size; ++g) here[g].radius *= times[g];
         } else {
             if (here.size == 0 || below.size() % here.size != 0)
                 throw py::value_error("balls: expected a part of those of the level below, got " +
-                                      std::to_string(here.size) + " over " + std::to_string(below.size()));
+                                      std::to_string(here.size) + " over " +
+                                      std::to_string(below.size()));
             std::vector<int64_t> offset;
             for (size_t g = 0; g <= here.size; ++g)
                 offset.push_back(static_cast<int64_t>(g * (below.size() / here.size)));
-            cpu::bound_spheres({below.data(), below.size()}, {offset.data(), offset.size()}, kNestingMargin,
-                               here);
+            cpu::bound_spheres({below.data(), below.size()}, {offset.data(), offset.size()},
+                               kNestingMargin, here);
         }
         below.assign(here.begin(), here.end());
         grown.append(array.object);
@@ -120,9 +127,11 @@ py::list grown_balls(const py::list& balls, const py::array& growth) {
 }  // namespace
 
 void bind_first_selected(py::module_& m) {
-    m.def("first_selected", &first_selected, "leaves"_a, "level"_a, "leaf_offset"_a, "group_offset"_a,
-          "ball"_a, "leaf_filter_px2"_a, "leaf_antialiased"_a, "level_filter_px2"_a,
-          "How many times larger the balls of level 1 are to be, for its groups to be selected where they "
+    m.def("first_selected", &first_selected, "leaves"_a, "level"_a, "leaf_offset"_a,
+          "group_offset"_a, "ball"_a, "leaf_filter_px2"_a, "leaf_antialiased"_a,
+          "level_filter_px2"_a,
+          "How many times larger the balls of level 1 are to be, for its groups to be selected "
+          "where they "
           "are no worse than their leaves at one sample a pixel.");
     m.def("grown_balls", &grown_balls, "balls"_a, "growth"_a,
           "Balls of each level after those of level 1 have grown so many times.");

@@ -36,7 +36,9 @@ class BoundTarget {
                 "gaussians: expected the device and the SH degree of the target, got others");
     }
     FitTarget on_host() const { return {&model_->planes(), filter_px2_, antialiased_}; }
-    cuda::DeviceFitTarget on_device() const { return {rows_.read<float>(), filter_px2_, antialiased_}; }
+    cuda::DeviceFitTarget on_device() const {
+        return {rows_.read<float>(), filter_px2_, antialiased_};
+    }
 
   private:
     Rows rows_;
@@ -46,18 +48,21 @@ class BoundTarget {
 };
 
 // The groups that index `num_targets` and `num_rows` gaussians.
-std::vector<FitGroup> groups_of(const py::array& target_range, const py::array& range, const py::array& ball,
-                                const py::array& stream, size_t num_targets, size_t num_rows) {
+std::vector<FitGroup> groups_of(const py::array& target_range, const py::array& range,
+                                const py::array& ball, const py::array& stream, size_t num_targets,
+                                size_t num_rows) {
     const py::ssize_t num_groups = range.ndim() == 2 ? range.shape(0) : 0;
-    const Span<const int64_t> targets = span_of<const int64_t>(target_range, "target_range", {num_groups, 2});
+    const Span<const int64_t> targets =
+        span_of<const int64_t>(target_range, "target_range", {num_groups, 2});
     const Span<const int64_t> own = span_of<const int64_t>(range, "range", {num_groups, 2});
     const Span<const float> balls = span_of<const float>(ball, "ball", {num_groups, 4});
     const Span<const int64_t> streams = span_of<const int64_t>(stream, "stream", {num_groups});
     std::vector<FitGroup> groups;
     for (py::ssize_t g = 0; g < num_groups; ++g) {
         const int64_t bounds[4] = {targets[2 * g], targets[2 * g + 1], own[2 * g], own[2 * g + 1]};
-        if (bounds[0] < 0 || bounds[1] < bounds[0] || bounds[1] > static_cast<int64_t>(num_targets) ||
-            bounds[2] < 0 || bounds[3] < bounds[2] || bounds[3] > static_cast<int64_t>(num_rows))
+        if (bounds[0] < 0 || bounds[1] < bounds[0] ||
+            bounds[1] > static_cast<int64_t>(num_targets) || bounds[2] < 0 ||
+            bounds[3] < bounds[2] || bounds[3] > static_cast<int64_t>(num_rows))
             throw py::value_error("range: expected [first, last) within the gaussians, group " +
                                   std::to_string(g) + " is not");
         FitGroup group{static_cast<uint64_t>(bounds[0]),
@@ -75,9 +80,10 @@ std::vector<FitGroup> groups_of(const py::array& target_range, const py::array& 
     return groups;
 }
 
-py::object fit_level_arrays(const FitConfig& config, const BoundTarget& target, const py::array& target_range,
-                            const Rows& gaussians, const py::array& range, const py::array& ball,
-                            const py::array& stream, FitProgress& progress) {
+py::object fit_level_arrays(const FitConfig& config, const BoundTarget& target,
+                            const py::array& target_range, const Rows& gaussians,
+                            const py::array& range, const py::array& ball, const py::array& stream,
+                            FitProgress& progress) {
     target.check_alike(gaussians);
     const std::vector<FitGroup> groups =
         groups_of(target_range, range, ball, stream, target.size(), gaussians.size());
@@ -92,7 +98,8 @@ py::object fit_level_arrays(const FitConfig& config, const BoundTarget& target, 
             const cuda::DeviceFitTarget on_device = target.on_device();
             {
                 const Unlocked unlocked;
-                cuda::fit_level(config, all, on_device, rows, error.span.data, progress, work.stream());
+                cuda::fit_level(config, all, on_device, rows, error.span.data, progress,
+                                work.stream());
             }
             return error.object;
         }
@@ -106,19 +113,19 @@ py::object fit_level_arrays(const FitConfig& config, const BoundTarget& target, 
 // Pictures of cuts, with what they borrow from.
 class BoundPictures {
   public:
-    BoundPictures(const BoundTable& table, const Rows& asset, const std::vector<BoundCamera>& cameras,
-                  uint64_t seed)
+    BoundPictures(const BoundTable& table, const Rows& asset,
+                  const std::vector<BoundCamera>& cameras, uint64_t seed)
         : asset_(asset),
           cameras_(cameras_of(cameras)),
-          pictures_(
-              pictures_of_cuts(table.table(), on_host(asset), {cameras_.data(), cameras_.size()}, seed)) {}
+          pictures_(pictures_of_cuts(table.table(), on_host(asset),
+                                     {cameras_.data(), cameras_.size()}, seed)) {}
 
     const CutPictures& pictures() const { return pictures_; }
     py::tuple view(uint64_t number) const {
         const CutView view = cut_view(pictures_, number);
         const auto count = static_cast<py::ssize_t>(view.clusters.size());
-        return py::make_tuple(BoundCamera{{}, view.camera}, py::array_t<int32_t>(count, view.clusters.data()),
-                              view.samples);
+        return py::make_tuple(BoundCamera{{}, view.camera},
+                              py::array_t<int32_t>(count, view.clusters.data()), view.samples);
     }
     // Throws unless these are the gaussians of the table.
     void check_all(const Rows& gaussians) const {
@@ -151,28 +158,31 @@ class BoundPictures {
 };
 
 void refine_cuts_arrays(const FitConfig& config, const BoundTarget& target, const Rows& gaussians,
-                        const py::array& radius, const BoundPictures& pictures, FitProgress& progress) {
+                        const py::array& radius, const BoundPictures& pictures,
+                        FitProgress& progress) {
     target.check_alike(gaussians);
     const auto count = static_cast<py::ssize_t>(gaussians.size());
     const CutRows levels{gaussians.write(), span_of<const float>(radius, "radius", {count})};
     pictures.check_all(gaussians);
     for (const float radius_of_one : levels.radius)
         if (!(radius_of_one > 0))
-            throw py::value_error("radius: expected positive numbers, got " + std::to_string(radius_of_one));
+            throw py::value_error("radius: expected positive numbers, got " +
+                                  std::to_string(radius_of_one));
     const Work work(gaussians.device());
     if constexpr (V3DG_WITH_CUDA != 0)
         if (!work.device().is_host()) {
             const cuda::DeviceFitTarget on_device = target.on_device();
             const Unlocked unlocked;
-            cuda::refine_cuts(config, on_device, levels, pictures.pictures(), progress, work.stream());
+            cuda::refine_cuts(config, on_device, levels, pictures.pictures(), progress,
+                              work.stream());
             return;
         }
     const Unlocked unlocked;
     refine_cuts(config, target.on_host(), target.size(), levels, pictures.pictures(), progress);
 }
 
-py::tuple weigh_cuts_arrays(const FitConfig& config, const Rows& gaussians, const BoundPictures& pictures,
-                            FitProgress& progress) {
+py::tuple weigh_cuts_arrays(const FitConfig& config, const Rows& gaussians,
+                            const BoundPictures& pictures, FitProgress& progress) {
     pictures.check_all(gaussians);
     const GaussianRows<const float> rows = gaussians.read<float>();
     const auto count = static_cast<py::ssize_t>(gaussians.size());
@@ -236,15 +246,16 @@ py::tuple dssim_of(const py::array& picture, const py::array& target) {
     const NewArray<float> gradient({}, {height, width});
     std::fill(gradient.span.begin(), gradient.span.end(), 0.0f);
     SsimScratch scratch;
-    const float value = dssim(p.data, t.data, static_cast<int>(width), static_cast<int>(height), 1.0f,
-                              gradient.span.data, scratch);
+    const float value = dssim(p.data, t.data, static_cast<int>(width), static_cast<int>(height),
+                              1.0f, gradient.span.data, scratch);
     return py::make_tuple(value, gradient.object);
 }
 
 template <class T>
 double mean_ssim_of(const py::array& picture, const py::array& target) {
     const Span<const T> p = span_of<const T>(picture, "picture", {-1, -1, -1});
-    const py::ssize_t height = picture.shape(0), width = picture.shape(1), channels = picture.shape(2);
+    const py::ssize_t height = picture.shape(0), width = picture.shape(1),
+                      channels = picture.shape(2);
     const Span<const T> t = span_of<const T>(target, "target", {height, width, channels});
     if (std::min(height, width) <= kSsimRadius || channels == 0)
         throw py::value_error("picture: expected at least " + std::to_string(kSsimRadius + 1) +
@@ -262,7 +273,8 @@ double ssim_of_pictures(const py::array& picture, const py::array& target) {
 }  // namespace
 
 void bind_fit_level(py::module_& m) {
-    py::class_<FitConfig>(m, "FitConfig", "How groups are fitted; a setting that is left out is an error.")
+    py::class_<FitConfig>(m, "FitConfig",
+                          "How groups are fitted; a setting that is left out is an error.")
         .def(py::init(&make_config), py::kw_only(), "steps"_a, "views_per_step"_a, "num_views"_a,
              "supersample"_a, "image_size"_a, "px2_per_gaussian"_a, "distance"_a, "filter_px2"_a,
              "antialiased"_a, "loss_l1"_a, "loss_dssim"_a, "loss_alpha"_a, "step_position"_a,
@@ -271,34 +283,40 @@ void bind_fit_level(py::module_& m) {
     py::class_<FitProgress>(m, "FitProgress",
                             "How far a fit is, to be looked at and cancelled from any thread.")
         .def(py::init<>())
-        .def_property_readonly("groups_done", [](const FitProgress& p) { return p.groups_done.load(); })
+        .def_property_readonly("groups_done",
+                               [](const FitProgress& p) { return p.groups_done.load(); })
         .def_property_readonly("loss_sum", [](const FitProgress& p) { return p.loss_sum.load(); })
         .def("cancel", [](FitProgress& p) { p.cancel = true; });
     py::class_<BoundTarget>(m, "FitTarget", "The gaussians that groups should look like.")
         .def(py::init<const Rows&, float, bool>(), "gaussians"_a, "filter_px2"_a, "antialiased"_a);
-    m.def("fit_level", &fit_level_arrays, "config"_a, "target"_a, "target_range"_a, "gaussians"_a, "range"_a,
-          "ball"_a, "stream"_a, "progress"_a,
-          "Fits groups of gaussians, in place, to look like groups of the target inside their balls (G, 4). "
+    m.def("fit_level", &fit_level_arrays, "config"_a, "target"_a, "target_range"_a, "gaussians"_a,
+          "range"_a, "ball"_a, "stream"_a, "progress"_a,
+          "Fits groups of gaussians, in place, to look like groups of the target inside their "
+          "balls (G, 4). "
           "Returns the residuals (G, 2) in colour and alpha.");
-    py::class_<BoundPictures>(m, "CutPictures",
-                              "Pictures of cuts from all around an asset, which is level 0, or from cameras.")
+    py::class_<BoundPictures>(
+        m, "CutPictures",
+        "Pictures of cuts from all around an asset, which is level 0, or from cameras.")
         .def(py::init<const BoundTable&, const Rows&, const std::vector<BoundCamera>&, uint64_t>(),
              py::kw_only(), "table"_a, "asset"_a, "cameras"_a, "seed"_a, py::keep_alive<1, 2>())
         .def("view", &BoundPictures::view, "number"_a,
-             "The camera of a window, the clusters that it shows, and the samples of a side of a pixel.");
-    m.def(
-        "refine_cuts", &refine_cuts_arrays, "config"_a, "target"_a, "gaussians"_a, "radius"_a, "pictures"_a,
-        "progress"_a,
-        "Moves the gaussians of clusters, in place, until pictures of cuts are those of the target: a step a "
-        "picture.");
+             "The camera of a window, the clusters that it shows, and the samples of a side of a "
+             "pixel.");
+    m.def("refine_cuts", &refine_cuts_arrays, "config"_a, "target"_a, "gaussians"_a, "radius"_a,
+          "pictures"_a, "progress"_a,
+          "Moves the gaussians of clusters, in place, until pictures of cuts are those of the "
+          "target: a step a "
+          "picture.");
     m.def("weigh_cuts", &weigh_cuts_arrays, "config"_a, "gaussians"_a, "pictures"_a, "progress"_a,
-          "What pictures of cuts, one a step, show of each gaussian: the sum (N,) of its blend weights, in "
+          "What pictures of cuts, one a step, show of each gaussian: the sum (N,) of its blend "
+          "weights, in "
           "parts "
           "of the pixels of each picture, and in how many of the cuts it was (N,).");
     m.def("dssim", &dssim_of, "picture"_a, "target"_a,
           "Mean of 1 - SSIM of one channel, and its gradient by the picture.");
     m.def("ssim", &ssim_of_pictures, "picture"_a, "target"_a,
-          "Mean of SSIM of pictures (H, W, C), both float32 or both float64; the border is mirrored.");
+          "Mean of SSIM of pictures (H, W, C), both float32 or both float64; the border is "
+          "mirrored.");
 }
 
 }  // namespace v3dg

@@ -15,8 +15,8 @@ namespace v3dg {
 
 namespace {
 
-// What a picture from a pool shows: colours, and where clusters have their own, those; or how many gaussians
-// each pixel is blended of, in place of depth.
+// What a picture from a pool shows: colours, and where clusters have their own, those; or how many
+// gaussians each pixel is blended of, in place of depth.
 struct PoolLook {
     SceneColors colors = SceneColors::own;
     bool counts = false;
@@ -25,12 +25,13 @@ struct PoolLook {
     py::list cluster_colors;
 
     bool is_plain() const {
-        return colors == SceneColors::own && !counts && !is_aside && !chooser && cluster_colors.empty();
+        return colors == SceneColors::own && !counts && !is_aside && !chooser &&
+               cluster_colors.empty();
     }
 };
 
-PoolLook pool_look(const std::string& shows, const py::list& cluster_colors, const BoundEyes* chooser,
-                   bool is_aside) {
+PoolLook pool_look(const std::string& shows, const py::list& cluster_colors,
+                   const BoundEyes* chooser, bool is_aside) {
     PoolLook look;
     if (shows == "residency") look.colors = SceneColors::missing;
     if (shows == "error") look.colors = SceneColors::metrics;
@@ -112,10 +113,11 @@ class BoundSceneFrame {
         const auto draw_paced = [&](const SelectRule& paced,
                                     uint32_t* last_bin) -> std::unique_ptr<BoundDrawing> {
             if (device_.is_host())
-                return on_host(scene, eyes, shade, [&](HostScene host, Span<const Picture<float>> out) {
-                    host.last_bin = last_bin;
-                    return cpu::draw_scene(host, eyes, paced, out, flag_of(stop));
-                });
+                return on_host(scene, eyes, shade,
+                               [&](HostScene host, Span<const Picture<float>> out) {
+                                   host.last_bin = last_bin;
+                                   return cpu::draw_scene(host, eyes, paced, out, flag_of(stop));
+                               });
 #if V3DG_WITH_CUDA
             const Work work(device_);
             NewPictures pictures;
@@ -123,8 +125,8 @@ class BoundSceneFrame {
             auto drawing = frame_->draw(scene.on_device(), eyes, paced, images, work.stream(),
                                         place_of(pictures, device_));
             return std::make_unique<BoundDrawing>(std::move(pictures),
-                                                  py::make_tuple(py::cast(this), scene_object), device_,
-                                                  turns_, std::move(drawing), rule);
+                                                  py::make_tuple(py::cast(this), scene_object),
+                                                  device_, turns_, std::move(drawing), rule);
 #else
             return nullptr;
 #endif
@@ -133,10 +135,12 @@ class BoundSceneFrame {
     }
 
     // What is resident of the bundles of a pool, with what comes in before.
-    std::unique_ptr<BoundDrawing> draw_resident(const py::object& scene_object, const py::object& pool_object,
+    std::unique_ptr<BoundDrawing> draw_resident(const py::object& scene_object,
+                                                const py::object& pool_object,
                                                 const BoundEyes& camera, const SelectRule& rule,
-                                                const Shade& shade, const Stop* stop, BudgetSteps* steps,
-                                                const std::string& shows, const py::list& cluster_colors,
+                                                const Shade& shade, const Stop* stop,
+                                                BudgetSteps* steps, const std::string& shows,
+                                                const py::list& cluster_colors,
                                                 const BoundEyes* chooser, bool is_aside) {
         const PoolLook look = pool_look(shows, cluster_colors, chooser, is_aside);
         auto& pool = checked_pool(scene_object, pool_object);
@@ -150,18 +154,20 @@ class BoundSceneFrame {
                                     uint32_t* last_bin) -> std::unique_ptr<BoundDrawing> {
             if (device_.is_host()) {
                 const float wanted = rule.tolerance_px2;
-                return resident_on_host(*state, pool, eyes, paced, wanted, shade, stop, look, last_bin);
+                return resident_on_host(*state, pool, eyes, paced, wanted, shade, stop, look,
+                                        last_bin);
             }
 #if V3DG_WITH_CUDA
             const Work work(device_);
             NewPictures pictures;
             const cuda::EyeImages images = new_images(eyes, shade, pictures);
             SelectRule used = paced;
-            auto drawing = frame_->draw_resident(scene.on_device(), pool.on_device(), eyes, used, images,
-                                                 work.stream(), place_of(pictures, device_));
+            auto drawing =
+                frame_->draw_resident(scene.on_device(), pool.on_device(), eyes, used, images,
+                                      work.stream(), place_of(pictures, device_));
             return std::make_unique<BoundDrawing>(
-                std::move(pictures), py::make_tuple(py::cast(this), scene_object, pool_object), device_,
-                turns_, std::move(drawing), used, &pool.on_device());
+                std::move(pictures), py::make_tuple(py::cast(this), scene_object, pool_object),
+                device_, turns_, std::move(drawing), used, &pool.on_device());
 #else
             return nullptr;
 #endif
@@ -183,7 +189,8 @@ class BoundSceneFrame {
         {
             const Unlocked unlocked;
             pool.frame_on_host(
-                *state, rule, PoolFrame::aside, [&](auto tables, const SelectRule& raised, auto needs) {
+                *state, rule, PoolFrame::aside,
+                [&](auto tables, const SelectRule& raised, auto needs) {
                     const HostScene host{tables, {models.data(), models.size()}, state->instances};
                     cpu::select({tables, state->instances, eyes, raised, needs}, cut);
                     const GivenCut given{{cut.instance.data(), cut.instance.size()},
@@ -198,36 +205,41 @@ class BoundSceneFrame {
                               picked.depth);
     }
 
-    std::unique_ptr<BoundDrawing> draw_cut(const py::object& scene_object, const BoundCamera& camera,
-                                           const py::object& instance_ids, const py::object& cluster_ids,
-                                           const Shade& shade, const Stop* stop, const py::object& weights) {
+    std::unique_ptr<BoundDrawing> draw_cut(const py::object& scene_object,
+                                           const BoundCamera& camera,
+                                           const py::object& instance_ids,
+                                           const py::object& cluster_ids, const Shade& shade,
+                                           const Stop* stop, const py::object& weights) {
         auto& scene = checked(scene_object);
         const GivenCut given = given_cut(instance_ids, cluster_ids, weights);
         if (device_.is_host())
             return on_host(scene, camera.camera, shade,
                            [&](const HostScene& host, Span<const Picture<float>> out) {
-                               return cpu::draw_cut(host, camera.camera, given, out[0], flag_of(stop));
+                               return cpu::draw_cut(host, camera.camera, given, out[0],
+                                                    flag_of(stop));
                            });
 #if V3DG_WITH_CUDA
         const Turn turn(turns_.get());
         const Work work(device_);
         NewPictures pictures;
         const cuda::EyeImages images = new_images(camera.camera, shade, pictures);
-        auto drawing = frame_->draw_cut(scene.on_device(), camera.camera, given, images, work.stream(),
-                                        place_of(pictures, device_));
+        auto drawing = frame_->draw_cut(scene.on_device(), camera.camera, given, images,
+                                        work.stream(), place_of(pictures, device_));
         return std::make_unique<BoundDrawing>(
             std::move(pictures),
-            py::make_tuple(py::cast(this), scene_object, instance_ids, cluster_ids, weights), device_, turns_,
-            std::move(drawing), SelectRule{});
+            py::make_tuple(py::cast(this), scene_object, instance_ids, cluster_ids, weights),
+            device_, turns_, std::move(drawing), SelectRule{});
 #else
         return nullptr;
 #endif
     }
 
     // As draw_cut(), with the number of gaussians that each pixel is blended of in place of depth.
-    std::unique_ptr<BoundDrawing> count_cut(const py::object& scene_object, const BoundCamera& camera,
-                                            const py::array& instance_ids, const py::array& cluster_ids,
-                                            Shade shade, const Stop* stop, const py::object& weights) {
+    std::unique_ptr<BoundDrawing> count_cut(const py::object& scene_object,
+                                            const BoundCamera& camera,
+                                            const py::array& instance_ids,
+                                            const py::array& cluster_ids, Shade shade,
+                                            const Stop* stop, const py::object& weights) {
         require_host("count_cut");
         const GivenCut given = given_cut(instance_ids, cluster_ids, weights);
         shade.with_depth = true;
@@ -239,16 +251,19 @@ class BoundSceneFrame {
                        });
     }
 
-    // As draw_cut(), with the share of the rule's tolerance that each pair's metric takes as its colour.
-    std::unique_ptr<BoundDrawing> draw_metrics(const py::object& scene_object, const BoundCamera& camera,
-                                               const SelectRule& rule, const py::array& instance_ids,
+    // As draw_cut(), with the share of the rule's tolerance that each pair's metric takes as its
+    // colour.
+    std::unique_ptr<BoundDrawing> draw_metrics(const py::object& scene_object,
+                                               const BoundCamera& camera, const SelectRule& rule,
+                                               const py::array& instance_ids,
                                                const py::array& cluster_ids, const Shade& shade,
                                                const Stop* stop, const py::object& weights) {
         require_host("draw_metrics");
         const GivenCut given = given_cut(instance_ids, cluster_ids, weights);
         return on_host(checked(scene_object), camera.camera, shade,
                        [&](const HostScene& host, Span<const Picture<float>> out) {
-                           return cpu::draw_metrics(host, camera.camera, rule, given, out[0], flag_of(stop));
+                           return cpu::draw_metrics(host, camera.camera, rule, given, out[0],
+                                                    flag_of(stop));
                        });
     }
 
@@ -280,8 +295,8 @@ class BoundSceneFrame {
             shows_any = cpu::pick_cut(host_scene(*state, models), camera.camera, given, picked);
         }
         if (!shows_any) return py::none();
-        return py::make_tuple(given.instance[picked.pair], given.cluster[picked.pair], picked.weight,
-                              picked.depth);
+        return py::make_tuple(given.instance[picked.pair], given.cluster[picked.pair],
+                              picked.weight, picked.depth);
     }
 
   private:
@@ -298,11 +313,14 @@ class BoundSceneFrame {
                                              const py::list& colors) {
         std::vector<SceneModel> models;
         for (size_t b = 0; b < scene.tables.size(); ++b) {
-            models.push_back(
-                {pool.on_host().planes(b), scene.bundle(b).appearance(), {}, pool.on_host().codes(b)});
+            models.push_back({pool.on_host().planes(b),
+                              scene.bundle(b).appearance(),
+                              {},
+                              pool.on_host().codes(b)});
             const auto clusters = static_cast<py::ssize_t>(scene.tables[b].num_clusters());
             if (colors.empty()) continue;
-            if (b >= colors.size()) throw py::value_error("colors: expected none, or of each bundle");
+            if (b >= colors.size())
+                throw py::value_error("colors: expected none, or of each bundle");
             models.back().cluster_sh =
                 span_of<const float>(colors[b].cast<py::array>(), "colors", {clusters, 3}).data;
         }
@@ -311,8 +329,9 @@ class BoundSceneFrame {
 
     static std::unique_ptr<BoundDrawing> resident_on_host(const SceneState& scene, BoundPool& pool,
                                                           const Eyes& eyes, const SelectRule& rule,
-                                                          float wanted_px2, Shade shade, const Stop* stop,
-                                                          const PoolLook& look, uint32_t* last_bin) {
+                                                          float wanted_px2, Shade shade,
+                                                          const Stop* stop, const PoolLook& look,
+                                                          uint32_t* last_bin) {
         shade.with_depth |= look.counts;
         HostPictures out(eyes, shade);
         if (look.counts)
@@ -320,7 +339,8 @@ class BoundSceneFrame {
         const std::vector<SceneModel> models = models_in(pool, scene, look.cluster_colors);
         SceneFrameCounts counts{};
         const auto cut = [&](auto tables, const SelectRule& raised, auto needs) {
-            HostScene host{tables, {models.data(), models.size()}, scene.instances, needs, last_bin};
+            HostScene host{
+                tables, {models.data(), models.size()}, scene.instances, needs, last_bin};
             host.colors = look.colors;
             host.wanted_px2 = wanted_px2;
             if (look.chooser) host.chooser = &*look.chooser;
@@ -329,7 +349,8 @@ class BoundSceneFrame {
         };
         {
             const Unlocked unlocked;
-            pool.frame_on_host(scene, rule, look.is_aside ? PoolFrame::aside : PoolFrame::flight, cut);
+            pool.frame_on_host(scene, rule, look.is_aside ? PoolFrame::aside : PoolFrame::flight,
+                               cut);
         }
         return std::make_unique<BoundDrawing>(std::move(out.out), stats_of(counts));
     }
@@ -340,23 +361,27 @@ class BoundSceneFrame {
         GivenCut given{span_on<const int32_t>(device_, instance_ids, "instance_ids", {-1}), {}, {}};
         const auto size = static_cast<py::ssize_t>(given.instance.size);
         given.cluster = span_on<const int32_t>(device_, cluster_ids, "cluster_ids", {size});
-        if (!weights.is_none()) given.weight = span_on<const float>(device_, weights, "weights", {size});
+        if (!weights.is_none())
+            given.weight = span_on<const float>(device_, weights, "weights", {size});
         return given;
     }
 
     BoundScene& checked(const py::object& scene_object) const {
         auto& scene = held<BoundScene>(scene_object, "scene");
-        if (scene.device() != device_) throw py::value_error("scene: expected one on the frame's device");
+        if (scene.device() != device_)
+            throw py::value_error("scene: expected one on the frame's device");
         const std::vector<size_t>& of_scene = scene.state()->num_gaussians;
         if (of_scene.size() > num_gaussians_.size() ||
             !std::equal(of_scene.begin(), of_scene.end(), num_gaussians_.begin()))
-            throw py::value_error("scene: expected one of the bundles that the frame has the gaussians of");
+            throw py::value_error(
+                "scene: expected one of the bundles that the frame has the gaussians of");
         return scene;
     }
 
     void check_device(Device device, const char* name) const {
         if (device != device_)
-            throw py::value_error(std::string(name) + ": expected what is on the frame's device, got others");
+            throw py::value_error(std::string(name) +
+                                  ": expected what is on the frame's device, got others");
     }
 
 #if V3DG_WITH_CUDA
@@ -380,22 +405,26 @@ class BoundSceneFrame {
 
     std::vector<SceneModel> models_of(const SceneState& scene) const {
         std::vector<SceneModel> models(host_.begin(), host_.begin() + scene.tables.size());
-        for (size_t b = 0; b < models.size(); ++b) models[b].appearance = scene.bundle(b).appearance();
+        for (size_t b = 0; b < models.size(); ++b)
+            models[b].appearance = scene.bundle(b).appearance();
         return models;
     }
 
     static HostScene host_scene(const SceneState& scene, const std::vector<SceneModel>& models) {
-        return {{scene.tables.data(), scene.tables.size()}, {models.data(), models.size()}, scene.instances};
+        return {{scene.tables.data(), scene.tables.size()},
+                {models.data(), models.size()},
+                scene.instances};
     }
 
     // The windows of the eyes, drawn by draw(host scene, pictures) without Python's lock.
     template <class DrawPictures>
-    std::unique_ptr<BoundDrawing> on_host(const BoundScene& scene, const Eyes& eyes, const Shade& shade,
-                                          const DrawPictures& draw) const {
+    std::unique_ptr<BoundDrawing> on_host(const BoundScene& scene, const Eyes& eyes,
+                                          const Shade& shade, const DrawPictures& draw) const {
         HostPictures out(eyes, shade);
         const std::shared_ptr<const SceneState> state = scene.state();
         const std::vector<SceneModel> models = models_of(*state);
-        const py::list gaussians = models_, colors = palettes_;  // which another thread may replace meanwhile
+        const py::list gaussians = models_,
+                       colors = palettes_;  // which another thread may replace meanwhile
         SceneFrameCounts counts;
         {
             const Unlocked unlocked;
@@ -428,7 +457,8 @@ class BoundAssetFrame {
 #endif
     }
 
-    std::unique_ptr<BoundDrawing> draw(const BoundCamera& camera, const Shade& shade, const Stop* stop) {
+    std::unique_ptr<BoundDrawing> draw(const BoundCamera& camera, const Shade& shade,
+                                       const Stop* stop) {
         const auto& model = held<BoundModel>(model_, "model");
         if (model.device().is_host()) return on_host(model, camera, shade, stop);
 #if V3DG_WITH_CUDA
@@ -455,8 +485,8 @@ class BoundAssetFrame {
         SceneFrameCounts counts;
         {
             const Unlocked unlocked;
-            counts = cpu::draw_model(*model.on_host().planes, model.size(), camera.camera, out.pictures[0],
-                                     flag_of(stop));
+            counts = cpu::draw_model(*model.on_host().planes, model.size(), camera.camera,
+                                     out.pictures[0], flag_of(stop));
         }
         return std::make_unique<BoundDrawing>(std::move(out.out), stats_of(counts));
     }
@@ -487,11 +517,12 @@ void bind_frame(py::module_& m) {
         .def_readonly("draw_ms", &FrameStats::draw_ms)
         .def_readonly("levels", &FrameStats::levels)
         .def_readonly("num_draws", &FrameStats::num_draws);
-    py::class_<Shade>(m, "Shade",
-                      "What is behind a picture, when its pixels stop, and whether their depth is drawn.")
-        .def(py::init([](const std::array<double, 3>& background, float min_transmittance, bool with_depth) {
-                 return Shade{background, min_transmittance, with_depth};
-             }),
+    py::class_<Shade>(
+        m, "Shade",
+        "What is behind a picture, when its pixels stop, and whether their depth is drawn.")
+        .def(py::init(
+                 [](const std::array<double, 3>& background, float min_transmittance,
+                    bool with_depth) { return Shade{background, min_transmittance, with_depth}; }),
              py::kw_only(), "background"_a, "min_transmittance"_a, "with_depth"_a);
     py::class_<NewPicture>(m, "Picture", "The planes of a picture.")
         .def_readonly("color", &NewPicture::color)
@@ -501,25 +532,31 @@ void bind_frame(py::module_& m) {
         .def_property_readonly("color", [](const BoundDrawing& d) { return d.picture().color; })
         .def_property_readonly("alpha", [](const BoundDrawing& d) { return d.picture().alpha; })
         .def_property_readonly("depth", [](const BoundDrawing& d) { return d.picture().depth; })
-        .def_property_readonly("right", &BoundDrawing::right, "Of two eyes: what the right one sees.")
-        .def("finish", &BoundDrawing::finish, py::return_value_policy::copy, "Waits for the picture.");
+        .def_property_readonly("right", &BoundDrawing::right,
+                               "Of two eyes: what the right one sees.")
+        .def("finish", &BoundDrawing::finish, py::return_value_policy::copy,
+             "Waits for the picture.");
     py::class_<BoundSceneFrame>(m, "SceneFrame", "Draws scenes of the same bundles on one device.")
         .def(py::init<int>(), "device"_a)
         .def("set_models", &BoundSceneFrame::set_models, "models"_a, "palettes"_a)
-        .def("draw", &BoundSceneFrame::draw, "scene"_a, "camera"_a, "rule"_a, "shade"_a, "stop"_a = nullptr,
-             "steps"_a = nullptr)
-        .def("draw_resident", &BoundSceneFrame::draw_resident, "scene"_a, "pool"_a, "camera"_a, "rule"_a,
-             "shade"_a, "stop"_a = nullptr, "steps"_a = nullptr, py::kw_only(), "shows"_a = "appearance",
-             "colors"_a = py::list(), "chooser"_a = nullptr, "aside"_a = false)
-        .def("pick_resident", &BoundSceneFrame::pick_resident, "scene"_a, "pool"_a, "camera"_a, "rule"_a)
-        .def("draw_cut", &BoundSceneFrame::draw_cut, "scene"_a, "camera"_a, "instance_ids"_a, "cluster_ids"_a,
-             "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
+        .def("draw", &BoundSceneFrame::draw, "scene"_a, "camera"_a, "rule"_a, "shade"_a,
+             "stop"_a = nullptr, "steps"_a = nullptr)
+        .def("draw_resident", &BoundSceneFrame::draw_resident, "scene"_a, "pool"_a, "camera"_a,
+             "rule"_a, "shade"_a, "stop"_a = nullptr, "steps"_a = nullptr, py::kw_only(),
+             "shows"_a = "appearance", "colors"_a = py::list(), "chooser"_a = nullptr,
+             "aside"_a = false)
+        .def("pick_resident", &BoundSceneFrame::pick_resident, "scene"_a, "pool"_a, "camera"_a,
+             "rule"_a)
+        .def("draw_cut", &BoundSceneFrame::draw_cut, "scene"_a, "camera"_a, "instance_ids"_a,
+             "cluster_ids"_a, "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
         .def("count_cut", &BoundSceneFrame::count_cut, "scene"_a, "camera"_a, "instance_ids"_a,
              "cluster_ids"_a, "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
         .def("draw_metrics", &BoundSceneFrame::draw_metrics, "scene"_a, "camera"_a, "rule"_a,
-             "instance_ids"_a, "cluster_ids"_a, "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
+             "instance_ids"_a, "cluster_ids"_a, "shade"_a, "stop"_a = nullptr,
+             "weights"_a = py::none())
         .def("memory", &BoundSceneFrame::memory,
-             "Bytes that it keeps on a CUDA device, by part; and those of the pool of all frames there.")
+             "Bytes that it keeps on a CUDA device, by part; and those of the pool of all frames "
+             "there.")
         .def("pick_cut", &BoundSceneFrame::pick_cut, "scene"_a, "camera"_a, "instance_ids"_a,
              "cluster_ids"_a);
     py::class_<BoundAssetFrame>(m, "AssetFrame",

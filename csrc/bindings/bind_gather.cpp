@@ -36,14 +36,15 @@ py::tuple gathered(const GatherInput& in, Device device, int sh_degree) {
     return out.arrays();
 }
 
-py::tuple gather(const std::vector<std::reference_wrapper<const Rows>>& bundles, const Instances& instances,
-                 const py::array& instance, const py::array& first_row, const py::array& offset,
-                 const py::object& weights, int device) {
+py::tuple gather(const std::vector<std::reference_wrapper<const Rows>>& bundles,
+                 const Instances& instances, const py::array& instance, const py::array& first_row,
+                 const py::array& offset, const py::object& weights, int device) {
     std::vector<GaussianRows<const float>> rows;
     int sh_degree = 0;
     for (const Rows& bundle : bundles) {
         if (bundle.device() != Device{device})
-            throw py::value_error("bundles: expected gaussians on the device that is asked for, got others");
+            throw py::value_error(
+                "bundles: expected gaussians on the device that is asked for, got others");
         rows.push_back(bundle.read<float>());
         sh_degree = std::max(sh_degree, bundle.sh_degree());
     }
@@ -65,7 +66,8 @@ py::tuple gather(const std::vector<std::reference_wrapper<const Rows>>& bundles,
 }
 
 // All of a bundle as one cluster of one instance.
-py::tuple transform(const Rows& rows, const py::array& quaternion, const py::array& position, double scale) {
+py::tuple transform(const Rows& rows, const py::array& quaternion, const py::array& position,
+                    double scale) {
     const GaussianRows<const float> bundle = rows.read<float>();
     const int32_t first = 0;
     const int64_t first_row = 0, offset[] = {0, static_cast<int64_t>(bundle.size)};

@@ -18,18 +18,22 @@ namespace {
 PageRun run_of(const py::array& hashes, size_t first_page, const py::array& first_cluster,
                const py::array& offset, const py::array& places) {
     constexpr size_t kMost = size_t(1) << 62;
-    PageRun run{
-        first_page, {}, boundaries_of(offset, "offset", kMost), boundaries_of(places, "places", kMost), {}};
+    PageRun run{first_page,
+                {},
+                boundaries_of(offset, "offset", kMost),
+                boundaries_of(places, "places", kMost),
+                {}};
     run.first_cluster = boundaries_of(first_cluster, "first_cluster", run.offset.size - 1);
     if (run.first_cluster.size != run.places.size)
-        throw py::value_error("places: expected " + std::to_string(run.first_cluster.size) + ", got " +
-                              std::to_string(run.places.size));
-    run.hashes = span_of<const uint8_t>(hashes, "hashes", {static_cast<py::ssize_t>(run.size()), 16});
+        throw py::value_error("places: expected " + std::to_string(run.first_cluster.size) +
+                              ", got " + std::to_string(run.places.size));
+    run.hashes =
+        span_of<const uint8_t>(hashes, "hashes", {static_cast<py::ssize_t>(run.size()), 16});
     return run;
 }
 
-// Calls body() without the interpreter lock; what goes wrong with a page gets the file's name, which need not
-// be text that can be encoded.
+// Calls body() without the interpreter lock; what goes wrong with a page gets the file's name,
+// which need not be text that can be encoded.
 template <class Body>
 void naming_file(const py::object& path, const Body& body) {
     try {
@@ -48,7 +52,8 @@ void naming_file(const py::object& path, const Body& body) {
     }
 }
 
-void read_rows(const py::object& path, int descriptor, const PageRun& run, PageCodec codec, const Rows& out) {
+void read_rows(const py::object& path, int descriptor, const PageRun& run, PageCodec codec,
+               const Rows& out) {
     const GaussianRows<float> rows = out.write();
     const auto count = static_cast<size_t>(run.offset[run.offset.size - 1] - run.offset[0]);
     if (!out.device().is_host() || rows.size != count)
@@ -61,8 +66,8 @@ void read_rows(const py::object& path, int descriptor, const PageRun& run, PageC
         const size_t needed = is_quantized ? page_bytes(size, clusters.size - 1, rows.sh_degree)
                                            : sizeof(float) * (11 + rows.num_sh()) * size;
         if (run.num_bytes(page) < needed)
-            throw py::value_error("places: expected " + std::to_string(needed) + " bytes of a page, got " +
-                                  std::to_string(run.num_bytes(page)));
+            throw py::value_error("places: expected " + std::to_string(needed) +
+                                  " bytes of a page, got " + std::to_string(run.num_bytes(page)));
     }
     naming_file(path, [&] {
         const PosixFile file = PosixFile::duplicate(descriptor);
@@ -73,24 +78,28 @@ void read_rows(const py::object& path, int descriptor, const PageRun& run, PageC
 void read_words(const py::object& path, int descriptor, const PageRun& run, const py::array& out) {
     const int64_t num_bytes = run.places[run.size()] - run.places[0];
     if (num_bytes % 4 != 0)
-        throw py::value_error("places: expected whole words, got " + std::to_string(num_bytes) + " bytes");
-    const Span<int32_t> words = span_of<int32_t>(out, "out", {static_cast<py::ssize_t>(num_bytes / 4)});
+        throw py::value_error("places: expected whole words, got " + std::to_string(num_bytes) +
+                              " bytes");
+    const Span<int32_t> words =
+        span_of<int32_t>(out, "out", {static_cast<py::ssize_t>(num_bytes / 4)});
     naming_file(path, [&] { read_codes(PosixFile::duplicate(descriptor), run, words); });
 }
 
 // `out` is rows, which are decoded, or an array of words, which are not.
-void read_run(const py::object& path, int descriptor, const py::object& out, const std::string& codec,
-              const py::array& hashes, size_t first_page, const py::array& first_cluster,
-              const py::array& offset, const py::array& places) {
+void read_run(const py::object& path, int descriptor, const py::object& out,
+              const std::string& codec, const py::array& hashes, size_t first_page,
+              const py::array& first_cluster, const py::array& offset, const py::array& places) {
     const PageRun run = run_of(hashes, first_page, first_cluster, offset, places);
-    if (py::isinstance<py::array>(out)) return read_words(path, descriptor, run, out.cast<py::array>());
+    if (py::isinstance<py::array>(out))
+        return read_words(path, descriptor, run, out.cast<py::array>());
     const PageCodec of = codec == "quantized" ? PageCodec::quantized : PageCodec::float32;
     read_rows(path, descriptor, run, of, held<Rows>(out, "out"));
 }
 
 std::vector<py::bytes> hash_messages(const std::vector<py::array>& arrays) {
     std::vector<Span<const uint8_t>> messages;
-    for (const py::array& array : arrays) messages.push_back(span_of<const uint8_t>(array, "messages", {-1}));
+    for (const py::array& array : arrays)
+        messages.push_back(span_of<const uint8_t>(array, "messages", {-1}));
     std::vector<PageHash> hashes(messages.size());
     {
         const Unlocked unlocked;
@@ -105,12 +114,13 @@ std::vector<py::bytes> hash_messages(const std::vector<py::array>& arrays) {
 // With the array that it reads to and hashes.
 class BoundHashedRead {
   public:
-    BoundHashedRead(const py::object& path, int descriptor, size_t offset, py::array_t<uint8_t> message,
-                    size_t num_before, HashOf how)
+    BoundHashedRead(const py::object& path, int descriptor, size_t offset,
+                    py::array_t<uint8_t> message, size_t num_before, HashOf how)
         : path_(path), message_(std::move(message)), offset_(offset), num_before_(num_before) {
         const Span<uint8_t> bytes = span_of<uint8_t>(message_, "message", {-1});
-        naming_file(path_,
-                    [&] { read_.emplace(PosixFile::duplicate(descriptor), offset, bytes, num_before, how); });
+        naming_file(path_, [&] {
+            read_.emplace(PosixFile::duplicate(descriptor), offset, bytes, num_before, how);
+        });
     }
     py::array wait();
     bool is_sound();
@@ -122,18 +132,21 @@ class BoundHashedRead {
     std::optional<HashedRead> read_;
 };
 
-// Parts of several files. Small ones come to pieces of memory together, for which the system takes large
-// pages.
+// Parts of several files. Small ones come to pieces of memory together, for which the system takes
+// large pages.
 class BoundReader {
   public:
-    std::unique_ptr<BoundHashedRead> read(const py::object& path, int descriptor, const py::bytes& before,
-                                          size_t offset, size_t num_bytes, bool in_pieces) {
+    std::unique_ptr<BoundHashedRead> read(const py::object& path, int descriptor,
+                                          const py::bytes& before, size_t offset, size_t num_bytes,
+                                          bool in_pieces) {
         const auto first = before.cast<std::string_view>();
         if (num_bytes < kPageHashBytes)
-            throw py::value_error("num_bytes: expected at least 16, got " + std::to_string(num_bytes));
+            throw py::value_error("num_bytes: expected at least 16, got " +
+                                  std::to_string(num_bytes));
         py::array_t<uint8_t> message = take(first.size() + num_bytes);
         std::copy(first.begin(), first.end(), message.mutable_data());
-        return std::make_unique<BoundHashedRead>(path, descriptor, offset, std::move(message), first.size(),
+        return std::make_unique<BoundHashedRead>(path, descriptor, offset, std::move(message),
+                                                 first.size(),
                                                  in_pieces ? HashOf::pieces : HashOf::bytes);
     }
 
@@ -177,25 +190,29 @@ bool BoundHashedRead::is_sound() {
 }  // namespace
 
 void bind_pages(py::module_& m) {
-    py::class_<BoundHashedRead>(m, "HashedRead", "A part of a file that is read and hashed at the same time.")
+    py::class_<BoundHashedRead>(m, "HashedRead",
+                                "A part of a file that is read and hashed at the same time.")
         .def("wait", &BoundHashedRead::wait,
              "The bytes, once all are there; ValueError if the file has fewer.")
-        .def("is_sound", &BoundHashedRead::is_sound, "Whether all that was read has the hash at its end.");
-    py::class_<BoundReader>(m, "HashedReader", "Reads parts of several files, small ones to memory together.")
+        .def("is_sound", &BoundHashedRead::is_sound,
+             "Whether all that was read has the hash at its end.");
+    py::class_<BoundReader>(m, "HashedReader",
+                            "Reads parts of several files, small ones to memory together.")
         .def(py::init<>())
-        .def(
-            "read", &BoundReader::read, "path"_a, "descriptor"_a, "before"_a, "offset"_a, "num_bytes"_a,
-            "in_pieces"_a,
-            "Bytes at one place of a file that end with the BLAKE2b-128 of `before` and them, or of those of "
-            "their pieces. They are aligned to eight if `before` has a multiple of eight.");
-    m.def("blake2b", &hash_messages, "messages"_a, "BLAKE2b-128 of several messages, side by side.");
+        .def("read", &BoundReader::read, "path"_a, "descriptor"_a, "before"_a, "offset"_a,
+             "num_bytes"_a, "in_pieces"_a,
+             "Bytes at one place of a file that end with the BLAKE2b-128 of `before` and them, or "
+             "of those of "
+             "their pieces. They are aligned to eight if `before` has a multiple of eight.");
+    m.def("blake2b", &hash_messages, "messages"_a,
+          "BLAKE2b-128 of several messages, side by side.");
     m.attr("DAMAGED") = kDamaged;
     m.attr("HASH_PIECE_BYTES") = kHashPieceBytes;
-    m.def(
-        "read_pages", &read_run, "path"_a, "descriptor"_a, "out"_a, "codec"_a, "hashes"_a, py::kw_only(),
-        "first_page"_a, "first_cluster"_a, "offset"_a, "places"_a,
-        "Fills rows with the gaussians of neighbouring pages of a file, which have these hashes (n, 16), or "
-        "an array of words (W,) int32 with what the pages are as they are.");
+    m.def("read_pages", &read_run, "path"_a, "descriptor"_a, "out"_a, "codec"_a, "hashes"_a,
+          py::kw_only(), "first_page"_a, "first_cluster"_a, "offset"_a, "places"_a,
+          "Fills rows with the gaussians of neighbouring pages of a file, which have these hashes "
+          "(n, 16), or "
+          "an array of words (W,) int32 with what the pages are as they are.");
 }
 
 }  // namespace v3dg

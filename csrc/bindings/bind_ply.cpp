@@ -58,17 +58,21 @@ class BoundPlyFile {
     py::tuple read(int64_t first, int64_t last) {
         if (first < 0 || last < first || static_cast<size_t>(last) > ply_.num_gaussians())
             throw py::value_error(
-                "rows: expected 0 <= first <= last <= " + std::to_string(ply_.num_gaussians()) + ", got " +
-                std::to_string(first) + " to " + std::to_string(last));
-        const auto n = static_cast<py::ssize_t>(last - first), k = static_cast<py::ssize_t>(ply_.num_sh);
-        const NewArray<float> means({}, {n, 3}), quats({}, {n, 4}), scales({}, {n, 3}), opacities({}, {n}),
-            sh({}, {n, k, 3});
-        const PlyGaussians<float> out = {means.span, quats.span, scales.span, opacities.span, sh.span};
+                "rows: expected 0 <= first <= last <= " + std::to_string(ply_.num_gaussians()) +
+                ", got " + std::to_string(first) + " to " + std::to_string(last));
+        const auto n = static_cast<py::ssize_t>(last - first),
+                   k = static_cast<py::ssize_t>(ply_.num_sh);
+        const NewArray<float> means({}, {n, 3}), quats({}, {n, 4}), scales({}, {n, 3}),
+            opacities({}, {n}), sh({}, {n, k, 3});
+        const PlyGaussians<float> out = {means.span, quats.span, scales.span, opacities.span,
+                                         sh.span};
         // Read and set under the interpreter's lock, so that several threads may read.
         const PlyPlace known = next_;
-        next_ = with_path(
-            path_, [&](const char*) { return read_ply(ply_, static_cast<size_t>(first), known, out); });
-        return py::make_tuple(means.object, quats.object, scales.object, opacities.object, sh.object);
+        next_ = with_path(path_, [&](const char*) {
+            return read_ply(ply_, static_cast<size_t>(first), known, out);
+        });
+        return py::make_tuple(means.object, quats.object, scales.object, opacities.object,
+                              sh.object);
     }
 
   private:
@@ -78,16 +82,18 @@ class BoundPlyFile {
 };
 
 constexpr const char* kEncodings[] = {"ascii", "binary_little_endian", "binary_big_endian"};
-constexpr const char* kTypes[] = {"char", "uchar", "short", "ushort", "int", "uint", "float", "double"};
+constexpr const char* kTypes[] = {"char", "uchar", "short", "ushort",
+                                  "int",  "uint",  "float", "double"};
 
 py::tuple ply_header(const py::object& path) {
-    const PlyHeader header =
-        with_path(Path(path), [](const char* name) { return read_ply_header(open_ply_file(name)); });
+    const PlyHeader header = with_path(
+        Path(path), [](const char* name) { return read_ply_header(open_ply_file(name)); });
     py::list elements;
     for (const PlyElement& element : header.elements) {
         py::list properties;
         for (const PlyProperty& property : element.properties) {
-            const char* type = property.is_list ? "list" : kTypes[static_cast<size_t>(property.type)];
+            const char* type =
+                property.is_list ? "list" : kTypes[static_cast<size_t>(property.type)];
             properties.append(py::make_tuple(printable(property.name), type));
         }
         elements.append(py::make_tuple(printable(element.name), element.count, properties));
@@ -98,8 +104,8 @@ py::tuple ply_header(const py::object& path) {
 PlyEncoding encoding_of(const std::string& name) {
     for (size_t i = 0; i < std::size(kEncodings); ++i)
         if (name == kEncodings[i]) return static_cast<PlyEncoding>(i);
-    throw py::value_error("encoding: expected binary_little_endian, binary_big_endian or ascii, got " +
-                          quoted(name));
+    throw py::value_error(
+        "encoding: expected binary_little_endian, binary_big_endian or ascii, got " + quoted(name));
 }
 
 void ply_write(const py::object& path, const py::array& means, const py::array& quats,
@@ -109,12 +115,15 @@ void ply_write(const py::object& path, const py::array& means, const py::array& 
     const py::ssize_t n = means.ndim() > 0 ? means.shape(0) : 0;
     const py::ssize_t k = sh.ndim() > 1 ? sh.shape(1) : 0;
     if (k != 1 && k != 4 && k != 9 && k != 16)
-        throw py::value_error("sh: expected shape (N, K, 3) with K 1, 4, 9 or 16, got " + shape_text(sh));
-    const PlyGaussians<const float> in = {
-        span_of<const float>(means, "means", {n, 3}), span_of<const float>(quats, "quats", {n, 4}),
-        span_of<const float>(scales, "scales", {n, 3}), span_of<const float>(opacities, "opacities", {n}),
-        span_of<const float>(sh, "sh", {n, k, 3})};
-    with_path(Path(path), [&](const char* name) { write_ply(name, in, chosen, static_cast<size_t>(k)); });
+        throw py::value_error("sh: expected shape (N, K, 3) with K 1, 4, 9 or 16, got " +
+                              shape_text(sh));
+    const PlyGaussians<const float> in = {span_of<const float>(means, "means", {n, 3}),
+                                          span_of<const float>(quats, "quats", {n, 4}),
+                                          span_of<const float>(scales, "scales", {n, 3}),
+                                          span_of<const float>(opacities, "opacities", {n}),
+                                          span_of<const float>(sh, "sh", {n, k, 3})};
+    with_path(Path(path),
+              [&](const char* name) { write_ply(name, in, chosen, static_cast<size_t>(k)); });
 }
 
 }  // namespace
@@ -126,7 +135,8 @@ void bind_ply(py::module_& m) {
         .def_property_readonly("sh_degree", &BoundPlyFile::sh_degree)
         .def("read", &BoundPlyFile::read, "first"_a, "last"_a);
     m.def("ply_header", &ply_header, "path"_a,
-          "Encoding, bytes of the header, and elements: name, count, and properties' names and types.");
+          "Encoding, bytes of the header, and elements: name, count, and properties' names and "
+          "types.");
     m.def("ply_write", ply_write, "path"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a,
           "encoding"_a);
 }

@@ -10,10 +10,12 @@ namespace v3dg {
 
 namespace {
 
-// At most so much of a pool's memory is for pages on their way: what comes in while a few frames are drawn.
+// At most so much of a pool's memory is for pages on their way: what comes in while a few frames
+// are drawn.
 constexpr size_t kMostBlockBytes = size_t(64) << 20, kMostBlockBytesOnDevice = size_t(128) << 20;
 constexpr size_t kBlockShare = 8;
-// Threads that read do more than wait for the disk: they hash. There are more of them where there are cores.
+// Threads that read do more than wait for the disk: they hash. There are more of them where there
+// are cores.
 constexpr unsigned kMostThreads = 16;
 
 [[noreturn]] void raise(const PageError& error) {
@@ -45,23 +47,24 @@ std::string text_of_error() {
     return problem.empty() ? "the fetch failed" : problem;
 }
 
-// What a function raises that is asked for parts of a file, or nothing. With Python's lock; nothing here has
-// a destructor that needs it, for Python may end the thread in the function.
+// What a function raises that is asked for parts of a file, or nothing. With Python's lock; nothing
+// here has a destructor that needs it, for Python may end the thread in the function.
 std::string told_by(PyObject* function, Span<const int64_t> places) {
     PyObject* const list = PyList_New(static_cast<py::ssize_t>(places.size / 2));
     for (size_t k = 0; list != nullptr && k < places.size / 2; ++k)
         PyList_SET_ITEM(list, static_cast<py::ssize_t>(k),
                         Py_BuildValue("(LL)", static_cast<long long>(places[2 * k]),
                                       static_cast<long long>(places[2 * k + 1])));
-    PyObject* const done = list == nullptr ? nullptr : PyObject_CallFunctionObjArgs(function, list, nullptr);
+    PyObject* const done =
+        list == nullptr ? nullptr : PyObject_CallFunctionObjArgs(function, list, nullptr);
     Py_XDECREF(list);
     Py_XDECREF(done);
     return done == nullptr ? text_of_error() : std::string();
 }
 
-// Has a function of Python fetch, for threads that have no part in its lock until then: whoever waits for
-// them has to have given that up. The function is kept for ever, for a pool may leave threads behind that
-// call it.
+// Has a function of Python fetch, for threads that have no part in its lock until then: whoever
+// waits for them has to have given that up. The function is kept for ever, for a pool may leave
+// threads behind that call it.
 Fetch fetch_by(const py::object& function) {
     if (function.is_none()) return {};
     PyObject* const kept = function.inc_ref().ptr();
@@ -87,7 +90,8 @@ GivenSource given_source(const py::handle& source, const ClusterTable& table) {
     given.descriptor = file[1].cast<int>();
     given.sh_degree = file[3].cast<int>();
     const py::array places = file[4], hashes = file[5];
-    const auto num_pages = static_cast<py::ssize_t>(table.num_clusters() > 0 ? table.num_pages() : 0);
+    const auto num_pages =
+        static_cast<py::ssize_t>(table.num_clusters() > 0 ? table.num_pages() : 0);
     given.places = span_of<const int64_t>(places, "places", {num_pages + 1});
     given.hashes = span_of<const uint8_t>(hashes, "hashes", {num_pages, 16});
     given.fetch = fetch_by(file[6]);
@@ -95,15 +99,17 @@ GivenSource given_source(const py::handle& source, const ClusterTable& table) {
 }
 
 std::shared_ptr<const PageSource> source_of(const GivenSource& given, const ClusterTable& table) {
-    if (given.rows != nullptr) return std::make_shared<MemoryPages>(table, given.rows->read<float>());
-    return std::make_shared<FilePages>(table, given.sh_degree, given.codec, given.name, given.descriptor,
-                                       given.places, given.hashes, given.fetch);
+    if (given.rows != nullptr)
+        return std::make_shared<MemoryPages>(table, given.rows->read<float>());
+    return std::make_shared<FilePages>(table, given.sh_degree, given.codec, given.name,
+                                       given.descriptor, given.places, given.hashes, given.fetch);
 }
 
 py::array_t<bool> resident_pages(BoundPool& pool, size_t bundle) {
     if (bundle >= pool.pool().num_bundles())
-        throw py::value_error("bundle: expected one below " + std::to_string(pool.pool().num_bundles()) +
-                              ", got " + std::to_string(bundle));
+        throw py::value_error("bundle: expected one below " +
+                              std::to_string(pool.pool().num_bundles()) + ", got " +
+                              std::to_string(bundle));
     const Span<const int64_t> shift = pool.pool().shift(bundle);
     py::array_t<bool> there(static_cast<py::ssize_t>(shift.size));
     std::transform(shift.begin(), shift.end(), there.mutable_data(),
@@ -200,8 +206,8 @@ void BoundPool::make_on_device(const Work& work) {
         host.push_back(bound.table());
         appearance.push_back(bound.appearance());
     }
-    on_device_ =
-        std::make_unique<cuda::DevicePages>(*pool_, std::move(tables), host, appearance, work.stream());
+    on_device_ = std::make_unique<cuda::DevicePages>(*pool_, std::move(tables), host, appearance,
+                                                     work.stream());
 }
 #endif
 
@@ -243,12 +249,13 @@ SettlingStep BoundPool::settle_step(const py::object& scene_object, const BoundE
 #endif
     const Unlocked unlocked;
     const PoolFrame kind = begins ? PoolFrame::first_look : PoolFrame::look;
-    step.noted = frame_on_host(*state, rule, kind, [&](auto tables, const SelectRule& raised, auto needs) {
-        SelectOutput out;
-        cpu::select({tables, state->instances, eyes, raised, needs}, out);
-        step.tolerance_px2 = out.fits_budget ? out.tolerance_px2 : raised.tolerance_px2;
-        return step.tolerance_px2;
-    });
+    step.noted =
+        frame_on_host(*state, rule, kind, [&](auto tables, const SelectRule& raised, auto needs) {
+            SelectOutput out;
+            cpu::select({tables, state->instances, eyes, raised, needs}, out);
+            step.tolerance_px2 = out.fits_budget ? out.tolerance_px2 : raised.tolerance_px2;
+            return step.tolerance_px2;
+        });
     return step;
 }
 
@@ -266,11 +273,14 @@ void bind_pool(py::module_& m) {
         .def_readonly("is_damage", &PoolStatus::is_damage);
     py::class_<SettlingStep>(m, "SettlingStep", "What a step towards a settled view found out.")
         .def_readonly("tolerance_px2", &SettlingStep::tolerance_px2)
-        .def_property_readonly("is_decided", [](const SettlingStep& step) { return step.noted.is_decided; })
-        .def_property_readonly("num_absent", [](const SettlingStep& step) { return step.noted.num_absent; });
-    py::class_<BoundPool>(m, "PagePool", "Pages of bundles in a fixed amount of memory of one device.")
-        .def(py::init<py::list, py::list, int, size_t, unsigned>(), "tables"_a, "sources"_a, "device"_a,
-             "num_bytes"_a, "num_threads"_a)
+        .def_property_readonly("is_decided",
+                               [](const SettlingStep& step) { return step.noted.is_decided; })
+        .def_property_readonly("num_absent",
+                               [](const SettlingStep& step) { return step.noted.num_absent; });
+    py::class_<BoundPool>(m, "PagePool",
+                          "Pages of bundles in a fixed amount of memory of one device.")
+        .def(py::init<py::list, py::list, int, size_t, unsigned>(), "tables"_a, "sources"_a,
+             "device"_a, "num_bytes"_a, "num_threads"_a)
         .def("settle_step", &BoundPool::settle_step, "scene"_a, "camera"_a, "rule"_a, "begins"_a,
              "Brings all pages that were read and finds out what a view needs.")
         .def("status", &BoundPool::status)
@@ -279,12 +289,16 @@ void bind_pool(py::module_& m) {
              "(P,) in how many frames of eight pages have faded in, up to the last one.")
         .def(
             "raise_tolerance",
-            [](BoundPool& p, float from) { return p.pool().raise_tolerance_at_once(from); }, "from_px2"_a,
+            [](BoundPool& p, float from) { return p.pool().raise_tolerance_at_once(from); },
+            "from_px2"_a,
             "Raises it, unless there is room for what the last view needs; whether it did.")
         .def(
-            "wait", [](BoundPool& p, double seconds) { return p.pool().wait(seconds); }, "seconds"_a,
-            py::call_guard<Unlocked>(), "Waits for pages; whether there are any to bring.")
-        .def("read_one", [](BoundPool& p) { return p.pool().read_one(); }, py::call_guard<Unlocked>());
+            "wait", [](BoundPool& p, double seconds) { return p.pool().wait(seconds); },
+            "seconds"_a, py::call_guard<Unlocked>(),
+            "Waits for pages; whether there are any to bring.")
+        .def(
+            "read_one", [](BoundPool& p) { return p.pool().read_one(); },
+            py::call_guard<Unlocked>());
 }
 
 }  // namespace v3dg

@@ -8,8 +8,8 @@ namespace {
 
 py::tuple page_code_bytes(int sh_degree) {
     check_sh_degree(sh_degree);
-    return py::make_tuple(4 * (kRecordWords + num_sh_words(sh_degree)), cluster_code_bytes(sh_degree),
-                          kPageAlignment);
+    return py::make_tuple(4 * (kRecordWords + num_sh_words(sh_degree)),
+                          cluster_code_bytes(sh_degree), kPageAlignment);
 }
 
 py::ssize_t num_words(Span<const int64_t> offset, int sh_degree) {
@@ -20,7 +20,8 @@ py::ssize_t num_words(Span<const int64_t> offset, int sh_degree) {
 py::object encode_rows(const Rows& gaussians, const py::array& offset) {
     const GaussianRows<const float> in = gaussians.read<float>();
     if (!gaussians.device().is_host())
-        throw py::value_error("gaussians: expected arrays on the host, got others; bring them there");
+        throw py::value_error(
+            "gaussians: expected arrays on the host, got others; bring them there");
     const Span<const int64_t> clusters = boundaries_of(offset, "offset", in.size);
     const NewArray<int32_t> page({}, {num_words(clusters, in.sh_degree)});
     {
@@ -37,7 +38,8 @@ void decode_rows(const py::array& page, const py::array& offset, const Rows& out
     const Span<const int64_t> clusters = boundaries_of(offset, "offset", rows.size);
     const auto words = span_of<const int32_t>(page, "page", {num_words(clusters, rows.sh_degree)});
     const Unlocked unlocked;
-    cpu::decode_page({clusters, reinterpret_cast<const uint32_t*>(words.data), rows.sh_degree}, rows);
+    cpu::decode_page({clusters, reinterpret_cast<const uint32_t*>(words.data), rows.sh_degree},
+                     rows);
 }
 
 py::object codebook_of(const py::array& values) {
@@ -59,29 +61,34 @@ py::tuple palette_of(const py::array& vectors, size_t size) {
         palette = make_palette(in, width, size);
     }
     const py::ssize_t count = width ? palette.vectors.size() / width : 1;
-    return py::make_tuple(
-        py::array_t<double>({count, vectors.shape(1)}, palette.vectors.data()),
-        py::array_t<uint32_t>(static_cast<py::ssize_t>(palette.labels.size()), palette.labels.data()));
+    return py::make_tuple(py::array_t<double>({count, vectors.shape(1)}, palette.vectors.data()),
+                          py::array_t<uint32_t>(static_cast<py::ssize_t>(palette.labels.size()),
+                                                palette.labels.data()));
 }
 
 }  // namespace
 
 void bind_quantize(py::module_& m) {
     m.def("page_code_bytes", &page_code_bytes, "sh_degree"_a,
-          "Bytes of a gaussian and of a cluster in a page of codes, and what pages are filled up to.");
+          "Bytes of a gaussian and of a cluster in a page of codes, and what pages are filled up "
+          "to.");
     m.def("encode_page", &encode_rows, "gaussians"_a, "offset"_a,
-          "Words (W,) int32 of a page: the gaussians from offset[0] on as codes relative to the ranges of "
+          "Words (W,) int32 of a page: the gaussians from offset[0] on as codes relative to the "
+          "ranges of "
           "their clusters, which begin at `offset` (K+1,).");
     m.def("decode_page", &decode_rows, "page"_a, "offset"_a, "out"_a,
           "Writes the gaussians of a page of codes to rows from offset[0] on.");
     m.def("codebook_of", &codebook_of, "values"_a,
-          "256 ascending numbers near the values (N,), by Lloyd's algorithm; if there are no more different "
+          "256 ascending numbers near the values (N,), by Lloyd's algorithm; if there are no more "
+          "different "
           "values, these.");
     m.def("palette_of", &palette_of, "vectors"_a, "size"_a,
-          "At most `size` vectors (K, D) that stand for many (N, D), and which of them for each (N,).");
-    py::class_<BoundCodes>(m, "Codes", "All pages of a bundle as codes, on the host; borrows the arrays.")
-        .def(py::init<py::array, py::array, py::array, int>(), "pages"_a, "first_cluster"_a, "offset"_a,
-             "sh_degree"_a);
+          "At most `size` vectors (K, D) that stand for many (N, D), and which of them for each "
+          "(N,).");
+    py::class_<BoundCodes>(m, "Codes",
+                           "All pages of a bundle as codes, on the host; borrows the arrays.")
+        .def(py::init<py::array, py::array, py::array, int>(), "pages"_a, "first_cluster"_a,
+             "offset"_a, "sh_degree"_a);
 }
 
 }  // namespace v3dg

@@ -22,10 +22,12 @@ using Values = py::array_t<float, py::array::c_style | py::array::forcecast>;
 
 void bind_colors(py::module_& m) {
     m.def(
-        "level_colors", [](size_t count) { return colors_of({py::ssize_t(count)}, count, level_color); },
-        "count"_a, "Colours of levels, from fine to coarse: (count, 3).");
+        "level_colors",
+        [](size_t count) { return colors_of({py::ssize_t(count)}, count, level_color); }, "count"_a,
+        "Colours of levels, from fine to coarse: (count, 3).");
     m.def(
-        "cluster_colors", [](size_t count) { return colors_of({py::ssize_t(count)}, count, cluster_color); },
+        "cluster_colors",
+        [](size_t count) { return colors_of({py::ssize_t(count)}, count, cluster_color); },
         "count"_a, "Colours of clusters, of which neighbours differ: (count, 3).");
     const auto add = [&](const char* name, auto color, const char* doc) {
         m.def(
@@ -39,7 +41,8 @@ void bind_colors(py::module_& m) {
     add("ramp", ramp_color, "Colours of values of 0 to 1, from dark to bright: (..., 3).");
     add(
         "missing_colors", [](float share) { return missing_color(share, 1.0f); },
-        "Colours of clusters whose metric is this share of the tolerance that is wanted: (..., 3).");
+        "Colours of clusters whose metric is this share of the tolerance that is wanted: (..., "
+        "3).");
 }
 
 }  // namespace
@@ -53,9 +56,11 @@ void bind_scene(py::module_& m) {
              "Gaussians of clusters, where they are codes: means, quats, scales, opacities, sh.")
         .def("__len__", &BoundModel::size)
         .def_property_readonly("bytes", &BoundModel::bytes);
-    py::class_<BoundPalette>(m, "Palette", "Colours of a bundle's clusters, in which gaussians can be drawn.")
+    py::class_<BoundPalette>(m, "Palette",
+                             "Colours of a bundle's clusters, in which gaussians can be drawn.")
         .def(py::init<py::object, py::array, int>(), "table"_a, "sh"_a, "device"_a);
-    py::class_<BudgetSteps>(m, "BudgetSteps", "What pictures with a budget know of the ones before.")
+    py::class_<BudgetSteps>(m, "BudgetSteps",
+                            "What pictures with a budget know of the ones before.")
         .def(py::init<>());
     py::class_<BoundScene>(m, "ResidentScene", "What selection reads of a scene, on one device.")
         .def(py::init<int>(), "device"_a)
@@ -65,7 +70,8 @@ void bind_scene(py::module_& m) {
         .def("set_poses", &BoundScene::set_poses, "positions"_a, "quaternions"_a, "scales"_a)
         .def("select", &BoundScene::select, "camera"_a, "rule"_a, "steps"_a = nullptr)
         .def("page_needs", &BoundScene::page_needs, "camera"_a, "rule"_a,
-             "For each bundle how urgently its pages are needed: (G+1,), above 1 where the cut misses them.");
+             "For each bundle how urgently its pages are needed: (G+1,), above 1 where the cut "
+             "misses them.");
 }
 
 }  // namespace v3dg

@@ -26,17 +26,18 @@ struct Arguments {
     std::vector<ClusterTable> tables;
     SelectInput input;
 
-    Arguments(const Tables& tables_of_bundles, const Instances& instances, const BoundCamera& camera,
-              const SelectRule& rule) {
+    Arguments(const Tables& tables_of_bundles, const Instances& instances,
+              const BoundCamera& camera, const SelectRule& rule) {
         for (const BoundTable& table : tables_of_bundles) tables.push_back(table.table());
         instances.check_bundles(tables.size());
         input = {{tables.data(), tables.size()}, instances.table(), camera.camera, rule, {}};
     }
 };
 
-// Where the values of each instance begin, if its bundle has counts[b] of them; at the end, how many there
-// are.
-NewArray<int64_t> offset_of_instances(Span<const int32_t> bundle, const std::vector<size_t>& counts) {
+// Where the values of each instance begin, if its bundle has counts[b] of them; at the end, how
+// many there are.
+NewArray<int64_t> offset_of_instances(Span<const int32_t> bundle,
+                                      const std::vector<size_t>& counts) {
     NewArray<int64_t> offset({}, {static_cast<py::ssize_t>(bundle.size + 1)});
     offset.span[0] = 0;
     for (size_t i = 0; i < bundle.size; ++i)
@@ -59,8 +60,8 @@ py::tuple group_metrics(const Tables& tables, const Instances& instances, const 
     return py::make_tuple(metric.object, offset.object);
 }
 
-py::tuple bounds_may_draw(const Tables& tables, const Instances& instances, const BoundCamera& camera,
-                          const SelectRule& rule, bool and_coarser) {
+py::tuple bounds_may_draw(const Tables& tables, const Instances& instances,
+                          const BoundCamera& camera, const SelectRule& rule, bool and_coarser) {
     const Arguments arguments(tables, instances, camera, rule);
     std::vector<size_t> counts;
     for (const ClusterTable& table : arguments.tables)
@@ -68,16 +69,18 @@ py::tuple bounds_may_draw(const Tables& tables, const Instances& instances, cons
     const Span<const int32_t> bundle = arguments.input.instances.bundle;
     const NewArray<int64_t> offset = offset_of_instances(bundle, counts);
     const NewArray<uint8_t> may_draw({}, {static_cast<py::ssize_t>(offset.span[bundle.size])});
-    cpu::bounds_may_draw(arguments.input, and_coarser ? Tolerances::from_this_on : Tolerances::this_one,
-                         offset.span, may_draw.span);
+    cpu::bounds_may_draw(arguments.input,
+                         and_coarser ? Tolerances::from_this_on : Tolerances::this_one, offset.span,
+                         may_draw.span);
     return py::make_tuple(may_draw.object, offset.object);
 }
 
 }  // namespace
 
 BoundTable::BoundTable(py::array ball, py::array weight, py::array level, py::array own_group,
-                       py::array parent_group, py::array box, py::array filter_px2, py::array antialiased,
-                       py::array offset, py::object page_shift, py::object page_begins)
+                       py::array parent_group, py::array box, py::array filter_px2,
+                       py::array antialiased, py::array offset, py::object page_shift,
+                       py::object page_begins)
     : arrays_{ball, weight, level, own_group, parent_group, box, filter_px2, antialiased, offset} {
     const Span<const float> balls = span_of<const float>(ball, "ball", {-1, 4});
     const size_t num_groups = balls.size / 4;
@@ -91,8 +94,9 @@ BoundTable::BoundTable(py::array ball, py::array weight, py::array level, py::ar
     given.parent_group = span_of<const int32_t>(parent_group, "parent_group", {clusters});
     const Span<const float> boxes = span_of<const float>(box, "box", {clusters, 2, 3});
     given.box = {reinterpret_cast<const Box*>(boxes.data), given.num_clusters()};
-    const ClusterAppearance appearance{span_of<const float>(filter_px2, "filter_px2", {clusters}),
-                                       span_of<const uint8_t>(antialiased, "antialiased", {clusters})};
+    const ClusterAppearance appearance{
+        span_of<const float>(filter_px2, "filter_px2", {clusters}),
+        span_of<const uint8_t>(antialiased, "antialiased", {clusters})};
     given.offset = span_of<const int64_t>(offset, "offset", {clusters + 1});
     check_groups(given.own_group, "own_group", num_groups);
     check_groups(given.parent_group, "parent_group", num_groups);
@@ -139,26 +143,31 @@ BoundCut::BoundCut(const SelectOutput& out)
       fits_budget(out.fits_budget) {}
 
 void bind_select(py::module_& m) {
-    py::class_<BoundTable>(m, "ClusterTable", "What selection and drawing read of a bundle's clusters.")
-        .def(py::init<py::array, py::array, py::array, py::array, py::array, py::array, py::array, py::array,
-                      py::array, py::object, py::object>(),
-             py::kw_only(), "ball"_a, "weight"_a, "level"_a, "own_group"_a, "parent_group"_a, "box"_a,
-             "filter_px2"_a, "antialiased"_a, "offset"_a, "page_shift"_a = py::none(),
+    py::class_<BoundTable>(m, "ClusterTable",
+                           "What selection and drawing read of a bundle's clusters.")
+        .def(py::init<py::array, py::array, py::array, py::array, py::array, py::array, py::array,
+                      py::array, py::array, py::object, py::object>(),
+             py::kw_only(), "ball"_a, "weight"_a, "level"_a, "own_group"_a, "parent_group"_a,
+             "box"_a, "filter_px2"_a, "antialiased"_a, "offset"_a, "page_shift"_a = py::none(),
              "page_begins"_a = py::none())
-        .def("bytes_on", &BoundTable::bytes_on, "device"_a, "Memory that the tables take on a device.");
-    py::class_<BoundCut>(m, "Cut", "The clusters that one view needs, and what their selection came to.")
+        .def("bytes_on", &BoundTable::bytes_on, "device"_a,
+             "Memory that the tables take on a device.");
+    py::class_<BoundCut>(m, "Cut",
+                         "The clusters that one view needs, and what their selection came to.")
         .def_readonly("instance_ids", &BoundCut::instance_ids)
         .def_readonly("cluster_ids", &BoundCut::cluster_ids)
-        .def_readonly("weights", &BoundCut::weights, "None of them without a fade, where all are 1.")
+        .def_readonly("weights", &BoundCut::weights,
+                      "None of them without a fade, where all are 1.")
         .def_readonly("num_gaussians", &BoundCut::num_gaussians)
         .def_readonly("tolerance_px2", &BoundCut::tolerance_px2)
         .def_readonly("fits_budget", &BoundCut::fits_budget);
     m.def("group_metrics", &group_metrics, "tables"_a, "instances"_a, "camera"_a, "rule"_a,
           "Metric of every group of every instance, px2, and where each instance's metrics begin.");
-    m.def(
-        "bounds_may_draw", &bounds_may_draw, "tables"_a, "instances"_a, "camera"_a, "rule"_a, "and_coarser"_a,
-        "For each eight neighbouring clusters of every instance, 0 if their bounds tell that none is drawn; "
-        "and where each instance's values begin.");
+    m.def("bounds_may_draw", &bounds_may_draw, "tables"_a, "instances"_a, "camera"_a, "rule"_a,
+          "and_coarser"_a,
+          "For each eight neighbouring clusters of every instance, 0 if their bounds tell that "
+          "none is drawn; "
+          "and where each instance's values begin.");
 }
 
 }  // namespace v3dg

@@ -21,13 +21,17 @@ struct Segments {
     Segments(const py::array& in_offset, const py::array& out_offset, size_t num_rows)
         : in(segments_of(in_offset, "in_offset", -1)),
           out(segments_of(out_offset, "out_offset", static_cast<py::ssize_t>(in.size))) {
-        if (in.size == 0 || in[0] != 0 || in[in.size - 1] != static_cast<int64_t>(num_rows) || out[0] != 0)
+        if (in.size == 0 || in[0] != 0 || in[in.size - 1] != static_cast<int64_t>(num_rows) ||
+            out[0] != 0)
             throw py::value_error(
-                "in_offset, out_offset: expected segments from 0, in_offset up to the number of gaussians");
+                "in_offset, out_offset: expected segments from 0, in_offset up to the number of "
+                "gaussians");
         for (size_t g = 0; g + 1 < in.size; ++g)
-            if (out[g + 1] - out[g] > in[g + 1] - in[g] || (out[g + 1] == out[g] && in[g + 1] > in[g]))
-                throw py::value_error("out_offset: expected 1 to as many gaussians as come in, segment " +
-                                      std::to_string(g) + " has others");
+            if (out[g + 1] - out[g] > in[g + 1] - in[g] ||
+                (out[g + 1] == out[g] && in[g + 1] > in[g]))
+                throw py::value_error(
+                    "out_offset: expected 1 to as many gaussians as come in, segment " +
+                    std::to_string(g) + " has others");
     }
     size_t num_out() const { return static_cast<size_t>(out[out.size - 1]); }
 };
@@ -36,7 +40,8 @@ py::object prune(const Rows& gaussians, const py::array& in_offset, const py::ar
     const GaussianRows<const float> in = gaussians.read<float>();
     const Segments segments(in_offset, out_offset, in.size);
     const Work work(gaussians.device());
-    const NewArray<int64_t> kept(gaussians.device(), {static_cast<py::ssize_t>(segments.num_out())});
+    const NewArray<int64_t> kept(gaussians.device(),
+                                 {static_cast<py::ssize_t>(segments.num_out())});
     {
         const Unlocked unlocked;
         V3DG_DISPATCH(work, prune, in, segments.in, segments.out, kept.span);
@@ -62,7 +67,8 @@ void bind_simplify(py::module_& m) {
     m.def("prune", &prune, "gaussians"_a, "in_offset"_a, "out_offset"_a,
           "Rows (M,) int64 of the gaussians of each segment that survive, ascending.");
     m.def("merge", &merge, "gaussians"_a, "in_offset"_a, "out_offset"_a,
-          "Joins pairs of gaussians in each segment until as many are left as wanted: means, quats, scales, "
+          "Joins pairs of gaussians in each segment until as many are left as wanted: means, "
+          "quats, scales, "
           "opacities, sh.");
 }
 

@@ -13,8 +13,8 @@ using Corners = std::array<int, 4>;
 void set_window(const Corners& w, Camera& camera) {
     const int width = static_cast<int>(camera.width), height = static_cast<int>(camera.height);
     if (!(0 <= w[0] && w[0] < w[2] && w[2] <= width && 0 <= w[1] && w[1] < w[3] && w[3] <= height))
-        throw py::value_error("window: expected x0 < x1 and y0 < y1 within " + std::to_string(width) + " x " +
-                              std::to_string(height) + " px, got " +
+        throw py::value_error("window: expected x0 < x1 and y0 < y1 within " +
+                              std::to_string(width) + " x " + std::to_string(height) + " px, got " +
                               py::str(py::tuple(py::cast(w))).cast<std::string>());
     camera.x0 = w[0];
     camera.y0 = w[1];
@@ -22,10 +22,11 @@ void set_window(const Corners& w, Camera& camera) {
     camera.y1 = w[3];
 }
 
-BoundCamera make_camera(const py::array& viewmat, const py::array& K, int width, int height, double near) {
+BoundCamera make_camera(const py::array& viewmat, const py::array& K, int width, int height,
+                        double near) {
     if (width < 1 || height < 1 || width > UINT16_MAX || height > UINT16_MAX)
-        throw py::value_error("width, height: expected 1 to 65535 px, got " + std::to_string(width) + " x " +
-                              std::to_string(height));
+        throw py::value_error("width, height: expected 1 to 65535 px, got " +
+                              std::to_string(width) + " x " + std::to_string(height));
     const Span<const double> view = span_of<const double>(viewmat, "viewmat", {4, 4});
     const Span<const double> k = span_of<const double>(K, "K", {3, 3});
     BoundCamera out;
@@ -84,7 +85,8 @@ SelectRule make_rule(double tolerance_px2, std::optional<uint64_t> budget, int32
     rule.footprint = footprint_of(footprint);
     rule.culls = culls;
     if (!(fade >= 1) || (fade > 1 && rule.footprint == Footprint::paper))
-        throw py::value_error("fade: expected a factor of 1 or more, and 1 with the paper's footprint");
+        throw py::value_error(
+            "fade: expected a factor of 1 or more, and 1 with the paper's footprint");
     rule.fade = {static_cast<float>(fade), 1.0f / static_cast<float>(fade)};
     rule.frame = frame;
     return rule;
@@ -100,8 +102,10 @@ int degree_of_bases(py::ssize_t bases, const std::string& shape) {
     return degree;
 }
 
-Rows::Rows(py::object means, py::object quats, py::object scales, py::object opacities, py::object sh)
-    : arrays_{std::move(means), std::move(quats), std::move(scales), std::move(opacities), std::move(sh)},
+Rows::Rows(py::object means, py::object quats, py::object scales, py::object opacities,
+           py::object sh)
+    : arrays_{std::move(means), std::move(quats), std::move(scales), std::move(opacities),
+              std::move(sh)},
       device_(device_of(arrays_[0], "means")) {
     const std::vector<py::ssize_t> shape = shape_of(arrays_[4], "sh");
     sh_degree_ = degree_of_bases(shape.size() == 3 ? shape[1] : -1, shape_text(arrays_[4]));
@@ -119,13 +123,15 @@ Rows::Rows(py::object means, py::object quats, py::object scales, py::object opa
     if (device_.is_host()) return;
     for (const float* start : {rows.quats, rows.sh})
         if (reinterpret_cast<uintptr_t>(start) % 16 != 0)
-            throw py::value_error("quats, sh: expected memory that begins at a multiple of 16 bytes");
+            throw py::value_error(
+                "quats, sh: expected memory that begins at a multiple of 16 bytes");
 }
 
 void Rows::check_precision(bool wants_double) const {
     if (wants_double != is_double_)
-        throw py::value_error(std::string("means: expected dtype ") + (wants_double ? "float64" : "float32") +
-                              ", got " + (is_double_ ? "float64" : "float32"));
+        throw py::value_error(std::string("means: expected dtype ") +
+                              (wants_double ? "float64" : "float32") + ", got " +
+                              (is_double_ ? "float64" : "float32"));
 }
 
 NewRows::NewRows(Device device, size_t size, int sh_degree)
@@ -161,42 +167,47 @@ void check_instance_bundles(Span<const int32_t> bundle, size_t num_bundles) {
 
 Span<const int64_t> offsets_of(const py::handle& offset, size_t last) {
     const Span<const int64_t> values = span_of<const int64_t>(offset, "offset", {-1});
-    bool good = values.size > 0 && values[0] == 0 && values[values.size - 1] == static_cast<int64_t>(last);
+    bool good =
+        values.size > 0 && values[0] == 0 && values[values.size - 1] == static_cast<int64_t>(last);
     for (size_t i = 1; good && i < values.size; ++i) good = values[i - 1] <= values[i];
     if (!good)
-        throw py::value_error("offset: expected ascending boundaries from 0 to " + std::to_string(last) +
-                              ", got others");
+        throw py::value_error("offset: expected ascending boundaries from 0 to " +
+                              std::to_string(last) + ", got others");
     return values;
 }
 
 Window window_of(const Camera& c) {
-    return {static_cast<int>(c.x0), static_cast<int>(c.y0), static_cast<int>(c.x1), static_cast<int>(c.y1)};
+    return {static_cast<int>(c.x0), static_cast<int>(c.y0), static_cast<int>(c.x1),
+            static_cast<int>(c.y1)};
 }
 
 void bind_types(py::module_& m) {
-    py::class_<BoundCamera>(m, "Camera",
-                            "A pinhole camera, or a window of its image, as every operation takes it.")
-        .def(py::init(&make_camera), py::kw_only(), "viewmat"_a, "K"_a, "width"_a, "height"_a, "near"_a)
+    py::class_<BoundCamera>(
+        m, "Camera", "A pinhole camera, or a window of its image, as every operation takes it.")
+        .def(py::init(&make_camera), py::kw_only(), "viewmat"_a, "K"_a, "width"_a, "height"_a,
+             "near"_a)
         .def("window", &window_of_camera, "x0"_a, "y0"_a, "x1"_a, "y1"_a,
              "The same camera, of whose image only the pixels [x0, x1) x [y0, y1) are wanted.")
         .def_property_readonly("position", &position_of, "Where it is in the world: (3,).")
         .def_property_readonly("K", &intrinsics_of, "In px: (3, 3).")
         .def_property_readonly("width", &BoundCamera::width)
         .def_property_readonly("height", &BoundCamera::height);
-    py::class_<BoundEyes>(m, "Eyes", "Two cameras that look the same way and share a cut; or a camera.")
+    py::class_<BoundEyes>(m, "Eyes",
+                          "Two cameras that look the same way and share a cut; or a camera.")
         .def(py::init([](const BoundCamera& only) { return BoundEyes{only.camera}; }), "camera"_a)
         .def(py::init(&make_eyes), "left"_a, "right"_a);
     py::implicitly_convertible<BoundCamera, BoundEyes>();
     py::class_<SelectRule>(m, "Rule", "What a selection chooses.")
-        .def(py::init(&make_rule), py::kw_only(), "tolerance_px2"_a, "budget"_a, "min_level"_a, "footprint"_a,
-             "culls"_a, "fade"_a = 1.0, "frame"_a = 0)
+        .def(py::init(&make_rule), py::kw_only(), "tolerance_px2"_a, "budget"_a, "min_level"_a,
+             "footprint"_a, "culls"_a, "fade"_a = 1.0, "frame"_a = 0)
         .def_readonly("tolerance_px2", &SelectRule::tolerance_px2);
-    py::class_<Instances>(m, "Instances", "Instances of bundles; borrows the arrays, which are on the host.")
-        .def(py::init<py::array, py::array, py::array, py::array, py::array>(), py::kw_only(), "bundle"_a,
-             "positions"_a, "quaternions"_a, "scales"_a, "importance"_a);
+    py::class_<Instances>(m, "Instances",
+                          "Instances of bundles; borrows the arrays, which are on the host.")
+        .def(py::init<py::array, py::array, py::array, py::array, py::array>(), py::kw_only(),
+             "bundle"_a, "positions"_a, "quaternions"_a, "scales"_a, "importance"_a);
     py::class_<Rows>(m, "Rows", "The arrays of gaussians, on the host or on a CUDA device.")
-        .def(py::init<py::object, py::object, py::object, py::object, py::object>(), "means"_a, "quats"_a,
-             "scales"_a, "opacities"_a, "sh"_a)
+        .def(py::init<py::object, py::object, py::object, py::object, py::object>(), "means"_a,
+             "quats"_a, "scales"_a, "opacities"_a, "sh"_a)
         .def("__len__", &Rows::size)
         .def_property_readonly(
             "device", [](const Rows& rows) { return rows.device().number; },

@@ -15,7 +15,8 @@ inline void check_sh_degree(int sh_degree) {
 // Ascending boundaries among so many.
 inline Span<const int64_t> boundaries_of(const py::array& array, const char* name, size_t count) {
     const Span<const int64_t> values = span_of<const int64_t>(array, name, {-1});
-    bool good = values.size > 0 && values[0] >= 0 && values[values.size - 1] <= static_cast<int64_t>(count);
+    bool good =
+        values.size > 0 && values[0] >= 0 && values[values.size - 1] <= static_cast<int64_t>(count);
     for (size_t i = 1; good && i < values.size; ++i) good = values[i - 1] <= values[i];
     if (!good)
         throw py::value_error(std::string(name) + ": expected ascending boundaries from 0 to " +
@@ -33,22 +34,25 @@ class BoundCodes {
         // Addresses of codes, in units of 8 bytes, have 32 bits; so have rows.
         constexpr size_t kMostWords = size_t(1) << 33;
         if (words.size > kMostWords)
-            throw py::value_error("pages: expected at most 32 GiB, got more; build several bundles");
+            throw py::value_error(
+                "pages: expected at most 32 GiB, got more; build several bundles");
         const size_t most = words.size / kRecordWords;
         const auto clusters = boundaries_of(arrays_[2], "offset", most);
         const auto pages_of = boundaries_of(arrays_[1], "first_cluster", clusters.size - 1);
         size_t num_bytes = 0;
         for (size_t p = 0; p + 1 < pages_of.size; ++p)
-            num_bytes += page_bytes(static_cast<size_t>(clusters[pages_of[p + 1]] - clusters[pages_of[p]]),
-                                    static_cast<size_t>(pages_of[p + 1] - pages_of[p]), sh_degree);
+            num_bytes +=
+                page_bytes(static_cast<size_t>(clusters[pages_of[p + 1]] - clusters[pages_of[p]]),
+                           static_cast<size_t>(pages_of[p + 1] - pages_of[p]), sh_degree);
         if (clusters[0] != 0 || pages_of[0] != 0 ||
             pages_of[pages_of.size - 1] != static_cast<int64_t>(clusters.size - 1) ||
             num_bytes != 4 * words.size)
             throw py::value_error("pages: expected " + std::to_string(num_bytes) +
-                                  " bytes of all clusters in order, got " + std::to_string(4 * words.size));
+                                  " bytes of all clusters in order, got " +
+                                  std::to_string(4 * words.size));
         const Unlocked unlocked;
-        pages_ = std::make_unique<CodedPages>(reinterpret_cast<const uint32_t*>(words.data), pages_of,
-                                              clusters, sh_degree);
+        pages_ = std::make_unique<CodedPages>(reinterpret_cast<const uint32_t*>(words.data),
+                                              pages_of, clusters, sh_degree);
     }
 
     const CodedPages& pages() const { return *pages_; }

@@ -29,10 +29,13 @@ class Stop {
     std::atomic<bool> requested_{false};
 };
 
-inline const std::atomic<bool>* flag_of(const Stop* stop) { return stop == nullptr ? nullptr : stop->flag(); }
+inline const std::atomic<bool>* flag_of(const Stop* stop) {
+    return stop == nullptr ? nullptr : stop->flag();
+}
 
-// While it lives, one thread draws with a frame. Python's lock alone does not see to that, for torch gives it
-// up while it looks for memory; and so it is given up here, too, where another thread has its turn.
+// While it lives, one thread draws with a frame. Python's lock alone does not see to that, for
+// torch gives it up while it looks for memory; and so it is given up here, too, where another
+// thread has its turn.
 class Turn {
   public:
     explicit Turn(std::mutex* mutex) {
@@ -55,13 +58,21 @@ struct FrameStats {
     bool exceeds_budget;
     double select_ms, draw_ms;
     std::vector<int64_t> levels;  // on the host, gaussians selected by level
-    int num_draws = 1;            // more where buffers on a device were too small, and it was drawn again
+    int num_draws = 1;  // more where buffers on a device were too small, and it was drawn again
 };
 
 inline FrameStats stats_of(const SceneFrameCounts& c) {
-    return {
-        c.gaussians,      c.render.in_frustum,    c.render.records,     c.render.entries, 0, c.tolerance_px2,
-        c.exceeds_budget, 1e3 * c.select_seconds, 1e3 * c.draw_seconds, c.levels,         1};
+    return {c.gaussians,
+            c.render.in_frustum,
+            c.render.records,
+            c.render.entries,
+            0,
+            c.tolerance_px2,
+            c.exceeds_budget,
+            1e3 * c.select_seconds,
+            1e3 * c.draw_seconds,
+            c.levels,
+            1};
 }
 
 // The pictures of a frame: of a camera, or of two eyes, left first.
@@ -75,9 +86,9 @@ class BoundDrawing {
 
 #if V3DG_WITH_CUDA
     // `kept` are the frame, which may have to draw again, and what it reads.
-    BoundDrawing(NewPictures pictures, py::object kept, Device device, std::shared_ptr<std::mutex> turns,
-                 std::unique_ptr<cuda::Drawing> drawing, const SelectRule& rule,
-                 cuda::DevicePages* pages = nullptr)
+    BoundDrawing(NewPictures pictures, py::object kept, Device device,
+                 std::shared_ptr<std::mutex> turns, std::unique_ptr<cuda::Drawing> drawing,
+                 const SelectRule& rule, cuda::DevicePages* pages = nullptr)
         : pictures_(std::move(pictures)),
           kept_(std::move(kept)),
           device_(device),
@@ -103,17 +114,18 @@ class BoundDrawing {
             if (pages_ != nullptr) pages_->note_frames(work.stream());
             const cuda::FrameTimes times = drawing_->times();
             const bool exceeds = c.choice.exceeds_budget;
-            stats_ = {static_cast<int64_t>(exceeds ? c.choice.least : c.gaussians / pictures_.size()),
-                      c.in_frustum,
-                      c.records,
-                      c.entries,
-                      c.items,
-                      rule_.budget == kNoBudget ? rule_.tolerance_px2 : c.choice.tolerance_px2,
-                      exceeds,
-                      times.prepare_ms,
-                      times.draw_ms,
-                      {},
-                      drawing_->num_draws()};
+            stats_ = {
+                static_cast<int64_t>(exceeds ? c.choice.least : c.gaussians / pictures_.size()),
+                c.in_frustum,
+                c.records,
+                c.entries,
+                c.items,
+                rule_.budget == kNoBudget ? rule_.tolerance_px2 : c.choice.tolerance_px2,
+                exceeds,
+                times.prepare_ms,
+                times.draw_ms,
+                {},
+                drawing_->num_draws()};
         }
 #endif
         return stats_;

@@ -16,10 +16,10 @@
 #include "base/device.h"
 #endif
 
-// A child of fork() has none of the threads that GNU's OpenMP keeps for the next loop, but would wait for
-// them without end. So the thread that forks lets its own go first; they come back, on either side, with the
-// next loop. LLVM's OpenMP, which may stand in, minds forks itself and then holds locks that this would wait
-// for.
+// A child of fork() has none of the threads that GNU's OpenMP keeps for the next loop, but would
+// wait for them without end. So the thread that forks lets its own go first; they come back, on
+// either side, with the next loop. LLVM's OpenMP, which may stand in, minds forks itself and then
+// holds locks that this would wait for.
 static void let_threads_go() { omp_pause_resource_all(omp_pause_hard); }
 static bool must_let_threads_go() {
     Dl_info found;
@@ -35,11 +35,12 @@ static int num_cuda_devices() {
 #endif
 }
 
-// An object that only `__new__` has made holds nothing. When a function is given one, pybind11 asks its class
-// for memory of that size, whose content nobody has made.
+// An object that only `__new__` has made holds nothing. When a function is given one, pybind11 asks
+// its class for memory of that size, whose content nobody has made.
 static void* refuse_unmade(size_t) {
     throw v3dg::py::type_error(
-        "self: expected an object that its class has made, got one of __new__ alone; call the class instead");
+        "self: expected an object that its class has made, got one of __new__ alone; call the "
+        "class instead");
 }
 static void refuse_unmade_objects(const v3dg::py::module_& m) {
     for (const auto& [name, value] : v3dg::py::dict(m.attr("__dict__"))) {
@@ -62,7 +63,8 @@ PYBIND11_MODULE(_core, m) {
     m.def(
         "isa", [] { return v3dg::isa_name(v3dg::active_isa()); },
         "Instruction set that the CPU half runs on.");
-    m.def("num_cuda_devices", &num_cuda_devices, "CUDA devices to run on; 0 without CUDA or a driver.");
+    m.def("num_cuda_devices", &num_cuda_devices,
+          "CUDA devices to run on; 0 without CUDA or a driver.");
     v3dg::bind_types(m);
     v3dg::bind_ply(m);
     v3dg::bind_cluster(m);

@@ -9,16 +9,16 @@
 
 namespace v3dg {
 
-// What is behind the gaussians of a pixel, when it stops (frame/image.h), and whether its depth is drawn,
-// too.
+// What is behind the gaussians of a pixel, when it stops (frame/image.h), and whether its depth is
+// drawn, too.
 struct Shade {
     std::array<double, 3> background;
     float min_transmittance = kStopsBefore;
     bool with_depth = true;
 };
 
-// The planes of a new picture, to be filled in: colour (H, W, 3), alpha and, where it is wanted, depth (H,
-// W).
+// The planes of a new picture, to be filled in: colour (H, W, 3), alpha and, where it is wanted,
+// depth (H, W).
 struct NewPicture {
     py::ssize_t height, width;
     py::object color, alpha, depth;
@@ -46,7 +46,8 @@ struct NewPicture {
 
 #if V3DG_WITH_CUDA
     cuda::PicturePlanes on_device(Device device) {
-        const NewArray<float> color_plane(device, {height, width, 3}), alpha_plane(device, {height, width});
+        const NewArray<float> color_plane(device, {height, width, 3}),
+            alpha_plane(device, {height, width});
         color = color_plane.object;
         alpha = alpha_plane.object;
         if (!with_depth) return {color_plane.span.data, alpha_plane.span.data, nullptr};
@@ -58,8 +59,8 @@ struct NewPicture {
                                  const cuda::PicturePlanes& planes = {}) const {
         const auto& of = shade.background;
         const float b[3] = {float(of[0]), float(of[1]), float(of[2])};
-        return cuda::frame_image(pinhole_of<float>(camera), static_cast<int>(width), static_cast<int>(height),
-                                 b, planes);
+        return cuda::frame_image(pinhole_of<float>(camera), static_cast<int>(width),
+                                 static_cast<int>(height), b, planes);
     }
 #endif
 };

@@ -16,16 +16,16 @@
 
 namespace v3dg {
 
-// Frames of a pool: one of a flight; a look at what a view needs, the first or a later one while it settles;
-// and one aside, for which pages neither come nor are asked for: of what was there for the last one, as that
-// was.
+// Frames of a pool: one of a flight; a look at what a view needs, the first or a later one while it
+// settles; and one aside, for which pages neither come nor are asked for: of what was there for the
+// last one, as that was.
 enum class PoolFrame { flight, first_look, look, aside };
 
 class BoundPool {
   public:
-    // `sources` has for each table either the arrays of gaussians in memory, or the file of the bundle: its
-    // name, descriptor, codec, SH degree, places (P+1,), hashes (P, 16), and what fetches parts of it, or
-    // None.
+    // `sources` has for each table either the arrays of gaussians in memory, or the file of the
+    // bundle: its name, descriptor, codec, SH degree, places (P+1,), hashes (P, 16), and what
+    // fetches parts of it, or None.
     BoundPool(const py::list& tables, const py::list& sources, int device, size_t num_bytes,
               unsigned num_threads);
     ~BoundPool();
@@ -35,10 +35,11 @@ class BoundPool {
     PoolStatus status() const { return pool_->status(); }
     void check_scene(const SceneState& scene) const;
 
-    // A frame on the host: brings pages, calls cut(tables, rule, needs), which returns the tolerance that was
-    // used, and takes note of what that needed. Without Python's lock.
+    // A frame on the host: brings pages, calls cut(tables, rule, needs), which returns the
+    // tolerance that was used, and takes note of what that needed. Without Python's lock.
     template <class Cut>
-    NotedView frame_on_host(const SceneState& scene, SelectRule rule, PoolFrame kind, const Cut& cut) {
+    NotedView frame_on_host(const SceneState& scene, SelectRule rule, PoolFrame kind,
+                            const Cut& cut) {
         pool_->check_process();  // In a child of fork() the lock may be held for ever.
         const std::lock_guard<std::mutex> lock(busy_);
         if (kind == PoolFrame::first_look) pool_->begin_settling();
@@ -70,11 +71,11 @@ class BoundPool {
     cuda::DevicePages& on_device() { return *on_device_; }
 #endif
 
-    // Takes a step towards settling a view: brings all pages that were read, cuts the scene without drawing
-    // it, and waits until the pool has decided about what the cut needs. `begins`: the first step, which
-    // forgets earlier frames (PagePool::begin_settling).
-    SettlingStep settle_step(const py::object& scene_object, const BoundEyes& camera, const SelectRule& rule,
-                             bool begins);
+    // Takes a step towards settling a view: brings all pages that were read, cuts the scene without
+    // drawing it, and waits until the pool has decided about what the cut needs. `begins`: the
+    // first step, which forgets earlier frames (PagePool::begin_settling).
+    SettlingStep settle_step(const py::object& scene_object, const BoundEyes& camera,
+                             const SelectRule& rule, bool begins);
 
   private:
 #if V3DG_WITH_CUDA

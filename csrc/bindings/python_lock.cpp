@@ -12,8 +12,8 @@ namespace {
 
 namespace py = pybind11;
 
-// Of threads that make themselves known to Python, one at a time. What they need for that is gone at some
-// moment of the interpreter's end, so none begins once that is near.
+// Of threads that make themselves known to Python, one at a time. What they need for that is gone
+// at some moment of the interpreter's end, so none begins once that is near.
 struct Entrance {
     std::mutex busy;
     bool is_closed = false;

@@ -40,7 +40,8 @@ class BoundModel {
         const Work work(device_);
         codes_ = given.pages().codes();
         for (size_t c = 0; c < codes_.num_clusters(); ++c)
-            num_gaussians_.push_back(static_cast<uint32_t>(codes_.offset[c + 1] - codes_.offset[c]));
+            num_gaussians_.push_back(
+                static_cast<uint32_t>(codes_.offset[c + 1] - codes_.offset[c]));
         if (device_.is_host()) {
             codes_object_ = codes;
             return;
@@ -76,13 +77,16 @@ class BoundModel {
 
     // The gaussians of clusters, from codes: means, quats, scales, opacities, sh.
     py::tuple decode(const py::array& cluster_ids) const {
-        if (!has_codes()) throw py::value_error("decode: expected a model of codes, got one of rows");
-        const Span<const int32_t> cluster = span_of<const int32_t>(cluster_ids, "cluster_ids", {-1});
+        if (!has_codes())
+            throw py::value_error("decode: expected a model of codes, got one of rows");
+        const Span<const int32_t> cluster =
+            span_of<const int32_t>(cluster_ids, "cluster_ids", {-1});
         std::vector<int64_t> offset{0};
         for (const int32_t c : cluster) {
             if (c < 0 || static_cast<size_t>(c) >= num_gaussians_.size())
                 throw std::out_of_range("cluster_ids: expected ids below " +
-                                        std::to_string(num_gaussians_.size()) + ", got " + std::to_string(c));
+                                        std::to_string(num_gaussians_.size()) + ", got " +
+                                        std::to_string(c));
             offset.push_back(offset.back() + num_gaussians_[c]);
         }
         const Work work(device_);
@@ -120,7 +124,8 @@ class BoundPalette {
         const Work work(device_);
 #if V3DG_WITH_CUDA
         if (device_.is_host()) return;
-        on_device_ = std::make_shared<cuda::DevicePalette>(colors, table.on_device(work), work.stream());
+        on_device_ =
+            std::make_shared<cuda::DevicePalette>(colors, table.on_device(work), work.stream());
 #endif
     }
 
@@ -140,7 +145,8 @@ class BoundPalette {
 #endif
 };
 
-// A scene as the host knows it. It stays as it is: whoever draws it keeps it, and a change makes another.
+// A scene as the host knows it. It stays as it is: whoever draws it keeps it, and a change makes
+// another.
 struct SceneState {
     py::list bundles;
     py::tuple arrays;
@@ -192,8 +198,9 @@ class BoundScene {
         state_ = std::move(state);
     }
 
-    void set_instances(const py::array& bundle, const py::array& importance, const py::object& positions,
-                       const py::object& quaternions, const py::object& scales) {
+    void set_instances(const py::array& bundle, const py::array& importance,
+                       const py::object& positions, const py::object& quaternions,
+                       const py::object& scales) {
         auto state = std::make_shared<SceneState>(*state_);
         InstanceTable& instances = state->instances;
         instances.bundle = span_of<const int32_t>(bundle, "bundle", {-1});
@@ -217,7 +224,8 @@ class BoundScene {
     }
 
     // New poses of the same instances.
-    void set_poses(const py::object& positions, const py::object& quaternions, const py::object& scales) {
+    void set_poses(const py::object& positions, const py::object& quaternions,
+                   const py::object& scales) {
         if (device_.is_host()) {
             const py::tuple arrays = state_->arrays;
             set_instances(arrays[0], arrays[1], positions, quaternions, scales);
@@ -226,7 +234,8 @@ class BoundScene {
 #if V3DG_WITH_CUDA
         auto state = std::make_shared<SceneState>(*state_);
         const auto count = static_cast<py::ssize_t>(state->instances.bundle.size);
-        state->arrays = py::make_tuple(state->arrays[0], state->arrays[1], positions, quaternions, scales);
+        state->arrays =
+            py::make_tuple(state->arrays[0], state->arrays[1], positions, quaternions, scales);
         const Work work(device_);
         on_device_->set_poses(doubles_anywhere(positions, "positions", {count, 3}),
                               doubles_anywhere(quaternions, "quaternions", {count, 4}),
@@ -254,7 +263,8 @@ class BoundScene {
                             out);
 #if V3DG_WITH_CUDA
             else
-                cut_->select(*on_device_, camera.eyes, paced, out, work.stream(), nullptr, last_bin);
+                cut_->select(*on_device_, camera.eyes, paced, out, work.stream(), nullptr,
+                             last_bin);
 #endif
             return out;
         };
@@ -264,7 +274,8 @@ class BoundScene {
     // Priorities of the pages of each bundle, on the host.
     py::list page_needs(const BoundCamera& camera, const SelectRule& rule) const {
         if (!device_.is_host())
-            throw py::value_error("page_needs: expected a scene on the CPU, got one on a CUDA device");
+            throw py::value_error(
+                "page_needs: expected a scene on the CPU, got one on a CUDA device");
         const std::shared_ptr<const SceneState> state = state_;
         py::list priorities;
         std::vector<Span<uint32_t>> needs;

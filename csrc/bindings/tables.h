@@ -16,14 +16,16 @@ namespace v3dg {
 // The tables of one bundle with the arrays that they borrow from.
 class BoundTable {
   public:
-    BoundTable(py::array ball, py::array weight, py::array level, py::array own_group, py::array parent_group,
-               py::array box, py::array filter_px2, py::array antialiased, py::array offset,
-               py::object page_shift, py::object page_begins);
+    BoundTable(py::array ball, py::array weight, py::array level, py::array own_group,
+               py::array parent_group, py::array box, py::array filter_px2, py::array antialiased,
+               py::array offset, py::object page_shift, py::object page_begins);
     BoundTable(const BoundTable&) = delete;
 
     const ClusterTable& table() const { return host_->table(); }
     const ClusterAppearance& appearance() const { return host_->appearance(); }
-    size_t num_gaussians() const { return static_cast<size_t>(table().offset[table().offset.size - 1]); }
+    size_t num_gaussians() const {
+        return static_cast<size_t>(table().offset[table().offset.size - 1]);
+    }
 
     // Memory that the tables take on a device.
     size_t bytes_on(int device) const;

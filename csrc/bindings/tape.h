@@ -15,7 +15,8 @@ struct Centers {
 class Tape {
   public:
     virtual ~Tape() = default;
-    // Gradients of means, quats, scales, opacities, sh and background; sum and size of those by the centres.
+    // Gradients of means, quats, scales, opacities, sh and background; sum and size of those by the
+    // centres.
     virtual py::tuple backward(const py::object& d_color, const py::object& d_alpha,
                                const py::object& d_depth, Centers wanted) = 0;
 };
@@ -36,7 +37,7 @@ struct Look {
 };
 
 // Colour, alpha, depth or None, counts and times or None, and the tape or None.
-py::tuple rasterize(const Rows& gaussians, const BoundCamera& camera, const Look& look, bool with_depth,
-                    bool keep_tape);
+py::tuple rasterize(const Rows& gaussians, const BoundCamera& camera, const Look& look,
+                    bool with_depth, bool keep_tape);
 
 }  // namespace v3dg

@@ -1,7 +1,7 @@
 #pragma once
 
-// Value types that cross between Python and the core. All of them are immutable; those that hold arrays keep
-// them alive.
+// Value types that cross between Python and the core. All of them are immutable; those that hold
+// arrays keep them alive.
 
 #include <array>
 
@@ -27,10 +27,12 @@ struct BoundEyes {
     Eyes eyes;
 };
 
-// The arrays of gaussians, all on the host or all on one CUDA device, float32 or, on the host, float64.
+// The arrays of gaussians, all on the host or all on one CUDA device, float32 or, on the host,
+// float64.
 class Rows {
   public:
-    Rows(py::object means, py::object quats, py::object scales, py::object opacities, py::object sh);
+    Rows(py::object means, py::object quats, py::object scales, py::object opacities,
+         py::object sh);
 
     Device device() const { return device_; }
     size_t size() const { return size_; }
@@ -84,11 +86,14 @@ struct NewRows {
 
     NewRows(Device device, size_t size, int sh_degree);
     GaussianRows<float> rows() const {
-        return {means.span.data, quats.span.data, scales.span.data, opacities.span.data, sh.span.data, size,
+        return {means.span.data,  quats.span.data,
+                scales.span.data, opacities.span.data,
+                sh.span.data,     size,
                 sh_degree};
     }
     py::tuple arrays() const {
-        return py::make_tuple(means.object, quats.object, scales.object, opacities.object, sh.object);
+        return py::make_tuple(means.object, quats.object, scales.object, opacities.object,
+                              sh.object);
     }
 };
 

@@ -1,6 +1,6 @@
-// Bounding balls of all segments in step: blocks find the sphere of each segment that reaches farthest from
-// its centre, then a warp a segment adds it to the core set and moves the centre. Segments that are done cost
-// a look at a flag.
+// Bounding balls of all segments in step: blocks find the sphere of each segment that reaches
+// farthest from its centre, then a warp a segment adds it to the core set and moves the centre.
+// Segments that are done cost a look at a flag.
 
 #include <vector>
 
@@ -58,8 +58,9 @@ __global__ void start_kernel(const Ball* spheres, const int64_t* offset, size_t 
 }
 
 // A block takes a chunk of a segment.
-__global__ void farthest_kernel(const Ball* spheres, const int64_t* offset, const uint32_t* segment_of_chunk,
-                                const uint32_t* first_chunk, const Search* searches, Farthest* found) {
+__global__ void farthest_kernel(const Ball* spheres, const int64_t* offset,
+                                const uint32_t* segment_of_chunk, const uint32_t* first_chunk,
+                                const Search* searches, Farthest* found) {
     const uint32_t s = segment_of_chunk[blockIdx.x];
     if (searches[s].phase == Phase::done) return;
     const Center center = searches[s].center;
@@ -82,8 +83,8 @@ __global__ void farthest_kernel(const Ball* spheres, const int64_t* offset, cons
     }
 }
 
-// Moves `center` towards the centre of the smallest ball around the spheres that the first lanes hold;
-// returns its radius.
+// Moves `center` towards the centre of the smallest ball around the spheres that the first lanes
+// hold; returns its radius.
 __device__ double center_core(const Ball& mine, int count, Center& center) {
     const unsigned lane = threadIdx.x % 32;
     const auto find = [&](const Center& at) {
@@ -94,9 +95,10 @@ __device__ double center_core(const Ball& mine, int count, Center& center) {
     Farthest far = find(at);
     double best_radius = far.distance;
     for (int step = kFirstCoreStep; step <= kLastCoreStep; ++step) {
-        const Ball sphere{
-            __shfl_sync(kAllLanes, mine.x, far.index), __shfl_sync(kAllLanes, mine.y, far.index),
-            __shfl_sync(kAllLanes, mine.z, far.index), __shfl_sync(kAllLanes, mine.radius, far.index)};
+        const Ball sphere{__shfl_sync(kAllLanes, mine.x, far.index),
+                          __shfl_sync(kAllLanes, mine.y, far.index),
+                          __shfl_sync(kAllLanes, mine.z, far.index),
+                          __shfl_sync(kAllLanes, mine.radius, far.index)};
         if (!move_center(sphere, far.distance, step, at)) break;
         far = find(at);
         if (far.distance < best_radius) {
@@ -117,7 +119,8 @@ __global__ void advance_kernel(const Ball* spheres, const int64_t* offset, size_
     if (search.phase == Phase::done) return;
     const unsigned lane = threadIdx.x % 32;
     Farthest far{-1.0, 0};
-    for (uint32_t c = first_chunk[s] + lane; c < first_chunk[s + 1]; c += 32) far = farther(far, found[c]);
+    for (uint32_t c = first_chunk[s] + lane; c < first_chunk[s + 1]; c += 32)
+        far = farther(far, found[c]);
     far = farthest_of_warp(far);
 
     if (search.phase == Phase::measure) {
@@ -158,8 +161,8 @@ __global__ void advance_kernel(const Ball* spheres, const int64_t* offset, size_
 
 }  // namespace
 
-void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double margin, Span<Ball> ball,
-                   Stream stream) {
+void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double margin,
+                   Span<Ball> ball, Stream stream) {
     const size_t num_segments = ball.size;
     std::vector<uint32_t> first_chunk{0}, segment_of_chunk;
     for (size_t s = 0; s < num_segments; ++s) {
@@ -168,23 +171,23 @@ void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double 
         first_chunk.push_back(static_cast<uint32_t>(segment_of_chunk.size()));
     }
     const DeviceBuffer<int64_t> offsets(offset, stream);
-    const DeviceBuffer<uint32_t> first_chunks(Span<const uint32_t>{first_chunk.data(), first_chunk.size()},
-                                              stream);
+    const DeviceBuffer<uint32_t> first_chunks(
+        Span<const uint32_t>{first_chunk.data(), first_chunk.size()}, stream);
     const DeviceBuffer<uint32_t> segments(
         Span<const uint32_t>{segment_of_chunk.data(), segment_of_chunk.size()}, stream);
     DeviceBuffer<Search> searches(num_segments, stream);
     DeviceBuffer<Ball> cores(num_segments * kCoreSize, stream);
     DeviceBuffer<Farthest> found(segment_of_chunk.size(), stream);
-    launch("bound_spheres: start", start_kernel, blocks_for(num_segments, kBlockSize), kBlockSize, 0, stream,
-           spheres.data, offsets.data(), num_segments, searches.data(), ball.data);
+    launch("bound_spheres: start", start_kernel, blocks_for(num_segments, kBlockSize), kBlockSize,
+           0, stream, spheres.data, offsets.data(), num_segments, searches.data(), ball.data);
     // The core set grows from two spheres by one a pass; then come the last look and the radius.
     for (int pass = 0; pass < kCoreSize + 1; ++pass) {
-        launch("bound_spheres: farthest", farthest_kernel, static_cast<unsigned>(segment_of_chunk.size()),
-               kBlockSize, 0, stream, spheres.data, offsets.data(), segments.data(), first_chunks.data(),
-               searches.data(), found.data());
-        launch("bound_spheres: advance", advance_kernel, blocks_for(num_segments, kWarps), kBlockSize, 0,
-               stream, spheres.data, offsets.data(), num_segments, first_chunks.data(), found.data(), margin,
-               searches.data(), cores.data(), ball.data);
+        launch("bound_spheres: farthest", farthest_kernel,
+               static_cast<unsigned>(segment_of_chunk.size()), kBlockSize, 0, stream, spheres.data,
+               offsets.data(), segments.data(), first_chunks.data(), searches.data(), found.data());
+        launch("bound_spheres: advance", advance_kernel, blocks_for(num_segments, kWarps),
+               kBlockSize, 0, stream, spheres.data, offsets.data(), num_segments,
+               first_chunks.data(), found.data(), margin, searches.data(), cores.data(), ball.data);
     }
 }
 

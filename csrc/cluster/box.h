@@ -13,15 +13,15 @@ struct BoxInput {
     Span<const int64_t> offset;           // [C + 1] gaussians of each cluster
 };
 
-// Boxes of what clusters draw: the reach of an opaque gaussian around every mean, rounded outwards, without
-// that of the filter. A cluster of no gaussians gets a box of none: +inf to -inf. Both halves give the same
-// bits.
+// Boxes of what clusters draw: the reach of an opaque gaussian around every mean, rounded outwards,
+// without that of the filter. A cluster of no gaussians gets a box of none: +inf to -inf. Both
+// halves give the same bits.
 //
 // box: [C].
 namespace cpu { void bound_by_boxes(const BoxInput& in, Span<Box> box); }
 
-// Rows and boxes on the device, offsets on the host. Work is queued on the stream. Throws std::runtime_error
-// when CUDA reports an error.
+// Rows and boxes on the device, offsets on the host. Work is queued on the stream. Throws
+// std::runtime_error when CUDA reports an error.
 namespace cuda { void bound_by_boxes(const BoxInput& in, Span<Box> box, Stream stream); }
 
 }  // namespace v3dg

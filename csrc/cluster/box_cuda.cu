@@ -11,8 +11,8 @@ namespace {
 
 constexpr unsigned kBlockSize = 128;
 
-__global__ void box_kernel(const float* means, const float* quats, const float* scales, const int64_t* offset,
-                           size_t num_clusters, Box* out) {
+__global__ void box_kernel(const float* means, const float* quats, const float* scales,
+                           const int64_t* offset, size_t num_clusters, Box* out) {
     const size_t c = (blockIdx.x * size_t(kBlockSize) + threadIdx.x) / 32;
     if (c >= num_clusters) return;
     const unsigned lane = threadIdx.x % 32;
@@ -35,8 +35,8 @@ __global__ void box_kernel(const float* means, const float* quats, const float* 
 void bound_by_boxes(const BoxInput& in, Span<Box> box, Stream stream) {
     assert(in.offset.size == box.size + 1);
     const DeviceBuffer<int64_t> offset(in.offset, stream);
-    launch("bound by boxes", box_kernel, blocks_for(32 * box.size, kBlockSize), kBlockSize, 0, stream,
-           in.means, in.quats, in.scales, offset.data(), box.size, box.data);
+    launch("bound by boxes", box_kernel, blocks_for(32 * box.size, kBlockSize), kBlockSize, 0,
+           stream, in.means, in.quats, in.scales, offset.data(), box.size, box.data);
 }
 
 }  // namespace cuda

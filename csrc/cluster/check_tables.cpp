@@ -13,7 +13,8 @@ namespace v3dg {
 
 namespace {
 
-constexpr double kRounding = 1e-9;  // two ways to compute the same double need not agree to the last bit
+constexpr double kRounding =
+    1e-9;  // two ways to compute the same double need not agree to the last bit
 
 template <class Expected>
 std::string text_of(const Expected& expected, size_t row) {
@@ -33,7 +34,8 @@ void check_rows(const char* table, size_t count, const Holds& holds, const Expec
 // As above, for rows that are at least all before them.
 template <class Value>
 void check_ascends(const char* table, size_t count, const Value& value, const char* expected) {
-    check_rows(table, count, [&](size_t i) { return i == 0 || value(i) >= value(i - 1); }, expected);
+    check_rows(
+        table, count, [&](size_t i) { return i == 0 || value(i) >= value(i - 1); }, expected);
 }
 
 bool is_finite(Span<const float> values, size_t row, size_t width) {
@@ -66,7 +68,8 @@ class Checker {
             "the level before, or one more");
     }
 
-    // Every group replaces the clusters of one page and makes clusters of the next level for one parent.
+    // Every group replaces the clusters of one page and makes clusters of the next level for one
+    // parent.
     void check_tree() const {
         check_links("clusters.own_group", t_.own_group, t_.level, 0, 0);
         check_links("clusters.parent_group", t_.parent_group, t_.level, last_level_, 1);
@@ -79,21 +82,25 @@ class Checker {
         check_ascends(
             "clusters.parent_group", num_clusters_,
             [&](size_t c) {
-                return t_.level[c] == last_level_ ? static_cast<int64_t>(num_groups_) : t_.parent_group[c];
+                return t_.level[c] == last_level_ ? static_cast<int64_t>(num_groups_)
+                                                  : t_.parent_group[c];
             },
-            "parents in ascending order, so that groups are in the order of the clusters they replace");
+            "parents in ascending order, so that groups are in the order of the clusters they "
+            "replace");
         check_is_used("own_group", t_.own_group);
         check_is_used("parent_group", t_.parent_group);
         const auto of_own = [&](size_t c) {
             return t_.own_group[c] >= 0 ? t_.parent[t_.own_group[c]] : t_.parent_group[c];
         };
         check_rows(
-            "clusters.parent_group", num_clusters_, [&](size_t c) { return t_.parent_group[c] == of_own(c); },
+            "clusters.parent_group", num_clusters_,
+            [&](size_t c) { return t_.parent_group[c] == of_own(c); },
             [&](size_t c) { return std::to_string(of_own(c)) + ", its own group's parent"; });
     }
 
     void check_values() const {
-        const Span<const float> corners{reinterpret_cast<const float*>(t_.box.data), 6 * num_clusters_};
+        const Span<const float> corners{reinterpret_cast<const float*>(t_.box.data),
+                                        6 * num_clusters_};
         check_rows(
             "clusters.box", num_clusters_, [&](size_t c) { return is_finite(corners, c, 6); },
             "finite numbers");
@@ -107,19 +114,23 @@ class Checker {
             "a lower corner not above the upper");
         check_rows(
             "clusters.filter_px2", num_clusters_,
-            [&](size_t c) { return std::isfinite(t_.filter_px2[c]) && t_.filter_px2[c] >= 0; }, "0 or more");
+            [&](size_t c) { return std::isfinite(t_.filter_px2[c]) && t_.filter_px2[c] >= 0; },
+            "0 or more");
         check_rows(
             "clusters.antialiased", num_clusters_, [&](size_t c) { return t_.antialiased[c] <= 1; },
             "0 or 1");
-        const Span<const float> balls{reinterpret_cast<const float*>(t_.ball.data), 4 * num_groups_};
+        const Span<const float> balls{reinterpret_cast<const float*>(t_.ball.data),
+                                      4 * num_groups_};
         check_rows(
-            "groups.ball", num_groups_, [&](size_t g) { return is_finite(balls, g, 4); }, "finite numbers");
+            "groups.ball", num_groups_, [&](size_t g) { return is_finite(balls, g, 4); },
+            "finite numbers");
         check_rows(
             "groups.ball", num_groups_, [&](size_t g) { return t_.ball[g].radius >= kMinRadius; },
             "a radius of " + shown(kMinRadius) + " or more");
         check_rows(
             "groups.weight", num_groups_,
-            [&](size_t g) { return std::isfinite(t_.weight[g]) && t_.weight[g] > 0; }, "a positive number");
+            [&](size_t g) { return std::isfinite(t_.weight[g]) && t_.weight[g] > 0; },
+            "a positive number");
         check_rows(
             "groups.error", num_groups_,
             [&](size_t g) {
@@ -139,7 +150,8 @@ class Checker {
         check_rows(
             "groups.ball", num_groups_,
             [&](size_t g) {
-                return t_.parent[g] < 0 || t_.ball[t_.parent[g]].radius >= needed(g) * (1 - kRounding);
+                return t_.parent[g] < 0 ||
+                       t_.ball[t_.parent[g]].radius >= needed(g) * (1 - kRounding);
             },
             [&](size_t g) {
                 return "a ball inside that of group " + std::to_string(t_.parent[g]) +
@@ -153,8 +165,8 @@ class Checker {
 
   private:
     // Each row links to a group of its own level plus `above`; those of level `without` to none.
-    void check_links(const char* table, Span<const int32_t> links, Span<const int32_t> level, int32_t without,
-                     int above) const {
+    void check_links(const char* table, Span<const int32_t> links, Span<const int32_t> level,
+                     int32_t without, int above) const {
         const auto wanted = [&](size_t row) { return int64_t{level[row]} + above; };
         check_rows(
             table, links.size,
@@ -165,7 +177,8 @@ class Checker {
                 return is_inside && t_.group_level[link] == wanted(row);
             },
             [&](size_t row) {
-                return level[row] == without ? "-1" : "a group of level " + std::to_string(wanted(row));
+                return level[row] == without ? "-1"
+                                             : "a group of level " + std::to_string(wanted(row));
             });
     }
 
@@ -174,7 +187,8 @@ class Checker {
         for (const int32_t link : links)
             if (link >= 0) is_used[link] = 1;
         check_rows(
-            "groups", num_groups_, [&](size_t g) { return is_used[g] != 0; }, "a cluster with it as " + name);
+            "groups", num_groups_, [&](size_t g) { return is_used[g] != 0; },
+            "a cluster with it as " + name);
     }
 
     static std::string shown(double number) {

@@ -9,8 +9,8 @@
 
 namespace v3dg {
 
-// C clusters, by level, then by parent group; G groups, in the order of the clusters that they replace.
-// Group -1 is none.
+// C clusters, by level, then by parent group; G groups, in the order of the clusters that they
+// replace. Group -1 is none.
 struct GivenTables {
     Span<const int64_t> offset;        // [C + 1]
     Span<const int32_t> level;         // [C]
@@ -33,8 +33,8 @@ struct TableFault {
     std::string expected;
 };
 
-// Nothing in the tables is believed. A group's ball and weight have to contain those below, so that the
-// metric never decreases towards the root.
+// Nothing in the tables is believed. A group's ball and weight have to contain those below, so that
+// the metric never decreases towards the root.
 void check_tables(const GivenTables& tables, int64_t num_gaussians);
 
 }  // namespace v3dg

@@ -1,5 +1,5 @@
-// Median split: segments in parallel, and a task a node, down to a size where tasks cost more than they win.
-// Bounding balls: one thread a segment.
+// Median split: segments in parallel, and a task a node, down to a size where tasks cost more than
+// they win. Bounding balls: one thread a segment.
 
 #include "base/threads.h"
 #include "cluster/cluster.h"
@@ -58,8 +58,9 @@ void move_median(IndexedPoint* first, IndexedPoint* middle, IndexedPoint* last) 
     });
 }
 
-// Splits points first .. last into the node's 2^depth leaves. Plain arguments: LLVM's OpenMP, which stands in
-// for gcc's where threads are checked (.ci/sanitize), forgets to copy others into a task that runs at once.
+// Splits points first .. last into the node's 2^depth leaves. Plain arguments: LLVM's OpenMP, which
+// stands in for gcc's where threads are checked (.ci/sanitize), forgets to copy others into a task
+// that runs at once.
 void split_node(IndexedPoint* points, ptrdiff_t first, ptrdiff_t last, int depth, int64_t* order) {
     if (depth == 0) {
         for (ptrdiff_t i = first; i < last; ++i) order[i] = points[i].index;
@@ -131,8 +132,8 @@ Center center_of(const Ball* spheres, size_t count) {
 
 }  // namespace
 
-void cpu::median_split(Span<const Point> means, Span<const int64_t> offset, int depth, Span<int64_t> order,
-                       Span<int64_t> leaf_offset) {
+void cpu::median_split(Span<const Point> means, Span<const int64_t> offset, int depth,
+                       Span<int64_t> order, Span<int64_t> leaf_offset) {
     assert(order.size == means.size);
     halve_segments(offset, depth, leaf_offset);
     std::vector<IndexedPoint> points(means.size);

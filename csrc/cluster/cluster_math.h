@@ -11,8 +11,8 @@ struct Point {
     float axis[3];
 };
 
-// A ball contains another with this relative margin, so that rounding in the float32 footprint (about 1e-6)
-// cannot turn their order round.
+// A ball contains another with this relative margin, so that rounding in the float32 footprint
+// (about 1e-6) cannot turn their order round.
 constexpr double kNestingMargin = 4e-6;
 
 // Squares of radii stay normal numbers, so that they keep their relative precision.
@@ -28,14 +28,15 @@ V3DG_HD inline double reach(const Center& center, const Ball& sphere) {
     return sqrt(dx * dx + dy * dy + dz * dz) + sphere.radius;
 }
 
-// The centre of the smallest ball around many spheres comes from a core set of a few: those that were the
-// farthest from the centre of the ones before (Badoiu and Clarkson, Smaller core-sets for balls, SODA 2003).
+// The centre of the smallest ball around many spheres comes from a core set of a few: those that
+// were the farthest from the centre of the ones before (Badoiu and Clarkson, Smaller core-sets for
+// balls, SODA 2003).
 constexpr int kCoreSize = 24;
 constexpr int kFirstCoreStep = 2, kLastCoreStep = 255;
 constexpr double kCoreTolerance = 1e-4;
 
-// Moves the centre of a core set towards the sphere that reaches farthest from it, to `radius`. False when
-// the two are concentric, so that there is nothing to move towards.
+// Moves the centre of a core set towards the sphere that reaches farthest from it, to `radius`.
+// False when the two are concentric, so that there is nothing to move towards.
 V3DG_HD inline bool move_center(const Ball& farthest, double radius, int step, Center& center) {
     const double distance = radius - farthest.radius;
     if (distance <= 0.0) return false;
@@ -53,7 +54,8 @@ V3DG_HD inline bool core_suffices(double radius, double core_radius, int core_si
 
 // The centre as a ball in float32 has it; the radius is still to come.
 V3DG_HD inline Ball ball_at(const Center& center) {
-    return {static_cast<float>(center.x), static_cast<float>(center.y), static_cast<float>(center.z), 0.0f};
+    return {static_cast<float>(center.x), static_cast<float>(center.y),
+            static_cast<float>(center.z), 0.0f};
 }
 V3DG_HD inline Center center_of(const Ball& ball) { return {ball.x, ball.y, ball.z}; }
 

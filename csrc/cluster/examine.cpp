@@ -33,7 +33,8 @@ uint16_t findings_of(const GaussianRows<const float>& in, size_t row) {
     note(!are_finite(scale, 3), kScaleNotFinite);
     note(!std::isfinite(opacity), kOpacityNotFinite);
     note(!are_finite(in.sh + in.num_sh() * row, in.num_sh()), kShNotFinite);
-    note(std::any_of(mean, mean + 3, is_too_large) || std::any_of(scale, scale + 3, is_too_large), kTooLarge);
+    note(std::any_of(mean, mean + 3, is_too_large) || std::any_of(scale, scale + 3, is_too_large),
+         kTooLarge);
     note(std::any_of(scale, scale + 3, [](float value) { return value < 0; }), kNegativeScale);
     note(opacity < 0 || (opacity > 1 && std::isfinite(opacity)), kOpacityOutOfRange);
     note(opacity >= 0 && opacity < static_cast<float>(kMinAlpha), kTransparent);
@@ -43,7 +44,8 @@ uint16_t findings_of(const GaussianRows<const float>& in, size_t row) {
 }  // namespace
 
 void examine(const GaussianRows<const float>& in, Span<uint16_t> findings) {
-    parallel_for(in.size, kGaussiansAtOnce, [&](size_t row) { findings[row] = findings_of(in, row); });
+    parallel_for(in.size, kGaussiansAtOnce,
+                 [&](size_t row) { findings[row] = findings_of(in, row); });
 }
 
 }  // namespace v3dg

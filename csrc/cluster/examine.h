@@ -7,7 +7,8 @@
 
 namespace v3dg {
 
-// Why a gaussian cannot be drawn: bits, of which it may have several. All but the last are wrong values.
+// Why a gaussian cannot be drawn: bits, of which it may have several. All but the last are wrong
+// values.
 enum Finding : uint16_t {
     kMeanNotFinite = 1 << 0,
     kQuatNotFinite = 1 << 1,

@@ -1,9 +1,9 @@
 // Median split, one level at a time for all nodes at once.
 //
-// Four lists of the points' indices are kept, sorted within each node: along x, y and z, ties by index, and
-// by index alone. So a node's extent is the difference of two values, its median the middle of a list, and a
-// split a stable partition of the lists by the side that each point goes to. In the end the list by index is
-// the order within leaves.
+// Four lists of the points' indices are kept, sorted within each node: along x, y and z, ties by
+// index, and by index alone. So a node's extent is the difference of two values, its median the
+// middle of a list, and a split a stable partition of the lists by the side that each point goes
+// to. In the end the list by index is the order within leaves.
 
 #include <cub/device/device_radix_sort.cuh>
 
@@ -20,7 +20,8 @@ namespace {
 
 constexpr unsigned kNumLists = 4, kByIndex = 3;  // list l begins at l * count
 constexpr unsigned kBlockSize = 256;
-constexpr unsigned kWordsPerTile = 64;  // a block partitions one tile of a list, a warp 32 points at a time
+constexpr unsigned kWordsPerTile =
+    64;  // a block partitions one tile of a list, a warp 32 points at a time
 constexpr unsigned kTileSize = 32 * kWordsPerTile;
 
 // Positions first .. last of every list; those before `middle` are the left half's.
@@ -29,7 +30,8 @@ struct Node {
     uint32_t lefts_before;  // left halves of the nodes before, in points
 };
 
-// The last node that begins at or before `position`, between the nodes low and high; so an empty node never.
+// The last node that begins at or before `position`, between the nodes low and high; so an empty
+// node never.
 __device__ uint32_t node_at(const Node* nodes, uint32_t low, uint32_t high, size_t position) {
     while (low < high) {
         const uint32_t middle = low + (high - low + 1) / 2;
@@ -45,19 +47,21 @@ __device__ uint32_t node_at(const Node* nodes, uint32_t low, uint32_t high, size
 struct NodeRange {
     uint32_t low, high;
 };
-__device__ NodeRange nodes_of_tile(const Node* nodes, uint32_t num_nodes, size_t tile, size_t count) {
+__device__ NodeRange nodes_of_tile(const Node* nodes, uint32_t num_nodes, size_t tile,
+                                   size_t count) {
     __shared__ uint32_t found[2];
     if (threadIdx.x < 2) {
         const size_t last = (tile + 1) * kTileSize < count ? (tile + 1) * kTileSize - 1 : count - 1;
-        found[threadIdx.x] = node_at(nodes, 0, num_nodes - 1, threadIdx.x == 0 ? tile * kTileSize : last);
+        found[threadIdx.x] =
+            node_at(nodes, 0, num_nodes - 1, threadIdx.x == 0 ? tile * kTileSize : last);
     }
     __syncthreads();
     return {found[0], found[1]};
 }
 
 // Sort keys along one axis: the segment, then the value. -0 counts as 0, as it does in comparisons.
-__global__ void keys_kernel(const Point* means, size_t count, const Node* segments, uint32_t num_segments,
-                            int axis, uint64_t* keys, uint32_t* indices) {
+__global__ void keys_kernel(const Point* means, size_t count, const Node* segments,
+                            uint32_t num_segments, int axis, uint64_t* keys, uint32_t* indices) {
     const size_t i = blockIdx.x * size_t(kBlockSize) + threadIdx.x;
     if (i >= count) return;
     const uint32_t bits = __float_as_uint(means[i].axis[axis] + 0.0f);
@@ -139,14 +143,15 @@ __global__ void sum_kernel(uint32_t num_tiles, unsigned first_list, uint32_t* ti
 }
 
 // Moves every point to its half of its node, in the order in which the list has them.
-__global__ void partition_kernel(const Node* nodes, uint32_t num_nodes, const uint32_t* from, uint32_t* to,
-                                 unsigned first_list, size_t count, const uint32_t* words,
-                                 const uint32_t* tile_lefts) {
+__global__ void partition_kernel(const Node* nodes, uint32_t num_nodes, const uint32_t* from,
+                                 uint32_t* to, unsigned first_list, size_t count,
+                                 const uint32_t* words, const uint32_t* tile_lefts) {
     const size_t list = first_list + blockIdx.y;
     const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
     __shared__ uint32_t word_bits[kWordsPerTile], lefts_before_word[kWordsPerTile];
     const bool has_word = threadIdx.x < kWordsPerTile;
-    const uint32_t bits = has_word ? words[(list * gridDim.x + blockIdx.x) * kWordsPerTile + threadIdx.x] : 0;
+    const uint32_t bits =
+        has_word ? words[(list * gridDim.x + blockIdx.x) * kWordsPerTile + threadIdx.x] : 0;
     uint32_t total;
     const uint32_t before =
         tile_lefts[list * gridDim.x + blockIdx.x] + block_prefix<uint32_t>(__popc(bits), total);
@@ -162,9 +167,9 @@ __global__ void partition_kernel(const Node* nodes, uint32_t num_nodes, const ui
         const uint32_t lefts = lefts_before_word[k] + __popc(word_bits[k] & ((1u << lane) - 1));
         const uint32_t left_rank = lefts - node.lefts_before;
         const bool left = (word_bits[k] >> lane & 1) != 0;
-        const uint32_t place = left
-                                   ? node.first + left_rank
-                                   : node.middle + (static_cast<uint32_t>(position) - node.first - left_rank);
+        const uint32_t place =
+            left ? node.first + left_rank
+                 : node.middle + (static_cast<uint32_t>(position) - node.first - left_rank);
         to[list * count + place] = from[list * count + position];
     }
 }
@@ -200,8 +205,8 @@ void sort_lists(const Point* means, size_t count, const Node* segments, uint32_t
     int num_bits = 32;
     while (num_bits < 64 && (uint64_t(num_segments - 1) >> (num_bits - 32)) != 0) ++num_bits;
     const auto sort = [&](void* scratch, size_t& bytes, uint32_t* list) {
-        check(cub::DeviceRadixSort::SortPairs(scratch, bytes, keys.data(), sorted_keys.data(), indices.data(),
-                                              list, count, 0, num_bits, stream),
+        check(cub::DeviceRadixSort::SortPairs(scratch, bytes, keys.data(), sorted_keys.data(),
+                                              indices.data(), list, count, 0, num_bits, stream),
               "median_split: sort");
     };
     size_t bytes = 0;
@@ -209,24 +214,26 @@ void sort_lists(const Point* means, size_t count, const Node* segments, uint32_t
     DeviceBuffer<unsigned char> scratch(bytes, stream);
     const unsigned blocks = blocks_for(count, kBlockSize);
     for (int axis = 0; axis < 3; ++axis) {
-        launch("median_split: keys", keys_kernel, blocks, kBlockSize, 0, stream, means, count, segments,
-               num_segments, axis, keys.data(), indices.data());
+        launch("median_split: keys", keys_kernel, blocks, kBlockSize, 0, stream, means, count,
+               segments, num_segments, axis, keys.data(), indices.data());
         sort(scratch.data(), bytes, lists + axis * count);
     }
 }
 
 }  // namespace
 
-void median_split(Span<const Point> means, Span<const int64_t> offset, int depth, Span<int64_t> order,
-                  Span<int64_t> leaf_offset, Stream stream) {
+void median_split(Span<const Point> means, Span<const int64_t> offset, int depth,
+                  Span<int64_t> order, Span<int64_t> leaf_offset, Stream stream) {
     halve_segments(offset, depth, leaf_offset);
     const size_t count = means.size;
     if (count == 0) return;
     const unsigned blocks = blocks_for(count, kBlockSize);
-    DeviceBuffer<uint32_t> buffer(kNumLists * count, stream), next_buffer(kNumLists * count, stream);
+    DeviceBuffer<uint32_t> buffer(kNumLists * count, stream),
+        next_buffer(kNumLists * count, stream);
     uint32_t *lists = buffer.data(), *next = next_buffer.data();
     const std::vector<Node> host_nodes = nodes_of_levels(leaf_offset, depth);
-    const DeviceBuffer<Node> all_nodes(Span<const Node>{host_nodes.data(), host_nodes.size()}, stream);
+    const DeviceBuffer<Node> all_nodes(Span<const Node>{host_nodes.data(), host_nodes.size()},
+                                       stream);
     const Node* nodes = all_nodes.data();
     uint32_t num_nodes = static_cast<uint32_t>(offset.size - 1);
     if (depth > 0) sort_lists(means.data, count, nodes, num_nodes, lists, stream);
@@ -242,21 +249,23 @@ void median_split(Span<const Point> means, Span<const int64_t> offset, int depth
         const unsigned first_list = level + 1 == depth ? kByIndex : 0;
         const unsigned num_lists = kNumLists - first_list;
         launch("median_split: longest axis", longest_axis_kernel, blocks_for(num_nodes, kBlockSize),
-               kBlockSize, 0, stream, means.data, nodes, num_nodes, lists, count, axis_of_node.data());
+               kBlockSize, 0, stream, means.data, nodes, num_nodes, lists, count,
+               axis_of_node.data());
         launch("median_split: sides", side_kernel, tiles, kBlockSize, 0, stream, nodes, num_nodes,
                axis_of_node.data(), lists, count, goes_left.data());
-        launch("median_split: count", count_kernel, dim3(tiles, num_lists), kBlockSize, 0, stream, lists,
-               first_list, count, goes_left.data(), words.data(), tile_lefts.data());
+        launch("median_split: count", count_kernel, dim3(tiles, num_lists), kBlockSize, 0, stream,
+               lists, first_list, count, goes_left.data(), words.data(), tile_lefts.data());
         launch("median_split: sum", sum_kernel, num_lists, 1024, 0, stream, tiles, first_list,
                tile_lefts.data());
-        launch("median_split: partition", partition_kernel, dim3(tiles, num_lists), kBlockSize, 0, stream,
-               nodes, num_nodes, lists, next, first_list, count, words.data(), tile_lefts.data());
+        launch("median_split: partition", partition_kernel, dim3(tiles, num_lists), kBlockSize, 0,
+               stream, nodes, num_nodes, lists, next, first_list, count, words.data(),
+               tile_lefts.data());
         std::swap(lists, next);
         nodes += num_nodes;
         num_nodes *= 2;
     }
-    launch("median_split: widen", widen_kernel, blocks, kBlockSize, 0, stream, lists + kByIndex * count,
-           count, order.data);
+    launch("median_split: widen", widen_kernel, blocks, kBlockSize, 0, stream,
+           lists + kByIndex * count, count, order.data);
 }
 
 }  // namespace cuda

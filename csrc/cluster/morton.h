@@ -7,8 +7,8 @@
 
 namespace v3dg {
 
-// Indices that put points along a curve that keeps neighbours together; the same on every run. Points are
-// finite.
+// Indices that put points along a curve that keeps neighbours together; the same on every run.
+// Points are finite.
 void morton_order(Span<const Point> points, Span<int64_t> order);
 
 }  // namespace v3dg

@@ -12,7 +12,8 @@ namespace cuda {
 
 namespace {
 
-// Pages come in for so long before a frame, and so many bytes at least are brought before that is measured.
+// Pages come in for so long before a frame, and so many bytes at least are brought before that is
+// measured.
 constexpr float kBringMs = 2.0f;
 constexpr size_t kLeastMeasured = size_t(4) << 20, kLeastBytesAFrame = size_t(8) << 20;
 
@@ -55,12 +56,15 @@ Pinned<T> pinned(size_t count) {
 }
 
 // The degree 0 is in the planes. Rows begin at multiples of 16 bytes.
-int stride_of(int sh_degree) { return sh_degree == 0 ? 0 : (3 * num_sh_bases(sh_degree) + 3) / 4 * 4; }
+int stride_of(int sh_degree) {
+    return sh_degree == 0 ? 0 : (3 * num_sh_bases(sh_degree) + 3) / 4 * 4;
+}
 
 }  // namespace
 
 void FreePinned::operator()(void* memory) const noexcept {
-    if (cudaFreeHost(memory) != cudaSuccess) cudaGetLastError();  // at exit the driver may be gone before us
+    if (cudaFreeHost(memory) != cudaSuccess)
+        cudaGetLastError();  // at exit the driver may be gone before us
 }
 
 unsigned char* PinnedBlocks::allocate(size_t bytes) {
@@ -82,7 +86,8 @@ struct DevicePages::Flight {
     std::vector<unsigned char*> blocks;  // that `moves` reads
     bool is_bounded = false;
     size_t bytes_in = 0;
-    cudaEvent_t done = nullptr, begun = nullptr, brought = nullptr;  // bringing pages begins, and is over
+    cudaEvent_t done = nullptr, begun = nullptr,
+                brought = nullptr;  // bringing pages begins, and is over
 
     Flight(size_t most_changes, size_t most_arrivals)
         : moves(pinned<PageMove>(most_changes)),
@@ -91,7 +96,8 @@ struct DevicePages::Flight {
           arrivals(pinned<Arrival>(most_arrivals)),
           report(pinned<NeedsReport>(1)) {
         check(cudaEventCreateWithFlags(&done, cudaEventDisableTiming), "cudaEventCreate");
-        for (cudaEvent_t* event : {&begun, &brought}) check(cudaEventCreate(event), "cudaEventCreate");
+        for (cudaEvent_t* event : {&begun, &brought})
+            check(cudaEventCreate(event), "cudaEventCreate");
     }
     ~Flight() {
         for (cudaEvent_t event : {done, begun, brought})
@@ -114,8 +120,8 @@ DevicePages::DevicePages(PagePool& pool, std::vector<std::shared_ptr<const Bundl
         make_packed(stream);
     make_tables(host, appearance, stream);
     for (size_t k = 0; k < kMostFlights; ++k)
-        flights_.push_back(
-            std::make_unique<Flight>(pool.most_changes(), pool.plan().num_slots + pool.most_changes()));
+        flights_.push_back(std::make_unique<Flight>(pool.most_changes(),
+                                                    pool.plan().num_slots + pool.most_changes()));
     check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
 }
 
@@ -125,11 +131,12 @@ void DevicePages::make_packed(cudaStream_t stream) {
     const float* sh = sh_.reserve(static_cast<size_t>(sh_stride_) * num_rows, stream);
     std::vector<PackedPlanes> packed;
     for (uint32_t b = 0; b < tables_.size(); ++b)
-        packed.push_back({{plane, plane + 4 * num_rows, plane + 8 * num_rows, plane + 12 * num_rows},
-                          sh,
-                          pool_.source(b).sh_degree(),
-                          sh_stride_,
-                          {}});
+        packed.push_back(
+            {{plane, plane + 4 * num_rows, plane + 8 * num_rows, plane + 12 * num_rows},
+             sh,
+             pool_.source(b).sh_degree(),
+             sh_stride_,
+             {}});
     packed_.copy_from({packed.data(), packed.size()}, stream);
 }
 
@@ -151,7 +158,8 @@ void DevicePages::make_coded(cudaStream_t stream) {
 }
 
 void DevicePages::make_tables(const std::vector<ClusterTable>& host,
-                              const std::vector<ClusterAppearance>& appearance, cudaStream_t stream) {
+                              const std::vector<ClusterAppearance>& appearance,
+                              cudaStream_t stream) {
     std::vector<uint8_t> joins;
     std::vector<size_t> first_join;
     size_t num_pages = 0;
@@ -267,7 +275,8 @@ SlotPage DevicePages::slot_page(const PageChange& change, const unsigned char* b
     return page;
 }
 
-void DevicePages::bring(const std::vector<PageChange>& changes, Flight& flight, cudaStream_t stream) {
+void DevicePages::bring(const std::vector<PageChange>& changes, Flight& flight,
+                        cudaStream_t stream) {
     const bool keeps_codes = pool_.keeps_codes();
     size_t staged = 0, num_pages = 0;
     for (size_t k = 0; k < changes.size(); ++k) {
@@ -285,7 +294,8 @@ void DevicePages::bring(const std::vector<PageChange>& changes, Flight& flight, 
         staged += move.num_vectors * sizeof(uint4);
         if (keeps_codes) {
             move.cluster_shift = cluster_shift_.data() + place;
-            move.cluster_value = static_cast<uint32_t>(change.cluster - source.first_cluster(change.page));
+            move.cluster_value =
+                static_cast<uint32_t>(change.cluster - source.first_cluster(change.page));
             flight.codes[num_pages++] = slot_page(change, bytes);
         } else {
             flight.rows[num_pages++] = page_rows(change, bytes);
@@ -309,16 +319,18 @@ void DevicePages::note_arrivals(Flight& flight, cudaStream_t stream) {
     const std::vector<Arrival>& changed = pool_.arrivals().changed();
     if (changed.empty()) return;
     std::copy(changed.begin(), changed.end(), flight.arrivals.get());
-    launch("arrivals_kernel", arrivals_kernel, blocks_for(changed.size(), kThreads), kThreads, 0, stream,
-           flight.arrivals.get(), static_cast<unsigned>(changed.size()), begins_.data());
+    launch("arrivals_kernel", arrivals_kernel, blocks_for(changed.size(), kThreads), kThreads, 0,
+           stream, flight.arrivals.get(), static_cast<unsigned>(changed.size()), begins_.data());
 }
 
 PartlyResident DevicePages::begin_frame(bool is_bounded, Arrive arrive, cudaStream_t stream) {
     if (is_capturing(stream))
         throw std::runtime_error(
-            "memory: expected no CUDA graph of a pool, whose pages come and go; capture a renderer without "
+            "memory: expected no CUDA graph of a pool, whose pages come and go; capture a renderer "
+            "without "
             "memory");
-    if (under_way_.size() == kMostFlights) check(cudaEventSynchronize(under_way_.front()->done), "a frame");
+    if (under_way_.size() == kMostFlights)
+        check(cudaEventSynchronize(under_way_.front()->done), "a frame");
     note_flights(false);
     if (current_ != nullptr) {  // its frame was given up before its cut
         check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
@@ -334,8 +346,8 @@ PartlyResident DevicePages::begin_frame(bool is_bounded, Arrive arrive, cudaStre
     bring(changes, flight, stream);
     note_arrivals(flight, stream);
     return {bundles_.data(),
-            {words_.data(), num_words_, need_.data(), list_.data(), static_cast<unsigned>(pool_.most_needs()),
-             flight.report.get(), flight.needs->list}};
+            {words_.data(), num_words_, need_.data(), list_.data(),
+             static_cast<unsigned>(pool_.most_needs()), flight.report.get(), flight.needs->list}};
 }
 
 void DevicePages::end_frame(cudaStream_t stream) {
@@ -349,8 +361,8 @@ SelectRule DevicePages::raised(SelectRule rule) const {
     return rule;
 }
 
-SettlingStep DevicePages::settle_step(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
-                                      bool begins, cudaStream_t stream) {
+SettlingStep DevicePages::settle_step(const SceneTables& scene, const Eyes& eyes,
+                                      const SelectRule& rule, bool begins, cudaStream_t stream) {
     const StreamLock lock(busy_, stream);
     note_flights(true);
     if (begins) pool_.begin_settling();

@@ -34,21 +34,23 @@ constexpr size_t kMostFlights = 4;
 // Bytes that a packed row of a pool takes.
 size_t packed_row_bytes(int max_sh_degree);
 
-// Gaussians in slots: codes, or packed rows whatever the codec of their pages is. Frames read them, and those
-// that come and go are brought, in the order of locks of mutex(), on any streams of the device.
+// Gaussians in slots: codes, or packed rows whatever the codec of their pages is. Frames read them,
+// and those that come and go are brought, in the order of locks of mutex(), on any streams of the
+// device.
 class DevicePages {
   public:
     // `tables` are on the current device, `host` are the same on the host.
     DevicePages(PagePool& pool, std::vector<std::shared_ptr<const BundleTables>> tables,
-                const std::vector<ClusterTable>& host, const std::vector<ClusterAppearance>& appearance,
-                cudaStream_t stream);
+                const std::vector<ClusterTable>& host,
+                const std::vector<ClusterAppearance>& appearance, cudaStream_t stream);
     ~DevicePages();
     DevicePages(const DevicePages&) = delete;
     DevicePages& operator=(const DevicePages&) = delete;
 
     StreamMutex& mutex() { return busy_; }
-    // Takes note of what frames needed whose cuts are over. Enqueues what brings pages in before a cut, and
-    // returns what that reads. Under the lock. Waits only where kMostFlights cuts are not over.
+    // Takes note of what frames needed whose cuts are over. Enqueues what brings pages in before a
+    // cut, and returns what that reads. Under the lock. Waits only where kMostFlights cuts are not
+    // over.
     PartlyResident begin_frame(bool is_bounded, Arrive arrive, cudaStream_t stream);
     // The cut is enqueued. Under the lock.
     void end_frame(cudaStream_t stream);
@@ -60,17 +62,17 @@ class DevicePages {
     // What the pool says that the frame which began last is drawn with.
     SelectRule raised(SelectRule rule) const;
 
-    // Cuts the scene without drawing, and waits until the pool has decided about what that needs. `begins`:
-    // it forgets earlier frames before (PagePool::begin_settling).
-    SettlingStep settle_step(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, bool begins,
-                             cudaStream_t stream);
+    // Cuts the scene without drawing, and waits until the pool has decided about what that needs.
+    // `begins`: it forgets earlier frames before (PagePool::begin_settling).
+    SettlingStep settle_step(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
+                             bool begins, cudaStream_t stream);
 
   private:
     struct Flight;
     void make_packed(cudaStream_t stream);
     void make_coded(cudaStream_t stream);
-    void make_tables(const std::vector<ClusterTable>& host, const std::vector<ClusterAppearance>& appearance,
-                     cudaStream_t stream);
+    void make_tables(const std::vector<ClusterTable>& host,
+                     const std::vector<ClusterAppearance>& appearance, cudaStream_t stream);
     NotedView note_flights(bool waits);
     void measure(const Flight& flight);
     Flight& free_flight();

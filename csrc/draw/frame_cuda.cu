@@ -13,7 +13,8 @@ namespace cuda {
 // What a frame counts, cleared before it.
 struct Frame::State {
     FrameCounters counters;
-    unsigned projected[2], scan_ticket, scattered, spread;  // what blocks and warps have taken of their work
+    unsigned projected[2], scan_ticket, scattered,
+        spread;  // what blocks and warps have taken of their work
     alignas(8) uint32_t plan_counts[2 * kPlanClasses];
 };
 
@@ -23,7 +24,8 @@ struct Frame::Slot {
     cudaEvent_t begun = nullptr, prepared = nullptr, counted = nullptr, done = nullptr;
 
     Slot() {
-        check(cudaMallocHost(reinterpret_cast<void**>(&counters), sizeof *counters), "cudaMallocHost");
+        check(cudaMallocHost(reinterpret_cast<void**>(&counters), sizeof *counters),
+              "cudaMallocHost");
         *counters = FrameCounters{};
         for (cudaEvent_t* event : {&begun, &prepared, &counted, &done})
             check(cudaEventCreate(event), "cudaEventCreate");
@@ -37,7 +39,8 @@ struct Frame::Slot {
     }
 };
 
-constexpr size_t kEllipseFloats = 8, kRecordFloats = 10;  // in RecordPlanes::ellipse, and with ::rest
+constexpr size_t kEllipseFloats = 8,
+                 kRecordFloats = 10;  // in RecordPlanes::ellipse, and with ::rest
 
 // So many frames can be in flight, or be captured, without a new slot.
 constexpr size_t kSlots = 8;
@@ -58,8 +61,8 @@ T* Frame::room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing) {
 
 Frame::Slot* Frame::take_slot(bool capturing) {
     // The oldest is the first to be over. A capture may not ask; nobody draws beside one.
-    const bool waits =
-        !free_slots_.empty() && !capturing && cudaEventQuery(free_slots_.front()->done) != cudaSuccess;
+    const bool waits = !free_slots_.empty() && !capturing &&
+                       cudaEventQuery(free_slots_.front()->done) != cudaSuccess;
     if (free_slots_.empty() || waits) {
         cudaGetLastError();
         if (capturing)
@@ -77,16 +80,16 @@ void Frame::enlarge(const FrameCounters& counters) {
     if (counters.gaussians > kMostFrameRecords)
         throw std::length_error("gaussians: expected at most " + std::to_string(kMostFrameRecords) +
                                 " in one frame, got " + std::to_string(counters.gaussians));
-    // Growing takes as long as several frames. So buffers grow seldom, all that are nearly full together, by
-    // some more than was counted, and before the next frame of a moving camera exceeds one and is drawn
-    // twice.
-    const auto is_full = [](unsigned long long capacity, unsigned long long count, unsigned free_part) {
-        return count > capacity - capacity / free_part;
-    };
-    const bool grows =
-        is_full(capacity_.items, counters.items, 32) || is_full(capacity_.records, counters.gaussians, 32) ||
-        is_full(capacity_.large, counters.large, 32) || is_full(capacity_.entries, counters.entries, 32) ||
-        is_full(capacity_.spread, counters.spread, 32);
+    // Growing takes as long as several frames. So buffers grow seldom, all that are nearly full
+    // together, by some more than was counted, and before the next frame of a moving camera exceeds
+    // one and is drawn twice.
+    const auto is_full = [](unsigned long long capacity, unsigned long long count,
+                            unsigned free_part) { return count > capacity - capacity / free_part; };
+    const bool grows = is_full(capacity_.items, counters.items, 32) ||
+                       is_full(capacity_.records, counters.gaussians, 32) ||
+                       is_full(capacity_.large, counters.large, 32) ||
+                       is_full(capacity_.entries, counters.entries, 32) ||
+                       is_full(capacity_.spread, counters.spread, 32);
     if (!grows) return;
     const Capacity before = capacity_;
     const auto grow = [is_full](unsigned long long& capacity, unsigned long long count) {
@@ -104,8 +107,8 @@ void Frame::enlarge(const FrameCounters& counters) {
     // Whoever differentiates is told what was counted before lists are spread.
     if (keeps_ == Keeps::tape) capacity_.spread = std::max(capacity_.spread, capacity_.entries);
     if (was_captured_ || capacity_ == before) return;
-    // The largest buffers go before larger ones come, and not into the pool: pieces of the old size are of no
-    // use.
+    // The largest buffers go before larger ones come, and not into the pool: pieces of the old size
+    // are of no use.
     records_ = {};
     boxes_ = {};
     entries_ = {};
@@ -119,7 +122,8 @@ std::unique_ptr<Drawing> Frame::draw(const FrameBatch& batch, Prepare prepare, c
     drawing->is_captured_ = is_capturing(stream);
     was_captured_ = was_captured_ || drawing->is_captured_;
     drawing->slot_ = take_slot(drawing->is_captured_);
-    // If the frame before is over and was too large or nearly so, this one is likely to be too large.
+    // If the frame before is over and was too large or nearly so, this one is likely to be too
+    // large.
     if (last_ != nullptr && !last_->is_captured_ && !drawing->is_captured_) {
         const cudaError_t over = cudaEventQuery(last_->slot_->done);
         if (over == cudaSuccess) enlarge(*last_->slot_->counters);
@@ -139,15 +143,16 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     const StreamLock lock(busy_, stream);
 
     const size_t parts = tile_bin_parts(batch.num_tiles);
-    const size_t cleared_bytes = sizeof(State) + (parts + batch.num_zeros) * sizeof(unsigned long long) +
+    const size_t cleared_bytes = sizeof(State) +
+                                 (parts + batch.num_zeros) * sizeof(unsigned long long) +
                                  batch.num_tiles * sizeof(uint32_t);
     if (cleared_bytes > cleared_.capacity()) num_zero_bytes_ = 0;
     unsigned char* cleared = room(cleared_, cleared_bytes, drawing);
     State* state = reinterpret_cast<State*>(cleared);
     auto* scan_state = reinterpret_cast<unsigned long long*>(cleared + sizeof(State));
     unsigned long long* zeros = scan_state + parts;
-    const TileCounts tiles{reinterpret_cast<uint32_t*>(zeros + batch.num_zeros), &state->scan_ticket,
-                           &state->scattered, scan_state};
+    const TileCounts tiles{reinterpret_cast<uint32_t*>(zeros + batch.num_zeros),
+                           &state->scan_ticket, &state->scattered, scan_state};
     const ItemList items{room(items_, capacity.items, drawing), &state->counters, capacity.items,
                          capacity.records, zeros};
     room(records_, kRecordFloats * capacity.records, drawing);
@@ -155,7 +160,8 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     ItemTiles* item_tiles = room(item_tiles_, capacity.items, drawing);
     LargeRecord* large = room(large_, capacity.large, drawing);
     TileEntry* entries = room(entries_, capacity.entries, drawing);
-    // The blend stage overwrites the tiles of records over few tiles, which have all been read by then.
+    // The blend stage overwrites the tiles of records over few tiles, which have all been read by
+    // then.
     FewTiles* few = room(scratch_, capacity.spread, drawing);
     const bool keeps_tape = keeps_ == Keeps::tape;
     uint32_t* source = keeps_tape ? room(source_, capacity.records, drawing) : nullptr;
@@ -172,22 +178,24 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     if (!capturing) check(cudaEventRecord(slot.prepared, stream), "cudaEventRecord");
     project({batch.models, batch.packed, batch.coded, batch.placements, batch.images, items,
              batch.has_shared_items, batch.has_faded_items},
-            {planes, few, item_records, item_tiles, source, tiles, large, capacity.large, state->projected},
+            {planes, few, item_records, item_tiles, source, tiles, large, capacity.large,
+             state->projected},
             stream);
-    tile_bin({item_tiles, few, planes, batch.images, batch.num_images, batch.num_tiles, capacity, large,
-              tiles, &state->counters},
+    tile_bin({item_tiles, few, planes, batch.images, batch.num_images, batch.num_tiles, capacity,
+              large, tiles, &state->counters},
              bins, stream);
     num_plans_ = keeps_tape ? batch.num_tiles : most_plans(batch.num_tiles);
     room(plans_, num_plans_, drawing);
     const RasterTape tape{keeps_tape ? room(order_, capacity.entries, drawing) : nullptr,
                           keeps_tape ? room(blended_, batch.num_tiles, drawing) : nullptr};
     FrameLists of_frame = lists(batch);
-    // Whoever differentiates goes on while the pictures are blended; else the blending tells what was
-    // counted.
+    // Whoever differentiates goes on while the pictures are blended; else the blending tells what
+    // was counted.
     if (keeps_tape) {
-        place_slots(items, item_records, planes.box, room(first_slot_, capacity.records, drawing), stream);
-        check(cudaMemcpyAsync(slot.counters, &state->counters, sizeof *slot.counters, cudaMemcpyDeviceToHost,
-                              stream),
+        place_slots(items, item_records, planes.box, room(first_slot_, capacity.records, drawing),
+                    stream);
+        check(cudaMemcpyAsync(slot.counters, &state->counters, sizeof *slot.counters,
+                              cudaMemcpyDeviceToHost, stream),
               "cudaMemcpyAsync to the host");
         if (!capturing) check(cudaEventRecord(slot.counted, stream), "cudaEventRecord");
     } else {
@@ -203,8 +211,8 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     if (!capturing) check(cudaEventRecord(slot.done, stream), "cudaEventRecord");
     last_stream_ = stream;
     last_batch_ = batch;
-    // The next frame begins sooner if it finds what it counts cleared. A graph is replayed at any time, and a
-    // backward pass reads what was counted.
+    // The next frame begins sooner if it finds what it counts cleared. A graph is replayed at any
+    // time, and a backward pass reads what was counted.
     if (was_captured_ || keeps_tape) return;
     check(cudaMemsetAsync(cleared, 0, cleared_bytes, stream), "cudaMemsetAsync");
     num_zero_bytes_ = num_zero_bytes;
@@ -231,13 +239,14 @@ FrameLists Frame::lists(const FrameBatch& batch) const {
 std::vector<std::pair<const char*, size_t>> Frame::bytes() const {
     const size_t tape =
         boxes_.bytes() + source_.bytes() + first_slot_.bytes() + order_.bytes() + blended_.bytes();
-    return {{"records", records_.bytes()},
-            {"entries", entries_.bytes()},
-            {"scratch", scratch_.bytes()},
-            {"items", items_.bytes() + item_records_.bytes() + item_tiles_.bytes()},
-            {"large", large_.bytes()},
-            {"tiles", tile_first_.bytes() + image_of_tile_.bytes() + plans_.bytes() + cleared_.bytes()},
-            {"tape", tape}};
+    return {
+        {"records", records_.bytes()},
+        {"entries", entries_.bytes()},
+        {"scratch", scratch_.bytes()},
+        {"items", items_.bytes() + item_records_.bytes() + item_tiles_.bytes()},
+        {"large", large_.bytes()},
+        {"tiles", tile_first_.bytes() + image_of_tile_.bytes() + plans_.bytes() + cleared_.bytes()},
+        {"tape", tape}};
 }
 
 RecordPlanes Frame::records() const {
@@ -271,7 +280,8 @@ const FrameCounters& Drawing::finish() {
     if (is_captured_) {
         if (!was_drawn())
             throw std::runtime_error(
-                "frame: a captured graph met more than it has room for; draw once outside of the capture "
+                "frame: a captured graph met more than it has room for; draw once outside of the "
+                "capture "
                 "what it will meet, and capture it again");
         return *slot_->counters;
     }
@@ -298,8 +308,10 @@ const FrameCounters& Drawing::settle() {
 FrameTimes Drawing::times() const {
     FrameTimes times{0.0f, 0.0f};
     if (is_captured_) return times;
-    check(cudaEventElapsedTime(&times.prepare_ms, slot_->begun, slot_->prepared), "cudaEventElapsedTime");
-    check(cudaEventElapsedTime(&times.draw_ms, slot_->prepared, slot_->done), "cudaEventElapsedTime");
+    check(cudaEventElapsedTime(&times.prepare_ms, slot_->begun, slot_->prepared),
+          "cudaEventElapsedTime");
+    check(cudaEventElapsedTime(&times.draw_ms, slot_->prepared, slot_->done),
+          "cudaEventElapsedTime");
     return times;
 }
 

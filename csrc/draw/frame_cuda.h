@@ -24,9 +24,9 @@ struct FrameBatch {
     // As ProjectInput has them.
     const PackedPlanes* packed = nullptr;
     const CodedGaussians* coded = nullptr;
-    bool has_shared_items = false;           // whether there may be any; a frame that keeps a tape has none
+    bool has_shared_items = false;  // whether there may be any; a frame that keeps a tape has none
     float min_transmittance = kStopsBefore;  // of the images
-    bool has_faded_items = false;            // the same as of shared ones; these are of scenes and not shared
+    bool has_faded_items = false;  // the same as of shared ones; these are of scenes and not shared
     // Where the models change from frame to frame: what guards them. Whoever draws has it locked.
     StreamMutex* guards_models = nullptr;
     size_t num_zeros = 0;  // that ItemList is to have
@@ -54,9 +54,9 @@ class Drawing;
 
 // Draws batches of pictures: project, bin, blend. Keeps its buffers from frame to frame.
 //
-// Counts stay on the device, so drawing waits for nothing. A frame that found a buffer too small draws
-// nothing; finish() of its Drawing sees that, enlarges the buffer and draws it again, so look at pictures
-// after finish(). Frames may be enqueued on any streams, one after the other.
+// Counts stay on the device, so drawing waits for nothing. A frame that found a buffer too small
+// draws nothing; finish() of its Drawing sees that, enlarges the buffer and draws it again, so look
+// at pictures after finish(). Frames may be enqueued on any streams, one after the other.
 class Frame {
   public:
     enum class Keeps { nothing, tape };
@@ -66,16 +66,16 @@ class Frame {
     Frame(const Frame&) = delete;
     Frame& operator=(const Frame&) = delete;
 
-    // Enqueues what writes the batch's items, and its tables where they are not there yet. Called again when
-    // a frame is drawn again. The counters are zero before.
+    // Enqueues what writes the batch's items, and its tables where they are not there yet. Called
+    // again when a frame is drawn again. The counters are zero before.
     using Prepare = std::function<void(const ItemList& items, cudaStream_t stream)>;
 
-    // Says where the pictures of images without a place are. Called once, when the device has something to
-    // do.
+    // Says where the pictures of images without a place are. Called once, when the device has
+    // something to do.
     using Place = std::function<void(PicturePlanes planes[2])>;
 
-    // Enqueues a frame. While `stream` captures a graph nothing is allocated: draw as much once before. The
-    // frame's buffers then live as long as this object.
+    // Enqueues a frame. While `stream` captures a graph nothing is allocated: draw as much once
+    // before. The frame's buffers then live as long as this object.
     std::unique_ptr<Drawing> draw(const FrameBatch& batch, Prepare prepare, cudaStream_t stream,
                                   const Place& place = {});
 
@@ -107,12 +107,14 @@ class Frame {
     DeviceBuffer<ItemTiles> item_tiles_;
     DeviceBuffer<LargeRecord> large_;
     DeviceBuffer<TileEntry> entries_;
-    DeviceBuffer<unsigned long long> scratch_;  // the few tiles of records, then lists that are spread
+    DeviceBuffer<unsigned long long>
+        scratch_;  // the few tiles of records, then lists that are spread
     DeviceBuffer<unsigned long long> tile_first_;
     DeviceBuffer<TilePlan> plans_;
     uint32_t num_plans_ = 0;
-    DeviceBuffer<unsigned char> cleared_;  // State, states of the scan, zeros of items, counts of the tiles
-    size_t num_zero_bytes_ = 0;            // of these, that are zero when the next frame begins
+    DeviceBuffer<unsigned char>
+        cleared_;                // State, states of the scan, zeros of items, counts of the tiles
+    size_t num_zero_bytes_ = 0;  // of these, that are zero when the next frame begins
 
     std::vector<std::unique_ptr<Slot>> slots_;
     std::deque<Slot*> free_slots_;                // their frames may not be over yet
@@ -133,14 +135,14 @@ class Drawing {
 
     // Waits until the device is done with it; finish() may draw it again.
     void wait() const;
-    // As finish(), but the pictures may still be on their way: where the frame keeps a tape, it waits no
-    // longer than until everything is counted. Not of a captured frame.
+    // As finish(), but the pictures may still be on their way: where the frame keeps a tape, it
+    // waits no longer than until everything is counted. Not of a captured frame.
     const FrameCounters& settle();
-    // Waits until the pictures are drawn, drawing again if a buffer was too small. Throws OutOfMemory, or
-    // std::length_error past kMostFrameRecords.
+    // Waits until the pictures are drawn, drawing again if a buffer was too small. Throws
+    // OutOfMemory, or std::length_error past kMostFrameRecords.
     //
-    // Of a captured frame: of its last replay, which must be over; throws std::runtime_error if a buffer was
-    // too small.
+    // Of a captured frame: of its last replay, which must be over; throws std::runtime_error if a
+    // buffer was too small.
     const FrameCounters& finish();
     FrameTimes times() const;
     // More than 1 where buffers were too small; known once it is finished.

@@ -35,7 +35,8 @@ void DifferentiableFrame::draw(const ModelPicture& in, cudaStream_t stream) {
     check(cudaEventRecord(drawn_, stream), "cudaEventRecord");
 }
 
-void DifferentiableFrame::backward(const PictureGradient<float>& d_picture, const GaussianRows<float>& out,
+void DifferentiableFrame::backward(const PictureGradient<float>& d_picture,
+                                   const GaussianRows<float>& out,
                                    const CenterGradients<float>& centers, float* d_background,
                                    cudaStream_t stream) {
     check(cudaStreamWaitEvent(stream, drawn_, 0), "cudaStreamWaitEvent");
@@ -44,7 +45,8 @@ void DifferentiableFrame::backward(const PictureGradient<float>& d_picture, cons
     const DeviceBuffer<CenterSize<float>> size(centers.size != nullptr ? num_slots_ : 0, stream);
     const DeviceBuffer<uint8_t> is_touched(num_slots_, stream);
     const DeviceBuffer<float> d_background_of_tile(3 * size_t(tape.lists.num_tiles), stream);
-    if (num_slots_ > 0) check(cudaMemsetAsync(is_touched.data(), 0, num_slots_, stream), "cudaMemsetAsync");
+    if (num_slots_ > 0)
+        check(cudaMemsetAsync(is_touched.data(), 0, num_slots_, stream), "cudaMemsetAsync");
     const GradientSlots slots{tape.first_slot, slot.data(), size.data(), is_touched.data()};
     rasterize_backward({in_.image, tape.lists.records, tape.lists.tile_first, tape.raster.order,
                         tape.raster.blended, tape.lists.plans, d_picture},

@@ -20,11 +20,12 @@
 namespace v3dg {
 
 static double now() {
-    return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
+    return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch())
+        .count();
 }
 
-// Gaussians that are projected together: a run of one draw, short enough that it reaches few rows of tiles
-// where neighbours in memory are neighbours in space.
+// Gaussians that are projected together: a run of one draw, short enough that it reaches few rows
+// of tiles where neighbours in memory are neighbours in space.
 constexpr uint64_t kPieceSize = 4096;
 
 struct Piece {
@@ -55,22 +56,25 @@ static std::vector<Piece> pieces_of(const std::vector<Draw<T>>& draws) {
 // Enough chunks to spread over threads, few enough that a chunk's counters stay small beside it.
 static std::vector<Chunk> chunks_of(const std::vector<Piece>& pieces, size_t num_tiles) {
     const uint64_t total = pieces.empty() ? 0 : pieces.back().first + pieces.back().count;
-    const uint64_t size =
-        std::min(std::max({kPieceSize, uint64_t(num_tiles), (total + 1023) / 1024}), kMostChunkRecords);
+    const uint64_t size = std::min(
+        std::max({kPieceSize, uint64_t(num_tiles), (total + 1023) / 1024}), kMostChunkRecords);
     std::vector<Chunk> chunks;
     for (size_t p = 0; p < pieces.size(); ++p) {
-        if (chunks.empty() || pieces[p].first + pieces[p].count - pieces[chunks.back().first].first > size)
+        if (chunks.empty() ||
+            pieces[p].first + pieces[p].count - pieces[chunks.back().first].first > size)
             chunks.push_back({p, p});
         chunks.back().last = p + 1;
     }
     return chunks;
 }
 
-// Where the records of chunks go. A thread takes a strip of the room and puts one chunk behind the other, so
-// that the memory that is used has few gaps, and that which no record reaches is never touched.
+// Where the records of chunks go. A thread takes a strip of the room and puts one chunk behind the
+// other, so that the memory that is used has few gaps, and that which no record reaches is never
+// touched.
 class RecordRoom {
   public:
-    RecordRoom(const std::vector<Piece>& pieces, const std::vector<Chunk>& chunks) : mine_(most_threads()) {
+    RecordRoom(const std::vector<Piece>& pieces, const std::vector<Chunk>& chunks)
+        : mine_(most_threads()) {
         uint64_t total = 0;
         for (const Chunk& c : chunks) {
             const uint64_t end = pieces[c.last - 1].first + pieces[c.last - 1].count;
@@ -81,15 +85,17 @@ class RecordRoom {
         strip_ = 8 * longest_;
         size_ = total + total / 7 + (mine_.size() + 1) * strip_;
         if (size_ > UINT32_MAX)
-            throw std::length_error("gaussians: expected at most about 3000000000 in one picture, got " +
-                                    std::to_string(total));
+            throw std::length_error(
+                "gaussians: expected at most about 3000000000 in one picture, got " +
+                std::to_string(total));
     }
     uint64_t size() const { return size_; }
     uint64_t used() const { return used_; }
     // Where this thread's next chunk goes, and how many records it has.
     uint64_t take() {
         Strip& mine = mine_[omp_get_thread_num()];
-        if (mine.left < longest_) mine = {used_.fetch_add(strip_, std::memory_order_relaxed), strip_};
+        if (mine.left < longest_)
+            mine = {used_.fetch_add(strip_, std::memory_order_relaxed), strip_};
         return mine.next;
     }
     void keep(uint64_t count) {
@@ -117,10 +123,11 @@ static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_ti
     return order;
 }
 
-// Bytes of records and entries that a frame holds at once, or about: few, because they are read here and
-// there, but so many that a band has tiles for all threads. With a stop, which is seldom looked at while a
-// band is binned, the least.
-constexpr double kLeastBandBytes = 96 << 20, kMostBandBytes = 768 << 20, kThreadBandBytes = 48 << 20;
+// Bytes of records and entries that a frame holds at once, or about: few, because they are read
+// here and there, but so many that a band has tiles for all threads. With a stop, which is seldom
+// looked at while a band is binned, the least.
+constexpr double kLeastBandBytes = 96 << 20, kMostBandBytes = 768 << 20,
+                 kThreadBandBytes = 48 << 20;
 static double band_bytes_of(const std::atomic<bool>* stop) {
     if (stop != nullptr) return kLeastBandBytes;
     return std::clamp(kThreadBandBytes * most_threads(), kLeastBandBytes, kMostBandBytes);
@@ -128,19 +135,21 @@ static double band_bytes_of(const std::atomic<bool>* stop) {
 // So few gaussians need no look at how much they cover.
 constexpr uint64_t kFewGaussians = 65536;
 
-// Bands of tile rows with about as many bytes each; a single one where memory holds all. The first few
-// gaussians of a piece tell where it is drawn and how much it covers.
+// Bands of tile rows with about as many bytes each; a single one where memory holds all. The first
+// few gaussians of a piece tell where it is drawn and how much it covers.
 template <class T>
-static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws, const std::vector<Piece>& pieces,
-                                    const Pinhole<T>& camera, const Window& window,
-                                    const std::atomic<bool>* stop) {
-    if (pieces.empty() || pieces.back().first + pieces.back().count <= kFewGaussians) return {window};
+static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws,
+                                    const std::vector<Piece>& pieces, const Pinhole<T>& camera,
+                                    const Window& window, const std::atomic<bool>* stop) {
+    if (pieces.empty() || pieces.back().first + pieces.back().count <= kFewGaussians)
+        return {window};
     constexpr uint64_t kFew = 16;
     std::vector<Reach> reach(pieces.size());
     parallel_for(pieces.size(), 64, [&](size_t p) {
         if (is_stopped(stop)) return;
-        V3DG_DISPATCH_ISA(project<T>, draws[pieces[p].draw], pieces[p].skip, std::min(kFew, pieces[p].count),
-                          camera, Window{}, nullptr, nullptr, 0, reach[p]);
+        V3DG_DISPATCH_ISA(project<T>, draws[pieces[p].draw], pieces[p].skip,
+                          std::min(kFew, pieces[p].count), camera, Window{}, nullptr, nullptr, 0,
+                          reach[p]);
     });
     const TileGrid grid(window);
     std::vector<double> row_bytes(grid.rows, 0.0);
@@ -153,8 +162,8 @@ static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws, const std
             static_cast<double>(pieces[p].count) /
             static_cast<double>(std::min(kFew, pieces[p].count) * (last - first + 1)) *
             static_cast<double>(few.drawn * sizeof(Record<T>) + few.entries * sizeof(uint64_t));
-        for (int r = std::max(first - grid.first_row, 0); r <= std::min(last - grid.first_row, grid.rows - 1);
-             ++r) {
+        for (int r = std::max(first - grid.first_row, 0);
+             r <= std::min(last - grid.first_row, grid.rows - 1); ++r) {
             row_bytes[r] += share;
             bytes += share;
         }
@@ -175,9 +184,10 @@ static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws, const std
 
 // Draws one band; `is_first` of a picture's bands finds out what each piece reaches.
 template <class T>
-static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& pieces, bool is_first,
-                        const Pinhole<T>& camera, const Picture<T>& picture, bool keep_source,
-                        Workspace<T>& ws, const std::atomic<bool>* stop, RenderCounts& counts) {
+static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& pieces,
+                        bool is_first, const Pinhole<T>& camera, const Picture<T>& picture,
+                        bool keep_source, Workspace<T>& ws, const std::atomic<bool>* stop,
+                        RenderCounts& counts) {
     const double start = now();
     const Window& window = picture.window;
     const TileGrid grid(window);
@@ -194,12 +204,13 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
         size_t count = 0;
         for (size_t p = chunks[c].first; p < chunks[c].last && !is_stopped(stop); ++p) {
             Piece& piece = pieces[p];
-            if (!is_first && (piece.reach.bottom < window.y0 || piece.reach.top >= window.y1)) continue;
+            if (!is_first && (piece.reach.bottom < window.y0 || piece.reach.top >= window.y1))
+                continue;
             Reach reach;
-            count +=
-                V3DG_DISPATCH_ISA(project<T>, draws[piece.draw], piece.skip, piece.count, camera, window,
-                                  records + first + count, keep_source ? source + first + count : nullptr,
-                                  static_cast<uint32_t>(piece.first), reach);
+            count += V3DG_DISPATCH_ISA(project<T>, draws[piece.draw], piece.skip, piece.count,
+                                       camera, window, records + first + count,
+                                       keep_source ? source + first + count : nullptr,
+                                       static_cast<uint32_t>(piece.first), reach);
             piece.reach = reach;
         }
         if (is_stopped(stop)) return;
@@ -224,7 +235,8 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
         const uint32_t t = order[i];
         uint64_t* entry = ws.lists.entry.data() + offset[t];
         const size_t count = offset[t + 1] - offset[t];
-        sort_tile(records, ws.lists.format, entry, count, scratch[omp_get_thread_num()].reserve(count));
+        sort_tile(records, ws.lists.format, entry, count,
+                  scratch[omp_get_thread_num()].reserve(count));
         V3DG_DISPATCH_ISA(rasterize_tile<T>, records, ws.lists.format, entry, count,
                           kTileSize * grid.column(t), kTileSize * grid.row(t), picture);
     });
@@ -237,8 +249,8 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
 // The part of a picture that lies in a band of it.
 template <class T>
 static Picture<T> band_of(const Picture<T>& picture, const Window& band) {
-    const size_t skip =
-        static_cast<size_t>(band.y0 - picture.window.y0) * static_cast<size_t>(picture.window.width());
+    const size_t skip = static_cast<size_t>(band.y0 - picture.window.y0) *
+                        static_cast<size_t>(picture.window.width());
     Picture<T> part = picture;
     part.window = band;
     part.color += 3 * skip;
@@ -249,14 +261,17 @@ static Picture<T> band_of(const Picture<T>& picture, const Window& band) {
 }
 
 template <class T>
-RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera, const Picture<T>& picture,
-                    bool keep_source, Workspace<T>& ws, const std::atomic<bool>* stop) {
+RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera,
+                    const Picture<T>& picture, bool keep_source, Workspace<T>& ws,
+                    const std::atomic<bool>* stop) {
     RenderCounts counts{};
     std::vector<Piece> pieces = pieces_of(draws);
-    const std::vector<Window> bands = keep_source ? std::vector<Window>{picture.window}
-                                                  : bands_of(draws, pieces, camera, picture.window, stop);
+    const std::vector<Window> bands = keep_source
+                                          ? std::vector<Window>{picture.window}
+                                          : bands_of(draws, pieces, camera, picture.window, stop);
     for (size_t b = 0; b < bands.size() && !is_stopped(stop); ++b)
-        render_band(draws, pieces, b == 0, camera, band_of(picture, bands[b]), keep_source, ws, stop, counts);
+        render_band(draws, pieces, b == 0, camera, band_of(picture, bands[b]), keep_source, ws,
+                    stop, counts);
     for (const Piece& piece : pieces) {
         counts.in_frustum += piece.reach.in_frustum;
         counts.records += piece.reach.drawn;
@@ -272,18 +287,20 @@ static uint64_t num_tiles_of(const Record<T>& r) {
 
 template <class T>
 void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Picture<T>& picture,
-                     const PictureGradient<T>& d_picture, const Workspace<T>& ws, const GaussianRows<T>& out,
-                     const CenterGradients<T>& centers, T d_background[3]) {
+                     const PictureGradient<T>& d_picture, const Workspace<T>& ws,
+                     const GaussianRows<T>& out, const CenterGradients<T>& centers,
+                     T d_background[3]) {
     const TileGrid grid(picture.window);
     const Record<T>* records = ws.records.data();
     const uint64_t* offset = ws.lists.offset.data();
     const uint64_t* entry = ws.lists.entry.data();
-    // Each tile of a record has a gradient slot, the slots of a record side by side in the order of the
-    // tiles, so the sum over tiles does not depend on which thread came first.
+    // Each tile of a record has a gradient slot, the slots of a record side by side in the order of
+    // the tiles, so the sum over tiles does not depend on which thread came first.
     std::vector<uint64_t> first_slot(ws.room);
     uint64_t num_slots = 0;
     for (size_t c = 0; c < ws.num_chunks; ++c)
-        for (uint64_t r = ws.chunk_first.data()[c], end = r + ws.chunk_count.data()[c]; r < end; ++r) {
+        for (uint64_t r = ws.chunk_first.data()[c], end = r + ws.chunk_count.data()[c]; r < end;
+             ++r) {
             first_slot[r] = num_slots;
             num_slots += num_tiles_of(records[r]);
         }
@@ -302,9 +319,10 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
         d_entry.assign(count, RecordGradient<T>{});
         std::vector<CenterSize<T>>& size = sizes[omp_get_thread_num()];
         size.assign(with_size ? count : 0, CenterSize<T>{});
-        V3DG_DISPATCH_ISA(rasterize_tile_backward<T>, records, ws.lists.format, entry + offset[t], count,
-                          kTileSize * column, kTileSize * row, picture, d_picture, d_entry.data(),
-                          with_size ? size.data() : nullptr, &d_background_of_tile[3 * t]);
+        V3DG_DISPATCH_ISA(rasterize_tile_backward<T>, records, ws.lists.format, entry + offset[t],
+                          count, kTileSize * column, kTileSize * row, picture, d_picture,
+                          d_entry.data(), with_size ? size.data() : nullptr,
+                          &d_background_of_tile[3 * t]);
         for (size_t e = 0; e < count; ++e) {
             const uint64_t r = ws.lists.format.record_of(entry[offset[t] + e]);
             const int x0 = records[r].x0 / kTileSize, x1 = records[r].x1 / kTileSize,
@@ -337,12 +355,13 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
                 centers.sum[2 * static_cast<size_t>(gaussian) + 1] = d_records[i].ellipse.v;
             }
         }
-        V3DG_DISPATCH_ISA(project_backward<T>, draw, ws.source.data() + first, d_records.data(), count,
-                          camera, out);
+        V3DG_DISPATCH_ISA(project_backward<T>, draw, ws.source.data() + first, d_records.data(),
+                          count, camera, out);
     });
 }
 
-bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, int x, int y, Pick& picked) {
+bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, int x, int y,
+          Pick& picked) {
     float color[3], alpha;
     const Picture<float> pixel{{x, y, x + 1, y + 1}, {0, 0, 0}, color, &alpha, nullptr};
     Workspace<float> ws;
@@ -352,8 +371,9 @@ bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, i
     for (uint64_t e = ws.lists.offset.data()[0]; e < ws.lists.offset.data()[1]; ++e) {
         const uint64_t place = ws.lists.format.record_of(ws.lists.entry.data()[e]);
         const Record<float>& r = ws.records.data()[place];
-        const Falloff<float> f = falloff_at(static_cast<float>(x) + 0.5f, static_cast<float>(y) + 0.5f, r.u,
-                                            r.v, r.l11, r.l12, r.l22, r.log2_opacity);
+        const Falloff<float> f =
+            falloff_at(static_cast<float>(x) + 0.5f, static_cast<float>(y) + 0.5f, r.u, r.v, r.l11,
+                       r.l12, r.l22, r.log2_opacity);
         const bool goes_on = blend_live(f, transmittance, StopsBefore{}, [&](float weight) {
             if (weight > picked.weight) picked = {ws.source.data()[place], weight, r.depth};
         });
@@ -362,12 +382,13 @@ bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, i
     return picked.weight > 0.0f;
 }
 
-#define V3DG_INSTANTIATE(T)                                                                                  \
-    template RenderCounts render<T>(const std::vector<Draw<T>>&, const Pinhole<T>&, const Picture<T>&, bool, \
-                                    Workspace<T>&, const std::atomic<bool>*);                                \
-    template void render_backward<T>(const Draw<T>&, const Pinhole<T>&, const Picture<T>&,                   \
-                                     const PictureGradient<T>&, const Workspace<T>&, const GaussianRows<T>&, \
-                                     const CenterGradients<T>&, T*);
+#define V3DG_INSTANTIATE(T)                                                                \
+    template RenderCounts render<T>(const std::vector<Draw<T>>&, const Pinhole<T>&,        \
+                                    const Picture<T>&, bool, Workspace<T>&,                \
+                                    const std::atomic<bool>*);                             \
+    template void render_backward<T>(const Draw<T>&, const Pinhole<T>&, const Picture<T>&, \
+                                     const PictureGradient<T>&, const Workspace<T>&,       \
+                                     const GaussianRows<T>&, const CenterGradients<T>&, T*);
 V3DG_INSTANTIATE(float)
 V3DG_INSTANTIATE(double)
 #undef V3DG_INSTANTIATE

@@ -14,11 +14,12 @@ namespace v3dg {
 namespace {
 
 double now() {
-    return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
+    return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch())
+        .count();
 }
 
-// A workspace lent to one caller at a time, kept from frame to frame; a second caller gets one of its own.
-// Without a lock, which a fork() in the middle would leave closed.
+// A workspace lent to one caller at a time, kept from frame to frame; a second caller gets one of
+// its own. Without a lock, which a fork() in the middle would leave closed.
 class SharedWorkspace {
   public:
     // Threads may still draw when the process ends.
@@ -27,7 +28,8 @@ class SharedWorkspace {
         std::unique_ptr<Workspace<float>> kept(kept_.exchange(nullptr));
         return kept ? std::move(kept) : std::make_unique<Workspace<float>>();
     }
-    // Keeps what the next frame is likely to need, but does not sit on the memory of an exceptional one.
+    // Keeps what the next frame is likely to need, but does not sit on the memory of an exceptional
+    // one.
     void give_back(std::unique_ptr<Workspace<float>> workspace) {
         constexpr uint64_t kMostRoom = uint64_t(16) << 20;
         if (workspace->most_room <= kMostRoom) workspace.reset(kept_.exchange(workspace.release()));
@@ -46,27 +48,31 @@ SceneFrameCounts draw_all(const std::vector<Draw<float>>& draws, const Camera& c
                           const Picture<float>& picture, const std::atomic<bool>* stop) {
     SceneFrameCounts counts{};
     std::unique_ptr<Workspace<float>> workspace = shared_workspace().take();
-    counts.render = render<float>(draws, pinhole_of<float>(camera), picture, false, *workspace, stop);
+    counts.render =
+        render<float>(draws, pinhole_of<float>(camera), picture, false, *workspace, stop);
     shared_workspace().give_back(std::move(workspace));
     return counts;
 }
 
-// The clusters of a cut as draws. Clusters of one instance whose rows follow on each other make one draw if
-// they are drawn alike, also with the same weight. `tint` has three SH coefficients of the constant basis for
-// each pair, in place of its gaussians' colours; null: none.
+// The clusters of a cut as draws. Clusters of one instance whose rows follow on each other make one
+// draw if they are drawn alike, also with the same weight. `tint` has three SH coefficients of the
+// constant basis for each pair, in place of its gaussians' colours; null: none.
 class CutDraws {
   public:
-    CutDraws(const HostScene& scene, const Camera& camera, const GivenCut& given, const float* tint = nullptr)
+    CutDraws(const HostScene& scene, const Camera& camera, const GivenCut& given,
+             const float* tint = nullptr)
         : scene_(scene), camera_(camera), fades_(given.weight.size > 0) {
         for (size_t s = 0; s < given.instance.size; ++s)
-            add(given.instance[s], given.cluster[s], given.weight_of(s), tint ? tint + 3 * s : nullptr);
+            add(given.instance[s], given.cluster[s], given.weight_of(s),
+                tint ? tint + 3 * s : nullptr);
     }
 
     const std::vector<Draw<float>>& draws() const { return draws_; }
     int64_t num_gaussians() const { return static_cast<int64_t>(num_gaussians_); }
     // The pair that a gaussian belongs to, counted through all draws.
     size_t pair_of(uint64_t gaussian) const {
-        return std::upper_bound(end_of_pair_.begin(), end_of_pair_.end(), gaussian) - end_of_pair_.begin();
+        return std::upper_bound(end_of_pair_.begin(), end_of_pair_.end(), gaussian) -
+               end_of_pair_.begin();
     }
 
   private:
@@ -90,8 +96,10 @@ class CutDraws {
         end_of_pair_.back() = num_gaussians_ += count;
         if (tint == nullptr && model.cluster_sh != nullptr) tint = model.cluster_sh + 3 * size_t(c);
         const Palette palette = tint == nullptr ? model.palette : Palette{tint, nullptr, 1};
-        const Appearance<float> appearance = fades_ ? model.appearance.faded(table, c) : model.appearance[c];
-        const Draw<float> next{model.planes, first, count, view_, appearance, palette, model.codes, weight};
+        const Appearance<float> appearance =
+            fades_ ? model.appearance.faded(table, c) : model.appearance[c];
+        const Draw<float> next{model.planes, first,   count,       view_,
+                               appearance,   palette, model.codes, weight};
         if (i == last_instance_ && joins(draws_.back(), next))
             draws_.back().count += count;
         else
@@ -101,8 +109,8 @@ class CutDraws {
 
     // Whether the second, of the same instance, begins where the first ends and is drawn alike.
     static bool joins(const Draw<float>& a, const Draw<float>& b) {
-        return a.first + a.count == b.first && a.appearance == b.appearance && a.weight == b.weight &&
-               a.palette.sh == b.palette.sh;
+        return a.first + a.count == b.first && a.appearance == b.appearance &&
+               a.weight == b.weight && a.palette.sh == b.palette.sh;
     }
 
     const HostScene& scene_;
@@ -119,7 +127,8 @@ class CutDraws {
 std::vector<float> shares_of(const HostScene& scene, const Camera& camera, const SelectRule& rule,
                              const GivenCut& given, float tolerance_px2) {
     std::vector<float> share(given.instance.size);
-    cpu::pair_metrics({scene.tables, scene.instances, camera, rule}, given, {share.data(), share.size()});
+    cpu::pair_metrics({scene.tables, scene.instances, camera, rule}, given,
+                      {share.data(), share.size()});
     for (float& value : share) value = value > 0.0f ? value / tolerance_px2 : 0.0f;
     return share;
 }
@@ -129,7 +138,8 @@ void set_tint(const Rgb& rgb, float* tint) {
 }
 
 SceneFrameCounts draw_pairs(const HostScene& scene, const Camera& camera, const GivenCut& given,
-                            const float* tint, const Picture<float>& picture, const std::atomic<bool>* stop) {
+                            const float* tint, const Picture<float>& picture,
+                            const std::atomic<bool>* stop) {
     const double start = now();
     const CutDraws cut(scene, camera, given, tint);
     SceneFrameCounts counts = draw_all(cut.draws(), camera, picture, stop);
@@ -159,7 +169,8 @@ std::vector<float> tint_of(const HostScene& scene, const Camera& camera, const S
                            const GivenCut& given, float tolerance_px2) {
     if (scene.colors == SceneColors::own) return {};
     const bool is_metric = scene.colors == SceneColors::metrics;
-    // Of a budget, the tolerance that it comes to is wanted; a little more, for metrics are rounded.
+    // Of a budget, the tolerance that it comes to is wanted; a little more, for metrics are
+    // rounded.
     const float wanted = is_metric || rule.budget != kNoBudget ? tolerance_px2 : scene.wanted_px2;
     std::vector<float> tint(3 * given.instance.size);
     const std::vector<float> share =
@@ -168,8 +179,9 @@ std::vector<float> tint_of(const HostScene& scene, const Camera& camera, const S
         const ClusterTable& table = scene.tables[scene.instances.bundle[given.instance[s]]];
         const bool is_finest = level_of(table, given.cluster[s]) <= rule.min_level;
         const float grey = std::min(share[s], cpu::kMostShare);
-        const Rgb rgb = is_metric ? Rgb{grey, grey, grey}
-                                  : missing_color(is_finest ? 0.0f : share[s], 1.0001f * rule.fade.factor);
+        const Rgb rgb =
+            is_metric ? Rgb{grey, grey, grey}
+                      : missing_color(is_finest ? 0.0f : share[s], 1.0001f * rule.fade.factor);
         set_tint(rgb, tint.data() + 3 * s);
     }
     return tint;
@@ -178,7 +190,8 @@ std::vector<float> tint_of(const HostScene& scene, const Camera& camera, const S
 }  // namespace
 
 SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Eyes& eyes, const SelectRule& rule,
-                                 Span<const Picture<float>> pictures, const std::atomic<bool>* stop) {
+                                 Span<const Picture<float>> pictures,
+                                 const std::atomic<bool>* stop) {
     const double start = now();
     SelectOutput cut;
     const Eyes& chooser = scene.chooser == nullptr ? eyes : *scene.chooser;
@@ -189,12 +202,13 @@ SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Eyes& eyes, const
                          {cut.weight.data(), cut.weight.size()}};
     // Metrics are those from here, whatever was missing was so for whom it was chosen for.
     const Camera& judge = scene.colors == SceneColors::missing ? chooser.camera[0] : eyes.camera[0];
-    const std::vector<float> tint =
-        cut.fits_budget ? tint_of(scene, judge, rule, given, cut.tolerance_px2) : std::vector<float>{};
+    const std::vector<float> tint = cut.fits_budget
+                                        ? tint_of(scene, judge, rule, given, cut.tolerance_px2)
+                                        : std::vector<float>{};
     SceneFrameCounts counts{};
     for (size_t k = 0; k < pictures.size && cut.fits_budget; ++k)
-        counts.add_picture(draw_pairs(scene, eyes.camera[k], given, tint.empty() ? nullptr : tint.data(),
-                                      pictures[k], stop));
+        counts.add_picture(draw_pairs(scene, eyes.camera[k], given,
+                                      tint.empty() ? nullptr : tint.data(), pictures[k], stop));
     counts.gaussians = cut.num_gaussians;
     counts.tolerance_px2 = cut.tolerance_px2;
     counts.exceeds_budget = !cut.fits_budget;
@@ -208,9 +222,9 @@ SceneFrameCounts cpu::draw_cut(const HostScene& scene, const Camera& camera, con
     return draw_pairs(scene, camera, given, nullptr, picture, stop);
 }
 
-SceneFrameCounts cpu::draw_metrics(const HostScene& scene, const Camera& camera, const SelectRule& rule,
-                                   const GivenCut& given, const Picture<float>& picture,
-                                   const std::atomic<bool>* stop) {
+SceneFrameCounts cpu::draw_metrics(const HostScene& scene, const Camera& camera,
+                                   const SelectRule& rule, const GivenCut& given,
+                                   const Picture<float>& picture, const std::atomic<bool>* stop) {
     static_cast<void>(CutDraws(scene, camera, given));  // which checks the pairs
     HostScene shown = scene;
     shown.colors = SceneColors::metrics;
@@ -218,17 +232,20 @@ SceneFrameCounts cpu::draw_metrics(const HostScene& scene, const Camera& camera,
     return draw_pairs(scene, camera, given, tint.data(), picture, stop);
 }
 
-SceneFrameCounts cpu::draw_model(const GaussianPlanes<float>& model, size_t count, const Camera& camera,
-                                 const Picture<float>& picture, const std::atomic<bool>* stop) {
+SceneFrameCounts cpu::draw_model(const GaussianPlanes<float>& model, size_t count,
+                                 const Camera& camera, const Picture<float>& picture,
+                                 const std::atomic<bool>* stop) {
     const double start = now();
-    SceneFrameCounts counts = draw_all(
-        {{&model, 0, count, view_of_world<float>(camera), {0.0f, false, false}}}, camera, picture, stop);
+    SceneFrameCounts counts =
+        draw_all({{&model, 0, count, view_of_world<float>(camera), {0.0f, false, false}}}, camera,
+                 picture, stop);
     counts.gaussians = static_cast<int64_t>(count);
     counts.draw_seconds = now() - start;
     return counts;
 }
 
-bool cpu::pick_cut(const HostScene& scene, const Camera& camera, const GivenCut& given, ScenePick& picked) {
+bool cpu::pick_cut(const HostScene& scene, const Camera& camera, const GivenCut& given,
+                   ScenePick& picked) {
     const CutDraws cut(scene, camera, given);
     Pick found{};
     if (!pick(cut.draws(), pinhole_of<float>(camera), static_cast<int>(camera.x0),

@@ -8,8 +8,8 @@
 namespace v3dg {
 namespace cuda {
 
-FrameImage frame_image(const Pinhole<float>& camera, int width, int height, const float background[3],
-                       const PicturePlanes& planes) {
+FrameImage frame_image(const Pinhole<float>& camera, int width, int height,
+                       const float background[3], const PicturePlanes& planes) {
     return {camera,
             width,
             height,
@@ -35,12 +35,12 @@ CodedModel::CodedModel(const CodedPages& pages, cudaStream_t stream) : codes_(pa
     uint32_t* records = records_.reserve(kRecordWords * num_rows, stream);
     uint32_t* sh = sh_.reserve(sh_words * num_rows, stream);
     std::vector<uint32_t> next_records, next_sh;
-    const auto add = [stream](std::vector<uint32_t>& words, const uint32_t* from, size_t count, bool is_last,
-                              uint32_t*& to) {
+    const auto add = [stream](std::vector<uint32_t>& words, const uint32_t* from, size_t count,
+                              bool is_last, uint32_t*& to) {
         words.insert(words.end(), from, from + count);
         if (words.empty() || (words.size() < kWordsAtOnce && !is_last)) return;
-        check(cudaMemcpyAsync(to, words.data(), words.size() * sizeof(uint32_t), cudaMemcpyHostToDevice,
-                              stream),
+        check(cudaMemcpyAsync(to, words.data(), words.size() * sizeof(uint32_t),
+                              cudaMemcpyHostToDevice, stream),
               "cudaMemcpyAsync of codes");
         to += words.size();
         words.clear();
@@ -52,7 +52,8 @@ CodedModel::CodedModel(const CodedPages& pages, cudaStream_t stream) : codes_(pa
         const auto row = static_cast<uint32_t>(host.offset[first]);
         const auto count = static_cast<size_t>(host.offset[last] - host.offset[first]);
         const ClusterRanges& own = host.ranges_of(static_cast<uint32_t>(first));
-        add(next_records, host.record_of(own, row), kRecordWords * count, p + 1 == num_pages, records);
+        add(next_records, host.record_of(own, row), kRecordWords * count, p + 1 == num_pages,
+            records);
         add(next_sh, host.sh_of(own, row), sh_words * count, p + 1 == num_pages, sh);
     }
     std::vector<unsigned char> ranges(size_t(host.range_size) * host.num_clusters());
@@ -79,7 +80,8 @@ Palette DevicePalette::palette() const {
 }
 
 void SceneFrame::set_models(std::vector<DeviceModel> models,
-                            std::vector<std::shared_ptr<const DevicePalette>> palettes, cudaStream_t stream) {
+                            std::vector<std::shared_ptr<const DevicePalette>> palettes,
+                            cudaStream_t stream) {
     std::vector<GaussianRows<const float>> rows(models.size());
     std::vector<PackedPlanes> packed(models.size());
     std::vector<CodedGaussians> coded(models.size());
@@ -108,8 +110,8 @@ EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_tra
     return {{left, right}, 2, min_transmittance};
 }
 
-FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures, const SelectRule& rule,
-                             cudaStream_t stream) {
+FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures,
+                             const SelectRule& rule, cudaStream_t stream) {
     const FrameImage& last = pictures.image[pictures.count - 1];
     return {rows_.data(),
             placements_.reserve(pictures.count * scene.num_instances(), stream),
@@ -132,13 +134,14 @@ static SelectRule drawn_again(SelectRule rule) {
     return rule;
 }
 
-std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
-                                          const EyeImages& pictures, cudaStream_t stream,
-                                          const Frame::Place& place) {
+std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const Eyes& eyes,
+                                          const SelectRule& rule, const EyeImages& pictures,
+                                          cudaStream_t stream, const Frame::Place& place) {
     return frame_.draw(
         batch(scene, pictures, rule, stream),
         [=, &scene, next = rule](const ItemList& items, cudaStream_t on) mutable {
-            cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items, on);
+            cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items,
+                           on);
             next = drawn_again(next);
         },
         stream, place);
@@ -159,8 +162,8 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
     return frame_.draw(
         of_pages,
         [=, &scene, &pages](const ItemList& items, cudaStream_t on) mutable {
-            cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items, on,
-                           &resident);
+            cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items,
+                           on, &resident);
             next = drawn_again(next);
             // A frame that is drawn again tells nothing: another one may be telling.
             if (resident.needs.report != nullptr) pages.end_frame(on);
@@ -177,8 +180,8 @@ std::unique_ptr<Drawing> SceneFrame::draw_cut(const SceneTables& scene, const Ca
     return frame_.draw(
         of_cut,
         [=, &scene](const ItemList& items, cudaStream_t on) {
-            cut_.given_items(scene, camera, given, pictures.image[0], images_.data(), placements_.data(),
-                             items, on);
+            cut_.given_items(scene, camera, given, pictures.image[0], images_.data(),
+                             placements_.data(), items, on);
         },
         stream, place);
 }
@@ -194,9 +197,10 @@ std::vector<std::pair<const char*, size_t>> SceneFrame::bytes() const {
 constexpr unsigned kModelThreads = 128;
 
 // A thread an item.
-static __global__ void model_kernel(ModelTables tables, ModelTables* on_device, Appearance<float> appearance,
-                                    ItemList items) {
-    const unsigned long long i = blockIdx.x * static_cast<unsigned long long>(blockDim.x) + threadIdx.x;
+static __global__ void model_kernel(ModelTables tables, ModelTables* on_device,
+                                    Appearance<float> appearance, ItemList items) {
+    const unsigned long long i =
+        blockIdx.x * static_cast<unsigned long long>(blockDim.x) + threadIdx.x;
     const unsigned long long first = i * kItemSize, count = tables.rows.size;
     if (i == 0) {
         *on_device = tables;
@@ -210,20 +214,23 @@ static __global__ void model_kernel(ModelTables tables, ModelTables* on_device, 
     items.items[i] = {0, at, size, at, appearance, 0, 0, 1.0f};
 }
 
-std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows, const ModelView<float>& view,
-                                          float filter_px2, bool antialiased, const FrameImage& image,
+std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows,
+                                          const ModelView<float>& view, float filter_px2,
+                                          bool antialiased, const FrameImage& image,
                                           cudaStream_t stream, const PackedPlanes* packed,
                                           float min_transmittance, const Frame::Place& place) {
     if (tables_.data() == nullptr) tables_.reserve(1, stream);
     ModelTables* on_device = tables_.data();
-    const ModelTables tables{rows, packed == nullptr ? PackedPlanes{} : *packed, {view, 0, 0}, image};
+    const ModelTables tables{
+        rows, packed == nullptr ? PackedPlanes{} : *packed, {view, 0, 0}, image};
     FrameBatch batch{&on_device->rows,  &on_device->placement,
                      &on_device->image, 1,
                      num_tiles(image),  packed == nullptr ? nullptr : &on_device->packed,
                      nullptr,           false,
                      min_transmittance};
     batch.has_depth = image.planes.depth != nullptr;
-    const unsigned blocks = std::max(1u, blocks_for(blocks_for(rows.size, kItemSize), kModelThreads));
+    const unsigned blocks =
+        std::max(1u, blocks_for(blocks_for(rows.size, kItemSize), kModelThreads));
     return frame_.draw(
         batch,
         [=](const ItemList& items, cudaStream_t on) {

@@ -9,8 +9,8 @@ namespace v3dg {
 namespace cuda {
 
 // The only picture of a frame; `first_tile` and the tiles are filled in.
-FrameImage frame_image(const Pinhole<float>& camera, int width, int height, const float background[3],
-                       const PicturePlanes& planes);
+FrameImage frame_image(const Pinhole<float>& camera, int width, int height,
+                       const float background[3], const PicturePlanes& planes);
 
 // Gaussians that stay as they are, and packed.
 class PackedModel {
@@ -26,14 +26,16 @@ class PackedModel {
     PackedPlanes packed_;
 };
 
-// Gaussians as codes on the device that is current when they are made: all records, then all coefficients, so
-// that a row's place follows from its number.
+// Gaussians as codes on the device that is current when they are made: all records, then all
+// coefficients, so that a row's place follows from its number.
 class CodedModel {
   public:
     // Returns when they are there.
     CodedModel(const CodedPages& pages, cudaStream_t stream);
     const Codes& codes() const { return codes_; }
-    size_t bytes() const { return records_.bytes() + sh_.bytes() + ranges_.bytes() + offset_.bytes(); }
+    size_t bytes() const {
+        return records_.bytes() + sh_.bytes() + ranges_.bytes() + offset_.bytes();
+    }
 
   private:
     DeviceBuffer<uint32_t> records_, sh_;
@@ -51,8 +53,10 @@ struct DeviceModel {
 // Colours of the clusters of one bundle.
 class DevicePalette {
   public:
-    // `sh` is (C, 3), coefficients of the constant basis; the host's memory may be reused on return.
-    DevicePalette(Span<const float> sh, std::shared_ptr<const BundleTables> tables, cudaStream_t stream);
+    // `sh` is (C, 3), coefficients of the constant basis; the host's memory may be reused on
+    // return.
+    DevicePalette(Span<const float> sh, std::shared_ptr<const BundleTables> tables,
+                  cudaStream_t stream);
     Palette palette() const;
 
   private:
@@ -66,23 +70,28 @@ EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_tra
 // Draws a scene that stays on the device: selects, then draws the cut.
 class SceneFrame {
   public:
-    // The gaussians of each bundle of the scenes that are drawn next and, unless there are none, the colours
-    // of their clusters. The host's arrays may be reused on return.
+    // The gaussians of each bundle of the scenes that are drawn next and, unless there are none,
+    // the colours of their clusters. The host's arrays may be reused on return.
     void set_models(std::vector<DeviceModel> models,
-                    std::vector<std::shared_ptr<const DevicePalette>> palettes, cudaStream_t stream);
+                    std::vector<std::shared_ptr<const DevicePalette>> palettes,
+                    cudaStream_t stream);
 
     // The scene stays as it is until the drawing is finished. `place` says where the pictures are.
-    std::unique_ptr<Drawing> draw(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
-                                  const EyeImages& pictures, cudaStream_t stream, const Frame::Place& place);
-    // Draws what is resident of the bundles of a pool, with what comes in before; the pool stays, too. The
-    // rule becomes the one that is used. A frame that is drawn again has the pages that are there by then.
-    std::unique_ptr<Drawing> draw_resident(const SceneTables& scene, DevicePages& pages, const Eyes& eyes,
-                                           SelectRule& rule, const EyeImages& pictures, cudaStream_t stream,
+    std::unique_ptr<Drawing> draw(const SceneTables& scene, const Eyes& eyes,
+                                  const SelectRule& rule, const EyeImages& pictures,
+                                  cudaStream_t stream, const Frame::Place& place);
+    // Draws what is resident of the bundles of a pool, with what comes in before; the pool stays,
+    // too. The rule becomes the one that is used. A frame that is drawn again has the pages that
+    // are there by then.
+    std::unique_ptr<Drawing> draw_resident(const SceneTables& scene, DevicePages& pages,
+                                           const Eyes& eyes, SelectRule& rule,
+                                           const EyeImages& pictures, cudaStream_t stream,
                                            const Frame::Place& place);
-    // Draws pairs that were selected before; they are on the device and stay, too. There is one picture.
-    std::unique_ptr<Drawing> draw_cut(const SceneTables& scene, const Camera& camera, const GivenCut& given,
-                                      const EyeImages& pictures, cudaStream_t stream,
-                                      const Frame::Place& place);
+    // Draws pairs that were selected before; they are on the device and stay, too. There is one
+    // picture.
+    std::unique_ptr<Drawing> draw_cut(const SceneTables& scene, const Camera& camera,
+                                      const GivenCut& given, const EyeImages& pictures,
+                                      cudaStream_t stream, const Frame::Place& place);
 
     // Bytes of what it keeps on the device, by part, without the models.
     std::vector<std::pair<const char*, size_t>> bytes() const;
@@ -118,10 +127,12 @@ class ModelFrame {
     explicit ModelFrame(Frame::Keeps keeps = Frame::Keeps::nothing) : frame_(keeps) {}
 
     // The rows, and what is packed of them, stay where they are until the drawing is finished.
-    std::unique_ptr<Drawing> draw(const GaussianRows<const float>& rows, const ModelView<float>& view,
-                                  float filter_px2, bool antialiased, const FrameImage& image,
-                                  cudaStream_t stream, const PackedPlanes* packed = nullptr,
-                                  float min_transmittance = kStopsBefore, const Frame::Place& place = {});
+    std::unique_ptr<Drawing> draw(const GaussianRows<const float>& rows,
+                                  const ModelView<float>& view, float filter_px2, bool antialiased,
+                                  const FrameImage& image, cudaStream_t stream,
+                                  const PackedPlanes* packed = nullptr,
+                                  float min_transmittance = kStopsBefore,
+                                  const Frame::Place& place = {});
     FrameTape tape() const { return frame_.tape(); }
 
   private:

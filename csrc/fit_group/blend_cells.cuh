@@ -1,7 +1,7 @@
 #pragma once
 
-// Half-warps blend cells of 4 x 4 pixels, and go through them again for the gradients: what each gaussian
-// gets from a cell is summed over the cell's pixels into a slot of its own.
+// Half-warps blend cells of 4 x 4 pixels, and go through them again for the gradients: what each
+// gaussian gets from a cell is summed over the cell's pixels into a slot of its own.
 
 #include "fit_group/cell_lists.cuh"
 #include "frame/record.cuh"
@@ -40,7 +40,8 @@ __device__ void stage_records(const Fit& fit, uint32_t begin, uint32_t end) {
     for (uint32_t i = threadIdx.x % 32; i < 2 * Fit::kChunk; i += 32) {
         const uint32_t entry = begin + i % Fit::kChunk;
         if (entry >= end) continue;
-        const auto* from = reinterpret_cast<const float4*>(fit.ranked() + fit.list(i / Fit::kChunk)[entry]);
+        const auto* from =
+            reinterpret_cast<const float4*>(fit.ranked() + fit.list(i / Fit::kChunk)[entry]);
         auto* to = reinterpret_cast<float4*>(fit.staged() + i);
         for (int k = 0; k < kRecordVectors; ++k) to[k] = from[k];
     }
@@ -53,7 +54,8 @@ struct CellRecords {
 };
 
 template <class Fit>
-__device__ CellRecords records_at(const Fit& fit, const CellList<Fit>& list, uint32_t i, uint32_t begin) {
+__device__ CellRecords records_at(const Fit& fit, const CellList<Fit>& list, uint32_t i,
+                                  uint32_t begin) {
     CellRecords out;
     if (Fit::kSmall) {
         using Entries = CellEntries<typename Fit::Index>;
@@ -80,7 +82,8 @@ __device__ inline Blended blend_records(const CellPixel& p, const CellRecords& r
     Blended out;
 #pragma unroll
     for (int q = 0; q < kAtOnce; ++q) {
-        // As vectors (frame/record.cuh): nvcc rounds the falloff of a record that is taken apart otherwise.
+        // As vectors (frame/record.cuh): nvcc rounds the falloff of a record that is taken apart
+        // otherwise.
         const Record<float>& r = *records.record[q];
         const float4 a = *reinterpret_cast<const float4*>(&r.u);
         const float4 b = *reinterpret_cast<const float4*>(&r.l22);
@@ -100,15 +103,17 @@ struct BlendTargets {
     float2* errors;        // measure
 };
 
-// Half-warps add up the fragments of a chunk with one lane or, where it has fewer gaussians, two for each.
+// Half-warps add up the fragments of a chunk with one lane or, where it has fewer gaussians, two
+// for each.
 template <class Fit>
 constexpr int kLanesOfSum = kCellPixels / (Fit::kChunk < kCellPixels ? Fit::kChunk : kCellPixels);
 
-// Sums over the half-warp's cell, for record r, which is gaussian `i` of the chunk; all lanes come here,
-// those without a gaussian with a null `slot`. What RowSums says of a row is written out: through it nvcc
-// rounds the sums otherwise, and bundles would change in their last bits.
+// Sums over the half-warp's cell, for record r, which is gaussian `i` of the chunk; all lanes come
+// here, those without a gaussian with a null `slot`. What RowSums says of a row is written out:
+// through it nvcc rounds the sums otherwise, and bundles would change in their last bits.
 template <class Fit>
-__device__ void add_up(const Fit& fit, const CellPixel& p, uint32_t i, const Record<float>& r, float* slot) {
+__device__ void add_up(const Fit& fit, const CellPixel& p, uint32_t i, const Record<float>& r,
+                       float* slot) {
     constexpr int kLanes = kLanesOfSum<Fit>, kRows = kCell / kLanes;
     const float4 e = *reinterpret_cast<const float4*>(&r.u);
     const float l22 = r.l22;
@@ -156,8 +161,8 @@ __device__ void add_up(const Fit& fit, const CellPixel& p, uint32_t i, const Rec
 
 // A warp takes two cells side by side in view b. `unit` numbers the pair.
 template <Pass kPass, class Fit>
-__device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, int pair_x, int cell_y,
-                            uint32_t unit, const BlendTargets& targets) {
+__device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, int pair_x,
+                            int cell_y, uint32_t unit, const BlendTargets& targets) {
     const uint32_t lane = threadIdx.x % 32;
     const CellPixel p = pixel_at(fit, 2 * pair_x + lane / kCellPixels, cell_y);
     const int region = cell_y / kRegionCells * fit.regions_across + 2 * pair_x / kRegionCells;
@@ -176,7 +181,8 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
         stage_records(fit, begin, list.filled);
         const uint32_t end = min(list.filled, begin + Fit::kChunk);
         for (uint32_t i = begin; i < end; i += kAtOnce) {
-            const Blended blended = blend_records(p, records_at(fit, list, i, begin), transmittance);
+            const Blended blended =
+                blend_records(p, records_at(fit, list, i, begin), transmittance);
 #pragma unroll
             for (int q = 0; q < kAtOnce; ++q) {
                 color[0] += blended.weight[q] * blended.color[q].x;
@@ -216,29 +222,33 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
     }
     fit.d_pixels()[lane] = make_float4(d[0], d[1], d[2], 0);
 
-    // Blends the same records again, to the same numbers, now that the sum over all of them is known.
+    // Blends the same records again, to the same numbers, now that the sum over all of them is
+    // known.
     const auto slot_of = [&](uint32_t j) {
         const uint32_t slot =
             fit.slot_first(region)[j] + __popcll(fit.mask(region)[j] & ((CellMask(1) << cell) - 1));
         return targets.slots + kSums * static_cast<size_t>(slot - targets.slot_base);
     };
     float2* const mine = fit.fragments() + lane;  // this pixel's
-    float behind = d[0] * color[0] + d[1] * color[1] + d[2] * color[2] + d[3] * (1 - fabsf(transmittance));
+    float behind =
+        d[0] * color[0] + d[1] * color[1] + d[2] * color[2] + d[3] * (1 - fabsf(transmittance));
     transmittance = p.inside ? 1 : -1;
     uint32_t begin = 0;
     for (; begin < list.filled && __any_sync(kAllLanes, transmittance > 0); begin += Fit::kChunk) {
         stage_records(fit, begin, list.filled);
         const uint32_t end = min(list.filled, begin + Fit::kChunk);
         for (uint32_t i = begin; i < end; i += kAtOnce) {
-            const Blended blended = blend_records(p, records_at(fit, list, i, begin), transmittance);
+            const Blended blended =
+                blend_records(p, records_at(fit, list, i, begin), transmittance);
 #pragma unroll
             for (int q = 0; q < kAtOnce; ++q) {
                 const float3& rgb = blended.color[q];
                 const float by_weight = d[0] * rgb.x + d[1] * rgb.y + d[2] * rgb.z + d[3];
                 behind -= blended.weight[q] * by_weight;
-                mine[(i - begin + q) * 33] = make_float2(
-                    exponent_vjp(blended.alpha[q], blended.before[q], blended.weight[q], by_weight, behind),
-                    blended.weight[q]);
+                mine[(i - begin + q) * 33] =
+                    make_float2(exponent_vjp(blended.alpha[q], blended.before[q], blended.weight[q],
+                                             by_weight, behind),
+                                blended.weight[q]);
             }
         }
         __syncwarp();
@@ -248,7 +258,8 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
             const uint32_t j = is_entry ? list.entry[begin + i] : fit.nothing();
             const Record<float>* const staged =
                 Fit::kSmall ? nullptr : fit.staged() + lane / kCellPixels * Fit::kChunk;
-            add_up(fit, p, i, Fit::kSmall ? fit.ranked()[j] : staged[i], is_entry ? slot_of(j) : nullptr);
+            add_up(fit, p, i, Fit::kSmall ? fit.ranked()[j] : staged[i],
+                   is_entry ? slot_of(j) : nullptr);
         }
         __syncwarp();
     }
@@ -269,12 +280,14 @@ __device__ int cell_pairs(const Fit& fit) {
 }
 
 // 0, 1, 2, ... to the middle of [0, size), then alternately before and behind it.
-__device__ inline int from_middle(int k, int size) { return size / 2 + (k % 2 ? -(k + 1) / 2 : k / 2); }
+__device__ inline int from_middle(int k, int size) {
+    return size / 2 + (k % 2 ? -(k + 1) / 2 : k / 2);
+}
 
 // Warps take pairs of cells from a queue, those in the middle first, which have most to blend.
 template <Pass kPass, class Fit>
-__device__ void blend_regions(const Fit& fit, const FitCameras& cameras, int num_views, int first_region,
-                              int last_region, const BlendTargets& targets) {
+__device__ void blend_regions(const Fit& fit, const FitCameras& cameras, int num_views,
+                              int first_region, int last_region, const BlendTargets& targets) {
     const int rows = cell_rows(fit), pairs = cell_pairs(fit);
     for (;;) {
         uint32_t unit = 0;

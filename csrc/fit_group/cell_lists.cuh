@@ -1,7 +1,7 @@
 #pragma once
 
-// Which gaussians reach which cells of 4 x 4 pixels: a mask for each record, a slot for each record and cell,
-// in which its gradients from there are summed, and the list of a cell.
+// Which gaussians reach which cells of 4 x 4 pixels: a mask for each record, a slot for each record
+// and cell, in which its gradients from there are summed, and the list of a cell.
 
 #include "base/scan.cuh"
 #include "fit_group/depth_order.cuh"
@@ -9,8 +9,8 @@
 namespace v3dg {
 namespace cuda {
 
-// Cells of the region at (left, top) that the record may reach, a bit each, row by row. Rounded to pixel
-// centres, because each cell costs a slot and a place in a list.
+// Cells of the region at (left, top) that the record may reach, a bit each, row by row. Rounded to
+// pixel centres, because each cell costs a slot and a place in a list.
 __device__ inline CellMask cells_of(const Record<float>& r, int left, int top) {
     const PixelBox<int> box{max(r.x0 - left, 0), min(r.x1 - left, kRegion - 1), max(r.y0 - top, 0),
                             min(r.y1 - top, kRegion - 1)};
@@ -40,9 +40,10 @@ __device__ void arrange_by_depth(const Fit& fit, int num_views) {
         Record<float> record{};
         if (!is_hidden) fit.ranked()[r] = record = fit.records()[j];
         for (int region = 0; region < fit.num_regions(); ++region)
-            fit.mask(region)[r] = is_hidden ? 0
-                                            : cells_of(record, region % fit.regions_across * kRegion,
-                                                       region / fit.regions_across * kRegion);
+            fit.mask(region)[r] = is_hidden
+                                      ? 0
+                                      : cells_of(record, region % fit.regions_across * kRegion,
+                                                 region / fit.regions_across * kRegion);
     }
     fit.sync();
 }
@@ -108,16 +109,16 @@ __device__ void sum_slots(const Fit& fit, int num_views, const float* slots, uin
     }
 }
 
-// The ranks of what reaches a half-warp's cell, nearest first. Both half-warps' lists are filled up to one
-// length, with the rank of a record that draws nothing.
+// The ranks of what reaches a half-warp's cell, nearest first. Both half-warps' lists are filled up
+// to one length, with the rank of a record that draws nothing.
 template <class Fit>
 struct CellList {
     const typename Fit::Index* entry;
     uint32_t length, filled;
 };
 
-// Makes the lists of two neighbouring cells in view b, and returns the lane's own; `cell` is the left one's
-// bit.
+// Makes the lists of two neighbouring cells in view b, and returns the lane's own; `cell` is the
+// left one's bit.
 template <class Fit>
 __device__ CellList<Fit> make_lists(const Fit& fit, int b, int region, int cell) {
     constexpr int kLoads = 4;

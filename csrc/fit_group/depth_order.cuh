@@ -11,12 +11,13 @@ constexpr uint32_t kHiddenKey = 0xfffffffeu;  // of what is not drawn; comes aft
 
 // Puts gaussian `i` of the view whose keys these are into its position.
 template <class Fit>
-__device__ void rank_by_depth(const Fit& fit, const uint32_t* view_keys, uint32_t begin, uint32_t i) {
+__device__ void rank_by_depth(const Fit& fit, const uint32_t* view_keys, uint32_t begin,
+                              uint32_t i) {
     const uint4* all = reinterpret_cast<const uint4*>(view_keys);
     const uint32_t key = view_keys[i], warp_first = i - threadIdx.x % 32;
     uint32_t rank = 0;
-    // Of equal keys, the one whose place comes first comes first. So keys in runs of 32 before this warp's
-    // run precede this one if they are equal, and keys in runs behind it do not.
+    // Of equal keys, the one whose place comes first comes first. So keys in runs of 32 before this
+    // warp's run precede this one if they are equal, and keys in runs behind it do not.
     const auto count = [&](uint32_t from, uint32_t to, const auto& before) {
         for (uint32_t run = from; run < to; run += 32) {
             uint4 other[8];
@@ -31,7 +32,8 @@ __device__ void rank_by_depth(const Fit& fit, const uint32_t* view_keys, uint32_
         }
     };
     count(0, warp_first, [&](uint32_t other, uint32_t) { return other <= key; });
-    count(warp_first, warp_first + 32, [&](uint32_t other, uint32_t k) { return other < key + (k < i); });
+    count(warp_first, warp_first + 32,
+          [&](uint32_t other, uint32_t k) { return other < key + (k < i); });
     count(warp_first + 32, fit.n_padded, [&](uint32_t other, uint32_t) { return other < key; });
     fit.order()[begin + rank] = static_cast<typename Fit::Index>(begin + i);
 }
@@ -40,11 +42,12 @@ template <class Fit>
 __device__ void rank_by_counting(const Fit& fit, int num_views) {
     if (Fit::kSmall) {
         for (uint32_t j = fit.first(); j < num_views * fit.n_padded; j += fit.stride())
-            rank_by_depth(fit, fit.keys() + j / fit.n_padded * fit.n_padded, j / fit.n_padded * fit.n_padded,
-                          j % fit.n_padded);
+            rank_by_depth(fit, fit.keys() + j / fit.n_padded * fit.n_padded,
+                          j / fit.n_padded * fit.n_padded, j % fit.n_padded);
         return;
     }
-    // All threads read all keys, so these are copied to shared memory where they fit: fragments come later.
+    // All threads read all keys, so these are copied to shared memory where they fit: fragments
+    // come later.
     auto* copy = reinterpret_cast<uint32_t*>(shared_memory() + fit.layout.fragments);
     const bool fits = fit.n_padded * sizeof(uint32_t) <= Fit::kWarps * fragments_bytes(Fit::kChunk);
     for (int b = 0; b < num_views; ++b) {
@@ -65,8 +68,9 @@ __device__ void sort_bitonic(const Fit& fit, int b) {
     while (size < fit.n) size *= 2;
     const uint32_t begin = b * fit.n_padded;
     for (uint32_t i = threadIdx.x; i < size; i += Fit::kThreads)
-        sorted[i] =
-            i < fit.n ? static_cast<unsigned long long>(fit.keys()[begin + i]) << 32 | (begin + i) : ~0ull;
+        sorted[i] = i < fit.n
+                        ? static_cast<unsigned long long>(fit.keys()[begin + i]) << 32 | (begin + i)
+                        : ~0ull;
     __syncthreads();
     for (uint32_t run = 2; run <= size; run *= 2)
         for (uint32_t stride = run / 2; stride > 0; stride /= 2) {

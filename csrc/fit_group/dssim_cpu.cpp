@@ -4,13 +4,15 @@
 
 namespace v3dg {
 
-// Both passes of the separable window; its own transpose, since it is symmetric and zeros lie outside.
+// Both passes of the separable window; its own transpose, since it is symmetric and zeros lie
+// outside.
 static void blur(const float* in, int width, int height, float* rows, float* out) {
     for (int y = 0; y < height; ++y)
         for (int x = 0; x < width; ++x) {
             float sum = 0;
             for (int k = -kSsimRadius; k <= kSsimRadius; ++k)
-                if (x + k >= 0 && x + k < width) sum += ssim_weight<float>(k) * in[y * width + x + k];
+                if (x + k >= 0 && x + k < width)
+                    sum += ssim_weight<float>(k) * in[y * width + x + k];
             rows[y * width + x] = sum;
         }
     for (int y = 0; y < height; ++y) {
@@ -24,13 +26,13 @@ static void blur(const float* in, int width, int height, float* rows, float* out
     }
 }
 
-float dssim(const float* picture, const float* target, int width, int height, float weight, float* d_picture,
-            SsimScratch& scratch) {
+float dssim(const float* picture, const float* target, int width, int height, float weight,
+            float* d_picture, SsimScratch& scratch) {
     const int n = width * height;
     scratch.maps.resize(10 * static_cast<size_t>(n));
     float* const m = scratch.maps.data();
-    float *rows = m, *product = m + n, *mx = m + 2 * n, *my = m + 3 * n, *xx = m + 4 * n, *yy = m + 5 * n,
-          *xy = m + 6 * n, *d_mx = m + 7 * n, *d_xx = m + 8 * n, *d_xy = m + 9 * n;
+    float *rows = m, *product = m + n, *mx = m + 2 * n, *my = m + 3 * n, *xx = m + 4 * n,
+          *yy = m + 5 * n, *xy = m + 6 * n, *d_mx = m + 7 * n, *d_xx = m + 8 * n, *d_xy = m + 9 * n;
     blur(picture, width, height, rows, mx);
     blur(target, width, height, rows, my);
     for (int i = 0; i < n; ++i) product[i] = picture[i] * picture[i];

@@ -26,8 +26,9 @@ struct FitConfig {
     float filter_px2;        // of the gaussians that are fitted, with compensated opacity
     bool antialiased;
     LossWeights loss;
-    // Step sizes of Adam: position in radii or, if `position_in_world`, in world units; the last step takes
-    // `final_step` of them, exponentially. `beta2` is the decay of its mean of squared gradients.
+    // Step sizes of Adam: position in radii or, if `position_in_world`, in world units; the last
+    // step takes `final_step` of them, exponentially. `beta2` is the decay of its mean of squared
+    // gradients.
     float step_position, step_log_scale, step_quat, step_logit, step_sh0, step_sh_rest;
     bool position_in_world;
     float final_step, beta2;
@@ -72,22 +73,25 @@ struct FitScratch {
     Buffer<uint64_t> order, order_scratch, row;
 };
 
-// Throws std::invalid_argument where a picture of the group would have a side of more than 65,535 px.
+// Throws std::invalid_argument where a picture of the group would have a side of more than 65,535
+// px.
 void check_size(const FitConfig& config, const FitGroup& group);
 
 // View `index` of a group; those held out have the indices that held_out_view() gives.
 FitView fit_view(const FitConfig& config, const FitGroup& group, uint64_t index);
 
 // Draws the target in one view.
-V3DG_DECLARE_PER_ISA(void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget& target,
-                                     const FitView& view, FitScratch& scratch, FitImage& image))
+V3DG_DECLARE_PER_ISA(void fit_target(const FitConfig& config, const FitGroup& group,
+                                     const FitTarget& target, const FitView& view,
+                                     FitScratch& scratch, FitImage& image))
 
-// Fits one group: `rows` hold the start on entry and the result on return, in world units, as values without
-// logs or logits. `targets` holds the pictures of the fixed views and then of those held out. Writes the
-// residual of the result, mean |colour| and |alpha| over the views held out. A result that is no better there
-// than the start, or not finite, is thrown away.
-V3DG_DECLARE_PER_ISA(void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& target,
-                                    const FitImage* targets, const GaussianRows<float>& rows, float error[2],
+// Fits one group: `rows` hold the start on entry and the result on return, in world units, as
+// values without logs or logits. `targets` holds the pictures of the fixed views and then of those
+// held out. Writes the residual of the result, mean |colour| and |alpha| over the views held out. A
+// result that is no better there than the start, or not finite, is thrown away.
+V3DG_DECLARE_PER_ISA(void fit_group(const FitConfig& config, const FitGroup& group,
+                                    const FitTarget& target, const FitImage* targets,
+                                    const GaussianRows<float>& rows, float error[2],
                                     const std::atomic<bool>& cancel))
 
 }  // namespace v3dg

@@ -9,8 +9,8 @@
 #include "rasterize/simd_blend.h"
 #include "tile_bin/tile_bin.h"
 
-// One thread fits one group, start to end. The group's frame has its ball at the origin with radius 1, so
-// step sizes mean the same for every group and nothing is lost far from the world's origin.
+// One thread fits one group, start to end. The group's frame has its ball at the origin with radius
+// 1, so step sizes mean the same for every group and nothing is lost far from the world's origin.
 
 namespace v3dg {
 namespace V3DG_ISA {
@@ -21,15 +21,18 @@ static V3DG_INLINE Window square(int size) { return {0, 0, size, size}; }
 static int tiles_across(const FitView& view) { return (view.size + kTileSize - 1) / kTileSize; }
 
 // Projects a draw and sorts what is seen by depth; returns how many.
-static size_t project_sorted(const Draw<float>& draw, const Pinhole<float>& camera, FitScratch& scratch) {
+static size_t project_sorted(const Draw<float>& draw, const Pinhole<float>& camera,
+                             FitScratch& scratch) {
     Record<float>* records = scratch.records.reserve(draw.count);
     uint32_t* source = scratch.source.reserve(draw.count);
     const Window all = square(static_cast<int>(camera.width));
     Reach unused;
-    const size_t count = project<float>(draw, 0, draw.count, camera, all, records, source, 0, unused);
+    const size_t count =
+        project<float>(draw, 0, draw.count, camera, all, records, source, 0, unused);
     uint64_t* order = scratch.order.reserve(count);
     scratch.format = EntryFormat::of(count, 0, INT32_MAX);
-    for (size_t i = 0; i < count; ++i) order[i] = scratch.format.entry(depth_bits_of(records[i].depth), i, 0);
+    for (size_t i = 0; i < count; ++i)
+        order[i] = scratch.format.entry(depth_bits_of(records[i].depth), i, 0);
     sort_tile(records, scratch.format, order, count, scratch.order_scratch.reserve(count));
     return count;
 }
@@ -39,21 +42,22 @@ static bool misses_tile(const Record<float>& g, int left, int top) {
 }
 
 // Blends records in this order.
-static void blend_sorted(const FitScratch& scratch, const uint64_t* order, size_t count, int left, int top,
-                         int size, TilePlanes<float>& tile) {
-    blend_tile<float, Extra::kNothing>(count, left, top, square(size), StopsBefore{}, tile, [&](size_t i) {
-        const Record<float>& g = scratch.records.data()[scratch.format.record_of(order[i])];
-        return Listed<float>{&g, misses_tile(g, left, top) ? 0 : blocks_of(g, left, top)};
-    });
+static void blend_sorted(const FitScratch& scratch, const uint64_t* order, size_t count, int left,
+                         int top, int size, TilePlanes<float>& tile) {
+    blend_tile<float, Extra::kNothing>(
+        count, left, top, square(size), StopsBefore{}, tile, [&](size_t i) {
+            const Record<float>& g = scratch.records.data()[scratch.format.record_of(order[i])];
+            return Listed<float>{&g, misses_tile(g, left, top) ? 0 : blocks_of(g, left, top)};
+        });
 }
 
 static int place_in_tile(int x, int y) {
-    return (y / kBlockSize * kTileBlocks + x / kBlockSize) * kBlockPixels + y % kBlockSize * kBlockSize +
-           x % kBlockSize;
+    return (y / kBlockSize * kTileBlocks + x / kBlockSize) * kBlockPixels +
+           y % kBlockSize * kBlockSize + x % kBlockSize;
 }
 
-void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget& target, const FitView& view,
-                FitScratch& scratch, FitImage& image) {
+void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget& target,
+                const FitView& view, FitScratch& scratch, FitImage& image) {
     const int ss = config.supersample;
     const Draw<float> draw{target.model,
                            group.target_first,
@@ -79,11 +83,13 @@ void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget&
                 const int py = (top + y) / ss;
                 int px = left / ss, sample = left % ss;
                 for (int x = 0; x < kTileSize && left + x < ss * view.size; ++x) {
-                    const int p = place_in_tile(x, y), out = place_in_tile(px % kTileSize, py % kTileSize);
-                    float* planes =
-                        image.data() +
-                        static_cast<size_t>(py / kTileSize * across + px / kTileSize) * kPlanes * kTilePixels;
-                    for (int c = 0; c < 3; ++c) planes[c * kTilePixels + out] += share * tile.color[c][p];
+                    const int p = place_in_tile(x, y),
+                              out = place_in_tile(px % kTileSize, py % kTileSize);
+                    float* planes = image.data() +
+                                    static_cast<size_t>(py / kTileSize * across + px / kTileSize) *
+                                        kPlanes * kTilePixels;
+                    for (int c = 0; c < 3; ++c)
+                        planes[c * kTilePixels + out] += share * tile.color[c][p];
                     planes[3 * kTilePixels + out] += share * (1 - std::fabs(tile.transmittance[p]));
                     if (++sample == ss) {
                         sample = 0;
@@ -95,12 +101,15 @@ void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget&
     }
 }
 
-// The parameters of one group, one flat array in the order means, quats, log scales, logits, sh; a gradient
-// and two moments of the same shape.
+// The parameters of one group, one flat array in the order means, quats, log scales, logits, sh; a
+// gradient and two moments of the same shape.
 class Student {
   public:
     Student(const FitConfig& config, const FitGroup& group, const GaussianRows<float>& rows)
-        : config_(config), group_(group), n_(group.count), num_sh_(3 * num_sh_bases(rows.sh_degree)) {
+        : config_(config),
+          group_(group),
+          n_(group.count),
+          num_sh_(3 * num_sh_bases(rows.sh_degree)) {
         const size_t size = n_ * (11 + num_sh_);
         const size_t padded = (size + kPlanePadding) / kPlanePadding * kPlanePadding;
         value_.assign(padded, 0);
@@ -113,7 +122,8 @@ class Student {
             for (int k = 0; k < 3; ++k)
                 *p++ = (rows.means[3 * (group.first + i) + k] - group.center[k]) * inverse;
         p = std::copy_n(rows.quats + 4 * group.first, 4 * n_, p);
-        for (size_t i = 0; i < 3 * n_; ++i) *p++ = log_of_scale(rows.scales[3 * group.first + i] * inverse);
+        for (size_t i = 0; i < 3 * n_; ++i)
+            *p++ = log_of_scale(rows.scales[3 * group.first + i] * inverse);
         for (size_t i = 0; i < n_; ++i) *p++ = logit_of_opacity(rows.opacities[group.first + i]);
         std::copy_n(rows.sh + num_sh_ * group.first, num_sh_ * n_, p);
         plane_size_ = n_ + kPlanePadding;
@@ -134,8 +144,11 @@ class Student {
     }
 
     Draw<float> draw(const FitView& view) const {
-        return {
-            &model_, 0, n_, view_of_group(config_, view), {config_.filter_px2, config_.antialiased, false}};
+        return {&model_,
+                0,
+                n_,
+                view_of_group(config_, view),
+                {config_.filter_px2, config_.antialiased, false}};
     }
 
     void clear_gradient() { std::fill(gradient_.begin(), gradient_.end(), 0.0f); }
@@ -180,7 +193,8 @@ class Student {
         activate();
     }
 
-    // Writes the values back in world units; false, and nothing written, if one of them is not finite.
+    // Writes the values back in world units; false, and nothing written, if one of them is not
+    // finite.
     bool write(const GaussianRows<float>& rows) const {
         for (size_t i = 0; i < n_ * (11 + num_sh_); ++i)
             if (!std::isfinite(value_[i])) return false;
@@ -208,15 +222,15 @@ class Student {
         const size_t end = begin + count;
         for (; i + kLanes<float> <= end; i += kLanes<float>) {
             Vec<float> m = load(&m_[i]), v = load(&v_[i]);
-            const Vec<float> next = adam_step(load(&value_[i]), load(&gradient_[i]), m, v, step_size, beta2,
-                                              step.correction1, step.correction2);
+            const Vec<float> next = adam_step(load(&value_[i]), load(&gradient_[i]), m, v,
+                                              step_size, beta2, step.correction1, step.correction2);
             store(&m_[i], m);
             store(&v_[i], v);
             store(&value_[i], next);
         }
         for (; i < end; ++i)
-            value_[i] = adam_step(value_[i], gradient_[i], m_[i], v_[i], step_size, beta2, step.correction1,
-                                  step.correction2);
+            value_[i] = adam_step(value_[i], gradient_[i], m_[i], v_[i], step_size, beta2,
+                                  step.correction1, step.correction2);
         return end;
     }
 
@@ -257,7 +271,8 @@ class Comparison {
     Comparison(const FitConfig& config) : config_(config) {}
 
     // Mean |difference| of colour and alpha of one view.
-    void residual(const Student& student, const FitView& view, const FitImage& target, double error[2]) {
+    void residual(const Student& student, const FitView& view, const FitImage& target,
+                  double error[2]) {
         draw(student, view);
         const int across = tiles_across(view);
         for (int t = 0; t < across * across; ++t) compare(t, view, target, nullptr, error);
@@ -280,7 +295,8 @@ class Comparison {
                 const Vec<float> t_now = load(tile.transmittance + p);
                 const Vec<float> covered = 1 - (t_now < Vec<float>{} ? -t_now : t_now);
                 Vec<float> total = load(grad.d_weight + p) * covered;
-                for (int c = 0; c < 3; ++c) total += load(grad.d_color[c] + p) * load(tile.color[c] + p);
+                for (int c = 0; c < 3; ++c)
+                    total += load(grad.d_color[c] + p) * load(tile.color[c] + p);
                 store(grad.total + p, total);
             }
             uint64_t alive = clear_tile(tile, left, top, square(view.size), Extra::kNothing);
@@ -290,8 +306,8 @@ class Comparison {
                 if (misses_tile(g, left, top)) continue;
                 const uint64_t blocks = live_blocks(g, left, top, alive);
                 RecordGradient<float> d;
-                if (blocks == 0 ||
-                    !blend_record_vjp<float, false>(g, blocks, left, top, pixels, grad, tile, alive, d))
+                if (blocks == 0 || !blend_record_vjp<float, false>(g, blocks, left, top, pixels,
+                                                                   grad, tile, alive, d))
                     continue;
                 d_records_[r] += d;
             }
@@ -311,14 +327,16 @@ class Comparison {
         return count;
     }
 
-    // L1 parts of the loss in one tile: adds to the sums and, if wanted, writes the gradient of its pixels.
+    // L1 parts of the loss in one tile: adds to the sums and, if wanted, writes the gradient of its
+    // pixels.
     void compare(int t, const FitView& view, const FitImage& target, TileGradient<float>* grad,
                  double error[2]) {
         using V = Vec<float>;
         const int across = tiles_across(view);
         const int left = t % across * kTileSize, top = t / across * kTileSize;
         const float num_pixels = static_cast<float>(view.size) * static_cast<float>(view.size);
-        const float d_color = config_.loss.l1 / (3 * num_pixels), d_alpha = config_.loss.alpha / num_pixels;
+        const float d_color = config_.loss.l1 / (3 * num_pixels),
+                    d_alpha = config_.loss.alpha / num_pixels;
         const float* planes = target.data() + static_cast<size_t>(t) * kPlanes * kTilePixels;
         const TilePlanes<float>& tile = tiles_[t];
         V color_sum = V{}, alpha_sum = V{};
@@ -334,7 +352,8 @@ class Comparison {
                     continue;
                 }
                 for (int c = 0; c < 3; ++c) {
-                    const V difference = load(tile.color[c] + p) - load(planes + c * kTilePixels + p);
+                    const V difference =
+                        load(tile.color[c] + p) - load(planes + c * kTilePixels + p);
                     color_sum += magnitude(difference);
                     if (grad != nullptr) store(grad->d_color[c] + p, l1_vjp(difference, d_color));
                 }
@@ -363,8 +382,8 @@ class Comparison {
                         target[(static_cast<size_t>(t) * kPlanes + c) * kTilePixels + p];
                 }
             std::fill_n(rows_.begin() + 2 * n, n, 0.0f);
-            dssim(rows_.data(), rows_.data() + n, size, size, config_.loss.dssim / 3, rows_.data() + 2 * n,
-                  ssim_);
+            dssim(rows_.data(), rows_.data() + n, size, size, config_.loss.dssim / 3,
+                  rows_.data() + 2 * n, ssim_);
             for (int y = 0; y < size; ++y)
                 for (int x = 0; x < size; ++x)
                     grad_[y / kTileSize * across + x / kTileSize]
@@ -395,7 +414,8 @@ void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& 
         for (int i = 0; i < kHeldOutViews; ++i) {
             const uint64_t index = held_out_view(config, i);
             const FitView view = fit_view(config, group, index);
-            if (config.num_views == 0) fit_target(config, group, target, view, target_scratch, fresh);
+            if (config.num_views == 0)
+                fit_target(config, group, target, view, target_scratch, fresh);
             comparison.residual(s, view, config.num_views > 0 ? targets[index] : fresh, sum);
         }
         sum[0] /= kHeldOutViews;
@@ -409,7 +429,8 @@ void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& 
         for (int b = 0; b < config.views_per_step; ++b, ++next_view) {
             const uint64_t index = visited_view(config, stride, next_view);
             const FitView view = fit_view(config, group, index);
-            if (config.num_views == 0) fit_target(config, group, target, view, target_scratch, fresh);
+            if (config.num_views == 0)
+                fit_target(config, group, target, view, target_scratch, fresh);
             comparison.add_gradient(student, view, config.num_views > 0 ? targets[index] : fresh);
         }
         student.step(s);

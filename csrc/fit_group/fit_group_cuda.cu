@@ -1,10 +1,10 @@
 // A block, or a team of blocks, fits a group, start to end, then takes the next from a queue.
 //
-// One step: threads project gaussians and order them by depth; half-warps take cells of 4 x 4 pixels, list
-// the gaussians that reach them, blend them front to back, compare, and go through them again for the
-// gradients; what a gaussian gets from each cell has its own slot, and slots are added up in a fixed order;
-// threads carry that on to the parameters, and Adam moves them. So every run has the same result, whatever
-// order blocks and warps come in.
+// One step: threads project gaussians and order them by depth; half-warps take cells of 4 x 4
+// pixels, list the gaussians that reach them, blend them front to back, compare, and go through
+// them again for the gradients; what a gaussian gets from each cell has its own slot, and slots are
+// added up in a fixed order; threads carry that on to the parameters, and Adam moves them. So every
+// run has the same result, whatever order blocks and warps come in.
 
 #include "fit_group/fit_group_cuda.h"
 
@@ -40,7 +40,8 @@ __device__ void set_camera(const Fit& fit, FitCameras& cameras, int b, uint64_t 
     const FitView view = fit.in.views[fit.job.first_view + picture];
     cameras.view[b] = view_of_group(fit.in.config, view);
     cameras.camera[b] = camera_of(view, 1);
-    cameras.target[b] = fit.in.targets + fit.job.first_pixel + picture * fit.job.size * fit.job.size;
+    cameras.target[b] =
+        fit.in.targets + fit.job.first_pixel + picture * fit.job.size * fit.job.size;
 }
 
 template <class Fit>
@@ -52,16 +53,19 @@ __device__ bool project_one(const Fit& fit, uint32_t i, const ModelView<float>& 
     const Ellipse<float> e =
         project_gaussian(g, view, camera, fit.in.config.filter_px2, fit.in.config.antialiased, p);
     float half_x, half_y;
-    if (!(e.depth >= camera.near_depth) || !extent_of(g.opacity, e, p, half_x, half_y)) return false;
-    if (!meets_image(e.u, half_x, camera.width) || !meets_image(e.v, half_y, camera.height)) return false;
+    if (!(e.depth >= camera.near_depth) || !extent_of(g.opacity, e, p, half_x, half_y))
+        return false;
+    if (!meets_image(e.u, half_x, camera.width) || !meets_image(e.v, half_y, camera.height))
+        return false;
     const PixelBox<int> box = pixel_box(e, half_x, half_y, camera);
     if (!box.holds_pixels()) return false;
     set_ellipse(e, box, r);
     const float* sh = fit.at(fit.layout.value) + 11 * fit.n + fit.num_sh * i;
     float direction[3];
     from_eye(view, g.mean, direction);
-    with_degree(fit.in.rows.sh_degree,
-                [&](auto degree) { color_of_sh<float>(decltype(degree)::value, direction, sh, r.color); });
+    with_degree(fit.in.rows.sh_degree, [&](auto degree) {
+        color_of_sh<float>(decltype(degree)::value, direction, sh, r.color);
+    });
     return true;
 }
 
@@ -91,7 +95,8 @@ __device__ void project_views(const Fit& fit, const FitCameras& cameras, int num
 
 // From the sums of records to gradients of the parameters, for each view.
 template <class Fit>
-__device__ void project_views_backward(const Fit& fit, const FitCameras& cameras, int num_views, int turn) {
+__device__ void project_views_backward(const Fit& fit, const FitCameras& cameras, int num_views,
+                                       int turn) {
     const float* sums = fit.at(fit.layout.sums);
     const float* value = fit.at(fit.layout.value);
     for (uint32_t j = fit.first(); j < num_views * fit.n_padded; j += fit.stride()) {
@@ -114,8 +119,8 @@ __device__ void project_views_backward(const Fit& fit, const FitCameras& cameras
         Projection<float> p;
         to_view(view, g.mean, p.p);
         const Ellipse<float> e = project_gaussian(g, view, camera, filter_px2, antialiased, p);
-        const Ellipse<float> d_ellipse =
-            falloff_vjp(e.l11, e.l12, e.l22, FalloffSums<float>{d[0], d[1], d[2], d[3], d[4], d[5]});
+        const Ellipse<float> d_ellipse = falloff_vjp(
+            e.l11, e.l12, e.l22, FalloffSums<float>{d[0], d[1], d[2], d[3], d[4], d[5]});
         Gaussian3d<float> d_g =
             project_gaussian_vjp(g, view, camera, filter_px2, antialiased, p, e, d_ellipse);
         const float* sh = value + 11 * fit.n + fit.num_sh * i;
@@ -136,7 +141,8 @@ __device__ void project_views_backward(const Fit& fit, const FitCameras& cameras
 
 // Adds the |difference| of colour and alpha, summed over pixels, in every thread.
 template <class Fit>
-__device__ void measure_views(const Fit& fit, const FitCameras& cameras, int num_views, double error[2]) {
+__device__ void measure_views(const Fit& fit, const FitCameras& cameras, int num_views,
+                              double error[2]) {
     BlendTargets targets{};
     targets.errors = fit.template hot_at<float2>(fit.layout.errors);
     blend_regions<Pass::measure>(fit, cameras, num_views, 0, fit.num_regions(), targets);
@@ -150,7 +156,8 @@ __device__ void measure_views(const Fit& fit, const FitCameras& cameras, int num
 
 // Leaves the gradients of the parameters, for each view.
 template <class Fit>
-__device__ void differentiate_views(const Fit& fit, const FitCameras& cameras, int num_views, int turn) {
+__device__ void differentiate_views(const Fit& fit, const FitCameras& cameras, int num_views,
+                                    int turn) {
     BlendTargets targets{};
     if (fit.in.config.loss.dssim > 0) {
         const size_t planes = static_cast<size_t>(3 * kViewsAtOnce) * fit.job.size * fit.job.size;
@@ -175,7 +182,8 @@ __device__ void differentiate_views(const Fit& fit, const FitCameras& cameras, i
     for (int region = 0; region < fit.num_regions();) {
         int last = region + 1;
         targets.slot_base = slots_before(region);
-        while (last < fit.num_regions() && slots_before(last + 1) - targets.slot_base <= capacity) ++last;
+        while (last < fit.num_regions() && slots_before(last + 1) - targets.slot_base <= capacity)
+            ++last;
         blend_regions<Pass::train>(fit, cameras, num_views, region, last, targets);
         fit.sync();
         sum_slots(fit, num_views, targets.slots, targets.slot_base, region, last);
@@ -190,7 +198,8 @@ __device__ void differentiate_views(const Fit& fit, const FitCameras& cameras, i
 template <class Fit>
 __device__ void sum_errors(const Fit& fit, double error[2][2]) {
     if (threadIdx.x == 0)
-        for (int e = 0; e < 4; ++e) fit.all.error[fit.view_rank][e / 2][e % 2] = error[e / 2][e % 2];
+        for (int e = 0; e < 4; ++e)
+            fit.all.error[fit.view_rank][e / 2][e % 2] = error[e / 2][e % 2];
     fit.arrive_and_wait(-1);
     for (int e = 0; e < 4; ++e) {
         error[e / 2][e % 2] = 0;
@@ -208,14 +217,17 @@ __device__ void keep_if_better(const Fit& fit, double error[2][2]) {
         error[e][0] /= 3 * num_pixels;
         error[e][1] /= num_pixels;
     }
-    const bool better = config.steps > 0 &&
-                        residual_loss(config.loss, error[1]) <= residual_loss(config.loss, error[0]) &&
-                        write_parameters(fit);
+    const bool better =
+        config.steps > 0 &&
+        residual_loss(config.loss, error[1]) <= residual_loss(config.loss, error[0]) &&
+        write_parameters(fit);
     if (!fit.leads()) return;
-    for (int k = 0; k < 2; ++k) fit.in.error[2 * fit.job.error + k] = static_cast<float>(error[better][k]);
+    for (int k = 0; k < 2; ++k)
+        fit.in.error[2 * fit.job.error + k] = static_cast<float>(error[better][k]);
 }
 
-// The views held out, those of all steps, and those held out again, in batches of at most kViewsAtOnce.
+// The views held out, those of all steps, and those held out again, in batches of at most
+// kViewsAtOnce.
 template <class Fit>
 __device__ void fit_one_group(const Fit& fit) {
     const FitConfig& config = fit.in.config;
@@ -230,19 +242,22 @@ __device__ void fit_one_group(const Fit& fit) {
     };
     // Of the views of a batch, this block's.
     const auto own_of = [&](int num_views) {
-        return fit.view_stride == 1 ? num_views : static_cast<int>(fit.view_rank) < num_views ? 1 : 0;
+        return fit.view_stride == 1                          ? num_views
+               : static_cast<int>(fit.view_rank) < num_views ? 1
+                                                             : 0;
     };
     const auto set_cameras = [&](FitCameras& cameras, int64_t first) {
-        const int b = static_cast<int>(threadIdx.x) - (Fit::kThreads - 32);  // the warp with least to do
+        const int b =
+            static_cast<int>(threadIdx.x) - (Fit::kThreads - 32);  // the warp with least to do
         if (b == kViewsAtOnce && first >= 0 && first < num_visits)
             cameras.step = fit.in.steps[first / views_per_step];
         if (b < 0 || b >= own_of(views_at(first))) return;
         const int64_t visit = first + fit.view_rank + b;
         const bool is_of_step = visit >= 0 && visit < num_visits;
         const int64_t held_out = visit < 0 ? visit + kHeldOutViews : visit - num_visits;
-        set_camera(
-            fit, cameras, b,
-            is_of_step ? visited_view(config, fit.in.stride, visit) : num_fitted_pictures(config) + held_out);
+        set_camera(fit, cameras, b,
+                   is_of_step ? visited_view(config, fit.in.stride, visit)
+                              : num_fitted_pictures(config) + held_out);
     };
     double error[2][2] = {{0, 0}, {0, 0}};  // before and after
     start_parameters(fit);
@@ -329,16 +344,19 @@ int attribute(cudaDeviceAttr name) {
     return value;
 }
 
-// Returns whether so many blocks, at most kBlocks, fit on a multiprocessor; nothing happens where they do
-// not.
+// Returns whether so many blocks, at most kBlocks, fit on a multiprocessor; nothing happens where
+// they do not.
 template <class Shape, int kBlocks>
-bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stream, int blocks = kBlocks) {
+bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stream,
+         int blocks = kBlocks) {
     const size_t reserved = sizeof(FitShared) + 1024;  // ours, and the driver's own of each block
     const size_t limit =
-        (std::min<size_t>(attribute(cudaDevAttrMaxSharedMemoryPerBlockOptin) - sizeof(FitShared),
-                          attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor) / blocks - reserved)) /
+        (std::min<size_t>(
+            attribute(cudaDevAttrMaxSharedMemoryPerBlockOptin) - sizeof(FitShared),
+            attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor) / blocks - reserved)) /
         16 * 16;
-    const size_t most_blocks = blocks * static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
+    const size_t most_blocks =
+        blocks * static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
     // For a group. Together they need to run at the same time.
     size_t num_blocks = 1;
     if (attribute(cudaDevAttrCooperativeLaunch) != 0)
@@ -355,11 +373,13 @@ bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stre
         num_groups * (Shape::kSmall ? num_blocks : 1) * layout.scratch_bytes, stream);
     const DeviceBuffer<FitTeam> teams(num_groups, stream);
     const DeviceBuffer<FitQueue> queue(1, stream);
-    check(cudaMemsetAsync(teams.data(), 0, num_groups * sizeof(FitTeam), stream), "cudaMemsetAsync");
+    check(cudaMemsetAsync(teams.data(), 0, num_groups * sizeof(FitTeam), stream),
+          "cudaMemsetAsync");
     check(cudaMemsetAsync(queue.data(), 0, sizeof(FitQueue), stream), "cudaMemsetAsync");
     launch("fit_groups_kernel", fit_groups_kernel<Shape, kBlocks>,
-           static_cast<unsigned>(num_groups * num_blocks), Shape::kThreads, layout.shared_bytes, stream, in,
-           layout, scratch.data(), static_cast<unsigned>(num_blocks), teams.data(), queue.data());
+           static_cast<unsigned>(num_groups * num_blocks), Shape::kThreads, layout.shared_bytes,
+           stream, in, layout, scratch.data(), static_cast<unsigned>(num_blocks), teams.data(),
+           queue.data());
     return true;
 }
 
@@ -367,8 +387,9 @@ bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stre
 
 void make_steps(const FitConfig& config, FitStep* steps, cudaStream_t stream) {
     constexpr unsigned kThreads = 128;
-    launch("steps_kernel", steps_kernel, (static_cast<unsigned>(config.steps) + kThreads) / kThreads,
-           kThreads, 0, stream, config, steps);
+    launch("steps_kernel", steps_kernel,
+           (static_cast<unsigned>(config.steps) + kThreads) / kThreads, kThreads, 0, stream, config,
+           steps);
 }
 
 FitExtent extent_of(Span<const FitJob> jobs) {
@@ -398,7 +419,8 @@ void fit_groups(const FitGroupsInput& in, const FitExtent& level, cudaStream_t s
                           ? run_small()
                           : run<FitShape<512, false, 32>, 1>(in, most, largest, stream) ||
                                 run<FitShape<256, false, 16>, 1>(in, most, largest, stream);
-    if (!runs) throw std::runtime_error("cuda: expected 96 KiB of shared memory in a block, got less");
+    if (!runs)
+        throw std::runtime_error("cuda: expected 96 KiB of shared memory in a block, got less");
 }
 
 }  // namespace cuda

@@ -35,7 +35,8 @@ struct FitGroupsInput {
     FitSignals* signals;
 };
 
-// Pictures that a group is compared with: its fixed views, or those of all steps; then those held out.
+// Pictures that a group is compared with: its fixed views, or those of all steps; then those held
+// out.
 V3DG_HD inline uint64_t num_fitted_pictures(const FitConfig& config) {
     return config.num_views > 0 ? static_cast<uint64_t>(config.num_views)
                                 : static_cast<uint64_t>(config.steps) * config.views_per_step;
@@ -45,14 +46,15 @@ V3DG_HD inline uint64_t num_pictures(const FitConfig& config) {
 }
 V3DG_HD inline uint64_t view_of_picture(const FitConfig& config, uint64_t picture) {
     const uint64_t num_fitted = num_fitted_pictures(config);
-    return picture < num_fitted ? picture : held_out_view(config, static_cast<int>(picture - num_fitted));
+    return picture < num_fitted ? picture
+                                : held_out_view(config, static_cast<int>(picture - num_fitted));
 }
 
 // Writes what each step of Adam takes, on the device.
 void make_steps(const FitConfig& config, FitStep* steps, cudaStream_t stream);
 
-// The groups of a whole level. How blocks take groups follows from this, and not from those whose pictures
-// fit into memory together, so that free memory changes no bits.
+// The groups of a whole level. How blocks take groups follows from this, and not from those whose
+// pictures fit into memory together, so that free memory changes no bits.
 struct FitExtent {
     size_t num_groups;
     uint32_t most;  // gaussians of a group
@@ -60,8 +62,8 @@ struct FitExtent {
 };
 FitExtent extent_of(Span<const FitJob> jobs);
 
-// As v3dg::fit_group, for all groups at once; jobs are best ordered by falling size. Groups done are counted
-// in the signals; when they say cancel, groups under way stay as they were.
+// As v3dg::fit_group, for all groups at once; jobs are best ordered by falling size. Groups done
+// are counted in the signals; when they say cancel, groups under way stay as they were.
 void fit_groups(const FitGroupsInput& in, const FitExtent& level, cudaStream_t stream);
 
 }  // namespace cuda

@@ -1,6 +1,7 @@
 #pragma once
 
-// What both halves need to fit a group: its views, the parameters that Adam moves, the sizes of its steps.
+// What both halves need to fit a group: its views, the parameters that Adam moves, the sizes of its
+// steps.
 
 #include <numeric>
 
@@ -42,16 +43,19 @@ struct FitSize {
 V3DG_HD V3DG_INLINE FitSize size_of_group(const FitConfig& config, const FitGroup& group) {
     // The focal length at which the ball's footprint (select_math.h) has the wanted number of px².
     const double x2 = 1 / (static_cast<double>(config.distance) * config.distance);
-    const double focal =
-        sqrt_of(static_cast<double>(group.count) * config.px2_per_gaussian / solid_angle_of_ball(x2));
+    const double focal = sqrt_of(static_cast<double>(group.count) * config.px2_per_gaussian /
+                                 solid_angle_of_ball(x2));
     const double radius_px = focal * sqrt_of(x2 / (1 - x2));
     return {focal, 4 * ::ceil((radius_px + kMarginPx) / 2)};
 }
 
-// View `index` of a group. Fixed views lie on a lattice on the sphere, turned at random, and those held out,
-// which follow them, on one of their own; fresh ones lie anywhere.
-V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGroup& group, uint64_t index) {
-    const auto uniform = [&](uint64_t counter) { return random_uniform(config.seed, group.stream, counter); };
+// View `index` of a group. Fixed views lie on a lattice on the sphere, turned at random, and those
+// held out, which follow them, on one of their own; fresh ones lie anywhere.
+V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGroup& group,
+                                          uint64_t index) {
+    const auto uniform = [&](uint64_t counter) {
+        return random_uniform(config.seed, group.stream, counter);
+    };
     double rotation[9];
     if (config.num_views > 0) {
         // A Fibonacci lattice of directions, each with a random roll, all turned together.
@@ -61,7 +65,8 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
         const auto place = static_cast<double>(is_held_out ? index - num_fixed : index);
         const double z = 1 - (2 * place + 1) / (is_held_out ? kHeldOutViews : config.num_views),
                      r = sqrt_of(max_of(0.0, 1 - z * z));
-        const double angle = place * kPi * (3 - sqrt_of(5.0)), roll = 2 * kPi * uniform(16 + 3 * index);
+        const double angle = place * kPi * (3 - sqrt_of(5.0)),
+                     roll = 2 * kPi * uniform(16 + 3 * index);
         const double forward[3] = {r * ::cos(angle), r * ::sin(angle), z};
         const double side[3] = {-::sin(angle), ::cos(angle), 0};
         const double up[3] = {forward[1] * side[2] - forward[2] * side[1],
@@ -100,8 +105,9 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
     return view;
 }
 
-// A group looks at fixed views again and again, and at a fresh one each time. Which one at which visit:
-// `stride` is prime to the number of fixed views, so that all are visited, neighbours far apart.
+// A group looks at fixed views again and again, and at a fresh one each time. Which one at which
+// visit: `stride` is prime to the number of fixed views, so that all are visited, neighbours far
+// apart.
 inline uint64_t visiting_stride(const FitConfig& config) {
     const auto num_views = static_cast<uint64_t>(config.num_views);
     uint64_t stride = 29;
@@ -142,7 +148,13 @@ V3DG_HD V3DG_INLINE ModelView<float> view_of_group(const FitConfig& config, cons
 
 V3DG_HD V3DG_INLINE Pinhole<float> camera_of(const FitView& view, float scale) {
     const float size = scale * static_cast<float>(view.size);
-    return {scale * view.focal, scale * view.focal, scale * view.cx, scale * view.cy, size, size, 1e-3f};
+    return {scale * view.focal,
+            scale * view.focal,
+            scale * view.cx,
+            scale * view.cy,
+            size,
+            size,
+            1e-3f};
 }
 
 constexpr float kLeastScale = 1e-5f;    // of the radius: far below what a pixel shows
@@ -155,25 +167,26 @@ V3DG_HD V3DG_INLINE float logit_of_opacity(float opacity) {
     return ::logf(o / (1 - o));
 }
 
-// No mean leaves the box around the ball: from out there it may reach no picture of the group, and would be
-// left where nothing compares it with anything.
+// No mean leaves the box around the ball: from out there it may reach no picture of the group, and
+// would be left where nothing compares it with anything.
 template <class V>
 V3DG_HD V3DG_INLINE V held_in_box(V x) {
     return min_of(all_lanes<V>(1.0f), max_of(all_lanes<V>(-1.0f), x));
 }
 
-// No scale outgrows the ball's radius, which holds those of all that the group stands for, and none vanishes:
-// a value that ran away could not come back.
+// No scale outgrows the ball's radius, which holds those of all that the group stands for, and none
+// vanishes: a value that ran away could not come back.
 template <class V>
 V3DG_HD V3DG_INLINE V scale_of_log(V x) {
     return exp2_in_range(min_of(all_lanes<V>(0.0f), max_of(all_lanes<V>(-20.0f), x * kLog2e)));
 }
-// Nor does an opacity come closer to 0 and 1 than `kLeastOpacity`, where its gradient vanishes. Alpha is cut
-// at 0.999, so no more is needed.
+// Nor does an opacity come closer to 0 and 1 than `kLeastOpacity`, where its gradient vanishes.
+// Alpha is cut at 0.999, so no more is needed.
 template <class V>
 V3DG_HD V3DG_INLINE V opacity_of_logit(V x) {
     constexpr float kMost = 13.287568f;  // log2 of 1 / kLeastOpacity - 1
-    return 1 / (1 + exp2_in_range(min_of(all_lanes<V>(kMost), max_of(all_lanes<V>(-kMost), x * -kLog2e))));
+    return 1 / (1 + exp2_in_range(
+                        min_of(all_lanes<V>(kMost), max_of(all_lanes<V>(-kMost), x * -kLog2e))));
 }
 
 // What one step of Adam takes.
@@ -195,7 +208,8 @@ V3DG_HD inline FitStep fit_step(const FitConfig& config, int index) {
             static_cast<float>(1 / (1 - ::pow(static_cast<double>(config.beta2), index + 1.0)))};
 }
 
-V3DG_HD inline float position_step(const FitConfig& config, const FitGroup& group, const FitStep& step) {
+V3DG_HD inline float position_step(const FitConfig& config, const FitGroup& group,
+                                   const FitStep& step) {
     return config.position_in_world ? step.position / group.radius : step.position;
 }
 

@@ -1,7 +1,7 @@
 #pragma once
 
-// Where the arrays of a fit on the device lie: in the shared memory of blocks, or in their scratch. The host
-// decides that, and knows nothing of CUDA here.
+// Where the arrays of a fit on the device lie: in the shared memory of blocks, or in their scratch.
+// The host decides that, and knows nothing of CUDA here.
 
 #include <cstddef>
 #include <cstdint>
@@ -13,23 +13,26 @@ namespace v3dg {
 namespace cuda {
 
 constexpr int kViewsAtOnce = 2;
-// A half-warp blends a cell. Masks have a bit for each cell of a region; a larger picture takes several
-// regions.
+// A half-warp blends a cell. Masks have a bit for each cell of a region; a larger picture takes
+// several regions.
 constexpr int kCell = 4, kCellPixels = kCell * kCell;
 constexpr int kRegion = 32, kRegionCells = kRegion / kCell;
-static_assert(kRegionCells * kRegionCells == 64 && kCellPixels == 16, "a mask is a word, a cell half a warp");
+static_assert(kRegionCells * kRegionCells == 64 && kCellPixels == 16,
+              "a mask is a word, a cell half a warp");
 using CellMask = unsigned long long;
 constexpr int kAtOnce = 4;  // gaussians that a half-warp looks at together
 constexpr int kSums = 9;    // FalloffSums and colour
 constexpr int kSumStride = 12;
 
-// How a kernel was compiled: for small groups, which keep what is read again and again in shared memory, or
-// for large ones; and how many gaussians of a list a warp takes from pixels to sums at once.
+// How a kernel was compiled: for small groups, which keep what is read again and again in shared
+// memory, or for large ones; and how many gaussians of a list a warp takes from pixels to sums at
+// once.
 template <int kThreadsOfBlock, bool kIsSmall, int kChunkSize>
 struct FitShape {
     static constexpr int kThreads = kThreadsOfBlock, kWarps = kThreads / 32, kChunk = kChunkSize;
     static constexpr bool kSmall = kIsSmall;
-    using Index = std::conditional_t<kSmall, uint16_t, uint32_t>;  // of a gaussian in the views at once
+    using Index =
+        std::conditional_t<kSmall, uint16_t, uint32_t>;  // of a gaussian in the views at once
 };
 
 // Where an array lies: in the block's shared memory, or in the team's part of the scratch.
@@ -51,10 +54,14 @@ struct FitLayout {
     size_t scratch_bytes;  // of a team
 };
 
-// Of a warp: a value of two floats a gaussian and pixel, in rows of 33, and one of four floats a pixel.
-V3DG_HD constexpr size_t fragments_bytes(int chunk) { return (chunk * 33 * 2 + 32 * 4) * sizeof(float); }
+// Of a warp: a value of two floats a gaussian and pixel, in rows of 33, and one of four floats a
+// pixel.
+V3DG_HD constexpr size_t fragments_bytes(int chunk) {
+    return (chunk * 33 * 2 + 32 * 4) * sizeof(float);
+}
 
-// Deals out memory. Only small groups have arrays in shared memory that large ones have in the scratch.
+// Deals out memory. Only small groups have arrays in shared memory that large ones have in the
+// scratch.
 struct Arena {
     bool is_small;
     size_t shared_limit, shared = 0, scratch = 0;  // bytes
@@ -90,7 +97,8 @@ struct FitSizes {
 template <class Shape>
 FitLayout layout_of(const FitSizes& sizes) {
     constexpr bool kSmall = Shape::kSmall;
-    constexpr size_t kFloat = sizeof(float), kIndex = sizeof(typename Shape::Index), kWarps = Shape::kWarps;
+    constexpr size_t kFloat = sizeof(float), kIndex = sizeof(typename Shape::Index),
+                     kWarps = Shape::kWarps;
     constexpr size_t kFragments = kWarps * fragments_bytes(Shape::kChunk);
     FitLayout l{};
     Arena arena{kSmall, sizes.shared_limit};
@@ -113,8 +121,8 @@ FitLayout layout_of(const FitSizes& sizes) {
     const size_t errors_bytes = kViewsAtOnce * (cells + largest) * 2 * kFloat;
     l.errors = kSmall && errors_bytes <= kFragments ? l.fragments : arena.hot(errors_bytes);
     if (!kSmall) l.staged = arena.in_shared(kWarps * 2 * Shape::kChunk * sizeof(Record<float>));
-    // Fragments, and the lists of small groups in front of them, are done with when gradients come, and not
-    // begun when keys are sorted.
+    // Fragments, and the lists of small groups in front of them, are done with when gradients come,
+    // and not begun when keys are sorted.
     const size_t over = kSmall ? l.lists : l.fragments;
     const auto over_fragments = [&](size_t bytes) {
         return num_blocks == 1 && bytes <= l.fragments + kFragments - over ? Place{over, true}
@@ -129,7 +137,8 @@ FitLayout layout_of(const FitSizes& sizes) {
         while (size < sizes.most_gaussians) size *= 2;
         l.sort_keys = over_fragments(size * sizeof(unsigned long long));
     }
-    static_assert(kSumStride * kFloat == sizeof(Record<float>), "sums take the place of the records");
+    static_assert(kSumStride * kFloat == sizeof(Record<float>),
+                  "sums take the place of the records");
     l.sums = {l.records, kSmall};
     l.value = arena.anywhere(values * kFloat);
     l.m = arena.anywhere(values * kFloat);
@@ -138,10 +147,12 @@ FitLayout layout_of(const FitSizes& sizes) {
     // At least what one region can take.
     l.num_far_slots = static_cast<uint32_t>(places * kRegionCells * kRegionCells);
     l.far_slots = arena.in_scratch(l.num_far_slots * kSums * kFloat);
-    if (sizes.has_dssim) l.maps = arena.in_scratch(10 * 3 * kViewsAtOnce * largest * largest * kFloat);
+    if (sizes.has_dssim)
+        l.maps = arena.in_scratch(10 * 3 * kViewsAtOnce * largest * largest * kFloat);
     if (kSmall && arena.shared < sizes.shared_limit) {
         // The rest of the shared memory takes slots.
-        l.num_near_slots = static_cast<uint32_t>((sizes.shared_limit - arena.shared) / (kSums * kFloat));
+        l.num_near_slots =
+            static_cast<uint32_t>((sizes.shared_limit - arena.shared) / (kSums * kFloat));
         l.near_slots = {arena.in_shared(l.num_near_slots * kSums * kFloat), true};
     }
     l.shared_bytes = arena.shared;

@@ -9,9 +9,10 @@ void check_size(const FitConfig& config, const FitGroup& group) {
     if (config.image_size > 0) return;
     const double side = config.supersample * size_of_group(config, group).side;
     if (!(side <= UINT16_MAX))
-        throw std::invalid_argument("px2_per_gaussian, distance, supersample: expected pictures of at most " +
-                                    std::to_string(UINT16_MAX) + " px, got settings that give a group of " +
-                                    std::to_string(group.count) + " gaussians larger ones");
+        throw std::invalid_argument(
+            "px2_per_gaussian, distance, supersample: expected pictures of at most " +
+            std::to_string(UINT16_MAX) + " px, got settings that give a group of " +
+            std::to_string(group.count) + " gaussians larger ones");
 }
 
 FitView fit_view(const FitConfig& config, const FitGroup& group, uint64_t index) {

@@ -1,7 +1,7 @@
 #pragma once
 
-// The parameters of a group and their step. Means, quaternions, log scales and logits are a plane each; SH
-// coefficients follow, gaussian by gaussian.
+// The parameters of a group and their step. Means, quaternions, log scales and logits are a plane
+// each; SH coefficients follow, gaussian by gaussian.
 
 #include <cfloat>
 
@@ -72,8 +72,8 @@ __device__ bool write_parameters(const Fit& fit) {
 
 // Adds the views' gradients to those of the step so far; Adam follows the last.
 template <class Fit>
-__device__ void move_parameters(const Fit& fit, const FitStep& step, int num_views, int turn, bool is_first,
-                                bool is_last) {
+__device__ void move_parameters(const Fit& fit, const FitStep& step, int num_views, int turn,
+                                bool is_first, bool is_last) {
     float *value = fit.at(fit.layout.value), *m = fit.at(fit.layout.m), *v = fit.at(fit.layout.v),
           *sum = fit.at(fit.layout.sum);
     const float position = position_step(fit.in.config, fit.job.group, step);
@@ -97,8 +97,8 @@ __device__ void move_parameters(const Fit& fit, const FitStep& step, int num_vie
             size = step.logit;
         else if (fit.num_sh > 3 && (k - 11 * fit.n) % fit.num_sh >= 3)
             size = step.sh_rest;
-        const float moved =
-            adam_step(value[k], sum_of_views, m[k], v[k], size, beta2, step.correction1, step.correction2);
+        const float moved = adam_step(value[k], sum_of_views, m[k], v[k], size, beta2,
+                                      step.correction1, step.correction2);
         value[k] = k < 3 * fit.n ? held_in_box(moved) : moved;
     }
 }

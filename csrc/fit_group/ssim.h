@@ -14,10 +14,12 @@ struct SsimInput {
     size_t channels;
 };
 
-// Mean of SSIM over all pixels and channels. Gaussian window of 11 x 11, sigma 1.5, population variances, the
-// border mirrored without repeating the edge, constants 0.01² and 0.03²; the same on every run.
+// Mean of SSIM over all pixels and channels. Gaussian window of 11 x 11, sigma 1.5, population
+// variances, the border mirrored without repeating the edge, constants 0.01² and 0.03²; the same on
+// every run.
 //
-// Source: Wang et al., Image quality assessment: from error visibility to structural similarity, 2004.
+// Source: Wang et al., Image quality assessment: from error visibility to structural similarity,
+// 2004.
 template <class T>
 double mean_ssim(const SsimInput<T>& in);
 

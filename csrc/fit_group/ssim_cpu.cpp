@@ -39,7 +39,8 @@ double sum_of_row(const SsimInput<T>& in, size_t row) {
         const size_t column = i / in.channels, channel = i % in.channels;
         SsimSums<double> sums{};
         for (int k = -kSsimRadius; k <= kSsimRadius; ++k)
-            add(sums, ssim_weight<double>(k), columns[mirrored(column, k, in.width) * in.channels + channel]);
+            add(sums, ssim_weight<double>(k),
+                columns[mirrored(column, k, in.width) * in.channels + channel]);
         sum += ssim_of(sums).value;
     }
     return sum;

@@ -2,9 +2,9 @@
 
 // The blocks that fit a group together, and their memory.
 //
-// Small groups keep what is read again and again in shared memory. A block fits one or, where there are few,
-// a pair of blocks, each looking at every other view. Large groups lie in global memory, and are fitted by
-// teams where there are fewer groups than multiprocessors.
+// Small groups keep what is read again and again in shared memory. A block fits one or, where there
+// are few, a pair of blocks, each looking at every other view. Large groups lie in global memory,
+// and are fitted by teams where there are fewer groups than multiprocessors.
 
 #include "base/launch.cuh"
 #include "fit_group/fit_group_cuda.h"
@@ -44,8 +44,8 @@ struct FitShared {
     int cancel;
 };
 
-// A block that fits groups, one after the other: its place among those that fit a group with it, the barriers
-// between them, and where their arrays are.
+// A block that fits groups, one after the other: its place among those that fit a group with it,
+// the barriers between them, and where their arrays are.
 template <class Shape>
 struct FitBlock : Shape {
     using Shape::kChunk, Shape::kSmall, Shape::kThreads, Shape::kWarps;
@@ -59,7 +59,8 @@ struct FitBlock : Shape {
     const unsigned team_rank, team_size;
     const unsigned view_rank, view_stride;  // the views of a batch that the block looks at
     unsigned char* const scratch;
-    unsigned char* const exchange;  // of small groups: gradients by view, where blocks share the views
+    unsigned char* const
+        exchange;  // of small groups: gradients by view, where blocks share the views
     unsigned char* const hot;
     // The group.
     const FitJob& job;
@@ -68,8 +69,8 @@ struct FitBlock : Shape {
     uint32_t num_values = 0;
     int regions_across = 1;
 
-    __device__ FitBlock(const FitGroupsInput& input, const FitLayout& l, FitShared& shared, FitTeam* teams,
-                        unsigned num_blocks, unsigned char* all_scratch)
+    __device__ FitBlock(const FitGroupsInput& input, const FitLayout& l, FitShared& shared,
+                        FitTeam* teams, unsigned num_blocks, unsigned char* all_scratch)
         : in(input),
           layout(l),
           s(shared),
@@ -112,8 +113,9 @@ struct FitBlock : Shape {
             __syncthreads();
     }
 
-    // Barrier of all blocks that fit the group, after which s.cancel is the same in all of them: what
-    // read_cancel() left in `note`, which nobody may overwrite before all have come to another barrier.
+    // Barrier of all blocks that fit the group, after which s.cancel is the same in all of them:
+    // what read_cancel() left in `note`, which nobody may overwrite before all have come to another
+    // barrier.
     __device__ void sync_all(int note) const {
         if (num_blocks() > 1)
             arrive_and_wait(note);
@@ -143,17 +145,20 @@ struct FitBlock : Shape {
         return reinterpret_cast<T*>(hot + offset);
     }
     __device__ float* at(const Place& place) const {
-        return reinterpret_cast<float*>((place.is_shared ? shared_memory() : scratch) + place.offset);
+        return reinterpret_cast<float*>((place.is_shared ? shared_memory() : scratch) +
+                                        place.offset);
     }
-    // Gaussians have places: those of view b begin at b * n_padded. What is blended has ranks. In a small
-    // group ranks are places, and lists follow `order`; in a large one they are positions by depth, in which
-    // the records are sorted.
+    // Gaussians have places: those of view b begin at b * n_padded. What is blended has ranks. In a
+    // small group ranks are places, and lists follow `order`; in a large one they are positions by
+    // depth, in which the records are sorted.
     __device__ Record<float>* records() const { return hot_at<Record<float>>(layout.records); }
     __device__ Record<float>* ranked() const {
         return hot_at<Record<float>>(kSmall ? layout.records : layout.sorted);
     }
     __device__ uint32_t num_places() const { return kViewsAtOnce * n_padded; }
-    __device__ uint32_t nothing() const { return num_places(); }  // the rank of a record that draws nothing
+    __device__ uint32_t nothing() const {
+        return num_places();
+    }  // the rank of a record that draws nothing
     __device__ uint32_t* keys() const { return hot_at<uint32_t>(layout.keys); }
     __device__ Index* order() const { return hot_at<Index>(layout.order); }
     __device__ CellMask* mask(int region) const {
@@ -166,25 +171,28 @@ struct FitBlock : Shape {
     __device__ Index* list(int half) const {
         return hot_at<Index>(layout.lists + (2 * warp() + half) * layout.list_size);
     }
-    // The gradient by the exponent of a gaussian at a pixel, and its weight there, [gaussian][pixel]. Rows
-    // have a spare column, so that lanes that read one pixel each of different gaussians meet different
-    // banks.
+    // The gradient by the exponent of a gaussian at a pixel, and its weight there,
+    // [gaussian][pixel]. Rows have a spare column, so that lanes that read one pixel each of
+    // different gaussians meet different banks.
     __device__ float2* fragments() const {
         return reinterpret_cast<float2*>(shared_memory() + layout.fragments +
                                          threadIdx.x / 32 * fragments_bytes(kChunk));
     }
-    __device__ float4* d_pixels() const { return reinterpret_cast<float4*>(fragments() + kChunk * 33); }
+    __device__ float4* d_pixels() const {
+        return reinterpret_cast<float4*>(fragments() + kChunk * 33);
+    }
     // Of a large group, the records of a chunk, for each half-warp.
     __device__ Record<float>* staged() const {
         return reinterpret_cast<Record<float>*>(shared_memory() + layout.staged) +
                2 * kChunk * (threadIdx.x / 32);
     }
     __device__ int num_regions() const { return regions_across * regions_across; }
-    // Gradient by the values from view b of a batch. Blocks that share views write the gradients of one batch
-    // while others may still read those of the batch before, so there are two `turn`s.
+    // Gradient by the values from view b of a batch. Blocks that share views write the gradients of
+    // one batch while others may still read those of the batch before, so there are two `turn`s.
     __device__ float* gradient(int turn, int b) const {
         if (view_stride == 1) return at(layout.by_view) + static_cast<size_t>(b) * num_values;
-        return reinterpret_cast<float*>(exchange) + static_cast<size_t>(turn * kViewsAtOnce + b) * num_values;
+        return reinterpret_cast<float*>(exchange) +
+               static_cast<size_t>(turn * kViewsAtOnce + b) * num_values;
     }
 };
 

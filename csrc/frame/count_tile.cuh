@@ -1,7 +1,7 @@
 #pragma once
 
-// Warps that count into tiles. Neighbouring gaussians mostly lie in the same tile, so lanes with one tile go
-// there together.
+// Warps that count into tiles. Neighbouring gaussians mostly lie in the same tile, so lanes with
+// one tile go there together.
 
 #include "base/launch.cuh"
 #include "frame/tile_list.h"
@@ -22,8 +22,8 @@ struct WaitingTiles {
     unsigned count;
 };
 
-// Calls add(k, at) for each tile k of a lane's beyond the first, with where it is to wait behind the
-// `num_waiting`, and counts it to these; for a whole warp.
+// Calls add(k, at) for each tile k of a lane's beyond the first, with where it is to wait behind
+// the `num_waiting`, and counts it to these; for a whole warp.
 template <class Add>
 __device__ void let_wait(unsigned num_tiles, unsigned& num_waiting, const Add& add) {
     const unsigned lane = threadIdx.x % 32;
@@ -42,9 +42,11 @@ __device__ void count_tiles(uint32_t* count, unsigned num_tiles, const TileOf& t
     const unsigned lane = threadIdx.x % 32;
     count_tile(count, num_tiles > 0 ? tile_of(0) : kNoTile);
     unsigned num_waiting = waiting.count;
-    let_wait(num_tiles, num_waiting, [&](unsigned k, unsigned at) { waiting.tile[at] = tile_of(k); });
+    let_wait(num_tiles, num_waiting,
+             [&](unsigned k, unsigned at) { waiting.tile[at] = tile_of(k); });
     __syncwarp();
-    for (; num_waiting >= 32; num_waiting -= 32) count_tile(count, waiting.tile[num_waiting - 32 + lane]);
+    for (; num_waiting >= 32; num_waiting -= 32)
+        count_tile(count, waiting.tile[num_waiting - 32 + lane]);
     if (lane == 0) waiting.count = num_waiting;
     __syncwarp();
 }

@@ -7,16 +7,16 @@
 namespace v3dg {
 namespace cuda {
 
-// What a budget came to: the tolerance that was used, or that the coarsest cut, of `least` gaussians, exceeds
-// it and nothing was selected.
+// What a budget came to: the tolerance that was used, or that the coarsest cut, of `least`
+// gaussians, exceeds it and nothing was selected.
 struct CutChoice {
     float tolerance_px2;
     bool exceeds_budget;
     unsigned long long least;
 };
 
-// Counted on the device, from 0. What exceeds a capacity is counted but not stored, and nothing is then
-// drawn.
+// Counted on the device, from 0. What exceeds a capacity is counted but not stored, and nothing is
+// then drawn.
 struct FrameCounters {
     unsigned long long items, gaussians, in_frustum, records, entries;
     unsigned long long large;   // records over many tiles, or parts of them, in whole batches

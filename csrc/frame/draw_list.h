@@ -12,7 +12,8 @@ namespace v3dg {
 
 struct Codes;
 
-// How gaussians are drawn, apart from where. Neighbours in memory of the same appearance are drawn together.
+// How gaussians are drawn, apart from where. Neighbours in memory of the same appearance are drawn
+// together.
 template <class T>
 struct Appearance {
     T filter_px2;      // added to the variances on screen
@@ -50,10 +51,10 @@ struct alignas(16) Placement {
 };
 
 // Neighbouring gaussians of a placed model, or of a model that several placements share: those at
-// `placement` + k for each bit k of `sharers`, where it is not 0. They are to have one picture, and to make
-// kItemSize records at most: there is room for those from `record` on, and they stand at its beginning, by
-// gaussian and then by placement. The first gaussian belongs to `cluster` of the model, or to one of the
-// kItemClusters - 1 after that.
+// `placement` + k for each bit k of `sharers`, where it is not 0. They are to have one picture, and
+// to make kItemSize records at most: there is room for those from `record` on, and they stand at
+// its beginning, by gaussian and then by placement. The first gaussian belongs to `cluster` of the
+// model, or to one of the kItemClusters - 1 after that.
 struct DrawItem {
     uint32_t placement, first, count, record;
     Appearance<float> appearance;
@@ -61,17 +62,19 @@ struct DrawItem {
     float weight;  // multiplies opacities: 1, or less of what fades
 };
 
-// Where the items of a frame are written, in their order. Counts what there is, stores what there is room
-// for: counters->items, and in counters->gaussians the end of the last item's records. Items that would end
-// past record_capacity need not be stored.
+// Where the items of a frame are written, in their order. Counts what there is, stores what there
+// is room for: counters->items, and in counters->gaussians the end of the last item's records.
+// Items that would end past record_capacity need not be stored.
 struct ItemList {
     DrawItem* items;
     FrameCounters* counters;
     unsigned long long item_capacity, record_capacity;
     unsigned long long* zeros;  // as many as the frame was asked for, for whoever writes the items
 
-    V3DG_HD bool has_room_for(unsigned long long num_items, unsigned long long num_gaussians) const {
-        return Capacity{item_capacity, record_capacity, 0, 0, 0}.holds_items(num_items, num_gaussians);
+    V3DG_HD bool has_room_for(unsigned long long num_items,
+                              unsigned long long num_gaussians) const {
+        return Capacity{item_capacity, record_capacity, 0, 0, 0}.holds_items(num_items,
+                                                                             num_gaussians);
     }
     // For all that its writer has counted.
     V3DG_HD bool is_complete() const { return has_room_for(counters->items, counters->gaussians); }

@@ -12,15 +12,16 @@ namespace v3dg {
 constexpr int kBlockSize = 4;  // px
 constexpr int kTileBlocks = kTileSize / kBlockSize;
 
-// The blocks of a tile that a box in it meets, of 6 bits each: its first column and, higher, its last, and
-// the same of rows. A block has a bit, row by row.
+// The blocks of a tile that a box in it meets, of 6 bits each: its first column and, higher, its
+// last, and the same of rows. A block has a bit, row by row.
 struct BlocksOfBox {
     uint64_t columns[64] = {}, rows[64] = {};
     constexpr BlocksOfBox() {
         for (int first = 0; first < kTileBlocks; ++first)
             for (int last = first; last < kTileBlocks; ++last)
                 for (int b = 0; b < kTileBlocks * kTileBlocks; ++b) {
-                    const int column = b % kTileBlocks, row = b / kTileBlocks, at = last << 3 | first;
+                    const int column = b % kTileBlocks, row = b / kTileBlocks,
+                              at = last << 3 | first;
                     if (first <= column && column <= last) columns[at] |= uint64_t(1) << b;
                     if (first <= row && row <= last) rows[at] |= uint64_t(1) << b;
                 }
@@ -35,9 +36,9 @@ V3DG_INLINE uint32_t depth_bits_of(float depth) {
     return bits;
 }
 
-// What an entry holds, from its highest bits on: how far the bits of the record's depth are above the least,
-// its place among the records, and where in the tile its box is. Where depths and places are too many for a
-// word, the lowest bits of depths are dropped.
+// What an entry holds, from its highest bits on: how far the bits of the record's depth are above
+// the least, its place among the records, and where in the tile its box is. Where depths and places
+// are too many for a word, the lowest bits of depths are dropped.
 struct EntryFormat {
     static constexpr int kBoxBits = 12;
     int depth_shift = kBoxBits, dropped_bits = 0;
@@ -48,11 +49,13 @@ struct EntryFormat {
         EntryFormat f;
         f.least_depth = least;
         while (num_records << kBoxBits > uint64_t(1) << f.depth_shift) ++f.depth_shift;
-        while (uint64_t(most - least) >> f.dropped_bits >> (64 - f.depth_shift) != 0) ++f.dropped_bits;
+        while (uint64_t(most - least) >> f.dropped_bits >> (64 - f.depth_shift) != 0)
+            ++f.dropped_bits;
         return f;
     }
     V3DG_INLINE uint64_t entry(uint32_t depth_bits, uint64_t record, uint64_t box) const {
-        return uint64_t((depth_bits - least_depth) >> dropped_bits) << depth_shift | record << kBoxBits | box;
+        return uint64_t((depth_bits - least_depth) >> dropped_bits) << depth_shift |
+               record << kBoxBits | box;
     }
     V3DG_INLINE uint64_t record_of(uint64_t entry) const {
         return (entry & ((uint64_t(1) << depth_shift) - 1)) >> kBoxBits;

@@ -1,14 +1,16 @@
 #pragma once
 
-// Where the gradients of a CUDA frame's records are summed: one place for each tile that a record lies in.
+// Where the gradients of a CUDA frame's records are summed: one place for each tile that a record
+// lies in.
 
 #include "frame/tile_list.h"
 
 namespace v3dg {
 namespace cuda {
 
-// A record's gradient is the sum of its slots, one for each tile of its pixel box, row by row. A tile writes
-// the slots of the records that it blended and marks them as touched; the others mean nothing.
+// A record's gradient is the sum of its slots, one for each tile of its pixel box, row by row. A
+// tile writes the slots of the records that it blended and marks them as touched; the others mean
+// nothing.
 struct GradientSlots {
     const uint32_t* first;  // of each record
     RecordGradient<float>* slot;

@@ -18,11 +18,12 @@ struct Window {
     V3DG_INLINE bool contains(int x, int y) const { return x0 <= x && x < x1 && y0 <= y && y < y1; }
 };
 
-// A pixel stops where hardly any light gets through, and what is behind is left out. As gsplat's do: before a
-// gaussian that would leave kMinTransmittance or less, which is left out too.
+// A pixel stops where hardly any light gets through, and what is behind is left out. As gsplat's
+// do: before a gaussian that would leave kMinTransmittance or less, which is left out too.
 struct StopsBefore {};
-// Behind the gaussian that leaves this much or less. That light goes to what was blended, in proportion: so
-// no channel is off by more than this much of the difference between what was blended and what is behind it.
+// Behind the gaussian that leaves this much or less. That light goes to what was blended, in
+// proportion: so no channel is off by more than this much of the difference between what was
+// blended and what is behind it.
 template <class T>
 struct StopsBehind {
     T transmittance;
@@ -45,7 +46,7 @@ struct Picture {
     T background[3];
     T* color;  // premultiplied, the background composed last
     T* alpha;
-    T* depth;            // expected depth, sum of weight * depth over alpha, 0 where alpha is 0; may be null
+    T* depth;  // expected depth, sum of weight * depth over alpha, 0 where alpha is 0; may be null
     T* count = nullptr;  // gaussians that were blended, in place of depth; may be null
     float min_transmittance = kStopsBefore;
 };
@@ -62,8 +63,8 @@ namespace cuda {
 
 // A block blends one tile, a warp a part of four rows of it.
 constexpr int kFrameTileWidth = 32, kFrameTileHeight = 16;
-// Where a picture is, as Picture<float> has it. It may be asked for after the first stages of a frame are
-// enqueued.
+// Where a picture is, as Picture<float> has it. It may be asked for after the first stages of a
+// frame are enqueued.
 struct PicturePlanes {
     float *color, *alpha, *depth;  // all may be null, or depth alone
 };
@@ -78,7 +79,8 @@ struct FrameImage {
     PicturePlanes planes;
 };
 
-// The pictures of a scene's frame: one for each eye. Tiles of the second follow on those of the first.
+// The pictures of a scene's frame: one for each eye. Tiles of the second follow on those of the
+// first.
 struct EyeImages {
     FrameImage image[2];
     uint32_t count;

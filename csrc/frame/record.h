@@ -14,7 +14,8 @@ struct Record {
     T u, v, l11, l12, l22, log2_opacity;
     T color[3];
     T depth;
-    // First and last pixel whose centre the gaussian can reach, cut to the image or the window that is drawn.
+    // First and last pixel whose centre the gaussian can reach, cut to the image or the window that
+    // is drawn.
     uint16_t x0, x1, y0, y1;
 };
 
@@ -40,8 +41,8 @@ V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, const PixelBox<int>& b
     r.y1 = static_cast<uint16_t>(box.y1);
 }
 
-// Sum over pixels of the size of the gradient by a record's centre, along both axes: how much pixels pull at
-// it, also where they pull apart.
+// Sum over pixels of the size of the gradient by a record's centre, along both axes: how much
+// pixels pull at it, also where they pull apart.
 template <class V>
 struct CenterSize {
     V u, v;

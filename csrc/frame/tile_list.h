@@ -1,7 +1,7 @@
 #pragma once
 
-// Which tiles a record may touch, and the lists that tiles are blended from. Tiles are numbered through a
-// batch of pictures, row by row.
+// Which tiles a record may touch, and the lists that tiles are blended from. Tiles are numbered
+// through a batch of pictures, row by row.
 
 #include <cstdint>
 #include <cstring>
@@ -13,17 +13,19 @@
 namespace v3dg {
 namespace cuda {
 
-// A gaussian in the list of a tile, in one word: 54 bits of depth and record, and 10 of where in the tile it
-// is. A record has 26 bits and depth 28, which make it exact; or up to two more and fewer, in frames with
-// room for more records. Lists are blended by ascending depth, ties by record; where depths are not exact,
-// entries of one depth by those of their records, unless a tile has more than a thousand that share 26 bits.
+// A gaussian in the list of a tile, in one word: 54 bits of depth and record, and 10 of where in
+// the tile it is. A record has 26 bits and depth 28, which make it exact; or up to two more and
+// fewer, in frames with room for more records. Lists are blended by ascending depth, ties by
+// record; where depths are not exact, entries of one depth by those of their records, unless a tile
+// has more than a thousand that share 26 bits.
 struct TileEntry {
     unsigned long long key;
 };
 constexpr int kLeastRecordBits = 26, kMostRecordBits = 28, kEntryBoxBits = 10;
 constexpr unsigned long long kMostFrameRecords = 1ull << kMostRecordBits;
-constexpr int kEntryBlockSize = 4;                    // px; the box counts in blocks
-constexpr uint32_t kLastEntryDepth = (1u << 28) - 1;  // 32 octaves behind near, and whatever is farther
+constexpr int kEntryBlockSize = 4;  // px; the box counts in blocks
+constexpr uint32_t kLastEntryDepth =
+    (1u << 28) - 1;  // 32 octaves behind near, and whatever is farther
 
 constexpr uint32_t kExactDepths = ~0u << 4;
 
@@ -34,8 +36,8 @@ inline uint32_t depth_mask_of_entries(unsigned long long most_records) {
     return mask;
 }
 
-// Depth as entries are made of it, in steps of a float's last bit, or of up to four of them where records
-// need more bits; it is at least the camera's near depth.
+// Depth as entries are made of it, in steps of a float's last bit, or of up to four of them where
+// records need more bits; it is at least the camera's near depth.
 V3DG_HD inline uint32_t entry_depth(float depth, float near_depth, uint32_t depth_mask) {
     uint32_t depth_bits, near_bits;  // of positive floats, so they order as they do
     std::memcpy(&depth_bits, &depth, sizeof depth_bits);
@@ -46,7 +48,8 @@ V3DG_HD inline uint32_t entry_depth(float depth, float near_depth, uint32_t dept
 constexpr uint32_t kTileBlockColumns = kFrameTileWidth / kEntryBlockSize;
 constexpr uint32_t kTileBlockRows = kFrameTileHeight / kEntryBlockSize;
 
-// First and last block that a record's pixels lie in, counted from the corner of the picture or of a tile.
+// First and last block that a record's pixels lie in, counted from the corner of the picture or of
+// a tile.
 struct EntryBox {
     uint32_t x0, x1, y0, y1;
 };
@@ -59,8 +62,8 @@ V3DG_HD inline EntryBox entry_box(const Box& pixels) {
 }
 
 // In the tile of this column and row, counted from where the box is, which the box meets.
-V3DG_HD inline TileEntry tile_entry(uint32_t depth, uint32_t record, const EntryBox& box, uint32_t column,
-                                    uint32_t row) {
+V3DG_HD inline TileEntry tile_entry(uint32_t depth, uint32_t record, const EntryBox& box,
+                                    uint32_t column, uint32_t row) {
     const int left = static_cast<int>(kTileBlockColumns * column);
     const int top = static_cast<int>(kTileBlockRows * row);
     const uint32_t x0 = max_of(static_cast<int>(box.x0) - left, 0);
@@ -69,7 +72,8 @@ V3DG_HD inline TileEntry tile_entry(uint32_t depth, uint32_t record, const Entry
     const uint32_t y1 = min_of(box.y1 - top, kTileBlockRows - 1);
     const unsigned long long depth_and_record =
         static_cast<unsigned long long>(depth) << kLeastRecordBits | record;
-    return {depth_and_record << kEntryBoxBits | ((3 - (y1 - y0)) << 8 | (7 - (x1 - x0)) << 5 | y0 << 3 | x0)};
+    return {depth_and_record << kEntryBoxBits |
+            ((3 - (y1 - y0)) << 8 | (7 - (x1 - x0)) << 5 | y0 << 3 | x0)};
 }
 
 // The first 26 bits of depth, and the 28 that follow.
@@ -88,15 +92,15 @@ V3DG_HD inline uint32_t blocks_of(TileEntry e) {
     return (0xffu >> (fewer & 7)) * (0x01010101u >> (fewer & 24)) << (box & 31);
 }
 
-// A tile, or one of its parts, in the order in which they are blended; the parts of a tile stand side by
-// side, and the first of them says how the tile's list was spread if that is long.
+// A tile, or one of its parts, in the order in which they are blended; the parts of a tile stand
+// side by side, and the first of them says how the tile's list was spread if that is long.
 struct TilePlan {
     uint32_t tile, image;  // kNoTile where there is none
     uint32_t lowest;       // of the depths that the buckets were made for
     uint16_t last_bucket, shift;
     uint8_t part, log2_parts;
-    bool in_windows;                   // is the list, so that parts of the tile can be blended side by side
-    bool in_scratch;                   // is the list that was spread, and not in its own place
+    bool in_windows;  // is the list, so that parts of the tile can be blended side by side
+    bool in_scratch;  // is the list that was spread, and not in its own place
     unsigned long long first_scratch;  // where the list has room in the scratch, if it needs any
 };
 constexpr uint32_t kNoTile = ~0u;
@@ -112,7 +116,9 @@ V3DG_HD inline uint32_t tile_columns_of(const RecordBox& r) {
 V3DG_HD inline uint32_t tile_rows_of(const RecordBox& r) {
     return r.y1 / kFrameTileHeight - r.y0 / kFrameTileHeight + 1u;
 }
-V3DG_HD inline uint32_t num_tiles_of(const RecordBox& r) { return tile_columns_of(r) * tile_rows_of(r); }
+V3DG_HD inline uint32_t num_tiles_of(const RecordBox& r) {
+    return tile_columns_of(r) * tile_rows_of(r);
+}
 
 // The records of a frame in three planes: a Record in the order of its fields.
 struct RecordPlanes {
@@ -122,10 +128,13 @@ struct RecordPlanes {
     uint32_t depth_mask;  // of the upper half of entries
 
     V3DG_HD uint32_t record_of(TileEntry e) const {
-        return static_cast<uint32_t>(e.key >> kEntryBoxBits) & ~(depth_mask << (32 - kEntryBoxBits));
+        return static_cast<uint32_t>(e.key >> kEntryBoxBits) &
+               ~(depth_mask << (32 - kEntryBoxBits));
     }
     // Orders as depth does, and whether it is alike only where depth is.
-    V3DG_HD uint32_t depth_of(TileEntry e) const { return static_cast<uint32_t>(e.key >> 32) & depth_mask; }
+    V3DG_HD uint32_t depth_of(TileEntry e) const {
+        return static_cast<uint32_t>(e.key >> 32) & depth_mask;
+    }
     V3DG_HD bool is_exact(TileEntry e) const {
         return depth_mask == kExactDepths && depth_of(e) != kExactDepths;  // the last one is not
     }
@@ -136,7 +145,7 @@ struct FrameLists {
     const FrameImage* images;
     const uint32_t* image_of_tile;  // [num_tiles]
     uint32_t num_tiles;
-    RecordPlanes records;                  // in the order of items and gaussians, with gaps between items
+    RecordPlanes records;  // in the order of items and gaussians, with gaps between items
     const unsigned long long* tile_first;  // [num_tiles + 1] into entries
     TileEntry *entries, *scratch;          // each tile's in any order
     FrameCounters* counters;
@@ -160,41 +169,51 @@ constexpr unsigned kFewTiles = 4;
 struct TileBox {
     uint32_t left, top, columns, count;
 
-    // How far tile k of at most kFewTiles is from the first: with more than two columns there is one row.
-    V3DG_HD uint32_t columns_to(uint32_t k) const { return columns > 2 ? k : columns == 2 ? k & 1 : 0; }
-    V3DG_HD uint32_t rows_to(uint32_t k) const { return columns > 2 ? 0 : columns == 2 ? k >> 1 : k; }
+    // How far tile k of at most kFewTiles is from the first: with more than two columns there is
+    // one row.
+    V3DG_HD uint32_t columns_to(uint32_t k) const {
+        return columns > 2 ? k : columns == 2 ? k & 1 : 0;
+    }
+    V3DG_HD uint32_t rows_to(uint32_t k) const {
+        return columns > 2 ? 0 : columns == 2 ? k >> 1 : k;
+    }
 };
 
 V3DG_HD inline TileBox tile_box(const EntryBox& b) {
     const uint32_t left = b.x0 / kTileBlockColumns, top = b.y0 / kTileBlockRows;
-    const uint32_t columns = b.x1 / kTileBlockColumns - left + 1, rows = b.y1 / kTileBlockRows - top + 1;
+    const uint32_t columns = b.x1 / kTileBlockColumns - left + 1,
+                   rows = b.y1 / kTileBlockRows - top + 1;
     return {left, top, columns, columns * rows};
 }
 
-// A record over few tiles as the scattering kernel reads it: its depth, the number of its first tile in the
-// picture, and its blocks, counted from that tile: the first, and how many follow.
+// A record over few tiles as the scattering kernel reads it: its depth, the number of its first
+// tile in the picture, and its blocks, counted from that tile: the first, and how many follow.
 using FewTiles = unsigned long long;
 constexpr FewTiles kManyTiles = ~FewTiles(0);  // which has five columns
 constexpr int kFewBoxBits = 14, kFewTileBits = 22;
-constexpr uint32_t kMostFewTile = (1u << kFewTileBits) - 1;  // what lies in later tiles counts as large
+constexpr uint32_t kMostFewTile =
+    (1u << kFewTileBits) - 1;  // what lies in later tiles counts as large
 
 V3DG_HD inline FewTiles few_tiles(uint32_t depth, uint32_t tile, const EntryBox& b) {
-    const uint32_t box =
-        b.x0 % kTileBlockColumns << 11 | b.y0 % kTileBlockRows << 9 | (b.x1 - b.x0) << 4 | (b.y1 - b.y0);
+    const uint32_t box = b.x0 % kTileBlockColumns << 11 | b.y0 % kTileBlockRows << 9 |
+                         (b.x1 - b.x0) << 4 | (b.y1 - b.y0);
     return FewTiles(depth) << (kFewBoxBits + kFewTileBits) | FewTiles(tile) << kFewBoxBits | box;
 }
 V3DG_HD inline uint32_t depth_of(FewTiles f) {
     return static_cast<uint32_t>(f >> (kFewBoxBits + kFewTileBits));
 }
-V3DG_HD inline uint32_t tile_of(FewTiles f) { return static_cast<uint32_t>(f >> kFewBoxBits) & kMostFewTile; }
+V3DG_HD inline uint32_t tile_of(FewTiles f) {
+    return static_cast<uint32_t>(f >> kFewBoxBits) & kMostFewTile;
+}
 V3DG_HD inline EntryBox box_of(FewTiles f) {
     const uint32_t box = static_cast<uint32_t>(f), x0 = box >> 11 & 7, y0 = box >> 9 & 3;
     return {x0, x0 + (box >> 4 & 31), y0, y0 + (box & 15)};
 }
 
-// A record over more than kFewTiles tiles, or some of its rows of tiles and its pixels in those. They come in
-// batches of kLargeAtOnce of one item, so of neighbours in one picture; what a batch lacks is filled up at
-// its end. A batch has no more than kMostLargeTiles tiles, or a row of them of each record.
+// A record over more than kFewTiles tiles, or some of its rows of tiles and its pixels in those.
+// They come in batches of kLargeAtOnce of one item, so of neighbours in one picture; what a batch
+// lacks is filled up at its end. A batch has no more than kMostLargeTiles tiles, or a row of them
+// of each record.
 struct alignas(16) LargeRecord {
     uint32_t record, image;  // kNoRecord where there is none
     RecordBox box;

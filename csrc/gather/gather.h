@@ -23,12 +23,14 @@ struct GatherInput {
     Span<const float> weight;       // [S] that opacities are multiplied by; none where all are 1
 };
 
-// Writes the gaussians of all clusters in the world, in order. Spherical harmonics are rotated into the
-// world's frame, which is exact; the coefficients that a bundle lacks are 0. Computed in double precision;
-// both halves give the same bits.
+// Writes the gaussians of all clusters in the world, in order. Spherical harmonics are rotated into
+// the world's frame, which is exact; the coefficients that a bundle lacks are 0. Computed in double
+// precision; both halves give the same bits.
 namespace cpu { void gather(const GatherInput& in, const GaussianRows<float>& out); }
-// Rows of bundles and `out` are on the device, all else on the host. Work is queued on the stream. Throws
-// std::runtime_error when CUDA reports an error.
-namespace cuda { void gather(const GatherInput& in, const GaussianRows<float>& out, Stream stream); }
+// Rows of bundles and `out` are on the device, all else on the host. Work is queued on the stream.
+// Throws std::runtime_error when CUDA reports an error.
+namespace cuda {
+void gather(const GatherInput& in, const GaussianRows<float>& out, Stream stream);
+}
 
 }  // namespace v3dg

@@ -10,7 +10,8 @@ RotationTables::RotationTables(const GatherInput& in, int sh_degree)
     : rotation(9 * in.bundle.size), bands(sh_degree > 0 ? kBandsSize * in.bundle.size : 0) {
     parallel_for(in.bundle.size, 256, [&](size_t i) {
         rotation_of_quat(in.quaternion.data + 4 * i, rotation.data() + 9 * i);
-        if (sh_degree > 0) rotate_sh_bands(rotation.data() + 9 * i, sh_degree, bands.data() + kBandsSize * i);
+        if (sh_degree > 0)
+            rotate_sh_bands(rotation.data() + 9 * i, sh_degree, bands.data() + kBandsSize * i);
     });
 }
 

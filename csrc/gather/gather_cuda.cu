@@ -1,5 +1,5 @@
-// A thread writes the shape of a gaussian, or one of its SH bases. Blocks take neighbours, so they look up
-// few clusters.
+// A thread writes the shape of a gaussian, or one of its SH bases. Blocks take neighbours, so they
+// look up few clusters.
 
 #include "base/launch.cuh"
 #include "gather/gather.h"
@@ -13,7 +13,8 @@ namespace {
 constexpr unsigned kBlockSize = 256;
 
 // The last cluster that begins at or before `row`, from low to high; so an empty one never.
-__device__ size_t cluster_at(const Span<const int64_t>& offset, size_t low, size_t high, int64_t row) {
+__device__ size_t cluster_at(const Span<const int64_t>& offset, size_t low, size_t high,
+                             int64_t row) {
     while (low < high) {
         const size_t middle = low + (high - low + 1) / 2;
         if (offset[middle] <= row)
@@ -32,8 +33,8 @@ __global__ void __launch_bounds__(kBlockSize)
     const int64_t last = (first + kBlockSize < num ? first + kBlockSize : num) - 1;
     __shared__ size_t cluster[2];
     if (threadIdx.x < 2)
-        cluster[threadIdx.x] =
-            cluster_at(in.offset, 0, in.instance.size - 1, (threadIdx.x == 0 ? first : last) / num_items);
+        cluster[threadIdx.x] = cluster_at(in.offset, 0, in.instance.size - 1,
+                                          (threadIdx.x == 0 ? first : last) / num_items);
     __syncthreads();
     const int64_t item = first + threadIdx.x;
     if (item > last) return;
@@ -48,7 +49,9 @@ __global__ void __launch_bounds__(kBlockSize)
 template <class T>
 class Copy {
   public:
-    Copy(Span<const T>& span, cudaStream_t stream) : buffer_(span, stream) { span.data = buffer_.data(); }
+    Copy(Span<const T>& span, cudaStream_t stream) : buffer_(span, stream) {
+        span.data = buffer_.data();
+    }
 
   private:
     DeviceBuffer<T> buffer_;
@@ -69,8 +72,8 @@ void gather(const GatherInput& host, const GaussianRows<float>& out, Stream stre
     const Rotations rotations{rotation.data(), bands.data()};
     const Copy<float> weight(in.weight, stream);
     const Copy<int64_t> first_row(in.first_row, stream), offset(in.offset, stream);
-    launch("gather", gather_kernel, blocks_for(num_items, kBlockSize), kBlockSize, 0, stream, in, rotations,
-           out, num_sh_bases(out.sh_degree));
+    launch("gather", gather_kernel, blocks_for(num_items, kBlockSize), kBlockSize, 0, stream, in,
+           rotations, out, num_sh_bases(out.sh_degree));
 }
 
 }  // namespace cuda

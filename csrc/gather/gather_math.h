@@ -23,13 +23,14 @@ struct RotationTables {
 };
 
 // Writes all but the SH coefficients of the gaussian `within` cluster s.
-V3DG_HD inline void gather_shape(const GatherInput& in, const Rotations& rotations, size_t s, int64_t within,
-                                 const GaussianRows<float>& out) {
+V3DG_HD inline void gather_shape(const GatherInput& in, const Rotations& rotations, size_t s,
+                                 int64_t within, const GaussianRows<float>& out) {
     const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;
     const size_t i = in.instance[s];
     const GaussianRows<const float>& rows = in.bundles[in.bundle[i]];
     const double *r = rotations.rotation + 9 * i, scale = in.scale[i];
-    const double x = rows.means[3 * from], y = rows.means[3 * from + 1], z = rows.means[3 * from + 2];
+    const double x = rows.means[3 * from], y = rows.means[3 * from + 1],
+                 z = rows.means[3 * from + 2];
     for (int k = 0; k < 3; ++k) {
         const double rotated = r[3 * k] * x + r[3 * k + 1] * y + r[3 * k + 2] * z;
         out.means[3 * to + k] = static_cast<float>(scale * rotated + in.position[3 * i + k]);
@@ -50,9 +51,10 @@ V3DG_HD inline void gather_shape(const GatherInput& in, const Rotations& rotatio
     out.opacities[to] = in.weight.size == 0 ? opacity : opacity * in.weight[s];
 }
 
-// Writes the three coefficients of one SH basis of that gaussian, rotated into the world with its band.
-V3DG_HD inline void gather_sh(const GatherInput& in, const Rotations& rotations, size_t s, int64_t within,
-                              int basis, const GaussianRows<float>& out) {
+// Writes the three coefficients of one SH basis of that gaussian, rotated into the world with its
+// band.
+V3DG_HD inline void gather_sh(const GatherInput& in, const Rotations& rotations, size_t s,
+                              int64_t within, int basis, const GaussianRows<float>& out) {
     const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;
     const size_t i = in.instance[s];
     const GaussianRows<const float>& rows = in.bundles[in.bundle[i]];
@@ -62,8 +64,14 @@ V3DG_HD inline void gather_sh(const GatherInput& in, const Rotations& rotations,
         for (int c = 0; c < 3; ++c) result[c] = basis == 0 ? coefficients[c] : 0.0f;
         return;
     }
-    const int degree = basis < 4 ? 1 : basis < 9 ? 2 : 3, first = degree * degree, size = 2 * degree + 1;
-    const double* band = rotations.bands + kBandsSize * i + (degree == 1 ? 0 : degree == 2 ? 9 : 9 + 25);
+    const int degree = basis < 4   ? 1
+                       : basis < 9 ? 2
+                                   : 3,
+              first = degree * degree, size = 2 * degree + 1;
+    const double* band = rotations.bands + kBandsSize * i +
+                         (degree == 1   ? 0
+                          : degree == 2 ? 9
+                                        : 9 + 25);
     for (int c = 0; c < 3; ++c) {
         double sum = 0;
         for (int k = 0; k < size; ++k)

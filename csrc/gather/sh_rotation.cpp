@@ -1,5 +1,5 @@
-// A band is closed under rotation, so its matrix follows from the bases at enough directions: the colour
-// towards d in the new frame is the old one's towards the direction rotated back.
+// A band is closed under rotation, so its matrix follows from the bases at enough directions: the
+// colour towards d in the new frame is the old one's towards the direction rotated back.
 
 #include "gather/sh_rotation.h"
 
@@ -23,11 +23,13 @@ struct Direction {
 // Points on a spiral from pole to pole.
 Direction direction_of(int i) {
     const double z = 1 - (2 * i + 1) / static_cast<double>(kNumDirections);
-    const double turn = i * 3.14159265358979323846 * (3 - std::sqrt(5.0)), radius = std::sqrt(1 - z * z);
+    const double turn = i * 3.14159265358979323846 * (3 - std::sqrt(5.0)),
+                 radius = std::sqrt(1 - z * z);
     return {radius * std::cos(turn), radius * std::sin(turn), z};
 }
 
-// Least squares: row r of the solution for right-hand side b is the sum over directions of weight[r] times b.
+// Least squares: row r of the solution for right-hand side b is the sum over directions of
+// weight[r] times b.
 class Band {
   public:
     explicit Band(int degree) : degree_(degree), size_(2 * degree + 1) {
@@ -50,7 +52,8 @@ class Band {
             for (int other = 0; other < size_; ++other) {
                 const double factor = system[other][r];
                 if (other == r) continue;
-                for (int c = 0; c < size_ + kNumDirections; ++c) system[other][c] -= factor * system[r][c];
+                for (int c = 0; c < size_ + kNumDirections; ++c)
+                    system[other][c] -= factor * system[r][c];
             }
         }
         for (int r = 0; r < size_; ++r)
@@ -67,7 +70,8 @@ class Band {
                 back[a] = rotation[a] * d.x + rotation[3 + a] * d.y + rotation[6 + a] * d.z;
             sh_bases(degree_, back[0], back[1], back[2], basis);
             for (int r = 0; r < size_; ++r)
-                for (int c = 0; c < size_; ++c) matrix[size_ * r + c] += weight_[r][i] * basis[first + c];
+                for (int c = 0; c < size_; ++c)
+                    matrix[size_ * r + c] += weight_[r][i] * basis[first + c];
         }
     }
 
@@ -81,7 +85,8 @@ class Band {
 void rotate_sh_bands(const double rotation[9], int degree, double bands[kBandsSize]) {
     static const std::array<Band, 3> all{Band(1), Band(2), Band(3)};
     static constexpr int kFirst[3] = {0, 9, 9 + 25};
-    for (int band = 1; band <= degree; ++band) all[band - 1].rotate(rotation, bands + kFirst[band - 1]);
+    for (int band = 1; band <= degree; ++band)
+        all[band - 1].rotate(rotation, bands + kFirst[band - 1]);
 }
 
 }  // namespace v3dg

@@ -46,8 +46,9 @@ void blake2b(Span<const Span<const uint8_t>> messages, PageHash* digests) {
 
 void HashOfPieces::add_until(size_t end) {
     const size_t first = digests_.size();
-    const size_t last =
-        end < message_.size ? end / kHashPieceBytes : (message_.size + kHashPieceBytes - 1) / kHashPieceBytes;
+    const size_t last = end < message_.size
+                            ? end / kHashPieceBytes
+                            : (message_.size + kHashPieceBytes - 1) / kHashPieceBytes;
     std::vector<Span<const uint8_t>> pieces;
     for (size_t i = first; i < last; ++i) {
         const size_t begin = i * kHashPieceBytes;

@@ -12,8 +12,8 @@ namespace v3dg {
 constexpr size_t kPageHashBytes = 16, kHashBlockBytes = 128, kHashPieceBytes = 16384;
 using PageHash = std::array<uint8_t, kPageHashBytes>;
 
-// BLAKE2b with a digest of 16 bytes and no key, RFC 7693, of several messages: each in a lane of a vector
-// where the processor has wide ones, so that eight of about the same length are quickest.
+// BLAKE2b with a digest of 16 bytes and no key, RFC 7693, of several messages: each in a lane of a
+// vector where the processor has wide ones, so that eight of about the same length are quickest.
 void blake2b(Span<const Span<const uint8_t>> messages, PageHash* digests);
 
 // The same of bytes that come one after another.
@@ -31,8 +31,8 @@ class Blake2b {
     size_t num_waiting_ = 0;
 };
 
-// The same of the digests of a message's pieces of kHashPieceBytes, the last of which may be shorter. They
-// are hashed side by side, so it is several times as quick.
+// The same of the digests of a message's pieces of kHashPieceBytes, the last of which may be
+// shorter. They are hashed side by side, so it is several times as quick.
 class HashOfPieces {
   public:
     explicit HashOfPieces(Span<const uint8_t> message) : message_(message) {}

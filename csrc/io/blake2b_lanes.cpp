@@ -1,7 +1,7 @@
 #include "io/blake2b_lanes.h"
 
-// A formula of one word, or of as many as a vector has: either the words of several messages, a message a
-// lane, or those of a row of the state of one.
+// A formula of one word, or of as many as a vector has: either the words of several messages, a
+// message a lane, or those of a row of the state of one.
 
 #include <algorithm>
 #include <cstring>
@@ -51,10 +51,10 @@ V3DG_INLINE Row rotated(Row x) {
     constexpr int kBytes = kBits / 8;  // 2 or 3
     const auto order = [](int i) { return static_cast<char>((i & 8) | ((i + kBytes) & 7)); };
     const __m256i bytes = _mm256_setr_epi8(
-        order(0), order(1), order(2), order(3), order(4), order(5), order(6), order(7), order(8), order(9),
-        order(10), order(11), order(12), order(13), order(14), order(15), order(0), order(1), order(2),
-        order(3), order(4), order(5), order(6), order(7), order(8), order(9), order(10), order(11), order(12),
-        order(13), order(14), order(15));
+        order(0), order(1), order(2), order(3), order(4), order(5), order(6), order(7), order(8),
+        order(9), order(10), order(11), order(12), order(13), order(14), order(15), order(0),
+        order(1), order(2), order(3), order(4), order(5), order(6), order(7), order(8), order(9),
+        order(10), order(11), order(12), order(13), order(14), order(15));
     return (Row)_mm256_shuffle_epi8(bits, bytes);
 #endif
 }
@@ -125,7 +125,8 @@ V3DG_INLINE void compress(V* h, const V* m, V end, V last) {
 template <int kBy>
 V3DG_INLINE Row turned(Row x) {
     constexpr auto from = [](int i) { return (i + kBy) & 3; };
-    return (Row)_mm256_permute4x64_epi64((__m256i)x, from(0) | from(1) << 2 | from(2) << 4 | from(3) << 6);
+    return (Row)_mm256_permute4x64_epi64((__m256i)x,
+                                         from(0) | from(1) << 2 | from(2) << 4 | from(3) << 6);
 }
 
 V3DG_INLINE uint64_t word(const unsigned char* block, int i) {
@@ -155,7 +156,8 @@ V3DG_INLINE void mix_all_rows(Row& a, Row& b, Row& c, Row& d, const unsigned cha
     (mix_rows<kRounds>(a, b, c, d, block), ...);
 }
 
-V3DG_INLINE void compress_one(uint64_t* state, const unsigned char* block, uint64_t end, uint64_t last) {
+V3DG_INLINE void compress_one(uint64_t* state, const unsigned char* block, uint64_t end,
+                              uint64_t last) {
     Row h[2], start[2];
     std::memcpy(h, state, sizeof h);
     std::memcpy(start, kHashConstant, sizeof start);
@@ -168,7 +170,8 @@ V3DG_INLINE void compress_one(uint64_t* state, const unsigned char* block, uint6
 
 #else
 
-V3DG_INLINE void compress_one(uint64_t* state, const unsigned char* block, uint64_t end, uint64_t last) {
+V3DG_INLINE void compress_one(uint64_t* state, const unsigned char* block, uint64_t end,
+                              uint64_t last) {
     uint64_t m[16];
     std::memcpy(m, block, sizeof m);
     compress(state, m, end, last);
@@ -178,7 +181,8 @@ V3DG_INLINE void compress_one(uint64_t* state, const unsigned char* block, uint6
 
 }  // namespace
 
-void add_blocks(uint64_t* state, uint64_t num_bytes, const unsigned char* blocks, size_t num_blocks) {
+void add_blocks(uint64_t* state, uint64_t num_bytes, const unsigned char* blocks,
+                size_t num_blocks) {
     for (size_t i = 0; i < num_blocks; ++i, blocks += kHashBlockBytes)
         compress_one(state, blocks, num_bytes += kHashBlockBytes, 0);
 }
@@ -188,8 +192,10 @@ void add_last_block(uint64_t* state, uint64_t num_bytes, const unsigned char* bl
 }
 
 // Of a message of which so many bytes were added to the state, the rest lies here.
-static PageHash digest_of_rest(uint64_t* state, uint64_t num_bytes, const unsigned char* rest, size_t size) {
-    const size_t whole = size > 0 ? (size - 1) / kHashBlockBytes : 0, added = whole * kHashBlockBytes;
+static PageHash digest_of_rest(uint64_t* state, uint64_t num_bytes, const unsigned char* rest,
+                               size_t size) {
+    const size_t whole = size > 0 ? (size - 1) / kHashBlockBytes : 0,
+                 added = whole * kHashBlockBytes;
     add_blocks(state, num_bytes, rest, whole);
     unsigned char last[kHashBlockBytes] = {};
     if (size > 0) std::memcpy(last, rest + added, size - added);
@@ -219,8 +225,9 @@ V3DG_INLINE void load_words(const unsigned char* const* at, Words* m) {
                 pairs[i] = odd ? _mm512_unpackhi_epi64(rows[2 * i], rows[2 * i + 1])
                                : _mm512_unpacklo_epi64(rows[2 * i], rows[2 * i + 1]);
             for (int i = 0; i < 2; ++i) {
-                fours[i] = _mm512_shuffle_i64x2(pairs[2 * i], pairs[2 * i + 1], 0x88);      // + 0, + 4
-                fours[2 + i] = _mm512_shuffle_i64x2(pairs[2 * i], pairs[2 * i + 1], 0xdd);  // + 2, + 6
+                fours[i] = _mm512_shuffle_i64x2(pairs[2 * i], pairs[2 * i + 1], 0x88);  // + 0, + 4
+                fours[2 + i] =
+                    _mm512_shuffle_i64x2(pairs[2 * i], pairs[2 * i + 1], 0xdd);  // + 2, + 6
             }
             for (int i = 0; i < 2; ++i) {
                 Words* of = m + 8 * half + odd + 2 * i;
@@ -266,7 +273,8 @@ class Lanes {
     void advance() {
         size_t whole = SIZE_MAX;
         for (size_t k = 0; k < kNumLanes; ++k)
-            if (is_busy(k)) whole = std::min(whole, left_[k] > 0 ? (left_[k] - 1) / kHashBlockBytes : 0);
+            if (is_busy(k))
+                whole = std::min(whole, left_[k] > 0 ? (left_[k] - 1) / kHashBlockBytes : 0);
         add(whole);
         add_where_one_is_last();
     }

@@ -25,8 +25,10 @@ constexpr uint64_t kHashStart[8] = {kHashConstant[0] ^ 0x01010000 ^ kPageHashByt
                                     kHashConstant[7]};
 
 V3DG_DECLARE_PER_ISA(
-    // Adds whole blocks to a state of eight words, behind so many bytes; none of them is the last one.
-    void add_blocks(uint64_t* state, uint64_t num_bytes, const unsigned char* blocks, size_t num_blocks);
+    // Adds whole blocks to a state of eight words, behind so many bytes; none of them is the last
+    // one.
+    void add_blocks(uint64_t* state, uint64_t num_bytes, const unsigned char* blocks,
+                    size_t num_blocks);
     // Adds the last block, filled up with zeros; so many bytes are all of the message.
     void add_last_block(uint64_t* state, uint64_t num_bytes, const unsigned char* block);
     void hash_messages(Span<const Span<const uint8_t>> messages, PageHash* digests);)

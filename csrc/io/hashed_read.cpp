@@ -8,12 +8,14 @@ namespace v3dg {
 namespace {
 
 constexpr size_t kPieceBytes = size_t(1) << 20;
-constexpr size_t kPiecesAhead = 8;                  // that the disk is asked for together
-constexpr size_t kNeededBefore = size_t(64) << 10;  // of the coarsest page, which is in front of the tables
+constexpr size_t kPiecesAhead = 8;  // that the disk is asked for together
+constexpr size_t kNeededBefore = size_t(64)
+                                 << 10;  // of the coarsest page, which is in front of the tables
 
 }  // namespace
 
-HashedRead::HashedRead(PosixFile file, size_t offset, Span<uint8_t> message, size_t num_before, HashOf how)
+HashedRead::HashedRead(PosixFile file, size_t offset, Span<uint8_t> message, size_t num_before,
+                       HashOf how)
     : file_(std::move(file)),
       offset_(offset),
       bytes_{message.data + num_before, message.size - num_before},
@@ -36,8 +38,8 @@ bool HashedRead::read() {
                  expected += kPieceBytes)
                 file_.expect(offset_ + expected, std::min(kPieceBytes, bytes_.size - expected));
             const size_t size = std::min(kPieceBytes, bytes_.size - done);
-            is_whole =
-                file_.read_at(offset_ + done, reinterpret_cast<char*>(bytes_.data) + done, size) == size;
+            is_whole = file_.read_at(offset_ + done, reinterpret_cast<char*>(bytes_.data) + done,
+                                     size) == size;
             const std::lock_guard<std::mutex> lock(busy_);
             num_read_ = done + size;
             has_more_.notify_one();
@@ -72,7 +74,8 @@ bool HashedRead::hash() {
         end = num_before + std::min(wait_for_more(done - num_before), message_.size - num_before);
         if (end == done) break;  // the file ended, of which wait() tells
     }
-    wait_for_more(bytes_.size - 1);  // The hash to compare with may be all that is still to be read.
+    wait_for_more(bytes_.size -
+                  1);  // The hash to compare with may be all that is still to be read.
     const PageHash found = how_ == HashOf::bytes ? of_bytes.digest() : of_pieces.digest();
     return std::equal(found.begin(), found.end(), message_.end());
 }

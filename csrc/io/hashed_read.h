@@ -13,15 +13,15 @@ namespace v3dg {
 // How bytes are hashed: one after another, or piece by piece, the hashes of which have the hash.
 enum class HashOf { bytes, pieces };
 
-// A part of a file, with its hash behind it, that is read and hashed at the same time, where it is large on
-// threads of its own: the caller may look at it while it is still hashed. Where it is small, in the threads
-// that wait.
+// A part of a file, with its hash behind it, that is read and hashed at the same time, where it is
+// large on threads of its own: the caller may look at it while it is still hashed. Where it is
+// small, in the threads that wait.
 class HashedRead {
   public:
     static constexpr size_t kLargeBytes = size_t(4) << 20;
 
-    // What lies at `offset` comes to `message` behind so many bytes, with which it is hashed: all but the
-    // hash at the end. They stay where they are as long as this lives.
+    // What lies at `offset` comes to `message` behind so many bytes, with which it is hashed: all
+    // but the hash at the end. They stay where they are as long as this lives.
     HashedRead(PosixFile file, size_t offset, Span<uint8_t> message, size_t num_before, HashOf how);
     HashedRead(const HashedRead&) = delete;
 

@@ -1,8 +1,8 @@
 // 3D Gaussian Splatting .ply files, in the layout of the original 3DGS code.
 //
-// A file holds, for each gaussian, x y z, f_dc_0..2, f_rest_* (all red coefficients, then green, then blue),
-// opacity (logit), scale_0..2 (log) and rot_0..3 (w x y z). Memory holds values: standard deviations and
-// opacities in [0, 1], computed in double precision and rounded once.
+// A file holds, for each gaussian, x y z, f_dc_0..2, f_rest_* (all red coefficients, then green,
+// then blue), opacity (logit), scale_0..2 (log) and rot_0..3 (w x y z). Memory holds values:
+// standard deviations and opacities in [0, 1], computed in double precision and rounded once.
 //
 // Source: Kerbl et al., 3D Gaussian Splatting, SIGGRAPH 2023, and the files of its code.
 #pragma once
@@ -47,16 +47,17 @@ struct PlyFile {
 // Throws std::system_error when the file cannot be read, PlyError when it is not a 3DGS file.
 PlyFile open_ply(const char* path);
 
-// Reads gaussians `first` and on, as many as `out` holds, and returns where the next one begins. `known` is
-// the place of any gaussian, best of `first` itself. Quaternions are normalised, but those of length zero or
-// not finite stay as stored, as do those of length one up to rounding (so that reading what was written
-// changes nothing). Besides `out` it needs a few megabytes. Throws like open_ply; `out` is then partly
-// written.
+// Reads gaussians `first` and on, as many as `out` holds, and returns where the next one begins.
+// `known` is the place of any gaussian, best of `first` itself. Quaternions are normalised, but
+// those of length zero or not finite stay as stored, as do those of length one up to rounding (so
+// that reading what was written changes nothing). Besides `out` it needs a few megabytes. Throws
+// like open_ply; `out` is then partly written.
 PlyPlace read_ply(const PlyFile& ply, size_t first, PlyPlace known, const PlyGaussians<float>& out);
 
-// Creates `path`, which must not exist yet. Opacity 1 is written as logit 20, opacity 0 as logit -110, scale
-// 0 as log -110: finite, and read back as exactly 1, 0 and 0. Throws std::system_error, or
-// std::invalid_argument for a negative scale or an opacity outside [0, 1]; the file is then incomplete.
+// Creates `path`, which must not exist yet. Opacity 1 is written as logit 20, opacity 0 as logit
+// -110, scale 0 as log -110: finite, and read back as exactly 1, 0 and 0. Throws std::system_error,
+// or std::invalid_argument for a negative scale or an opacity outside [0, 1]; the file is then
+// incomplete.
 void write_ply(const char* path, const PlyGaussians<const float>& gaussians, PlyEncoding encoding,
                size_t num_sh);
 

@@ -8,7 +8,7 @@ namespace v3dg {
 namespace {
 
 constexpr size_t kMaxHeaderBytes = size_t(1) << 20;  // real ones have a few kilobytes
-constexpr size_t kMaxElements = 64;                  // real ones have one or two; each is walked over
+constexpr size_t kMaxElements = 64;  // real ones have one or two; each is walked over
 
 std::vector<std::string> words_of(const std::string& line) {
     const char* kSpace = " \t\r\v\f";
@@ -38,8 +38,9 @@ PlyType parse_type(const std::string& name) {
 
 PlyEncoding parse_format(const std::vector<std::string>& words) {
     if (words.size() != 3 || words[2] != "1.0")
-        throw PlyError("expected a format and the version 1.0, got " + std::to_string(words.size() - 1) +
-                       " words" + (words.size() > 2 ? " and version " + quoted(words[2]) : ""));
+        throw PlyError("expected a format and the version 1.0, got " +
+                       std::to_string(words.size() - 1) + " words" +
+                       (words.size() > 2 ? " and version " + quoted(words[2]) : ""));
     if (words[1] == "ascii") return PlyEncoding::ascii;
     if (words[1] == "binary_little_endian") return PlyEncoding::binary_little_endian;
     if (words[1] == "binary_big_endian") return PlyEncoding::binary_big_endian;
@@ -49,13 +50,15 @@ PlyEncoding parse_format(const std::vector<std::string>& words) {
 
 PlyElement parse_element(const std::vector<std::string>& words) {
     if (words.size() != 3)
-        throw PlyError("expected 'element NAME COUNT', got " + std::to_string(words.size()) + " words");
+        throw PlyError("expected 'element NAME COUNT', got " + std::to_string(words.size()) +
+                       " words");
     PlyElement element;
     element.name = words[1];
     const char* end = words[2].data() + words[2].size();
     const auto [stop, error] = std::from_chars(words[2].data(), end, element.count);
     if (error != std::errc() || stop != end)
-        throw PlyError("expected a count of element " + quoted(words[1]) + ", got " + quoted(words[2]));
+        throw PlyError("expected a count of element " + quoted(words[1]) + ", got " +
+                       quoted(words[2]));
     return element;
 }
 
@@ -71,7 +74,8 @@ PlyProperty parse_property(const std::vector<std::string>& words) {
     if (property.is_list) {
         property.count_type = parse_type(words[2]);
         if (property.count_type == PlyType::float32 || property.count_type == PlyType::float64)
-            throw PlyError("expected an integer type for the length of a list, got " + quoted(words[2]));
+            throw PlyError("expected an integer type for the length of a list, got " +
+                           quoted(words[2]));
     }
     return property;
 }
@@ -102,7 +106,8 @@ struct HeaderParser {
             if (!has_format) throw PlyError("expected a line 'format' before end_header, got none");
             return true;
         } else {
-            throw PlyError("expected format, element, property or end_header, got " + quoted(words[0]));
+            throw PlyError("expected format, element, property or end_header, got " +
+                           quoted(words[0]));
         }
         return false;
     }
@@ -111,7 +116,8 @@ struct HeaderParser {
 }  // namespace
 
 bool PlyElement::has_lists() const {
-    return std::any_of(properties.begin(), properties.end(), [](const PlyProperty& p) { return p.is_list; });
+    return std::any_of(properties.begin(), properties.end(),
+                       [](const PlyProperty& p) { return p.is_list; });
 }
 
 size_t PlyElement::min_row_bytes() const {
@@ -167,8 +173,9 @@ PlyHeader read_ply_header(const PosixFile& file) {
             throw PlyError("header line " + std::to_string(line_number) + ": " + error.what());
         }
         if (line_end >= text.size())
-            throw PlyError("expected end_header within the first " + std::to_string(kMaxHeaderBytes) +
-                           " bytes, got none in " + std::to_string(text.size()));
+            throw PlyError("expected end_header within the first " +
+                           std::to_string(kMaxHeaderBytes) + " bytes, got none in " +
+                           std::to_string(text.size()));
         line_begin = line_end + 1;
     }
 }

@@ -10,8 +10,8 @@
 
 namespace v3dg {
 
-// The content of a file is not what it should be. The message says what was expected and found, in one line
-// of printable ASCII, without the file's name.
+// The content of a file is not what it should be. The message says what was expected and found, in
+// one line of printable ASCII, without the file's name.
 struct PlyError : std::runtime_error {
     using std::runtime_error::runtime_error;
 };

@@ -1,5 +1,5 @@
-// Binary rows of fixed size are read and converted by all threads, each its own blocks. Text, and rows with
-// lists in them, are cut into rows by one thread and converted by all.
+// Binary rows of fixed size are read and converted by all threads, each its own blocks. Text, and
+// rows with lists in them, are cut into rows by one thread and converted by all.
 
 #include <algorithm>
 #include <charconv>
@@ -23,13 +23,15 @@ namespace {
 
 constexpr double kLeastSquared = 1e-140,
                  kMostSquared = 1e140;  // numbers whose squares are exact to the last digit
-constexpr size_t kBlockBytes = size_t(1)
-                               << 18;  // what one thread reads and converts at a time: fits its cache
-constexpr size_t kChunkBytes = size_t(1) << 22;  // what all threads convert together when one has to cut rows
-constexpr double kUnitTolerance = 1e-6;  // of a squared length; a rounded unit quaternion is off by 3e-7
+constexpr size_t kBlockBytes =
+    size_t(1) << 18;  // what one thread reads and converts at a time: fits its cache
+constexpr size_t kChunkBytes = size_t(1)
+                               << 22;  // what all threads convert together when one has to cut rows
+constexpr double kUnitTolerance =
+    1e-6;  // of a squared length; a rounded unit quaternion is off by 3e-7
 
-// Where in a row the number for one slot of a gaussian is found. Slots: mean, quat, scale, opacity, then sh
-// in memory's order.
+// Where in a row the number for one slot of a gaussian is found. Slots: mean, quat, scale, opacity,
+// then sh in memory's order.
 struct Field {
     size_t property;  // among the vertex element's
     size_t offset;    // bytes from the start of the row, lists left out
@@ -49,7 +51,8 @@ std::vector<std::string> slot_names(size_t num_sh) {
 
 size_t num_sh_of(const PlyElement& vertex) {
     size_t num_rest = 0;
-    for (const PlyProperty& property : vertex.properties) num_rest += property.name.rfind("f_rest_", 0) == 0;
+    for (const PlyProperty& property : vertex.properties)
+        num_rest += property.name.rfind("f_rest_", 0) == 0;
     for (const size_t num_sh : {1, 4, 9, 16})
         if (num_rest == 3 * (num_sh - 1)) return num_sh;
     throw PlyError("expected 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), got " +
@@ -59,8 +62,10 @@ size_t num_sh_of(const PlyElement& vertex) {
 std::string missing_text(const PlyElement& vertex, const std::vector<std::string>& missing) {
     std::string text = "expected vertex properties ";
     constexpr size_t kMaxNames = 8;
-    for (size_t i = 0; i < missing.size() && i < kMaxNames; ++i) text += (i == 0 ? "" : ", ") + missing[i];
-    if (missing.size() > kMaxNames) text += " and " + std::to_string(missing.size() - kMaxNames) + " more";
+    for (size_t i = 0; i < missing.size() && i < kMaxNames; ++i)
+        text += (i == 0 ? "" : ", ") + missing[i];
+    if (missing.size() > kMaxNames)
+        text += " and " + std::to_string(missing.size() - kMaxNames) + " more";
     text += ", got ";
     for (size_t i = 0; i < vertex.properties.size() && i < kMaxNames; ++i)
         text += (i == 0 ? "" : ", ") + quoted(vertex.properties[i].name);
@@ -77,11 +82,13 @@ std::vector<Field> fields_of(const PlyElement& vertex, size_t num_sh) {
     for (size_t p = 0; p < vertex.properties.size(); ++p) {
         const PlyProperty& property = vertex.properties[p];
         const bool is_new =
-            property.is_list ? lists.insert(property.name).second && !field_from_name.count(property.name)
-                             : field_from_name.insert({property.name, {p, offset, property.type}}).second &&
-                                   !lists.count(property.name);
+            property.is_list
+                ? lists.insert(property.name).second && !field_from_name.count(property.name)
+                : field_from_name.insert({property.name, {p, offset, property.type}}).second &&
+                      !lists.count(property.name);
         if (!is_new)
-            throw PlyError("expected each vertex property once, got " + quoted(property.name) + " twice");
+            throw PlyError("expected each vertex property once, got " + quoted(property.name) +
+                           " twice");
         if (!property.is_list) offset += size_of(property.type);
     }
     std::vector<Field> fields;
@@ -129,7 +136,8 @@ bool is_swapped(PlyEncoding encoding) {
     return (encoding == PlyEncoding::binary_big_endian) == (first == 1);
 }
 
-// Multiplies what doubles do not hold the squares of by a power of two; zeros and what is not finite stay.
+// Multiplies what doubles do not hold the squares of by a power of two; zeros and what is not
+// finite stay.
 void scale_extreme(double quat[4]) {
     double largest = 0;
     for (size_t j = 0; j < 4; ++j) largest = std::max(largest, std::abs(quat[j]));
@@ -154,7 +162,8 @@ void store_gaussian(const Load& load, size_t i, size_t num_sh, const PlyGaussian
     scale_extreme(quat);
     double norm2 = 0;
     for (const double component : quat) norm2 += component * component;
-    const bool keeps_length = !(norm2 > 0 && std::isfinite(norm2)) || std::abs(norm2 - 1) < kUnitTolerance;
+    const bool keeps_length =
+        !(norm2 > 0 && std::isfinite(norm2)) || std::abs(norm2 - 1) < kUnitTolerance;
     const double factor = keeps_length ? 1 : 1 / std::sqrt(norm2);
     for (size_t j = 0; j < 4; ++j) out.quats[4 * i + j] = static_cast<float>(quat[j] * factor);
 }
@@ -170,8 +179,9 @@ class RowDecoder {
         for (const PlyProperty& property : ply.vertex.properties)
             if (!property.is_list) row_bytes_ += size_of(property.type);
         is_native_float_ =
-            !is_swapped_ && std::all_of(fields_.begin(), fields_.end(),
-                                        [](const Field& field) { return field.type == PlyType::float32; });
+            !is_swapped_ && std::all_of(fields_.begin(), fields_.end(), [](const Field& field) {
+                return field.type == PlyType::float32;
+            });
     }
     size_t row_bytes() const { return row_bytes_; }
 
@@ -218,7 +228,8 @@ class ByteReader {
     void skip(size_t size, const PlyElement& element, uint64_t row) {
         if (size > file_bytes_ - std::min(offset_, file_bytes_))
             throw PlyError("expected " + std::to_string(element.count) + " rows of element " +
-                           quoted(element.name) + ", got the end of the file in row " + std::to_string(row));
+                           quoted(element.name) + ", got the end of the file in row " +
+                           std::to_string(row));
         offset_ += size;
     }
     // Valid until the next call. At most kBlockBytes.
@@ -229,7 +240,8 @@ class ByteReader {
             buffer_begin_ = begin;
             buffer_size_ = file_.read_at(begin, buffer_.data(), buffer_.size());
             if (buffer_size_ < size)
-                throw PlyError("expected the file not to change while it is read, got a shorter one");
+                throw PlyError(
+                    "expected the file not to change while it is read, got a shorter one");
         }
         return buffer_.data() + (begin - buffer_begin_);
     }
@@ -244,15 +256,17 @@ class ByteReader {
 };
 
 // Walks over one row; what is not in a list is appended to `packed`, if given.
-void walk_row(ByteReader& reader, const PlyElement& element, uint64_t row, bool is_swapped, char* packed) {
+void walk_row(ByteReader& reader, const PlyElement& element, uint64_t row, bool is_swapped,
+              char* packed) {
     for (const PlyProperty& property : element.properties) {
         if (property.is_list) {
             const size_t count_bytes = size_of(property.count_type);
-            const double count =
-                load_scalar(reader.take(count_bytes, element, row), property.count_type, is_swapped);
+            const double count = load_scalar(reader.take(count_bytes, element, row),
+                                             property.count_type, is_swapped);
             if (count < 0)
                 throw PlyError("expected a length of list " + quoted(property.name) + " in row " +
-                               std::to_string(row) + ", got " + std::to_string(static_cast<int64_t>(count)));
+                               std::to_string(row) + ", got " +
+                               std::to_string(static_cast<int64_t>(count)));
             reader.skip(static_cast<size_t>(count) * size_of(property.type), element, row);
         } else if (packed) {
             const size_t size = size_of(property.type);
@@ -282,8 +296,8 @@ class LineReader {
 
     size_t offset() const { return offset_ - (end_ - begin_); }
 
-    // Some of the next lines, at least one and at most `max_lines`; none at the end of the file. Valid until
-    // the next call.
+    // Some of the next lines, at least one and at most `max_lines`; none at the end of the file.
+    // Valid until the next call.
     const std::vector<Line>& next(uint64_t max_lines) {
         lines_.clear();
         bool at_end = false;
@@ -291,7 +305,8 @@ class LineReader {
             cut_lines(max_lines, at_end);
             if (!lines_.empty() || at_end) break;
             if (begin_ == 0 && end_ == buffer_.size() && end_ < kChunkBytes)
-                throw PlyError("expected the file not to change while it is read, got a longer one");
+                throw PlyError(
+                    "expected the file not to change while it is read, got a longer one");
             if (begin_ == 0 && end_ == buffer_.size())
                 throw PlyError("expected lines of at most " + std::to_string(kChunkBytes) +
                                " bytes, got a longer one");
@@ -312,7 +327,8 @@ class LineReader {
             const char* text = buffer_.data();
             const void* found = std::memchr(text + begin_, '\n', end_ - begin_);
             if (!found && !at_end) return;
-            const Line line = {text + begin_, found ? static_cast<const char*>(found) : text + end_};
+            const Line line = {text + begin_,
+                               found ? static_cast<const char*>(found) : text + end_};
             begin_ = std::min<size_t>(line.end - text + 1, end_);
             if (!std::all_of(line.begin, line.end, is_space)) lines_.push_back(line);
         }
@@ -361,8 +377,9 @@ class NumberReader {
         const size_t num_wanted = num_read_;
         while (!at_end()) next();
         if (num_read_ != num_wanted)
-            throw PlyError("vertex " + std::to_string(row_) + ": expected " + std::to_string(num_wanted) +
-                           " numbers, got " + std::to_string(num_read_));
+            throw PlyError("vertex " + std::to_string(row_) + ": expected " +
+                           std::to_string(num_wanted) + " numbers, got " +
+                           std::to_string(num_read_));
     }
     size_t num_read() const { return num_read_; }
 
@@ -388,8 +405,9 @@ void parse_row(Line line, uint64_t row, const PlyElement& vertex, double* value_
         }
     } catch (const NumberReader::EndOfLine&) {
         throw PlyError("vertex " + std::to_string(row) + ": expected " +
-                       (vertex.has_lists() ? "at least " : "") + std::to_string(vertex.properties.size()) +
-                       " numbers, got " + std::to_string(numbers.num_read()));
+                       (vertex.has_lists() ? "at least " : "") +
+                       std::to_string(vertex.properties.size()) + " numbers, got " +
+                       std::to_string(numbers.num_read()));
     }
     numbers.expect_end();
 }
@@ -412,12 +430,15 @@ size_t skip_text(const PlyFile& ply, size_t offset, const PlyElement& element) {
 // Throws unless `count` rows can be in what is left of the file.
 void check_size(const PlyFile& ply, const PlyElement& element, size_t offset) {
     const bool is_text = ply.encoding == PlyEncoding::ascii;
-    // A number and what separates it from the next are two characters; the last may end with the file.
+    // A number and what separates it from the next are two characters; the last may end with the
+    // file.
     const size_t row_bytes = is_text ? 2 * element.properties.size() : element.min_row_bytes();
-    const size_t left = ply.file_bytes - std::min(offset, ply.file_bytes);  // it may have grown since
+    const size_t left =
+        ply.file_bytes - std::min(offset, ply.file_bytes);  // it may have grown since
     if (row_bytes != 0 && element.count > (left + (is_text ? 1 : 0)) / row_bytes)
         throw PlyError("expected " + std::to_string(element.count) + " rows of element " +
-                       quoted(element.name) + " with " + (is_text || element.has_lists() ? "at least " : "") +
+                       quoted(element.name) + " with " +
+                       (is_text || element.has_lists() ? "at least " : "") +
                        std::to_string(row_bytes) + " bytes each, got " + std::to_string(left) +
                        " bytes; the file is truncated");
 }
@@ -452,7 +473,8 @@ PlyPlace read_fixed_rows(const PlyFile& ply, PlyPlace at, const PlyGaussians<flo
             const size_t count = std::min(block_rows, num_rows - first);
             const size_t size = count * row_bytes;
             if (ply.file.read_at(at.offset + first * row_bytes, rows, size) != size)
-                throw PlyError("expected the file not to change while it is read, got a shorter one");
+                throw PlyError(
+                    "expected the file not to change while it is read, got a shorter one");
             decoder.decode(rows, count, first);
         });
     }
@@ -473,7 +495,8 @@ PlyPlace read_rows_with_lists(const PlyFile& ply, PlyPlace at, const PlyGaussian
             walk_row(reader, ply.vertex, at.row + first + r, is_swapped(ply.encoding),
                      packed.data() + r * row_bytes);
 #pragma omp parallel for schedule(static) num_threads(most_threads())
-        for (size_t r = 0; r < count; ++r) decoder.decode(packed.data() + r * row_bytes, 1, first + r);
+        for (size_t r = 0; r < count; ++r)
+            decoder.decode(packed.data() + r * row_bytes, 1, first + r);
     }
     return {at.row + num_rows, reader.offset()};
 }
@@ -494,8 +517,8 @@ PlyPlace read_text(const PlyFile& ply, PlyPlace at, const PlyGaussians<float>& o
             error.run(r, [&] {
                 double* row = values.data() + omp_get_thread_num() * num_properties;
                 parse_row(lines[r], at.row + first + r, ply.vertex, row);
-                store_gaussian([&](size_t slot) { return row[fields[slot].property]; }, first + r, ply.num_sh,
-                               out);
+                store_gaussian([&](size_t slot) { return row[fields[slot].property]; }, first + r,
+                               ply.num_sh, out);
             });
         }
         error.rethrow();
@@ -513,7 +536,8 @@ PlyFile open_ply(const char* path) {
     PlyFile ply = {std::move(file), size, header.encoding, {}, header.size, 1};
     const auto is_vertex = [](const PlyElement& element) { return element.name == "vertex"; };
     const auto num_found = std::count_if(header.elements.begin(), header.elements.end(), is_vertex);
-    if (num_found != 1) throw PlyError("expected one element 'vertex', got " + std::to_string(num_found));
+    if (num_found != 1)
+        throw PlyError("expected one element 'vertex', got " + std::to_string(num_found));
     const auto vertex = std::find_if(header.elements.begin(), header.elements.end(), is_vertex);
     ply.vertex = *vertex;
     ply.num_sh = num_sh_of(ply.vertex);
@@ -524,7 +548,8 @@ PlyFile open_ply(const char* path) {
     return ply;
 }
 
-PlyPlace read_ply(const PlyFile& ply, size_t first, PlyPlace known, const PlyGaussians<float>& out) {
+PlyPlace read_ply(const PlyFile& ply, size_t first, PlyPlace known,
+                  const PlyGaussians<float>& out) {
     assert(first + out.opacities.size <= ply.num_gaussians());
     if (out.opacities.size == 0) return known;
     const PlyPlace from = known.row <= first ? known : ply.begin();
@@ -532,7 +557,8 @@ PlyPlace read_ply(const PlyFile& ply, size_t first, PlyPlace known, const PlyGau
     skipped.count = first - from.row;
     const PlyPlace at = {first, skip_element(ply, skipped, from.offset)};
     if (ply.encoding == PlyEncoding::ascii) return read_text(ply, at, out);
-    return ply.vertex.has_lists() ? read_rows_with_lists(ply, at, out) : read_fixed_rows(ply, at, out);
+    return ply.vertex.has_lists() ? read_rows_with_lists(ply, at, out)
+                                  : read_fixed_rows(ply, at, out);
 }
 
 }  // namespace v3dg

@@ -1,5 +1,5 @@
-// Rows are converted in blocks by all threads. Binary blocks have a known place, so each thread writes its
-// own; text is converted a few blocks at a time and written in order.
+// Rows are converted in blocks by all threads. Binary blocks have a known place, so each thread
+// writes its own; text is converted a few blocks at a time and written in order.
 
 #include <algorithm>
 #include <charconv>
@@ -24,8 +24,9 @@ namespace {
 constexpr size_t kBlockRows = 2048;  // half a megabyte at SH degree 3
 constexpr size_t kTextBlocks = 16;   // that are in memory together
 
-// Finite stand-ins for infinities, beyond the logs and logits of all other float32 values (-103.3 and 16.6
-// are the outermost) and far enough that exp and the sigmoid round to exactly 0 and 1, also in float32.
+// Finite stand-ins for infinities, beyond the logs and logits of all other float32 values (-103.3
+// and 16.6 are the outermost) and far enough that exp and the sigmoid round to exactly 0 and 1,
+// also in float32.
 constexpr float kLogOfZero = -110;
 constexpr float kLogitOfOne = 20;
 
@@ -34,7 +35,8 @@ std::string header_text(size_t num_gaussians, size_t num_sh, PlyEncoding encodin
     std::string text = std::string("ply\nformat ") + kNames[static_cast<int>(encoding)] +
                        " 1.0\nelement vertex " + std::to_string(num_gaussians) + "\n";
     const auto add = [&](const std::string& name, size_t count) {
-        for (size_t i = 0; i < count; ++i) text += "property float " + name + std::to_string(i) + "\n";
+        for (size_t i = 0; i < count; ++i)
+            text += "property float " + name + std::to_string(i) + "\n";
     };
     text += "property float x\nproperty float y\nproperty float z\n";
     add("f_dc_", 3);
@@ -46,8 +48,8 @@ std::string header_text(size_t num_gaussians, size_t num_sh, PlyEncoding encodin
 }
 
 [[noreturn]] void throw_value(const char* name, size_t i, const char* wanted, float got) {
-    throw std::invalid_argument(std::string(name) + "[" + std::to_string(i) + "]: expected " + wanted +
-                                ", got " + std::to_string(got));
+    throw std::invalid_argument(std::string(name) + "[" + std::to_string(i) + "]: expected " +
+                                wanted + ", got " + std::to_string(got));
 }
 
 float log_scale(float scale, size_t i) {
@@ -84,12 +86,14 @@ void store_bytes(const float* values, size_t count, PlyEncoding encoding, unsign
             for (size_t b = 0; b < 4; ++b)
                 bytes[4 * v + b] = static_cast<unsigned char>(bits >> (24 - 8 * b));
         else
-            for (size_t b = 0; b < 4; ++b) bytes[4 * v + b] = static_cast<unsigned char>(bits >> (8 * b));
+            for (size_t b = 0; b < 4; ++b)
+                bytes[4 * v + b] = static_cast<unsigned char>(bits >> (8 * b));
     }
 }
 
 void append_text(const float* values, size_t count, std::string& text) {
-    constexpr size_t kMaxDigits = 32;  // the shortest text of a float that reads back the same has at most 15
+    constexpr size_t kMaxDigits =
+        32;  // the shortest text of a float that reads back the same has at most 15
     char word[kMaxDigits];
     for (size_t v = 0; v < count; ++v) {
         text.append(word, std::to_chars(word, word + kMaxDigits, values[v]).ptr);
@@ -127,14 +131,15 @@ struct Writer {
 #pragma omp parallel for schedule(dynamic, 1) num_threads(num_threads)
         for (size_t block = 0; block < num_blocks(); ++block) {
             error.run(block, [&] {
-                unsigned char* const begin = buffers.get() + omp_get_thread_num() * kBlockRows * row_bytes;
+                unsigned char* const begin =
+                    buffers.get() + omp_get_thread_num() * kBlockRows * row_bytes;
                 unsigned char* end = begin;
                 for_rows(block, [&](const float* row) {
                     store_bytes(row, num_values(), encoding, end);
                     end += row_bytes;
                 });
-                file.write_at(offset + block * kBlockRows * row_bytes, reinterpret_cast<char*>(begin),
-                              end - begin);
+                file.write_at(offset + block * kBlockRows * row_bytes,
+                              reinterpret_cast<char*>(begin), end - begin);
             });
         }
         error.rethrow();
@@ -150,7 +155,8 @@ struct Writer {
             for (size_t b = 0; b < count; ++b) {
                 error.run(b, [&] {
                     texts[b].clear();
-                    for_rows(first + b, [&](const float* row) { append_text(row, num_values(), texts[b]); });
+                    for_rows(first + b,
+                             [&](const float* row) { append_text(row, num_values(), texts[b]); });
                 });
             }
             error.rethrow();

@@ -25,8 +25,12 @@ class PosixFile {
         return PosixFile(::open(path, O_WRONLY | O_CLOEXEC | O_CREAT | O_TRUNC, 0666));
     }
     // Of an open file, which may then be closed.
-    static PosixFile duplicate(int descriptor) { return PosixFile(::fcntl(descriptor, F_DUPFD_CLOEXEC, 0)); }
-    PosixFile(PosixFile&& other) noexcept : descriptor_(other.descriptor_) { other.descriptor_ = -1; }
+    static PosixFile duplicate(int descriptor) {
+        return PosixFile(::fcntl(descriptor, F_DUPFD_CLOEXEC, 0));
+    }
+    PosixFile(PosixFile&& other) noexcept : descriptor_(other.descriptor_) {
+        other.descriptor_ = -1;
+    }
     PosixFile& operator=(PosixFile&&) = delete;
     ~PosixFile() {
         if (descriptor_ >= 0) ::close(descriptor_);
@@ -44,7 +48,8 @@ class PosixFile {
         return read_at(offset, Span<iovec>{&piece, 1});
     }
 
-    // The same into several pieces of memory, one behind another, at most 1024. Changes what it is given.
+    // The same into several pieces of memory, one behind another, at most 1024. Changes what it is
+    // given.
     size_t read_at(size_t offset, Span<iovec> pieces) const {
         size_t done = 0;
         while (!pieces.empty()) {
@@ -67,8 +72,8 @@ class PosixFile {
     // Has the system begin to read what will be asked for; a hint, where it takes any.
     void expect(size_t offset, size_t size) const {
 #ifdef POSIX_FADV_WILLNEED
-        static_cast<void>(::posix_fadvise(descriptor_, static_cast<off_t>(offset), static_cast<off_t>(size),
-                                          POSIX_FADV_WILLNEED));
+        static_cast<void>(::posix_fadvise(descriptor_, static_cast<off_t>(offset),
+                                          static_cast<off_t>(size), POSIX_FADV_WILLNEED));
 #endif
     }
 

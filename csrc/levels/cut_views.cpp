@@ -14,14 +14,16 @@ namespace v3dg {
 namespace {
 
 constexpr double kNarrowestPx = 8, kMostPx = 1 << 15;  // of a side of a picture
-constexpr double kHomePx2 = 2;  // a gaussian: the size at which a cut is selected at the default tolerance
+constexpr double kHomePx2 =
+    2;  // a gaussian: the size at which a cut is selected at the default tolerance
 // A side of a picture, in the size at which its cut is at home.
 constexpr double kLeastSize = 0.18, kOctavesOfSize = 5.75;
 constexpr double kDistance = 2.5;     // from the centre, in radii
 constexpr double kNear = 0.01;        // in radii
 constexpr int kMostTries = 16;        // to find a gaussian that a picture shows
 constexpr double kMostOfAsset = 0.7;  // of its gaussians, in a cut
-constexpr double kShare = 0.99;       // of the gaussians that the radius holds; the rest may float far away
+constexpr double kShare =
+    0.99;  // of the gaussians that the radius holds; the rest may float far away
 
 // Numbers of one view.
 class Random {
@@ -29,7 +31,8 @@ class Random {
     Random(uint64_t seed, uint64_t stream) : seed_(seed), stream_(stream) {}
     double uniform() { return random_uniform(seed_, stream_, counter_++); }
     void direction(double out[3]) {
-        const double z = 2 * uniform() - 1, angle = 2 * kPi * uniform(), flat = std::sqrt(1 - z * z);
+        const double z = 2 * uniform() - 1, angle = 2 * kPi * uniform(),
+                     flat = std::sqrt(1 - z * z);
         out[0] = flat * std::cos(angle);
         out[1] = flat * std::sin(angle);
         out[2] = z;
@@ -72,9 +75,11 @@ Camera resized(Camera camera, double scale) {
     return camera;
 }
 
-// The same picture somewhere among the pixels of a screen, with what is beside it where it is narrow.
+// The same picture somewhere among the pixels of a screen, with what is beside it where it is
+// narrow.
 Camera on_screen(Camera camera, Random& random) {
-    const double width = std::max(camera.width, kNarrowestPx), height = std::max(camera.height, kNarrowestPx);
+    const double width = std::max(camera.width, kNarrowestPx),
+                 height = std::max(camera.height, kNarrowestPx);
     camera.cx += (width - camera.width) / 2 + random.uniform() - 0.5;
     camera.cy += (height - camera.height) / 2 + random.uniform() - 0.5;
     camera.width = camera.x1 = width;
@@ -82,21 +87,26 @@ Camera on_screen(Camera camera, Random& random) {
     return camera;
 }
 
-// A part of the picture around a gaussian. What is twice as large in the asset is seen twice as often.
-Camera window_of(const Camera& camera, double widest_px, const CutPictures& pictures, Random& random) {
+// A part of the picture around a gaussian. What is twice as large in the asset is seen twice as
+// often.
+Camera window_of(const Camera& camera, double widest_px, const CutPictures& pictures,
+                 Random& random) {
     double at[2] = {camera.width / 2, camera.height / 2};
     for (int tries = 0; tries < kMostTries; ++tries) {
         const std::vector<double>& weight = pictures.weight;
-        const auto found = std::upper_bound(weight.begin(), weight.end(), random.uniform() * weight.back());
+        const auto found =
+            std::upper_bound(weight.begin(), weight.end(), random.uniform() * weight.back());
         const auto i = std::min(static_cast<size_t>(found - weight.begin()), weight.size() - 1);
         double p[3];
         for (int row = 0; row < 3; ++row) {
             p[row] = camera.translation[row];
             for (int k = 0; k < 3; ++k)
-                p[row] += camera.rotation[3 * row + k] * static_cast<double>(pictures.means[3 * i + k]);
+                p[row] +=
+                    camera.rotation[3 * row + k] * static_cast<double>(pictures.means[3 * i + k]);
         }
         if (!(p[2] > camera.near)) continue;
-        const double x = camera.fx * p[0] / p[2] + camera.cx, y = camera.fy * p[1] / p[2] + camera.cy;
+        const double x = camera.fx * p[0] / p[2] + camera.cx,
+                     y = camera.fy * p[1] / p[2] + camera.cy;
         if (!(x >= 0 && x < camera.width && y >= 0 && y < camera.height)) continue;
         at[0] = x;
         at[1] = y;
@@ -106,7 +116,8 @@ Camera window_of(const Camera& camera, double widest_px, const CutPictures& pict
     window.width = window.x1 = std::min(camera.width, widest_px);
     window.height = window.y1 = std::min(camera.height, widest_px);
     window.cx -= std::clamp(std::round(at[0] - window.width / 2), 0.0, camera.width - window.width);
-    window.cy -= std::clamp(std::round(at[1] - window.height / 2), 0.0, camera.height - window.height);
+    window.cy -=
+        std::clamp(std::round(at[1] - window.height / 2), 0.0, camera.height - window.height);
     return window;
 }
 
@@ -123,9 +134,9 @@ SelectOutput selected(const ClusterTable& table, const Camera& camera, const Sel
     return out;
 }
 
-// How a picture is compared: a window of at most so many px, and the samples of a side of a pixel of the
-// asset. The larger its gaussians are seen, the smoother it is; what is small costs little. `size`: of the
-// picture, in that at which the asset itself is at home.
+// How a picture is compared: a window of at most so many px, and the samples of a side of a pixel
+// of the asset. The larger its gaussians are seen, the smoother it is; what is small costs little.
+// `size`: of the picture, in that at which the asset itself is at home.
 struct Comparison {
     double widest_px;
     int samples;
@@ -145,7 +156,8 @@ double median(std::vector<double> values) {
     return (*std::max_element(values.begin(), middle) + *middle) / 2;
 }
 
-Camera camera_at(const Surroundings& ball, double distance, const double outwards[3], const double right[3]) {
+Camera camera_at(const Surroundings& ball, double distance, const double outwards[3],
+                 const double right[3]) {
     double down[3];
     cross3(right, outwards, down);
     Camera camera{};
@@ -155,7 +167,8 @@ Camera camera_at(const Surroundings& ball, double distance, const double outward
         camera.rotation[6 + k] = -outwards[k];
         camera.eye[k] = ball.center[k] + distance * ball.radius * outwards[k];
     }
-    for (int row = 0; row < 3; ++row) camera.translation[row] = -dot3(camera.rotation + 3 * row, camera.eye);
+    for (int row = 0; row < 3; ++row)
+        camera.translation[row] = -dot3(camera.rotation + 3 * row, camera.eye);
     return camera;
 }
 
@@ -163,15 +176,18 @@ Surroundings surroundings_of(Span<const float> means, double share) {
     Surroundings found{};
     std::vector<double> values(means.size / 3);
     for (size_t k = 0; k < 3; ++k) {
-        for (size_t i = 0; i < values.size(); ++i) values[i] = static_cast<double>(means[3 * i + k]);
+        for (size_t i = 0; i < values.size(); ++i)
+            values[i] = static_cast<double>(means[3 * i + k]);
         found.center[k] = median(values);
     }
     for (size_t i = 0; i < values.size(); ++i) {
         double d[3];
-        for (size_t k = 0; k < 3; ++k) d[k] = static_cast<double>(means[3 * i + k]) - found.center[k];
+        for (size_t k = 0; k < 3; ++k)
+            d[k] = static_cast<double>(means[3 * i + k]) - found.center[k];
         values[i] = std::sqrt(dot3(d, d));
     }
-    const auto farthest = static_cast<std::ptrdiff_t>(share * static_cast<double>(values.size() - 1));
+    const auto farthest =
+        static_cast<std::ptrdiff_t>(share * static_cast<double>(values.size() - 1));
     std::nth_element(values.begin(), values.begin() + farthest, values.end());
     found.radius = values[static_cast<size_t>(farthest)];
     if (!(found.radius > 0)) found.radius = 1;
@@ -202,7 +218,8 @@ CutView cut_view(const CutPictures& pictures, uint64_t number) {
     Random random(pictures.seed, number);
     const double part = random.uniform();
     double all = static_cast<double>(pictures.weight.size());  // that a picture has without levels
-    const double share = pictures.most * std::pow(pictures.least / pictures.most, part * part) / all;
+    const double share =
+        pictures.most * std::pow(pictures.least / pictures.most, part * part) / all;
     const double size = kLeastSize * std::exp2(kOctavesOfSize * random.uniform());
     Camera camera;
     SelectRule rule{};
@@ -222,11 +239,12 @@ CutView cut_view(const CutPictures& pictures, uint64_t number) {
     if (!rule.culls) camera = on_screen(camera, random);
     rule.budget = static_cast<uint64_t>(std::ceil(share * all));
     SelectOutput whole = selected(pictures.table, camera, rule);
-    // From inside of groups these are refined at any tolerance, and a budget below what is left of them is
-    // met by nothing but the coarsest clusters: then by coarser levels alone.
+    // From inside of groups these are refined at any tolerance, and a budget below what is left of
+    // them is met by nothing but the coarsest clusters: then by coarser levels alone.
     const Span<const int32_t>& levels = pictures.table.level;
     const int32_t coarsest = levels.size > 0 ? levels[levels.size - 1] : 0;
-    while (std::isinf(whole.tolerance_px2) && 2 * whole.num_gaussians < static_cast<int64_t>(rule.budget) &&
+    while (std::isinf(whole.tolerance_px2) &&
+           2 * whole.num_gaussians < static_cast<int64_t>(rule.budget) &&
            rule.min_level < coarsest) {
         ++rule.min_level;
         whole = selected(pictures.table, camera, rule);

@@ -12,17 +12,21 @@ namespace v3dg {
 
 namespace {
 
-// By how much balls grow: a group is selected at 1.5 to 0.19 px² a gaussian at the default tolerance.
+// By how much balls grow: a group is selected at 1.5 to 0.19 px² a gaussian at the default
+// tolerance.
 constexpr double kLeast = 1.4, kMost = 4, kDefaultPx2 = 3;
-constexpr double kPx2[FirstSelected::kSizes] = {0.2, 0.5, 1.2, 3};  // a gaussian of half of the groups
-constexpr double kWidestPx = 2048, kBorderPx = 4;                   // of a picture, and around the ball
-constexpr double kDistance = 8, kShare = 0.999;  // from the centre, in radii; of the gaussians in the ball
-// A pixel counts by this power of how far it is off, as people see it. By this measure a level is as good as
-// the leaves, by FLIP, where it has so many times their loss.
+constexpr double kPx2[FirstSelected::kSizes] = {0.2, 0.5, 1.2,
+                                                3};  // a gaussian of half of the groups
+constexpr double kWidestPx = 2048, kBorderPx = 4;    // of a picture, and around the ball
+constexpr double kDistance = 8,
+                 kShare = 0.999;  // from the centre, in radii; of the gaussians in the ball
+// A pixel counts by this power of how far it is off, as people see it. By this measure a level is
+// as good as the leaves, by FLIP, where it has so many times their loss.
 constexpr float kPower = 0.7f;
 constexpr double kAsGood = 1.15;
-// Groups that few pixels show are taken to be like all: so many times the mean loss of a group is added, in
-// the proportion that all groups have. And it counts little what they look like: so much more for leaves.
+// Groups that few pixels show are taken to be like all: so many times the mean loss of a group is
+// added, in the proportion that all groups have. And it counts little what they look like: so much
+// more for leaves.
 constexpr double kLikeAll = 0.2, kOutOfSight = 0.05;
 constexpr double kNothing = 1e-9;  // a loss, or a footprint in the ball, below which there is none
 constexpr int kSteps = 64;         // of sizes that are looked at
@@ -39,7 +43,8 @@ FirstSelected::FirstSelected(Span<const float> means, Span<const Ball> balls,
     for (size_t g = 0; g < balls.size; ++g) {
         const double part = static_cast<double>(balls[g].radius) / around_.radius;
         const auto count = static_cast<double>(group_offset[g + 1] - group_offset[g]);
-        footprint_.push_back(std::max(kPi * part * part / count, kNothing) / (kDistance * kDistance));
+        footprint_.push_back(std::max(kPi * part * part / count, kNothing) /
+                             (kDistance * kDistance));
     }
     const double most = kWidestPx / 2 * std::sqrt(kDistance * kDistance - 1);
     for (size_t size = 0; size < kSizes; ++size) {
@@ -49,7 +54,8 @@ FirstSelected::FirstSelected(Span<const float> means, Span<const Ball> balls,
     }
 }
 
-// Looks at the ball from afar, from evenly all around; pixels lie elsewhere by a part of one each time.
+// Looks at the ball from afar, from evenly all around; pixels lie elsewhere by a part of one each
+// time.
 Camera FirstSelected::camera(size_t picture) const {
     const size_t side = picture % kSides;
     const double z = 1 - (2 * static_cast<double>(side) + 1) / kSides;
@@ -70,9 +76,11 @@ Camera FirstSelected::camera(size_t picture) const {
 }
 
 void FirstSelected::add(size_t picture, Span<const float> shares, Span<const int64_t> leaf_offset) {
-    std::vector<double>&of_leaves = of_leaves_[picture / kSides], &of_level = of_level_[picture / kSides];
+    std::vector<double>&of_leaves = of_leaves_[picture / kSides],
+    &of_level = of_level_[picture / kSides];
     for (size_t g = 0; g < of_leaves.size(); ++g)
-        for (auto i = static_cast<size_t>(leaf_offset[g]); i < static_cast<size_t>(leaf_offset[g + 1]); ++i) {
+        for (auto i = static_cast<size_t>(leaf_offset[g]);
+             i < static_cast<size_t>(leaf_offset[g + 1]); ++i) {
             of_leaves[g] += static_cast<double>(shares[3 * i]);
             of_level[g] += static_cast<double>(shares[3 * i + 1]);
         }
@@ -86,7 +94,8 @@ std::vector<float> FirstSelected::growth() const {
     }
     std::vector<float> growth;
     for (size_t g = 0; g < footprint_.size(); ++g) {
-        double px2[kSizes], worse[kSizes];  // logarithms; how much worse the level is than the leaves
+        double px2[kSizes],
+            worse[kSizes];  // logarithms; how much worse the level is than the leaves
         for (size_t size = 0; size < kSizes; ++size) {
             px2[size] = std::log(footprint_[g] * focal_[size] * focal_[size]);
             const double of_level = of_level_[size][g] + kLikeAll * mean_of_level[size] + kNothing;
@@ -114,14 +123,16 @@ std::vector<float> FirstSelected::growth() const {
     return growth;
 }
 
-void losses_of_pixels(const PictureColors& colors, size_t width, size_t height, Span<float> losses) {
+void losses_of_pixels(const PictureColors& colors, size_t width, size_t height,
+                      Span<float> losses) {
     constexpr size_t kSamples = FirstSelected::kSamples;
     std::vector<float> truth(3 * width * height), off(truth.size()), across(truth.size());
     for (size_t y = 0; y < kSamples * height; ++y)
         for (size_t i = 0; i < 3 * kSamples * width; ++i)
             truth[3 * (y / kSamples * width + i / (3 * kSamples)) + i % 3] +=
                 std::min(colors.truth[3 * kSamples * width * y + i], 1.0f) / (kSamples * kSamples);
-    // As little is seen of what is off in a single pixel, its neighbours share it. The border is empty.
+    // As little is seen of what is off in a single pixel, its neighbours share it. The border is
+    // empty.
     const auto shared = [](const std::vector<float>& from, size_t i, size_t step) {
         const float before = i < step ? 0.0f : from[i - step];
         return 0.25f * (before + 2 * from[i] + (i + step < from.size() ? from[i + step] : 0.0f));

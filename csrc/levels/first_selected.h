@@ -12,15 +12,17 @@
 
 namespace v3dg {
 
-// Pictures of the whole asset are compared, because alone groups show edges that others hide. Who has them
-// drawn adds their losses, and asks for the result.
+// Pictures of the whole asset are compared, because alone groups show edges that others hide. Who
+// has them drawn adds their losses, and asks for the result.
 class FirstSelected {
   public:
     static constexpr size_t kSides = 8, kSizes = 4;
     static constexpr int kSamples = 2;  // a side of a pixel of the truth
 
-    // Of the leaves' means, (N, 3), and the groups' balls; level 1 has the gaussians of `group_offset`.
-    FirstSelected(Span<const float> means, Span<const Ball> balls, Span<const int64_t> group_offset);
+    // Of the leaves' means, (N, 3), and the groups' balls; level 1 has the gaussians of
+    // `group_offset`.
+    FirstSelected(Span<const float> means, Span<const Ball> balls,
+                  Span<const int64_t> group_offset);
 
     static constexpr size_t num_pictures() { return kSides * kSizes; }
     Camera camera(size_t picture) const;

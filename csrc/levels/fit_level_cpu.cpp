@@ -1,4 +1,5 @@
-// Hands the groups of a level to threads. What is done for one group is in fit_group/fit_group_cpu.cpp.
+// Hands the groups of a level to threads. What is done for one group is in
+// fit_group/fit_group_cpu.cpp.
 
 #include "base/threads.h"
 #include "levels/fit_level.h"
@@ -22,30 +23,33 @@ void fit_level(const FitConfig& config, Span<const FitGroup> groups, const FitTa
     const size_t num_pictures =
         config.num_views > 0 ? config.num_views + kHeldOutViews : 0;  // kept of a group
     std::vector<FitImage> images;
-    // Pictures first, one a (group, view), so that the last levels, with a group or two, keep all threads
-    // busy.
+    // Pictures first, one a (group, view), so that the last levels, with a group or two, keep all
+    // threads busy.
     for (size_t first = 0; first < groups.size && !progress.cancel;) {
         size_t last = groups.size;
         if (num_pictures > 0) {
             const int size = fit_view(config, groups[first], 0).size;
             const size_t tiles = static_cast<size_t>((size + kTileSize - 1) / kTileSize);
-            const size_t bytes = num_pictures * tiles * tiles * kTileSize * kTileSize * 4 * sizeof(float);
-            last = std::min(groups.size, first + std::max<size_t>(most_threads(), kTargetBytes / bytes));
+            const size_t bytes =
+                num_pictures * tiles * tiles * kTileSize * kTileSize * 4 * sizeof(float);
+            last = std::min(groups.size,
+                            first + std::max<size_t>(most_threads(), kTargetBytes / bytes));
             images.resize((last - first) * num_pictures);
             std::vector<FitScratch> scratch(most_threads());
             parallel_for(images.size(), 1, [&](size_t i) {
                 if (progress.cancel) return;
                 const FitGroup& group = groups[first + i / num_pictures];
                 V3DG_DISPATCH_ISA(fit_target, config, group, target,
-                                  fit_view(config, group, i % num_pictures), scratch[omp_get_thread_num()],
-                                  images[i]);
+                                  fit_view(config, group, i % num_pictures),
+                                  scratch[omp_get_thread_num()], images[i]);
             });
         }
         parallel_for(last - first, 1, [&](size_t i) {
             if (progress.cancel) return;
             const size_t g = first + i;
-            V3DG_DISPATCH_ISA(fit_group, config, groups[g], target, images.data() + i * num_pictures, rows,
-                              error + 2 * g, progress.cancel);
+            V3DG_DISPATCH_ISA(fit_group, config, groups[g], target,
+                              images.data() + i * num_pictures, rows, error + 2 * g,
+                              progress.cancel);
             double sum = progress.loss_sum.load();
             const double own_error[2] = {error[2 * g], error[2 * g + 1]};
             const double loss = residual_loss(config.loss, own_error);

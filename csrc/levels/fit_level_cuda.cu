@@ -21,7 +21,8 @@ constexpr std::chrono::microseconds kBetweenLooks{50};
 class Signals {
   public:
     Signals() {
-        check(cudaHostAlloc(reinterpret_cast<void**>(&host_), sizeof(FitSignals), cudaHostAllocMapped),
+        check(cudaHostAlloc(reinterpret_cast<void**>(&host_), sizeof(FitSignals),
+                            cudaHostAllocMapped),
               "cudaHostAlloc");
         *host_ = FitSignals{};
     }
@@ -38,7 +39,10 @@ class Signals {
 
 class Event {
   public:
-    Event() { check(cudaEventCreateWithFlags(&event_, cudaEventDisableTiming), "cudaEventCreateWithFlags"); }
+    Event() {
+        check(cudaEventCreateWithFlags(&event_, cudaEventDisableTiming),
+              "cudaEventCreateWithFlags");
+    }
     Event(const Event&) = delete;
     Event& operator=(const Event&) = delete;
     ~Event() { cudaEventDestroy(event_); }
@@ -60,8 +64,9 @@ std::vector<FitJob> jobs_of(const FitConfig& config, Span<const FitGroup> groups
     std::vector<FitJob> jobs(groups.size);
     for (size_t g = 0; g < groups.size; ++g)
         jobs[g] = {groups[g], 0, 0, static_cast<uint32_t>(g), fit_view(config, groups[g], 0).size};
-    std::stable_sort(jobs.begin(), jobs.end(),
-                     [](const FitJob& a, const FitJob& b) { return a.group.count > b.group.count; });
+    std::stable_sort(jobs.begin(), jobs.end(), [](const FitJob& a, const FitJob& b) {
+        return a.group.count > b.group.count;
+    });
     return jobs;
 }
 
@@ -72,8 +77,9 @@ size_t target_bytes(const FitConfig& config, const FitJob& job) {
 // Fits jobs whose pictures fit into memory together.
 class LevelFit {
   public:
-    LevelFit(const FitConfig& config, const DeviceFitTarget& target, const GaussianRows<float>& rows,
-             const FitExtent& extent, FitProgress& progress, cudaStream_t stream)
+    LevelFit(const FitConfig& config, const DeviceFitTarget& target,
+             const GaussianRows<float>& rows, const FitExtent& extent, FitProgress& progress,
+             cudaStream_t stream)
         : config_(config),
           target_(target),
           rows_(rows),
@@ -103,16 +109,19 @@ class LevelFit {
         draw_targets(config_, jobs, on_device.data, target_, views, targets, frame_, stream_);
 
         Signals signals;
-        const FitGroupsInput in{
-            config_,       visiting_stride(config_), on_device, targets, views, steps_.data(), rows_,
-            error_.data(), signals.device()};
+        const FitGroupsInput in{config_,         visiting_stride(config_),
+                                on_device,       targets,
+                                views,           steps_.data(),
+                                rows_,           error_.data(),
+                                signals.device()};
         fit_groups(in, extent_, stream_);
         done_.record(stream_);
         const uint64_t done_before = progress_.groups_done;
         const double loss_before = progress_.loss_sum;
         const auto report = [&] {
             progress_.groups_done = done_before + signals.host().groups_done;
-            progress_.loss_sum = loss_before + std::ldexp(static_cast<double>(signals.host().loss_sum), -32);
+            progress_.loss_sum =
+                loss_before + std::ldexp(static_cast<double>(signals.host().loss_sum), -32);
         };
         while (!done_.has_happened()) {
             report();
@@ -142,7 +151,8 @@ class LevelFit {
 }  // namespace
 
 void fit_level(const FitConfig& config, Span<const FitGroup> groups, const DeviceFitTarget& target,
-               const GaussianRows<float>& rows, float* error, FitProgress& progress, Stream stream) {
+               const GaussianRows<float>& rows, float* error, FitProgress& progress,
+               Stream stream) {
     if (groups.empty() || progress.cancel) return;
     std::vector<FitJob> jobs = jobs_of(config, groups);
     size_t free_bytes = 0, total_bytes = 0;
@@ -151,7 +161,8 @@ void fit_level(const FitConfig& config, Span<const FitGroup> groups, const Devic
     LevelFit level(config, target, rows, extent_of({jobs.data(), jobs.size()}), progress, stream);
     for (size_t first = 0; first < jobs.size() && !progress.cancel;) {
         size_t last = first, bytes = 0;
-        while (last < jobs.size() && (last == first || bytes + target_bytes(config, jobs[last]) <= budget))
+        while (last < jobs.size() &&
+               (last == first || bytes + target_bytes(config, jobs[last]) <= budget))
             bytes += target_bytes(config, jobs[last++]);
         try {
             level.fit({jobs.data() + first, last - first});
@@ -163,8 +174,8 @@ void fit_level(const FitConfig& config, Span<const FitGroup> groups, const Devic
         first = last;
     }
     if (progress.cancel) return;
-    check(cudaMemcpyAsync(error, level.error(), 2 * groups.size * sizeof(float), cudaMemcpyDeviceToHost,
-                          stream),
+    check(cudaMemcpyAsync(error, level.error(), 2 * groups.size * sizeof(float),
+                          cudaMemcpyDeviceToHost, stream),
           "cudaMemcpyAsync");
     check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
 }

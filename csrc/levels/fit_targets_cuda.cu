@@ -23,7 +23,8 @@ struct TargetPicture {
     uint64_t first_pixel;  // of the large picture
 };
 
-__global__ void views_kernel(FitConfig config, Span<const FitJob> jobs, uint64_t pictures, FitView* views) {
+__global__ void views_kernel(FitConfig config, Span<const FitJob> jobs, uint64_t pictures,
+                             FitView* views) {
     const uint64_t i = blockIdx.x * uint64_t(blockDim.x) + threadIdx.x;
     if (i >= jobs.size * pictures) return;
     const FitJob& job = jobs[i / pictures];
@@ -43,8 +44,8 @@ struct TargetTables {
 };
 
 // A block takes a picture, its threads the items.
-__global__ void pictures_kernel(TargetTables t, unsigned long long num_items, unsigned long long num_records,
-                                ItemList items) {
+__global__ void pictures_kernel(TargetTables t, unsigned long long num_items,
+                                unsigned long long num_records, ItemList items) {
     if (blockIdx.x == 0 && threadIdx.x == 0) {
         items.counters->items = num_items;
         items.counters->gaussians = num_records;
@@ -63,8 +64,8 @@ __global__ void pictures_kernel(TargetTables t, unsigned long long num_items, un
         image.planes.color = t.color + 3 * p.first_pixel;
         image.planes.alpha = t.alpha + p.first_pixel;
         t.images[blockIdx.x] = image;
-        t.placements[blockIdx.x] = {view_of_world(t.config, job.group.center, job.group.radius, view), 0,
-                                    blockIdx.x};
+        t.placements[blockIdx.x] = {
+            view_of_world(t.config, job.group.center, job.group.radius, view), 0, blockIdx.x};
     }
     if (!items.has_room_for(num_items, num_records)) return;
     const uint32_t count = static_cast<uint32_t>(job.group.target_count);
@@ -92,7 +93,8 @@ __global__ void average_kernel(TargetTables t, float4* targets) {
         float4 sum = make_float4(0, 0, 0, 0);
         for (int y = 0; y < scale; ++y) {
             const uint64_t first =
-                p.first_pixel + (static_cast<uint64_t>(i / size * scale + y) * size + i % size) * scale;
+                p.first_pixel +
+                (static_cast<uint64_t>(i / size * scale + y) * size + i % size) * scale;
             for (int x = 0; x < scale; ++x) {
                 sum.x += share * t.color[3 * (first + x)];
                 sum.y += share * t.color[3 * (first + x) + 1];
@@ -104,19 +106,22 @@ __global__ void average_kernel(TargetTables t, float4* targets) {
     }
 }
 
-unsigned grid_of(uint64_t count) { return static_cast<unsigned>((count + kThreads - 1) / kThreads); }
+unsigned grid_of(uint64_t count) {
+    return static_cast<unsigned>((count + kThreads - 1) / kThreads);
+}
 
 }  // namespace
 
-void make_views(const FitConfig& config, Span<const FitJob> jobs, FitView* views, cudaStream_t stream) {
+void make_views(const FitConfig& config, Span<const FitJob> jobs, FitView* views,
+                cudaStream_t stream) {
     const uint64_t pictures = num_pictures(config);
-    launch("views_kernel", views_kernel, grid_of(jobs.size * pictures), kThreads, 0, stream, config, jobs,
-           pictures, views);
+    launch("views_kernel", views_kernel, grid_of(jobs.size * pictures), kThreads, 0, stream, config,
+           jobs, pictures, views);
 }
 
 void draw_targets(const FitConfig& config, Span<const FitJob> jobs, const FitJob* jobs_on_device,
-                  const DeviceFitTarget& target, const FitView* views, float4* targets, Frame& frame,
-                  cudaStream_t stream) {
+                  const DeviceFitTarget& target, const FitView* views, float4* targets,
+                  Frame& frame, cudaStream_t stream) {
     const uint64_t pictures_of_job = num_pictures(config);
     const DeviceBuffer<GaussianRows<const float>> model(
         Span<const GaussianRows<const float>>{&target.rows, 1}, stream);
@@ -136,9 +141,9 @@ void draw_targets(const FitConfig& config, Span<const FitJob> jobs, const FitJob
             if (!pictures.empty() &&
                 (pixels + size * size > kPixelsAtOnce || gaussians + count > kGaussiansAtOnce))
                 break;
-            pictures.push_back({static_cast<uint32_t>(next / pictures_of_job), static_cast<uint32_t>(items),
-                                static_cast<uint32_t>(gaussians), static_cast<uint32_t>(tiles),
-                                next % pictures_of_job, pixels});
+            pictures.push_back({static_cast<uint32_t>(next / pictures_of_job),
+                                static_cast<uint32_t>(items), static_cast<uint32_t>(gaussians),
+                                static_cast<uint32_t>(tiles), next % pictures_of_job, pixels});
             pixels += size * size;
             gaussians += count;
             items += (count + kItemSize - 1) / kItemSize;
@@ -146,15 +151,16 @@ void draw_targets(const FitConfig& config, Span<const FitJob> jobs, const FitJob
                      ((size + kFrameTileHeight - 1) / kFrameTileHeight);
         }
         const uint32_t num_images = static_cast<uint32_t>(pictures.size());
-        TargetTables tables{config,
-                            jobs_on_device,
-                            views,
-                            pictures_on_device.copy_from({pictures.data(), pictures.size()}, stream),
-                            {target.filter_px2, target.antialiased, false},
-                            color.reserve(3 * pixels, stream),
-                            alpha.reserve(pixels, stream),
-                            images.reserve(num_images, stream),
-                            placements.reserve(num_images, stream)};
+        TargetTables tables{
+            config,
+            jobs_on_device,
+            views,
+            pictures_on_device.copy_from({pictures.data(), pictures.size()}, stream),
+            {target.filter_px2, target.antialiased, false},
+            color.reserve(3 * pixels, stream),
+            alpha.reserve(pixels, stream),
+            images.reserve(num_images, stream),
+            placements.reserve(num_images, stream)};
         FrameBatch batch{model.data(), tables.placements, tables.images, num_images,
                          static_cast<uint32_t>(tiles)};
         batch.has_depth = false;
@@ -162,8 +168,8 @@ void draw_targets(const FitConfig& config, Span<const FitJob> jobs, const FitJob
             .draw(
                 batch,
                 [=](const ItemList& list, cudaStream_t on) {
-                    launch("pictures_kernel", pictures_kernel, num_images, kThreads, 0, on, tables, items,
-                           gaussians, list);
+                    launch("pictures_kernel", pictures_kernel, num_images, kThreads, 0, on, tables,
+                           items, gaussians, list);
                 },
                 stream)
             ->finish();

@@ -11,16 +11,18 @@ struct CutRows {
     Span<const float> radius;  // a length for each gaussian, which no scale outgrows
 };
 
-// Moves gaussians until pictures of cuts are those of the target: config.steps of Adam, each of the gaussians
-// that one picture shows. The first `target_count` of them, level 0, are the target's, and stay. A group is
-// fitted alone, seen from all sides at one size (fit_level.h); here it is seen as a cut shows it: next to
-// groups of its own level and of others, which hide parts of it, at the sizes of the pictures.
+// Moves gaussians until pictures of cuts are those of the target: config.steps of Adam, each of the
+// gaussians that one picture shows. The first `target_count` of them, level 0, are the target's,
+// and stay. A group is fitted alone, seen from all sides at one size (fit_level.h); here it is seen
+// as a cut shows it: next to groups of its own level and of others, which hide parts of it, at the
+// sizes of the pictures.
 //
-// Cuts are drawn with the filter of `config`, level 0 too, which shows without one: where pictures are small
-// that is a third of what cuts are off. The target's pictures are drawn larger and box-averaged. The loss is
-// that of the fit without D-SSIM; positions move in steps of a part of the radius. Of `config`, sizes,
-// samples and numbers of its own views are not looked at. The result does not depend on the number of
-// threads. Returns early once `progress.cancel` is set; `progress.groups_done` counts pictures.
+// Cuts are drawn with the filter of `config`, level 0 too, which shows without one: where pictures
+// are small that is a third of what cuts are off. The target's pictures are drawn larger and
+// box-averaged. The loss is that of the fit without D-SSIM; positions move in steps of a part of
+// the radius. Of `config`, sizes, samples and numbers of its own views are not looked at. The
+// result does not depend on the number of threads. Returns early once `progress.cancel` is set;
+// `progress.groups_done` counts pictures.
 void refine_cuts(const FitConfig& config, const FitTarget& target, uint64_t target_count,
                  const CutRows& levels, const CutPictures& pictures, FitProgress& progress);
 
@@ -31,7 +33,7 @@ struct SeenOfGaussians {
 };
 
 // Adds what config.steps pictures of cuts, drawn as refine_cuts draws them, show of each gaussian.
-void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows, const CutPictures& pictures,
-                const SeenOfGaussians& seen, FitProgress& progress);
+void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows,
+                const CutPictures& pictures, const SeenOfGaussians& seen, FitProgress& progress);
 
 }  // namespace v3dg

@@ -38,19 +38,22 @@ class Canvas {
 
 // Puts the slope of the loss in place of the picture.
 void compare(const FitConfig& config, int samples, Canvas& picture, Canvas& target) {
-    const auto width = static_cast<size_t>(picture.width()), height = static_cast<size_t>(picture.height());
+    const auto width = static_cast<size_t>(picture.width()),
+               height = static_cast<size_t>(picture.height());
     std::vector<double> loss_of_row(height, 0.0);
     parallel_for(height, 8, [&](size_t y) {
         for (size_t x = 0; x < width; ++x) {
             float* color = picture.color() + 3 * (y * width + x);
             float& alpha = picture.alpha()[y * width + x];
-            for (int k = 0; k < 3; ++k) color[k] -= box_average(target.color(), width, 3, k, x, y, samples);
+            for (int k = 0; k < 3; ++k)
+                color[k] -= box_average(target.color(), width, 3, k, x, y, samples);
             alpha -= box_average(target.alpha(), width, 1, 0, x, y, samples);
             loss_of_row[y] += loss_of_pixel(config.loss, color, alpha);
         }
     });
-    const float weight = weight_of_picture(std::accumulate(loss_of_row.begin(), loss_of_row.end(), 0.0),
-                                           static_cast<double>(width * height));
+    const float weight =
+        weight_of_picture(std::accumulate(loss_of_row.begin(), loss_of_row.end(), 0.0),
+                          static_cast<double>(width * height));
     for (size_t i = 0; i < 3 * width * height; ++i)
         picture.color()[i] = l1_vjp(picture.color()[i], config.loss.l1 / 3 * weight);
     for (size_t i = 0; i < width * height; ++i)
@@ -79,7 +82,8 @@ class Views {
 // The gaussians of one view, the picture of them, and the way back.
 class CutFrame {
   public:
-    explicit CutFrame(const FitConfig& config) : appearance_{config.filter_px2, config.antialiased, false} {}
+    explicit CutFrame(const FitConfig& config)
+        : appearance_{config.filter_px2, config.antialiased, false} {}
 
     // The rows of so many gaussians, which are written before they are drawn.
     const GaussianRows<float>& start(size_t count, int sh_degree) {
@@ -98,10 +102,12 @@ class CutFrame {
     }
     GaussianRows<const float> backward() {
         gradients_.assign(values_.size(), 0.0f);
-        const GaussianRows<float> gradient = rows_in(gradients_.data(), rows_.size, rows_.sh_degree);
+        const GaussianRows<float> gradient =
+            rows_in(gradients_.data(), rows_.size, rows_.sh_degree);
         float d_background[3] = {};
-        render_backward<float>(draw_, pinhole_, picture_, {canvas_.color(), canvas_.alpha(), nullptr},
-                               workspace_, gradient, {}, d_background);
+        render_backward<float>(draw_, pinhole_, picture_,
+                               {canvas_.color(), canvas_.alpha(), nullptr}, workspace_, gradient,
+                               {}, d_background);
         return gradient;
     }
 
@@ -119,8 +125,8 @@ class CutFrame {
 
 }  // namespace
 
-void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows, const CutPictures& pictures,
-                const SeenOfGaussians& seen, FitProgress& progress) {
+void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows,
+                const CutPictures& pictures, const SeenOfGaussians& seen, FitProgress& progress) {
     const auto steps = static_cast<size_t>(config.steps);
     Views views(pictures, steps);
     CutFrame frame(config);
@@ -174,7 +180,8 @@ void refine_cuts(const FitConfig& config, const FitTarget& target, uint64_t targ
         const FitStep step = fit_step(config, static_cast<int>(i));
         parallel_for(index.size(), kGaussiansAtOnce, [&](size_t g) {
             if (index[g] < target_count) return;
-            move_gaussian(rows, index[g], gradient, g, levels.radius[index[g]], step, config.beta2, kept);
+            move_gaussian(rows, index[g], gradient, g, levels.radius[index[g]], step, config.beta2,
+                          kept);
         });
         ++progress.groups_done;
     }

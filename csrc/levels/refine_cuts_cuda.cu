@@ -12,13 +12,16 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kThreads = 256;
-constexpr unsigned kGaussiansABlock = 64;  // few, so that a level of some thousands spreads over the device
+constexpr unsigned kGaussiansABlock =
+    64;  // few, so that a level of some thousands spreads over the device
 // Pictures of the target that are drawn at once, and that are there ahead of their steps.
 constexpr unsigned kThreadsAhead = 3, kPicturesAhead = 2 * kThreadsAhead;
 
 class OwnStream {
   public:
-    OwnStream() { check(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking), "cudaStreamCreate"); }
+    OwnStream() {
+        check(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking), "cudaStreamCreate");
+    }
     // Waits for its work, which reads what belongs to whoever called, also where a step has failed.
     ~OwnStream() {
         cudaStreamSynchronize(stream_);
@@ -72,8 +75,8 @@ ModelPicture picture_of(const GaussianRows<const float>& rows, float filter_px2,
 }
 
 // A thread a pixel: of a picture that is `samples` times as wide.
-__global__ void average_kernel(PicturePlanes larger, PicturePlanes picture, unsigned width, unsigned height,
-                               int samples) {
+__global__ void average_kernel(PicturePlanes larger, PicturePlanes picture, unsigned width,
+                               unsigned height, int samples) {
     const size_t pixel = size_t(blockIdx.x) * kThreads + threadIdx.x;
     if (pixel >= size_t(width) * height) return;
     const size_t x = pixel % width, y = pixel / width;
@@ -83,13 +86,15 @@ __global__ void average_kernel(PicturePlanes larger, PicturePlanes picture, unsi
 }
 
 // A thread a pixel: how far it is off, and the loss of the block's pixels.
-__global__ void difference_kernel(PicturePlanes picture, PicturePlanes target, PicturePlanes difference,
-                                  size_t num_pixels, LossWeights loss, double* loss_of_block) {
+__global__ void difference_kernel(PicturePlanes picture, PicturePlanes target,
+                                  PicturePlanes difference, size_t num_pixels, LossWeights loss,
+                                  double* loss_of_block) {
     const size_t pixel = size_t(blockIdx.x) * kThreads + threadIdx.x;
     double own = 0;
     if (pixel < num_pixels) {
         float* color = difference.color + 3 * pixel;
-        for (size_t k = 0; k < 3; ++k) color[k] = picture.color[3 * pixel + k] - target.color[3 * pixel + k];
+        for (size_t k = 0; k < 3; ++k)
+            color[k] = picture.color[3 * pixel + k] - target.color[3 * pixel + k];
         const float alpha = picture.alpha[pixel] - target.alpha[pixel];
         difference.alpha[pixel] = alpha;
         own = loss_of_pixel(loss, color, alpha);
@@ -148,8 +153,8 @@ __global__ void weight_kernel(Span<const uint32_t> index, GaussianRows<const flo
     if (g < index.size) weight[index[g]] += blend_weight(gradient.sh[3 * g], num_pixels);
 }
 __global__ void move_kernel(GaussianRows<float> rows, Span<const uint32_t> index,
-                            GaussianRows<const float> gradient, const float* radius, size_t num_fixed,
-                            FitStep step, float beta2, Moments moments) {
+                            GaussianRows<const float> gradient, const float* radius,
+                            size_t num_fixed, FitStep step, float beta2, Moments moments) {
     const size_t g = size_t(blockIdx.x) * kGaussiansABlock + threadIdx.x;
     if (g < index.size && index[g] >= num_fixed)
         move_gaussian(rows, index[g], gradient, g, radius[index[g]], step, beta2, moments);
@@ -158,19 +163,20 @@ __global__ void move_kernel(GaussianRows<float> rows, Span<const uint32_t> index
 // Writes the slope of the loss by each value of the picture.
 class Comparison {
   public:
-    const PicturePlanes& slopes(const LossWeights& loss, const Camera& camera, const PicturePlanes& picture,
-                                const PicturePlanes& target, cudaStream_t stream) {
+    const PicturePlanes& slopes(const LossWeights& loss, const Camera& camera,
+                                const PicturePlanes& picture, const PicturePlanes& target,
+                                cudaStream_t stream) {
         const size_t count = num_pixels(camera);
         const unsigned num_blocks = blocks_for(count, kThreads);
         slope_.start(camera, stream);
         double* losses = losses_.reserve(num_blocks, stream);
         float* weight = weight_.reserve(1, stream);
-        launch("difference_kernel", difference_kernel, num_blocks, kThreads, 0, stream, picture, target,
-               slope_.planes(), count, loss, losses);
-        launch("weigh_kernel", weigh_kernel, 1, 32, 0, stream, losses, num_blocks, static_cast<double>(count),
-               weight);
-        launch("slope_kernel", slope_kernel, num_blocks, kThreads, 0, stream, slope_.planes(), count, loss,
-               weight);
+        launch("difference_kernel", difference_kernel, num_blocks, kThreads, 0, stream, picture,
+               target, slope_.planes(), count, loss, losses);
+        launch("weigh_kernel", weigh_kernel, 1, 32, 0, stream, losses, num_blocks,
+               static_cast<double>(count), weight);
+        launch("slope_kernel", slope_kernel, num_blocks, kThreads, 0, stream, slope_.planes(),
+               count, loss, weight);
         return slope_.planes();
     }
 
@@ -193,14 +199,16 @@ class CutFrame {
     }
     const PicturePlanes& draw(const Camera& camera) {
         const PicturePlanes& planes = picture_.start(camera, stream_);
-        frame_.draw(picture_of(rows_, config_.filter_px2, config_.antialiased, camera, planes), stream_);
+        frame_.draw(picture_of(rows_, config_.filter_px2, config_.antialiased, camera, planes),
+                    stream_);
         return planes;
     }
     GaussianRows<const float> backward(const PicturePlanes& slopes) {
         const GaussianRows<float> gradient =
-            rows_in(gradients_.reserve(num_values(rows_.sh_degree) * rows_.size, stream_), rows_.size,
-                    rows_.sh_degree);
-        frame_.backward({slopes.color, slopes.alpha, nullptr}, gradient, {}, background_.data(), stream_);
+            rows_in(gradients_.reserve(num_values(rows_.sh_degree) * rows_.size, stream_),
+                    rows_.size, rows_.sh_degree);
+        frame_.backward({slopes.color, slopes.alpha, nullptr}, gradient, {}, background_.data(),
+                        stream_);
         return gradient;
     }
 
@@ -222,8 +230,8 @@ struct Wanted {
     Event made, used;
 };
 
-// Draws what steps need ahead of them: a step waits for the host as often as it draws, and leaves most of the
-// device idle.
+// Draws what steps need ahead of them: a step waits for the host as often as it draws, and leaves
+// most of the device idle.
 class WantedAhead {
   public:
     WantedAhead(const FitConfig& config, const DeviceFitTarget& target, const CutPictures& pictures,
@@ -268,10 +276,11 @@ class WantedAhead {
         wanted.gaussians.copy_from({gaussians.data(), gaussians.size()}, stream);
         const Camera camera = enlarged(view.camera, view.samples);
         const PicturePlanes& larger = worker.larger.start(camera, stream);
-        worker.frame.draw(picture_of(target_.rows, target_.filter_px2, target_.antialiased, camera, larger),
-                          stream);
-        launch("average_kernel", average_kernel, blocks_for(num_pixels(view.camera), kThreads), kThreads, 0,
-               stream, larger, wanted.picture.start(view.camera, stream),
+        worker.frame.draw(
+            picture_of(target_.rows, target_.filter_px2, target_.antialiased, camera, larger),
+            stream);
+        launch("average_kernel", average_kernel, blocks_for(num_pixels(view.camera), kThreads),
+               kThreads, 0, stream, larger, wanted.picture.start(view.camera, stream),
                static_cast<unsigned>(view.camera.width), static_cast<unsigned>(view.camera.height),
                view.samples);
         check(cudaEventRecord(wanted.made.get(), stream), "cudaEventRecord");
@@ -296,7 +305,8 @@ void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const C
     const size_t num = num_values(rows.sh_degree), num_moments = 2 * num * rows.size;
     const DeviceBuffer<float> moments(num_moments, stream), radius(levels.radius, stream);
     if (num_moments > 0)
-        check(cudaMemsetAsync(moments.data(), 0, num_moments * sizeof(float), stream), "cudaMemsetAsync");
+        check(cudaMemsetAsync(moments.data(), 0, num_moments * sizeof(float), stream),
+              "cudaMemsetAsync");
     check(cudaStreamSynchronize(stream),
           "refine_cuts");  // what pictures are made of is there for all streams
     CutFrame frame(config, stream);
@@ -311,8 +321,8 @@ void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const C
         const PicturePlanes& drawn = frame.draw(wanted.camera);
         const GaussianRows<const float> gradient = frame.backward(
             comparison.slopes(config.loss, wanted.camera, drawn, wanted.picture.planes(), stream));
-        launch("move_kernel", move_kernel, num_blocks, kGaussiansABlock, 0, stream, rows, index, gradient,
-               radius.data(), target.rows.size, fit_step(config, i), config.beta2,
+        launch("move_kernel", move_kernel, num_blocks, kGaussiansABlock, 0, stream, rows, index,
+               gradient, radius.data(), target.rows.size, fit_step(config, i), config.beta2,
                Moments{moments.data(), moments.data() + num * rows.size});
         ahead.next_is_used();
         ++progress.groups_done;
@@ -320,8 +330,9 @@ void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const C
     check(cudaStreamSynchronize(stream), "refine_cuts");
 }
 
-void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows, const CutPictures& pictures,
-                const SeenOfGaussians& seen, FitProgress& progress, Stream stream) {
+void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows,
+                const CutPictures& pictures, const SeenOfGaussians& seen, FitProgress& progress,
+                Stream stream) {
     const DeviceBuffer<double> weights(Span<const double>(seen.weight), stream);
     CutFrame frame(config, stream);
     DeviceBuffer<uint32_t> gaussians;
@@ -333,13 +344,13 @@ void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows, 
         gaussians.copy_from({shown.data(), shown.size()}, stream);
         const Span<const uint32_t> index{gaussians.data(), shown.size()};
         const unsigned num_blocks = blocks_for(index.size, kGaussiansABlock);
-        launch("gather_in_grey_kernel", gather_in_grey_kernel, num_blocks, kGaussiansABlock, 0, stream, rows,
-               index, frame.start(index.size, 0));
+        launch("gather_in_grey_kernel", gather_in_grey_kernel, num_blocks, kGaussiansABlock, 0,
+               stream, rows, index, frame.start(index.size, 0));
         frame.draw(view.camera);
         const PicturePlanes& slope = slopes.start(view.camera, stream);
         const size_t count = num_pixels(view.camera);
-        launch("sum_slope_kernel", sum_slope_kernel, blocks_for(count, kThreads), kThreads, 0, stream, slope,
-               count);
+        launch("sum_slope_kernel", sum_slope_kernel, blocks_for(count, kThreads), kThreads, 0,
+               stream, slope, count);
         launch("weight_kernel", weight_kernel, num_blocks, kGaussiansABlock, 0, stream, index,
                frame.backward(slope), count, weights.data());
         ++progress.groups_done;

@@ -18,7 +18,9 @@ struct Box {
     float lo[3], hi[3];
 };
 
-V3DG_HD inline Box no_box() { return {{INFINITY, INFINITY, INFINITY}, {-INFINITY, -INFINITY, -INFINITY}}; }
+V3DG_HD inline Box no_box() {
+    return {{INFINITY, INFINITY, INFINITY}, {-INFINITY, -INFINITY, -INFINITY}};
+}
 
 V3DG_HD inline void grow(Box& box, const Box& other) {
     for (int a = 0; a < 3; ++a) {

@@ -19,8 +19,8 @@ struct Pinhole {
     T near_depth;
 };
 
-// Model space to view space: view = linear * (model - eye) + translation, linear = uniform scale * rotation.
-// What is near the eye keeps its digits, however far from zero both are.
+// Model space to view space: view = linear * (model - eye) + translation, linear = uniform scale *
+// rotation. What is near the eye keeps its digits, however far from zero both are.
 template <class T>
 struct ModelView {
     T linear[9];            // row major
@@ -28,8 +28,8 @@ struct ModelView {
     T eye[3], eye_rest[3];  // the camera's position in model space is their sum
 };
 
-// The leading 24 bits of a number, which a float holds. Of its bits, for GCC 12 takes (double)(float)x to be
-// x where it vectorizes.
+// The leading 24 bits of a number, which a float holds. Of its bits, for GCC 12 takes
+// (double)(float)x to be x where it vectorizes.
 V3DG_HD inline double leading_bits(double x) {
     uint64_t bits;
     std::memcpy(&bits, &x, sizeof bits);
@@ -38,10 +38,11 @@ V3DG_HD inline double leading_bits(double x) {
     return x;
 }
 
-// Places the eye, in double precision; `translation` is that of view = linear * model + translation.
+// Places the eye, in double precision; `translation` is that of view = linear * model +
+// translation.
 template <class T>
-V3DG_HD inline void set_eye(const double linear[9], const double translation[3], const double eye[3],
-                            ModelView<T>& view) {
+V3DG_HD inline void set_eye(const double linear[9], const double translation[3],
+                            const double eye[3], ModelView<T>& view) {
     double rest[3] = {translation[0], translation[1], translation[2]};
     for (int k = 0; k < 3; ++k) {
         const double leading = leading_bits(eye[k]);
@@ -57,7 +58,8 @@ template <class V, class T>
 V3DG_HD V3DG_INLINE void to_view(const ModelView<T>& mv, const V point[3], V p[3]) {
     const V x = point[0] - mv.eye[0], y = point[1] - mv.eye[1], z = point[2] - mv.eye[2];
     for (int i = 0; i < 3; ++i)
-        p[i] = mv.linear[3 * i] * x + mv.linear[3 * i + 1] * y + mv.linear[3 * i + 2] * z + mv.translation[i];
+        p[i] = mv.linear[3 * i] * x + mv.linear[3 * i + 1] * y + mv.linear[3 * i + 2] * z +
+               mv.translation[i];
 }
 
 // From the eye to a point, both in the model.
@@ -89,8 +91,8 @@ struct Camera {
 };
 static_assert(sizeof(Camera) == 26 * sizeof(double), "nothing but its numbers is compared");
 
-// What one cut is for: a camera, or the two eyes of a stereo camera. They look the same way: their rotations
-// are equal.
+// What one cut is for: a camera, or the two eyes of a stereo camera. They look the same way: their
+// rotations are equal.
 struct Eyes {
     Camera camera[2];  // the same twice where there is one
     bool are_two;
@@ -105,8 +107,8 @@ struct Eyes {
     }
 };
 
-// Where a camera is: what its world-to-camera matrix brings to 0. The rotation in it may be off by what
-// float32 loses.
+// Where a camera is: what its world-to-camera matrix brings to 0. The rotation in it may be off by
+// what float32 loses.
 V3DG_HD inline void eye_of(const double viewmat[16], double eye[3]) {
     // The rotation's inverse by columns, which are cross products of its rows.
     double determinant = 0.0;

@@ -1,7 +1,7 @@
 #pragma once
 
-// The ellipse that a gaussian covers on the image, and the rows of pixels that it meets. Its falloff over a
-// pixel is computed in rasterize/rasterize_math.h.
+// The ellipse that a gaussian covers on the image, and the rows of pixels that it meets. Its
+// falloff over a pixel is computed in rasterize/rasterize_math.h.
 
 #include "math/gaussian.h"
 
@@ -16,7 +16,8 @@ struct Ellipse {
     V depth;
 };
 
-// The first and the last pixel in x and in y that something covers; none where a first lies after its last.
+// The first and the last pixel in x and in y that something covers; none where a first lies after
+// its last.
 template <class I>
 struct PixelBox {
     I x0, x1, y0, y1;
@@ -31,7 +32,8 @@ struct EllipseRows {
     V inverse;  // 1 / l11
     V slope;    // of the line through the middles of the rows' extents
     V l22;
-    V rightmost;  // height above the centre at which it reaches farthest right; farthest left is opposite
+    V rightmost;  // height above the centre at which it reaches farthest right; farthest left is
+                  // opposite
 };
 
 // Of where alpha is 1/255 or more.
@@ -46,11 +48,12 @@ V3DG_HD V3DG_INLINE EllipseRows<V> ellipse_rows(V l11, V l12, V l22, V log2_opac
     return e;
 }
 
-// Where the ellipse may lie between the heights y0 <= y1: from x0 to x1, all from its centre, with a margin,
-// so that the blend step alone decides. Means nothing where the ellipse's box does not meet the heights.
+// Where the ellipse may lie between the heights y0 <= y1: from x0 to x1, all from its centre, with
+// a margin, so that the blend step alone decides. Means nothing where the ellipse's box does not
+// meet the heights.
 //
-// From this, four places find the cells of a grid that a gaussian may reach. They round differently on
-// purpose: each says why.
+// From this, four places find the cells of a grid that a gaussian may reach. They round differently
+// on purpose: each says why.
 template <class V>
 V3DG_HD V3DG_INLINE void row_extent(const EllipseRows<V>& e, V y0, V y1, V& x0, V& x1) {
     const V a = min_of(max_of(e.rightmost, y0), y1), b = min_of(max_of(-e.rightmost, y0), y1);

@@ -16,7 +16,8 @@ constexpr double kMinTransmittance = 1e-4;  // a pixel that stops as gsplat's do
 constexpr double kLog2MinAlpha = -7.994353436858858;
 constexpr double kReachSigmas = 3.33;  // where opacity 1 has fallen below 1/255
 constexpr double kLn2 = 0.6931471805599453;
-constexpr double kFalloffScale = 0.8493218002880191;  // sqrt(log2(e) / 2): exp(-d²/2) = 2^-(scale d)²
+constexpr double kFalloffScale =
+    0.8493218002880191;  // sqrt(log2(e) / 2): exp(-d²/2) = 2^-(scale d)²
 
 template <class V>
 struct Gaussian3d {
@@ -26,9 +27,9 @@ struct Gaussian3d {
     V opacity;
 };
 
-// Gaussians as rows, the way users hold them, on the host or on a device: (N, 3), (N, 4), (N, 3), (N,) and
-// (N, bases, 3). T is const where they are only read. On a device, quaternions and SH coefficients start at a
-// multiple of 16 bytes.
+// Gaussians as rows, the way users hold them, on the host or on a device: (N, 3), (N, 4), (N, 3),
+// (N,) and (N, bases, 3). T is const where they are only read. On a device, quaternions and SH
+// coefficients start at a multiple of 16 bytes.
 template <class T>
 struct GaussianRows {
     T *means, *quats, *scales, *opacities, *sh;
@@ -43,8 +44,8 @@ struct GaussianRows {
 
 // Copies all of row `from` but its SH coefficients to row `to`.
 template <class T>
-V3DG_HD inline void copy_shape(const GaussianRows<const T>& source, size_t from, const GaussianRows<T>& rows,
-                               size_t to) {
+V3DG_HD inline void copy_shape(const GaussianRows<const T>& source, size_t from,
+                               const GaussianRows<T>& rows, size_t to) {
     for (size_t k = 0; k < 3; ++k) {
         rows.means[3 * to + k] = source.means[3 * from + k];
         rows.scales[3 * to + k] = source.scales[3 * from + k];
@@ -53,8 +54,8 @@ V3DG_HD inline void copy_shape(const GaussianRows<const T>& source, size_t from,
     rows.opacities[to] = source.opacities[from];
 }
 
-// The same as the CPU's rasterizer reads them: a plane an attribute. Planes hold `kPlanePadding` elements
-// more than there are gaussians, so that a vector load may run past the last.
+// The same as the CPU's rasterizer reads them: a plane an attribute. Planes hold `kPlanePadding`
+// elements more than there are gaussians, so that a vector load may run past the last.
 constexpr size_t kPlanePadding = 16;
 template <class T>
 struct GaussianPlanes {
@@ -68,7 +69,7 @@ struct GaussianPlanes {
 
 // Colours of a bundle's clusters that gaussians are drawn in, in place of their own.
 struct Palette {
-    const float* sh = nullptr;           // (C, 3) coefficients of the constant basis; null: no palette
+    const float* sh = nullptr;  // (C, 3) coefficients of the constant basis; null: no palette
     const int64_t* first_row = nullptr;  // [C] where clusters begin among the gaussians, ascending
     uint32_t num_clusters = 0;
 
@@ -86,8 +87,8 @@ struct Palette {
     }
 };
 
-// The same as a CUDA frame reads what stays on the device: four planes of (N, 4) that hold a PackedGaussian
-// each, and the SH coefficients as rows, of which `sh_stride` floats apart begin.
+// The same as a CUDA frame reads what stays on the device: four planes of (N, 4) that hold a
+// PackedGaussian each, and the SH coefficients as rows, of which `sh_stride` floats apart begin.
 struct PackedPlanes {
     const float* plane[4];
     const float* sh;
@@ -95,15 +96,17 @@ struct PackedPlanes {
     Palette palette;
 };
 
-// How many standard deviations a gaussian reaches at most: no fewer than extent_of() leads to. Negative where
-// it is too faint to be drawn, not a number where it is none.
+// How many standard deviations a gaussian reaches at most: no fewer than extent_of() leads to.
+// Negative where it is too faint to be drawn, not a number where it is none.
 V3DG_HD inline float reach_in_sigmas(float opacity) {
     if (opacity < float(kMinAlpha)) return -1.0f;
-    const float sigmas = sqrt_of(log2_of(opacity) - float(kLog2MinAlpha)) * float(1.001 / kFalloffScale);
+    const float sigmas =
+        sqrt_of(log2_of(opacity) - float(kLog2MinAlpha)) * float(1.001 / kFalloffScale);
     return opacity <= 1 ? sigmas : NAN;
 }
 
-// The same from its mean in its model's units. Also not a number where the gaussian may have no area.
+// The same from its mean in its model's units. Also not a number where the gaussian may have no
+// area.
 V3DG_HD inline float reach_of(const Gaussian3d<float>& g) {
     const float sigmas = reach_in_sigmas(g.opacity);
     if (sigmas < 0) return -1.0f;
@@ -112,8 +115,9 @@ V3DG_HD inline float reach_of(const Gaussian3d<float>& g) {
     return least > 0 ? most * sigmas : NAN;
 }
 
-// A gaussian in the form that is quickest to project, for what is projected more than once. Its covariance is
-// F Fᵀ with F = [f[0] f[3] 0; f[1] f[4] f[6]; f[2] f[5] f[7]], columns from the longest on.
+// A gaussian in the form that is quickest to project, for what is projected more than once. Its
+// covariance is F Fᵀ with F = [f[0] f[3] 0; f[1] f[4] f[6]; f[2] f[5] f[7]], columns from the
+// longest on.
 struct PackedGaussian {
     float mean[3];
     float reach;
@@ -149,8 +153,8 @@ V3DG_HD inline double inverse_of(double b) {
     return 1 / b;
 #endif
 }
-// a / b of numbers that are far from the ends of the range of doubles, as those that float32 leads to are;
-// for them it is how a device divides, without the test whether they are.
+// a / b of numbers that are far from the ends of the range of doubles, as those that float32 leads
+// to are; for them it is how a device divides, without the test whether they are.
 V3DG_HD inline double quotient_of(double a, double b, double inverse) {
 #ifdef __CUDA_ARCH__
     const double q = __dmul_rn(a, inverse);
@@ -179,14 +183,17 @@ V3DG_HD inline PackedGaussian pack_gaussian(const Gaussian3d<float>& g) {
     out.reach = reach_of(g);
     // Columns of its rotation, as rotation_of_quat() has it.
     const double w = g.quat[0], x = g.quat[1], y = g.quat[2], z = g.quat[3];
-    const double xx = product_of(x, x), yy = product_of(y, y), zz = product_of(z, z), wx = product_of(w, x),
-                 wz = product_of(w, z), xz = product_of(x, z);
+    const double xx = product_of(x, x), yy = product_of(y, y), zz = product_of(z, z),
+                 wx = product_of(w, x), wz = product_of(w, z), xz = product_of(x, z);
     const double n2 = sum_of(sum_of(::fma(w, w, xx), yy), zz),
                  s = n2 > 0 ? quotient_of(2, n2, inverse_of(n2)) : 0;
     double column[3][3] = {
-        {::fma(sum_of(yy, zz), -s, 1.0), product_of(s, ::fma(x, y, wz)), product_of(s, ::fma(-w, y, xz))},
-        {product_of(s, ::fma(x, y, -wz)), ::fma(sum_of(xx, zz), -s, 1.0), product_of(s, ::fma(y, z, wx))},
-        {product_of(s, ::fma(w, y, xz)), product_of(s, ::fma(y, z, -wx)), ::fma(sum_of(xx, yy), -s, 1.0)},
+        {::fma(sum_of(yy, zz), -s, 1.0), product_of(s, ::fma(x, y, wz)),
+         product_of(s, ::fma(-w, y, xz))},
+        {product_of(s, ::fma(x, y, -wz)), ::fma(sum_of(xx, zz), -s, 1.0),
+         product_of(s, ::fma(y, z, wx))},
+        {product_of(s, ::fma(w, y, xz)), product_of(s, ::fma(y, z, -wx)),
+         ::fma(sum_of(xx, yy), -s, 1.0)},
     };
     // Without indices that registers could not be used for.
     float scale[3] = {g.scale[0], g.scale[1], g.scale[2]};
@@ -204,9 +211,10 @@ V3DG_HD inline PackedGaussian pack_gaussian(const Gaussian3d<float>& g) {
     }
     for (int k = 0; k < 3; ++k)
         for (int i = 0; i < 3; ++i) column[k][i] = product_of(column[k][i], scale[k]);
-    // Rotate columns 1 and 2 by a Givens rotation so that column 2 begins with 0; F Fᵀ does not change. They
-    // are the shortest columns, so their rounding is least.
-    const double a0 = column[1][0], b0 = column[2][0], length = sqrt_of(::fma(a0, a0, product_of(b0, b0)));
+    // Rotate columns 1 and 2 by a Givens rotation so that column 2 begins with 0; F Fᵀ does not
+    // change. They are the shortest columns, so their rounding is least.
+    const double a0 = column[1][0], b0 = column[2][0],
+                 length = sqrt_of(::fma(a0, a0, product_of(b0, b0)));
     const double inverse = inverse_of(length);
     const double cosine = length > 0 ? quotient_of(a0, length, inverse) : 1,
                  sine = length > 0 ? quotient_of(b0, length, inverse) : 0;

@@ -1,7 +1,8 @@
 #pragma once
 
-// The few elementary operations that formulas need, for a scalar and, in sources compiled per instruction
-// set, for a SIMD vector of them. A formula written with these and `mask ? a : b` runs as either.
+// The few elementary operations that formulas need, for a scalar and, in sources compiled per
+// instruction set, for a SIMD vector of them. A formula written with these and `mask ? a : b` runs
+// as either.
 
 #include <cmath>
 #include <cstdint>
@@ -44,8 +45,8 @@ V3DG_HD inline int floor_to_int(float x) {
     return static_cast<int>(::floorf(x));
 #endif
 }
-// Exact enough to find a margin by, for positive x: relative error below 1e-6; that of the least normal
-// number for what is less.
+// Exact enough to find a margin by, for positive x: relative error below 1e-6; that of the least
+// normal number for what is less.
 V3DG_HD inline float rough_reciprocal(float x) {
 #ifdef __CUDA_ARCH__
     float inverse;  // without the care of a division for numbers beyond that
@@ -150,7 +151,8 @@ template <class T>
 constexpr int kLanes = kVectorBytes / static_cast<int>(sizeof(T));
 
 typedef int32_t IntVec32 __attribute__((vector_size(kVectorBytes)));
-typedef uint32_t BitsVec32 __attribute__((vector_size(kVectorBytes)));  // for arithmetic that may wrap
+typedef uint32_t BitsVec32
+    __attribute__((vector_size(kVectorBytes)));  // for arithmetic that may wrap
 
 template <>
 struct LaneOf<Vec<float>> {
@@ -212,10 +214,12 @@ V3DG_INLINE unsigned sign_bits_of(V x) {
     return bits_of((Mask)x >> (8 * sizeof(x[0]) - 1));
 }
 
-// 2^x for x in [-126, 127], relative error below 2^-22; anything for others. The integer part of x goes into
-// the exponent, a polynomial of least maximum relative error on [-1/2, 1/2] gives the rest.
+// 2^x for x in [-126, 127], relative error below 2^-22; anything for others. The integer part of x
+// goes into the exponent, a polynomial of least maximum relative error on [-1/2, 1/2] gives the
+// rest.
 V3DG_INLINE Vec<float> exp2_in_range(Vec<float> x) {
-    const Vec<float> magic = Vec<float>{} + 12582912.0f;  // 1.5 * 2^23: adding it rounds to an integer
+    const Vec<float> magic =
+        Vec<float>{} + 12582912.0f;  // 1.5 * 2^23: adding it rounds to an integer
     const Vec<float> shifted = x + magic;
     const Vec<float> f = x - (shifted - magic);
     Vec<float> p = f * 0.00132647f + 0.00967151f;
@@ -345,8 +349,8 @@ V3DG_HD V3DG_INLINE V min_of(V a, V b) {
     return a < b ? a : b;
 }
 
-// The same number in every lane. Zero is taken away, not added, which leaves every number what it is, so that
-// the compiler does not do it.
+// The same number in every lane. Zero is taken away, not added, which leaves every number what it
+// is, so that the compiler does not do it.
 template <class V>
 V3DG_HD V3DG_INLINE V all_lanes(Lane<V> x) {
     if constexpr (std::is_arithmetic<V>::value) return x;

@@ -7,9 +7,9 @@
 
 namespace v3dg {
 
-// Squared lengths from `least2` to `most2` are computed without a product that vanishes or overflows. A
-// quaternion of any other length, down to the least denormal number, comes between them when it is multiplied
-// by `up` or `down`, powers of two that round nothing.
+// Squared lengths from `least2` to `most2` are computed without a product that vanishes or
+// overflows. A quaternion of any other length, down to the least denormal number, comes between
+// them when it is multiplied by `up` or `down`, powers of two that round nothing.
 template <class T>
 struct QuatRange {
     static constexpr T least2 = T(0x1p-80), most2 = T(0x1p100), up = T(0x1p100), down = T(0x1p-100);
@@ -31,8 +31,8 @@ V3DG_HD V3DG_INLINE auto is_out_of_range(V length2) {
     return (length2 < all_lanes<V>(Range::least2)) | (length2 > all_lanes<V>(Range::most2));
 }
 
-// Multiplies a quaternion, where its squared length is outside of its range, by the power of two that brings
-// it inside, and returns that, elsewhere 1.
+// Multiplies a quaternion, where its squared length is outside of its range, by the power of two
+// that brings it inside, and returns that, elsewhere 1.
 template <class V>
 V3DG_HD V3DG_INLINE V bring_into_range(V q[4]) {
     using Range = QuatRange<Lane<V>>;
@@ -52,7 +52,8 @@ V3DG_HD V3DG_INLINE void normalise_quat(T q[4]) {
     for (int k = 0; k < 4; ++k) q[k] = length2 == 0 ? static_cast<T>(k == 0) : q[k] / length;
 }
 
-// Rounds a quaternion to float32. One that float32 would not hold, or without squares, becomes of length one.
+// Rounds a quaternion to float32. One that float32 would not hold, or without squares, becomes of
+// length one.
 V3DG_HD V3DG_INLINE void round_quat(double q[4], float out[4]) {
     const double length2 = length2_of_quat(q);
     const bool is_held = length2 >= QuatRange<float>::least2 && length2 <= QuatRange<float>::most2;
@@ -75,9 +76,9 @@ V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V s, V r[9]) {
     r[8] = 1 - s * (x * x + y * y);
 }
 
-// That of the normalised quaternion. Lengths out of range are rare, and what belongs to them is computed
-// again. The other lanes keep their first result: so its rounding depends neither on their neighbours nor on
-// how the compiler contracts it when it is moved behind the branch.
+// That of the normalised quaternion. Lengths out of range are rare, and what belongs to them is
+// computed again. The other lanes keep their first result: so its rounding depends neither on their
+// neighbours nor on how the compiler contracts it when it is moved behind the branch.
 template <class V>
 V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V r[9]) {
     const V n2 = length2_of_quat(q);
@@ -95,17 +96,21 @@ V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V r[9]) {
     }
 }
 
-// Gradient of a quaternion whose squared length is in range, through its normalisation, from that of the
-// rotation matrix.
+// Gradient of a quaternion whose squared length is in range, through its normalisation, from that
+// of the rotation matrix.
 template <class V>
 V3DG_HD V3DG_INLINE void rotation_of_quat_in_range_vjp(const V q[4], V n2, const V g[9], V g_q[4]) {
     const V s = n2 > V{} ? 2 / n2 : V{};
     const V w = q[0], x = q[1], y = q[2], z = q[3];
     const V d_w = s * (x * (g[7] - g[5]) + y * (g[2] - g[6]) + z * (g[3] - g[1]));
-    const V d_x = s * (y * (g[1] + g[3]) + z * (g[2] + g[6]) + w * (g[7] - g[5]) - 2 * x * (g[4] + g[8]));
-    const V d_y = s * (x * (g[1] + g[3]) + z * (g[5] + g[7]) + w * (g[2] - g[6]) - 2 * y * (g[0] + g[8]));
-    const V d_z = s * (x * (g[2] + g[6]) + y * (g[5] + g[7]) + w * (g[3] - g[1]) - 2 * z * (g[0] + g[4]));
-    // The matrix does not change with the length of the quaternion, so the gradient is orthogonal to it.
+    const V d_x =
+        s * (y * (g[1] + g[3]) + z * (g[2] + g[6]) + w * (g[7] - g[5]) - 2 * x * (g[4] + g[8]));
+    const V d_y =
+        s * (x * (g[1] + g[3]) + z * (g[5] + g[7]) + w * (g[2] - g[6]) - 2 * y * (g[0] + g[8]));
+    const V d_z =
+        s * (x * (g[2] + g[6]) + y * (g[5] + g[7]) + w * (g[3] - g[1]) - 2 * z * (g[0] + g[4]));
+    // The matrix does not change with the length of the quaternion, so the gradient is orthogonal
+    // to it.
     const V along = (w * d_w + x * d_x + y * d_y + z * d_z) * (s / 2);
     g_q[0] = d_w - along * w;
     g_q[1] = d_x - along * x;

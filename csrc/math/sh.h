@@ -1,7 +1,7 @@
 #pragma once
 
-// Real spherical harmonics of degree 0 to 3, in the order and with the signs that .ply assets are stored in.
-// A gaussian's colour is max(0, 1/2 + sum of coefficient * basis(view direction)).
+// Real spherical harmonics of degree 0 to 3, in the order and with the signs that .ply assets are
+// stored in. A gaussian's colour is max(0, 1/2 + sum of coefficient * basis(view direction)).
 
 #include "math/vec.h"
 
@@ -46,7 +46,8 @@ V3DG_HD V3DG_INLINE void sh_bases(int degree, V x, V y, V z, V basis[kMaxShBases
 
 // Gradient of the unit direction from that of the bases.
 template <class V>
-V3DG_HD V3DG_INLINE void sh_bases_vjp(int degree, V x, V y, V z, const V g[kMaxShBases], V g_dir[3]) {
+V3DG_HD V3DG_INLINE void sh_bases_vjp(int degree, V x, V y, V z, const V g[kMaxShBases],
+                                      V g_dir[3]) {
     using T = Lane<V>;
     V gx = V{}, gy = V{}, gz = V{};
     if (degree >= 1) {
@@ -65,10 +66,12 @@ V3DG_HD V3DG_INLINE void sh_bases_vjp(int degree, V x, V y, V z, const V g[kMaxS
         const V xx = x * x, yy = y * y, zz = z * z;
         const T a = T(0.5900435899266435), b = T(2.890611442640554), c = T(0.4570457994644658);
         const T d = T(0.3731763325901154), e = T(1.445305721320277);
-        gx += -6 * a * x * y * g[9] + b * y * z * g[10] + 2 * c * x * y * g[11] - 6 * d * x * z * g[12] -
-              c * (4 * zz - 3 * xx - yy) * g[13] + 2 * e * x * z * g[14] - 3 * a * (xx - yy) * g[15];
+        gx += -6 * a * x * y * g[9] + b * y * z * g[10] + 2 * c * x * y * g[11] -
+              6 * d * x * z * g[12] - c * (4 * zz - 3 * xx - yy) * g[13] + 2 * e * x * z * g[14] -
+              3 * a * (xx - yy) * g[15];
         gy += -3 * a * (xx - yy) * g[9] + b * x * z * g[10] - c * (4 * zz - xx - 3 * yy) * g[11] -
-              6 * d * y * z * g[12] + 2 * c * x * y * g[13] - 2 * e * y * z * g[14] + 6 * a * x * y * g[15];
+              6 * d * y * z * g[12] + 2 * c * x * y * g[13] - 2 * e * y * z * g[14] +
+              6 * a * x * y * g[15];
         gz += b * x * y * g[10] - 8 * c * y * z * g[11] + d * (6 * zz - 3 * xx - 3 * yy) * g[12] -
               8 * c * x * z * g[13] + e * (xx - yy) * g[14];
     }
@@ -77,12 +80,13 @@ V3DG_HD V3DG_INLINE void sh_bases_vjp(int degree, V x, V y, V z, const V g[kMaxS
     g_dir[2] = gz;
 }
 
-// Colour in a direction of any length, from the eye to the gaussian in model space; what is not finite is 0,
-// so that it stays off pixels on which the gaussian has no weight. `sh(k)` is the k-th coefficient of one
-// gaussian (or of one a lane), base by base, three channels each; it is asked for each once, in this order.
+// Colour in a direction of any length, from the eye to the gaussian in model space; what is not
+// finite is 0, so that it stays off pixels on which the gaussian has no weight. `sh(k)` is the k-th
+// coefficient of one gaussian (or of one a lane), base by base, three channels each; it is asked
+// for each once, in this order.
 template <class V, class Coefficient>
-V3DG_HD V3DG_INLINE void color_of_coefficients(int degree, const V direction[3], const Coefficient& sh,
-                                               V color[3]) {
+V3DG_HD V3DG_INLINE void color_of_coefficients(int degree, const V direction[3],
+                                               const Coefficient& sh, V color[3]) {
     using L = Lane<V>;
     const V most = all_lanes<V>(kInfinite<L>);
     if (degree == kPlainColor) {
@@ -118,8 +122,9 @@ V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V direction[3], const V* 
 
 // Adds to `d_direction` and sets `d_sh` from the gradient of the colour. `d_sh` may be `sh` itself.
 template <class V>
-V3DG_HD V3DG_INLINE void color_of_sh_vjp(int degree, const V direction[3], const V* sh, const V color[3],
-                                         const V d_color[3], V d_direction[3], V* d_sh) {
+V3DG_HD V3DG_INLINE void color_of_sh_vjp(int degree, const V direction[3], const V* sh,
+                                         const V color[3], const V d_color[3], V d_direction[3],
+                                         V* d_sh) {
     if (degree == kPlainColor) {
         for (int c = 0; c < 3; ++c) d_sh[c] = d_color[c];
         return;

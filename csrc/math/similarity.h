@@ -1,7 +1,8 @@
 #pragma once
 
-// Poses of instances, and a camera in the world as one instance sees it: composed in double precision, then
-// rounded. Decisions depend on it, so whoever calls it is compiled without contraction.
+// Poses of instances, and a camera in the world as one instance sees it: composed in double
+// precision, then rounded. Decisions depend on it, so whoever calls it is compiled without
+// contraction.
 
 #include <cfloat>
 
@@ -17,7 +18,8 @@ struct Pose {
     double scale;
 };
 
-// Whether a pose is one: what is not finite, of no size, or turned by a quaternion of zeros, is not drawn.
+// Whether a pose is one: what is not finite, of no size, or turned by a quaternion of zeros, is not
+// drawn.
 V3DG_HD inline bool is_placed(const Pose& pose) {
     double sum = pose.scale;
     for (int k = 0; k < 3; ++k) sum += fabs(pose.position[k]);
@@ -32,7 +34,8 @@ V3DG_HD inline bool is_placed(const Pose& pose) {
 
 // The camera in the frame of an instance.
 struct InstanceAxes {
-    double axes[9], origin[3];  // camera coordinates of an asset's point p, over the scale: axes p + origin
+    double axes[9],
+        origin[3];  // camera coordinates of an asset's point p, over the scale: axes p + origin
     double eye[3];
 };
 

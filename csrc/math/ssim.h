@@ -23,8 +23,8 @@ struct SsimSums {
     T x, y, xx, yy, xy;
 };
 
-// Structural similarity (Wang et al. 2004, constants 0.01² and 0.03²), and its derivatives by the sums of x,
-// x² and xy.
+// Structural similarity (Wang et al. 2004, constants 0.01² and 0.03²), and its derivatives by the
+// sums of x, x² and xy.
 template <class T>
 struct Ssim {
     T value, d_x, d_xx, d_xy;
@@ -47,7 +47,8 @@ V3DG_HD inline Ssim<T> ssim_of(const SsimSums<T>& s) {
 // Gradient of weight * |difference|.
 template <class V>
 V3DG_HD V3DG_INLINE V l1_vjp(V difference, Lane<V> weight) {
-    return difference > V{} ? all_lanes<V>(weight) : (difference < V{} ? all_lanes<V>(-weight) : V{});
+    return difference > V{} ? all_lanes<V>(weight)
+                            : (difference < V{} ? all_lanes<V>(-weight) : V{});
 }
 
 }  // namespace v3dg

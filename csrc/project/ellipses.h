@@ -1,6 +1,7 @@
 #pragma once
 
-// Where gaussians lie on an image, for those who train them: of each one, whether or not it is drawn.
+// Where gaussians lie on an image, for those who train them: of each one, whether or not it is
+// drawn.
 
 #include <cstdint>
 
@@ -9,8 +10,9 @@
 
 namespace v3dg {
 
-// Arrays of N gaussians. Zeros for those that are not in sight: before the near plane or behind the far
-// depth, nowhere an alpha of 1/255, outside of the image, or within `min_radius_px` of their centres.
+// Arrays of N gaussians. Zeros for those that are not in sight: before the near plane or behind the
+// far depth, nowhere an alpha of 1/255, outside of the image, or within `min_radius_px` of their
+// centres.
 template <class T>
 struct Ellipses {
     T* centers;      // (N, 2) px
@@ -42,7 +44,8 @@ struct EllipsesInput {
         const bool is_drawable = extent_of(g.opacity, e, s, half_x, half_y);
         const int32_t x = rounded_up(half_x), y = rounded_up(half_y);
         const bool is_seen = is_drawable & (s.p[2] >= camera.near_depth) & (s.p[2] <= far_depth) &
-                             meets_image(e.u, T(x), camera.width) & meets_image(e.v, T(y), camera.height) &
+                             meets_image(e.u, T(x), camera.width) &
+                             meets_image(e.v, T(y), camera.height) &
                              ((T(x) > min_radius_px) | (T(y) > min_radius_px));
         out.centers[2 * i] = is_seen ? e.u : T(0);
         out.centers[2 * i + 1] = is_seen ? e.v : T(0);
@@ -50,7 +53,9 @@ struct EllipsesInput {
         out.conics[3 * i] = is_seen ? s.c22 / s.det : T(0);
         out.conics[3 * i + 1] = is_seen ? -s.c12 / s.det : T(0);
         out.conics[3 * i + 2] = is_seen ? s.c11 / s.det : T(0);
-        out.opacities[i] = !is_seen ? T(0) : antialiased ? g.opacity * sqrt_of(s.det0 / s.det) : g.opacity;
+        out.opacities[i] = !is_seen      ? T(0)
+                           : antialiased ? g.opacity * sqrt_of(s.det0 / s.det)
+                                         : g.opacity;
         out.radii[2 * i] = is_seen ? x : 0;
         out.radii[2 * i + 1] = is_seen ? y : 0;
     }
@@ -67,6 +72,8 @@ namespace cpu {
 template <class T>
 void ellipses(const EllipsesInput<T>& in, const Ellipses<T>& out);
 }  // namespace cpu
-namespace cuda { void ellipses(const EllipsesInput<float>& in, const Ellipses<float>& out, Stream stream); }
+namespace cuda {
+void ellipses(const EllipsesInput<float>& in, const Ellipses<float>& out, Stream stream);
+}
 
 }  // namespace v3dg

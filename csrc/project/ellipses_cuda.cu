@@ -17,8 +17,8 @@ __global__ void ellipses_kernel(EllipsesInput<float> in, Ellipses<float> out) {
 }  // namespace
 
 void ellipses(const EllipsesInput<float>& in, const Ellipses<float>& out, Stream stream) {
-    launch("ellipses_kernel", &ellipses_kernel, blocks_for(in.rows.size, kThreads), kThreads, 0, stream, in,
-           out);
+    launch("ellipses_kernel", &ellipses_kernel, blocks_for(in.rows.size, kThreads), kThreads, 0,
+           stream, in, out);
 }
 
 }  // namespace cuda

@@ -20,19 +20,20 @@ struct Reach {
     int top = INT_MAX, bottom = INT_MIN;  // rows that hold all those pixels
 };
 
-// Projects gaussians [skip, skip + count) of a draw and writes a record, in order, for each one that reaches
-// a pixel centre in the window: in front of the near plane, alpha of at least 1/255 somewhere, a positive
-// finite determinant. The window may be empty, and is otherwise within the camera's image. `source` (or null)
-// receives `source_base` plus the gaussian's place behind `skip`. Returns the number of records.
-V3DG_DECLARE_PER_ISA(template <class T> size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count,
-                                                       const Pinhole<T>& camera, const Window& window,
-                                                       Record<T>* records, uint32_t* source,
-                                                       uint32_t source_base, Reach& reach))
+// Projects gaussians [skip, skip + count) of a draw and writes a record, in order, for each one
+// that reaches a pixel centre in the window: in front of the near plane, alpha of at least 1/255
+// somewhere, a positive finite determinant. The window may be empty, and is otherwise within the
+// camera's image. `source` (or null) receives `source_base` plus the gaussian's place behind
+// `skip`. Returns the number of records.
+V3DG_DECLARE_PER_ISA(template <class T> size_t project(
+    const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole<T>& camera,
+    const Window& window, Record<T>* records, uint32_t* source, uint32_t source_base, Reach& reach))
 
-// Writes the gradients of the `count` gaussians `source` (places in one draw) from those of their records.
-V3DG_DECLARE_PER_ISA(template <class T> void project_backward(const Draw<T>& draw, const uint32_t* source,
-                                                              const RecordGradient<T>* d_records,
-                                                              size_t count, const Pinhole<T>& camera,
-                                                              const GaussianRows<T>& out))
+// Writes the gradients of the `count` gaussians `source` (places in one draw) from those of their
+// records.
+V3DG_DECLARE_PER_ISA(template <class T>
+                     void project_backward(const Draw<T>& draw, const uint32_t* source,
+                                           const RecordGradient<T>* d_records, size_t count,
+                                           const Pinhole<T>& camera, const GaussianRows<T>& out))
 
 }  // namespace v3dg

@@ -1,7 +1,7 @@
 #pragma once
 
-// Backward pass of projection on CUDA: from the gradients of the records of a frame that shows one model to
-// those of the model's gaussians.
+// Backward pass of projection on CUDA: from the gradients of the records of a frame that shows one
+// model to those of the model's gaussians.
 
 #include "base/device.h"
 #include "frame/draw_list.h"
@@ -10,14 +10,14 @@
 namespace v3dg {
 namespace cuda {
 
-// Gives each record of a frame its slots, `first_slot` of the first, and counts all of them in the counters.
-// Does nothing when the items are over a capacity.
+// Gives each record of a frame its slots, `first_slot` of the first, and counts all of them in the
+// counters. Does nothing when the items are over a capacity.
 void place_slots(const ItemList& items, const uint32_t* item_records, const RecordBox* boxes,
                  uint32_t* first_slot, cudaStream_t stream);
 
 struct ProjectBackwardInput {
-    // Items of kItemSize gaussians, the last of what is left. The records of item i stand in a row from
-    // i * kItemSize on, in the order of their gaussians.
+    // Items of kItemSize gaussians, the last of what is left. The records of item i stand in a row
+    // from i * kItemSize on, in the order of their gaussians.
     const uint32_t* item_records;  // how many of an item's gaussians became records
     RecordPlanes records;
     const uint32_t* source;  // each record's gaussian
@@ -28,8 +28,9 @@ struct ProjectBackwardInput {
     bool antialiased;
 };
 
-// Writes the gradients of every gaussian, zeros for those without a record. Those of the SH coefficients
-// begin at a multiple of 16 bytes, as the coefficients do. The slots have sizes where `centers` does.
+// Writes the gradients of every gaussian, zeros for those without a record. Those of the SH
+// coefficients begin at a multiple of 16 bytes, as the coefficients do. The slots have sizes where
+// `centers` does.
 void project_backward(const ProjectBackwardInput& in, const GradientSlots& slots,
                       const GaussianRows<float>& out, const CenterGradients<float>& centers,
                       cudaStream_t stream);

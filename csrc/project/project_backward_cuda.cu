@@ -1,5 +1,5 @@
-// A block takes an item, a thread one of its records. SH coefficients go through shared memory, a row a
-// gaussian, and come back as their own gradients.
+// A block takes an item, a thread one of its records. SH coefficients go through shared memory, a
+// row a gaussian, and come back as their own gradients.
 
 #include <type_traits>
 
@@ -25,15 +25,16 @@ __device__ void add_slot(const Value* of_slot, uint32_t i, Value& sum) {
     sum += slot;
 }
 
-// Sum of `num` slots, in their order or, when there are many, in another that is fixed as well. All lanes of
-// the warp take part. Returns whether any was touched.
+// Sum of `num` slots, in their order or, when there are many, in another that is fixed as well. All
+// lanes of the warp take part. Returns whether any was touched.
 template <class Value>
-__device__ bool sum_of_slots(const GradientSlots& slots, const Value* of_slot, uint32_t first, uint32_t num,
-                             Value& sum) {
+__device__ bool sum_of_slots(const GradientSlots& slots, const Value* of_slot, uint32_t first,
+                             uint32_t num, Value& sum) {
     const int lane = threadIdx.x % 32;
     uint32_t touched = 0;
     if (num <= kFewSlots) {
-        for (uint32_t i = 0; i < num; ++i) touched |= static_cast<uint32_t>(slots.is_touched[first + i]) << i;
+        for (uint32_t i = 0; i < num; ++i)
+            touched |= static_cast<uint32_t>(slots.is_touched[first + i]) << i;
         for (uint32_t todo = touched; todo != 0; todo &= todo - 1)
             add_slot(of_slot, first + __ffs(todo) - 1, sum);
     }
@@ -59,8 +60,8 @@ __device__ bool sum_of_slots(const GradientSlots& slots, const Value* of_slot, u
     return touched != 0;
 }
 
-__global__ void place_slots_kernel(ItemList items, const uint32_t* item_records, const RecordBox* boxes,
-                                   uint32_t* first_slot) {
+__global__ void place_slots_kernel(ItemList items, const uint32_t* item_records,
+                                   const RecordBox* boxes, uint32_t* first_slot) {
     if (!items.is_complete()) return;
     const unsigned long long num_items = items.counters->items;
     __shared__ uint32_t sum_of_warp[kThreads / 32];
@@ -118,7 +119,8 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
     Word* sh_rows = reinterpret_cast<Word*>(shared_memory());
     __shared__ bool is_used[kThreads];  // whether anything flows into the gaussian
     const uint64_t first = static_cast<uint64_t>(blockIdx.x) * kItemSize;
-    const int num_here = static_cast<int>(min(static_cast<uint64_t>(kItemSize), in.rows.size - first));
+    const int num_here =
+        static_cast<int>(min(static_cast<uint64_t>(kItemSize), in.rows.size - first));
     is_used[threadIdx.x] = false;
     __syncthreads();
 
@@ -132,7 +134,8 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
         load_row(in.rows.quats, i, g.quat);
         load_row(in.rows.scales, i, g.scale);
         g.opacity = in.rows.opacities[i];
-        const float2 red_green = reinterpret_cast<const float2*>(in.records.ellipse)[4 * record + 3];
+        const float2 red_green =
+            reinterpret_cast<const float2*>(in.records.ellipse)[4 * record + 3];
         color[0] = red_green.x;
         color[1] = red_green.y;
         color[2] = in.records.rest[2 * record];
@@ -147,7 +150,9 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
     }
     __syncthreads();
     const Word* sh_in = reinterpret_cast<const Word*>(in.rows.sh + Row::kValues * first);
-    const auto is_wanted = [&](int k) { return k < Row::kWords * num_here && is_used[k / Row::kWords]; };
+    const auto is_wanted = [&](int k) {
+        return k < Row::kWords * num_here && is_used[k / Row::kWords];
+    };
 #pragma unroll
     for (int begin = 0; begin < Row::kWords; begin += kWordsAtOnce) {
         Word words[kWordsAtOnce];
@@ -167,9 +172,10 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
     if (used) {
         Projection<float> s;
         to_view(in.view, g.mean, s.p);
-        const Ellipse<float> e = project_gaussian(g, in.view, in.camera, in.filter_px2, in.antialiased, s);
-        Gaussian3d<float> d_gaussian =
-            project_gaussian_vjp(g, in.view, in.camera, in.filter_px2, in.antialiased, s, e, d.ellipse);
+        const Ellipse<float> e =
+            project_gaussian(g, in.view, in.camera, in.filter_px2, in.antialiased, s);
+        Gaussian3d<float> d_gaussian = project_gaussian_vjp(g, in.view, in.camera, in.filter_px2,
+                                                            in.antialiased, s, e, d.ellipse);
         Word words[Row::kWords];
         Word* row = sh_rows + (i - first) * Row::kStride;
         for (int k = 0; k < Row::kWords; ++k) words[k] = row[k];
@@ -194,8 +200,9 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
     __syncthreads();
     Word* sh_out = reinterpret_cast<Word*>(out.sh + Row::kValues * first);
     for (int k = threadIdx.x; k < Row::kWords * num_here; k += kThreads)
-        sh_out[k] =
-            is_used[k / Row::kWords] ? sh_rows[k / Row::kWords * Row::kStride + k % Row::kWords] : Word{};
+        sh_out[k] = is_used[k / Row::kWords]
+                        ? sh_rows[k / Row::kWords * Row::kStride + k % Row::kWords]
+                        : Word{};
 }
 
 // `sizes` of the gradients by the centres of the gaussians, which start as zeros.
@@ -210,10 +217,11 @@ __global__ void __launch_bounds__(kThreads)
 }
 
 template <int kDegree>
-void start(const ProjectBackwardInput& in, const GradientSlots& slots, const GaussianRows<float>& out,
-           float* d_centers, cudaStream_t stream) {
-    launch("project_backward_kernel", &project_backward_kernel<kDegree>, blocks_for(in.rows.size, kItemSize),
-           kThreads, kThreads * ShRow<kDegree>::kStride * sizeof(typename ShRow<kDegree>::Word), stream, in,
+void start(const ProjectBackwardInput& in, const GradientSlots& slots,
+           const GaussianRows<float>& out, float* d_centers, cudaStream_t stream) {
+    launch("project_backward_kernel", &project_backward_kernel<kDegree>,
+           blocks_for(in.rows.size, kItemSize), kThreads,
+           kThreads * ShRow<kDegree>::kStride * sizeof(typename ShRow<kDegree>::Word), stream, in,
            slots, out, d_centers);
 }
 
@@ -221,8 +229,8 @@ void start(const ProjectBackwardInput& in, const GradientSlots& slots, const Gau
 
 void place_slots(const ItemList& items, const uint32_t* item_records, const RecordBox* boxes,
                  uint32_t* first_slot, cudaStream_t stream) {
-    launch("place_slots_kernel", &place_slots_kernel, 8 * num_multiprocessors(), kThreads, 0, stream, items,
-           item_records, boxes, first_slot);
+    launch("place_slots_kernel", &place_slots_kernel, 8 * num_multiprocessors(), kThreads, 0,
+           stream, items, item_records, boxes, first_slot);
 }
 
 void project_backward(const ProjectBackwardInput& in, const GradientSlots& slots,
@@ -231,8 +239,8 @@ void project_backward(const ProjectBackwardInput& in, const GradientSlots& slots
     if (centers.size != nullptr) {
         check(cudaMemsetAsync(centers.size, 0, in.rows.size * sizeof *centers.size, stream),
               "cudaMemsetAsync");
-        launch("center_sizes_kernel", &center_sizes_kernel, blocks_for(in.rows.size, kItemSize), kThreads, 0,
-               stream, in, slots, centers.size);
+        launch("center_sizes_kernel", &center_sizes_kernel, blocks_for(in.rows.size, kItemSize),
+               kThreads, 0, stream, in, slots, centers.size);
     }
     switch (in.rows.sh_degree) {
         case kPlainColor: return start<kPlainColor>(in, slots, out, centers.sum, stream);

@@ -38,8 +38,8 @@ struct CodeSource {
 
     V3DG_INLINE Gaussian3d<V> load_gaussians(uint64_t i, uint64_t count) const {
         Bits<V> words[kRecordWords];
-        load_words(codes.record_of(ranges, static_cast<uint32_t>(i)), kRecordWords, kRecordWords, count,
-                   words);
+        load_words(codes.record_of(ranges, static_cast<uint32_t>(i)), kRecordWords, kRecordWords,
+                   count, words);
         Gaussian3d<V> g;
         V color[3];
         decode(words, ranges, g, color);
@@ -48,8 +48,8 @@ struct CodeSource {
     V3DG_INLINE int load_sh(uint64_t i, uint64_t count, V* sh) const {
         Bits<V> words[2 * kMaxShDegree];
         Gaussian3d<V> g;
-        load_words(codes.record_of(ranges, static_cast<uint32_t>(i)), kRecordWords, kRecordWords, count,
-                   words);
+        load_words(codes.record_of(ranges, static_cast<uint32_t>(i)), kRecordWords, kRecordWords,
+                   count, words);
         decode(words, ranges, g, sh);
         load_words(codes.sh_of(ranges, static_cast<uint32_t>(i)), num_sh_words(codes.sh_degree),
                    2 * codes.sh_stride, count, words);
@@ -59,8 +59,8 @@ struct CodeSource {
 
   private:
     // `width` words each, of rows that begin `stride` words apart.
-    static V3DG_INLINE void load_words(const uint32_t* rows, int width, uint64_t stride, uint64_t count,
-                                       Bits<V>* words) {
+    static V3DG_INLINE void load_words(const uint32_t* rows, int width, uint64_t stride,
+                                       uint64_t count, Bits<V>* words) {
         for (int lane = 0; lane < kLanes<float>; ++lane) {
             const uint64_t row = static_cast<uint64_t>(lane) < count ? lane : count - 1;
             for (int k = 0; k < width; ++k) words[k][lane] = rows[stride * row + k];
@@ -87,9 +87,10 @@ static V3DG_INLINE void load_palette(const Palette& palette, uint64_t at, unsign
 
 // Writes the records of those of the `count` gaussians from `at` on whose bits are set in `lanes`.
 template <class Source, class T, class V, class I>
-static V3DG_INLINE void write_records(const Source& from, const Draw<T>& draw, uint64_t at, uint64_t count,
-                                      unsigned lanes, const Gaussian3d<V>& g, const Ellipse<V>& e,
-                                      const PixelBox<I>& box, Record<T>* records) {
+static V3DG_INLINE void write_records(const Source& from, const Draw<T>& draw, uint64_t at,
+                                      uint64_t count, unsigned lanes, const Gaussian3d<V>& g,
+                                      const Ellipse<V>& e, const PixelBox<I>& box,
+                                      Record<T>* records) {
     V sh[3 * kMaxShBases], direction[3], color[3];
     from_eye(draw.view, g.mean, direction);
     if (draw.palette.sh != nullptr) {
@@ -101,7 +102,8 @@ static V3DG_INLINE void write_records(const Source& from, const Draw<T>& draw, u
     }
     for (Record<T>* r = records; lanes != 0; lanes &= lanes - 1, ++r) {
         const int i = __builtin_ctz(lanes);
-        const Ellipse<T> mine{e.u[i], e.v[i], e.l11[i], e.l12[i], e.l22[i], e.log2_opacity[i], e.depth[i]};
+        const Ellipse<T> mine{e.u[i],    e.v[i], e.l11[i], e.l12[i], e.l22[i], e.log2_opacity[i],
+                              e.depth[i]};
         set_ellipse(mine,
                     PixelBox<int>{static_cast<int>(box.x0[i]), static_cast<int>(box.x1[i]),
                                   static_cast<int>(box.y0[i]), static_cast<int>(box.y1[i])},
@@ -122,7 +124,8 @@ static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t fir
     size_t num_records = 0;
     for (uint64_t done = 0; done < count; done += kWidth) {
         const uint64_t at = first + done;
-        const unsigned lanes = count - done >= kWidth ? (1u << kWidth) - 1 : (1u << (count - done)) - 1;
+        const unsigned lanes =
+            count - done >= kWidth ? (1u << kWidth) - 1 : (1u << (count - done)) - 1;
         const Gaussian3d<V> g = from.load_gaussians(at, count - done);
         Projection<V> s;
         to_view(draw.view, g.mean, s.p);
@@ -134,8 +137,8 @@ static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t fir
 
         V half_x, half_y;
         const auto drawable = in_front & extent_of(g.opacity, e, s, half_x, half_y);
-        const auto meets =
-            drawable & meets_image(e.u, half_x, camera.width) & meets_image(e.v, half_y, camera.height);
+        const auto meets = drawable & meets_image(e.u, half_x, camera.width) &
+                           meets_image(e.v, half_y, camera.height);
         const unsigned meets_bits = bits_of(meets) & lanes;
         reach.in_frustum += __builtin_popcount(meets_bits);
         if (meets_bits == 0) continue;
@@ -173,20 +176,23 @@ static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t fir
 
 // As project(), a cluster at a time.
 static size_t project_codes(const Draw<float>& draw, uint64_t skip, uint64_t count,
-                            const Pinhole<float>& camera, const Window& window, Record<float>* records,
-                            uint32_t* source, uint32_t source_base, Reach& reach) {
+                            const Pinhole<float>& camera, const Window& window,
+                            Record<float>* records, uint32_t* source, uint32_t source_base,
+                            Reach& reach) {
     const Codes& codes = *draw.codes;
     const uint64_t start = draw.first + skip, end = start + count;
     size_t num_records = 0;
     uint64_t first = start;
-    size_t cluster = std::upper_bound(codes.offset.begin(), codes.offset.end(), static_cast<int64_t>(start)) -
-                     codes.offset.begin() - 1;
+    size_t cluster =
+        std::upper_bound(codes.offset.begin(), codes.offset.end(), static_cast<int64_t>(start)) -
+        codes.offset.begin() - 1;
     for (; first < end; ++cluster) {
         const uint64_t last = std::min(end, static_cast<uint64_t>(codes.offset[cluster + 1]));
-        num_records += project_rows(CodeSource{codes, codes.ranges_of(static_cast<uint32_t>(cluster))}, draw,
-                                    first, last - first, camera, window, records + num_records,
-                                    source == nullptr ? nullptr : source + num_records,
-                                    source_base + static_cast<uint32_t>(first - start), reach);
+        num_records +=
+            project_rows(CodeSource{codes, codes.ranges_of(static_cast<uint32_t>(cluster))}, draw,
+                         first, last - first, camera, window, records + num_records,
+                         source == nullptr ? nullptr : source + num_records,
+                         source_base + static_cast<uint32_t>(first - start), reach);
         first = last;
     }
     return num_records;
@@ -198,15 +204,17 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
                Reach& reach) {
     if constexpr (std::is_same<T, float>::value)
         if (draw.codes != nullptr)
-            return project_codes(draw, skip, count, camera, window, records, source, source_base, reach);
-    return project_rows(PlaneSource<T>{*draw.model}, draw, draw.first + skip, count, camera, window, records,
-                        source, source_base, reach);
+            return project_codes(draw, skip, count, camera, window, records, source, source_base,
+                                 reach);
+    return project_rows(PlaneSource<T>{*draw.model}, draw, draw.first + skip, count, camera, window,
+                        records, source, source_base, reach);
 }
 
 // Scattered gaussians: lanes are filled one by one, which is small beside the arithmetic.
 template <class T>
-void project_backward(const Draw<T>& draw, const uint32_t* source, const RecordGradient<T>* d_records,
-                      size_t count, const Pinhole<T>& camera, const GaussianRows<T>& out) {
+void project_backward(const Draw<T>& draw, const uint32_t* source,
+                      const RecordGradient<T>* d_records, size_t count, const Pinhole<T>& camera,
+                      const GaussianRows<T>& out) {
     using V = Vec<T>;
     constexpr size_t kWidth = kLanes<T>;
     const GaussianPlanes<T>& m = *draw.model;
@@ -258,11 +266,11 @@ void project_backward(const Draw<T>& draw, const uint32_t* source, const RecordG
     }
 }
 
-#define V3DG_INSTANTIATE(T)                                                                              \
-    template size_t project<T>(const Draw<T>&, uint64_t, uint64_t, const Pinhole<T>&, const Window&,     \
-                               Record<T>*, uint32_t*, uint32_t, Reach&);                                 \
-    template void project_backward<T>(const Draw<T>&, const uint32_t*, const RecordGradient<T>*, size_t, \
-                                      const Pinhole<T>&, const GaussianRows<T>&);
+#define V3DG_INSTANTIATE(T)                                                                      \
+    template size_t project<T>(const Draw<T>&, uint64_t, uint64_t, const Pinhole<T>&,            \
+                               const Window&, Record<T>*, uint32_t*, uint32_t, Reach&);          \
+    template void project_backward<T>(const Draw<T>&, const uint32_t*, const RecordGradient<T>*, \
+                                      size_t, const Pinhole<T>&, const GaussianRows<T>&);
 V3DG_INSTANTIATE(float)
 V3DG_INSTANTIATE(double)
 #undef V3DG_INSTANTIATE

@@ -1,12 +1,12 @@
-// A warp takes an item, and every so many items another. It looks at the spheres of 32 gaussians at a time;
-// those that may reach a pixel centre queue up, and are projected as soon as there are 32 of them. So no lane
-// waits for a gaussian that is not drawn, and records come out in order without asking another warp. Where
-// nearly all of 32 may reach one, the next ones are projected without a test, which would take longer than
-// what it spares.
+// A warp takes an item, and every so many items another. It looks at the spheres of 32 gaussians at
+// a time; those that may reach a pixel centre queue up, and are projected as soon as there are 32
+// of them. So no lane waits for a gaussian that is not drawn, and records come out in order without
+// asking another warp. Where nearly all of 32 may reach one, the next ones are projected without a
+// test, which would take longer than what it spares.
 //
-// Of a shared item it looks at one gaussian at a time, in front of up to 32 placements: many far instances of
-// a cluster of few gaussians are then a few items with full warps, and read those gaussians once. A kernel of
-// its own does that, which keeps its registers out of the other.
+// Of a shared item it looks at one gaussian at a time, in front of up to 32 placements: many far
+// instances of a cluster of few gaussians are then a few items with full warps, and read those
+// gaussians once. A kernel of its own does that, which keeps its registers out of the other.
 
 #include "project/project_cuda.h"
 
@@ -28,7 +28,8 @@ constexpr unsigned kMostWaiting = 64;  // large records, of which fewer than 32 
 // Where so many of an item's first 32 gaussians reach so few px at most, they are tested by rows.
 constexpr float kSmall = 3;
 constexpr unsigned kManySmall = 4;
-// Where so many of 32 gaussians pass the test, the next are not tested, while so many of them become records.
+// Where so many of 32 gaussians pass the test, the next are not tested, while so many of them
+// become records.
 constexpr unsigned kNearlyAll = 22, kMany = 12;
 
 // A gaussian in front of the camera.
@@ -42,10 +43,11 @@ template <class Model>
 struct WarpSpace {
     ItemTables<Model> tables;
     alignas(16) Queued queue[kQueue];
-    float4 ellipses[kEllipseVectors * 32];  // of records on their way out: written by lane, read in a row
-    RecordBox boxes[kMostWaiting];          // of the item's large records that wait,
-    uint8_t large[kMostWaiting];            // which they are,
-    unsigned num_large;                     // and how many
+    float4 ellipses[kEllipseVectors *
+                    32];            // of records on their way out: written by lane, read in a row
+    RecordBox boxes[kMostWaiting];  // of the item's large records that wait,
+    uint8_t large[kMostWaiting];    // which they are,
+    unsigned num_large;             // and how many
     WaitingTiles tiles;
 };
 
@@ -56,19 +58,20 @@ struct SphereTest {
     float half;           // px that it reaches from its centre
 };
 
-// Of a gaussian at p in view space. Without branches, because some lane of the warp would take each of them.
+// Of a gaussian at p in view space. Without branches, because some lane of the warp would take each
+// of them.
 template <class Source>
-__device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, const float p[3], float reach,
-                                  float reach_scale) {
+__device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, const float p[3],
+                                  float reach, float reach_scale) {
     const Pinhole<float>& cam = in.image.camera;
     const float inv_z = 1 / p[2], slope_x = p[0] * inv_z, slope_y = p[1] * inv_z;
     const float u = cam.fx * slope_x + cam.cx, v = cam.fy * slope_y + cam.cy;
-    const float half =
-        sphere_of_image(reach_scale * reach, inv_z, slope_x, slope_y, in.item.appearance.filter_px2);
+    const float half = sphere_of_image(reach_scale * reach, inv_z, slope_x, slope_y,
+                                       in.item.appearance.filter_px2);
     const float middle_x = 0.5f * cam.width, middle_y = 0.5f * cam.height;
     const float from_x = fabsf(u - middle_x), from_y = fabsf(v - middle_y);
-    const bool is_outside =
-        !(p[2] >= cam.near_depth) | (reach < 0) | (from_x - half >= middle_x) | (from_y - half >= middle_y);
+    const bool is_outside = !(p[2] >= cam.near_depth) | (reach < 0) | (from_x - half >= middle_x) |
+                            (from_y - half >= middle_y);
     // With its centre in the image it is in the frustum for certain, unless it is made too faint.
     const bool is_faded = Source::kFades && in.item.weight < 1;
     const bool is_inside =
@@ -77,19 +80,20 @@ __device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, 
     return {!(is_outside | misses), misses && !is_outside, half};
 }
 
-// Leaves out the first and the last row of a box where the ellipse misses all of their pixel centres, with a
-// margin, so that the blend step alone decides.
-__device__ void drop_missed_rows(const Ellipse<float>& e, const Projection<float>& s, float image_width,
-                                 PixelBox<int>& box) {
+// Leaves out the first and the last row of a box where the ellipse misses all of their pixel
+// centres, with a margin, so that the blend step alone decides.
+__device__ void drop_missed_rows(const Ellipse<float>& e, const Projection<float>& s,
+                                 float image_width, PixelBox<int>& box) {
     const float slope = quotient_of(s.c12, s.c22), u = e.u - 0.5f;
     const float margin = 2e-3f + 4e-7f * (2 * fabsf(e.u) + image_width);
     const float reach = e.log2_opacity - static_cast<float>(kLog2MinAlpha) + 1e-4f;
     const auto misses = [&](int row) {
         const float dy = static_cast<float>(row) + 0.5f - e.v;
-        // In this row alpha is largest here. No pixel centre, whether in the image or not, is nearer than
-        // the one that this rounds to.
+        // In this row alpha is largest here. No pixel centre, whether in the image or not, is
+        // nearer than the one that this rounds to.
         const float middle = slope * dy + u;
-        const float t1 = e.l11 * fmaxf(fabsf(middle - round_of(middle)) - margin, 0.0f), t2 = e.l22 * dy;
+        const float t1 = e.l11 * fmaxf(fabsf(middle - round_of(middle)) - margin, 0.0f),
+                    t2 = e.l22 * dy;
         return t1 * t1 + t2 * t2 > reach;
     };
     const bool misses_first = misses(box.y0), misses_last = misses(box.y1);
@@ -103,15 +107,15 @@ struct ItemTraits {
     bool have_shade;  // beyond the colour that project() finds
 };
 
-// The record of gaussian g at p in view space, but for its pixels, which are `box`. Returns whether it
-// reaches a pixel centre; where gaussians are not small those few that miss all centres in their box count,
-// too. Goes through all of it for those that do not, and for lanes without one, because others of the warp
-// do.
+// The record of gaussian g at p in view space, but for its pixels, which are `box`. Returns whether
+// it reaches a pixel centre; where gaussians are not small those few that miss all centres in their
+// box count, too. Goes through all of it for those that do not, and for lanes without one, because
+// others of the warp do.
 template <class Source>
-__device__ bool project_one(const ItemTables<typename Source::Model>& in, const ModelView<float>& view,
-                            typename Source::Place place, uint32_t g, const float p[3], bool is_one,
-                            const ItemTraits& traits, Record<float>& r, PixelBox<int>& box,
-                            unsigned& num_in_frustum) {
+__device__ bool project_one(const ItemTables<typename Source::Model>& in,
+                            const ModelView<float>& view, typename Source::Place place, uint32_t g,
+                            const float p[3], bool is_one, const ItemTraits& traits,
+                            Record<float>& r, PixelBox<int>& box, unsigned& num_in_frustum) {
     Projection<float> s;
     for (int i = 0; i < 3; ++i) s.p[i] = p[i];
     const Ellipse<float> e = Source::project(in, view, place, g, s, r.color);
@@ -134,7 +138,9 @@ template <class T>
 __device__ uint32_t load_word(const T& from) {
     static_assert(sizeof(T) <= 32 * sizeof(uint32_t), "a warp copies a table");
     const unsigned lane = threadIdx.x % 32;
-    return lane < sizeof(T) / sizeof(uint32_t) ? __ldg(reinterpret_cast<const uint32_t*>(&from) + lane) : 0;
+    return lane < sizeof(T) / sizeof(uint32_t)
+               ? __ldg(reinterpret_cast<const uint32_t*>(&from) + lane)
+               : 0;
 }
 template <class T>
 __device__ void store_word(T& to, uint32_t word) {
@@ -142,9 +148,11 @@ __device__ void store_word(T& to, uint32_t word) {
     if (lane < sizeof(T) / sizeof(uint32_t)) reinterpret_cast<uint32_t*>(&to)[lane] = word;
 }
 
-// Of a large record the rows of tiles that one of `count` parts of a batch has; no record if it has none.
+// Of a large record the rows of tiles that one of `count` parts of a batch has; no record if it has
+// none.
 __device__ LargeRecord part_of(LargeRecord large, int part, int count) {
-    const int top = large.box.y0 / kFrameTileHeight, rows = static_cast<int>(tile_rows_of(large.box));
+    const int top = large.box.y0 / kFrameTileHeight,
+              rows = static_cast<int>(tile_rows_of(large.box));
     const int first = rows * part / count, end = rows * (part + 1) / count;
     if (first == end) large.record = kNoRecord;
     if (first > 0) large.box.y0 = static_cast<uint16_t>((top + first) * kFrameTileHeight);
@@ -152,13 +160,15 @@ __device__ LargeRecord part_of(LargeRecord large, int part, int count) {
     return large;
 }
 
-// Writes the item's large records that wait: in whole batches, of which the last is filled up at the end of
-// the item and waits for more before. What lies over very many tiles is written in parts, a batch each.
+// Writes the item's large records that wait: in whole batches, of which the last is filled up at
+// the end of the item and waits for more before. What lies over very many tiles is written in
+// parts, a batch each.
 template <class Model>
-__device__ void write_large(WarpSpace<Model>& space, FrameCounters& counters, const ProjectOutput& out,
-                            bool is_end) {
+__device__ void write_large(WarpSpace<Model>& space, FrameCounters& counters,
+                            const ProjectOutput& out, bool is_end) {
     const unsigned num_large = space.num_large, lane = threadIdx.x % 32;
-    const unsigned num_batches = is_end ? blocks_for(num_large, kLargeAtOnce) : num_large / kLargeAtOnce;
+    const unsigned num_batches =
+        is_end ? blocks_for(num_large, kLargeAtOnce) : num_large / kLargeAtOnce;
     if (num_batches == 0) return;
     const unsigned count = num_batches * kLargeAtOnce;
     for (unsigned first = 0; first < count; first += 32) {
@@ -176,11 +186,12 @@ __device__ void write_large(WarpSpace<Model>& space, FrameCounters& counters, co
         for (unsigned step = 1; step < kLargeAtOnce; step *= 2)
             tiles += __shfl_xor_sync(kAllLanes, tiles, step);
         const unsigned parts = k < count ? (tiles + kMostLargeTiles - 1) / kMostLargeTiles : 0;
-        const unsigned of_first = __shfl_sync(kAllLanes, parts, 0), before = lane < 16 ? 0 : of_first;
+        const unsigned of_first = __shfl_sync(kAllLanes, parts, 0),
+                       before = lane < 16 ? 0 : of_first;
         unsigned long long place = 0;
         if (lane == 31)
-            place =
-                atomicAdd(&counters.large, static_cast<unsigned long long>(kLargeAtOnce * (before + parts)));
+            place = atomicAdd(&counters.large,
+                              static_cast<unsigned long long>(kLargeAtOnce * (before + parts)));
         place = __shfl_sync(kAllLanes, place, 31) + kLargeAtOnce * before + lane % kLargeAtOnce;
         for (unsigned part = 0; part < parts; ++part, place += kLargeAtOnce)
             if (place < out.large_capacity)
@@ -203,13 +214,14 @@ __device__ void write_large(WarpSpace<Model>& space, FrameCounters& counters, co
     __syncwarp();
 }
 
-// Writes the records of the lanes' gaussians, in their order, and counts them into tiles. Returns how many
-// there are. `sharers` are the placements of a shared item.
+// Writes the records of the lanes' gaussians, in their order, and counts them into tiles. Returns
+// how many there are. `sharers` are the placements of a shared item.
 template <class Source, bool kIsShared>
-__device__ unsigned write_records(WarpSpace<typename Source::Model>& space, const Placement* sharers,
-                                  const typename Source::Place& start, const ItemTraits& traits, bool has_one,
-                                  const Queued& mine, uint32_t first, FrameCounters& counters,
-                                  const ProjectOutput& out, unsigned& num_in_frustum) {
+__device__ unsigned write_records(WarpSpace<typename Source::Model>& space,
+                                  const Placement* sharers, const typename Source::Place& start,
+                                  const ItemTraits& traits, bool has_one, const Queued& mine,
+                                  uint32_t first, FrameCounters& counters, const ProjectOutput& out,
+                                  unsigned& num_in_frustum) {
     const auto& in = space.tables;
     const unsigned lane = threadIdx.x % 32;
     // A lane without one takes what is there.
@@ -233,9 +245,11 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
     };
     if (reaches_pixel) {
         space.ellipses[kEllipseVectors * rank] = {r.u, r.v, r.l11, r.l12};
-        space.ellipses[kEllipseVectors * rank + 1] = {r.l22, r.log2_opacity, r.color[0], r.color[1]};
+        space.ellipses[kEllipseVectors * rank + 1] = {r.l22, r.log2_opacity, r.color[0],
+                                                      r.color[1]};
         reinterpret_cast<float2*>(out.records.rest)[first + rank] = {r.color[2], r.depth};
-        const uint32_t depth = entry_depth(r.depth, in.image.camera.near_depth, out.records.depth_mask);
+        const uint32_t depth =
+            entry_depth(r.depth, in.image.camera.near_depth, out.records.depth_mask);
         out.few[first + rank] = is_large ? kManyTiles : few_tiles(depth, tile, blocks);
         if (out.source != nullptr) {  // a tape is kept
             out.source[first + rank] = g;
@@ -245,7 +259,8 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
     if (!reaches_pixel || is_large) tiles.count = 0;
     const unsigned large = __ballot_sync(kAllLanes, is_large);
     if (large != 0) {
-        const unsigned before = space.num_large, place = before + __popc(large & ((1u << lane) - 1));
+        const unsigned before = space.num_large,
+                       place = before + __popc(large & ((1u << lane) - 1));
         if (is_large) {
             space.large[place] = static_cast<uint8_t>(first + rank - in.item.record);
             space.boxes[place] = pixels();
@@ -255,7 +270,8 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
     }
     __syncwarp();
     if (large != 0 && space.num_large >= 32) write_large(space, counters, out, false);
-    float4* ellipses = reinterpret_cast<float4*>(out.records.ellipse) + kEllipseVectors * size_t(first);
+    float4* ellipses =
+        reinterpret_cast<float4*>(out.records.ellipse) + kEllipseVectors * size_t(first);
     const unsigned num_records = __popc(kept);
 #pragma unroll
     for (unsigned w = lane; w < kEllipseVectors * 32; w += 32)
@@ -310,9 +326,11 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
     const ModelView<float>& view = kIsShared ? of_sharer : tables.placement.view;
     const auto reach_scale_of = [&] {
         const float* linear = view.linear;
-        const float scale = sqrt_of(linear[6] * linear[6] + linear[7] * linear[7] + linear[8] * linear[8]);
-        return sees_its_axis(tables.limits) ? max_of(tables.image.camera.fx, tables.image.camera.fy) * scale
-                                            : NAN;
+        const float scale =
+            sqrt_of(linear[6] * linear[6] + linear[7] * linear[7] + linear[8] * linear[8]);
+        return sees_its_axis(tables.limits)
+                   ? max_of(tables.image.camera.fx, tables.image.camera.fy) * scale
+                   : NAN;
     };
     const float reach_scale = sees ? reach_scale_of() : 0;
     unsigned head = 0, waiting = 0;
@@ -332,7 +350,8 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
         bool may_reach = false, is_small = false;
         Queued mine{{}, kIsShared ? 32 * place + lane : place};
         if (place < count && sees) {
-            const float4 sphere = Source::sphere(tables.model, here, tables.item.first + place, fetched);
+            const float4 sphere =
+                Source::sphere(tables.model, here, tables.item.first + place, fetched);
             const float mean[3] = {sphere.x, sphere.y, sphere.z};
             to_view(view, mean, mine.p);
             if (are_tested) {
@@ -345,9 +364,11 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
             }
         }
         if (are_tested) {
-            if (first == 0) traits.are_small = __popc(__ballot_sync(kAllLanes, is_small)) >= kManySmall;
+            if (first == 0)
+                traits.are_small = __popc(__ballot_sync(kAllLanes, is_small)) >= kManySmall;
             const unsigned come = __ballot_sync(kAllLanes, may_reach);
-            if (may_reach) space.queue[(head + waiting + __popc(come & ((1u << lane) - 1))) % kQueue] = mine;
+            if (may_reach)
+                space.queue[(head + waiting + __popc(come & ((1u << lane) - 1))) % kQueue] = mine;
             waiting += __popc(come);
             __syncwarp();
             const bool are_nearly_all = !kIsShared && __popc(come) >= kNearlyAll;
@@ -379,9 +400,11 @@ __device__ void report_item(const ItemTables<Model>& tables, unsigned item, unsi
                             static_cast<uint32_t>(tables.image.tile_columns)};
 }
 
-__device__ void report_counts(FrameCounters& counters, unsigned num_in_frustum, unsigned num_records) {
+__device__ void report_counts(FrameCounters& counters, unsigned num_in_frustum,
+                              unsigned num_records) {
     num_in_frustum = warp_sum(num_in_frustum);
-    if (threadIdx.x % 32 != 0 || num_in_frustum == 0) return;  // there is no record that is not in it
+    if (threadIdx.x % 32 != 0 || num_in_frustum == 0)
+        return;  // there is no record that is not in it
     atomicAdd(&counters.in_frustum, static_cast<unsigned long long>(num_in_frustum));
     atomicAdd(&counters.records, static_cast<unsigned long long>(num_records));
 }
@@ -400,16 +423,18 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     Source::prepare();
     space.tiles.count = 0;
     __syncwarp();  // A warp without an item reads it next.
-    // Items differ much in what is seen of them, so a warp asks for another one as it begins with one.
+    // Items differ much in what is seen of them, so a warp asks for another one as it begins with
+    // one.
     for (unsigned i = blockIdx.x * kWarps + threadIdx.x / 32; i < num_items;) {
         const uint32_t item_word = load_word(in.items.items[i]);
         const unsigned next = take_next(taken, gridDim.x * kWarps);
-        const uint32_t placement_word = load_word(in.placements[__shfl_sync(kAllLanes, item_word, 0)]);
+        const uint32_t placement_word =
+            load_word(in.placements[__shfl_sync(kAllLanes, item_word, 0)]);
         __syncwarp();
         store_tables(space.tables, item_word, placement_word, in, models, loaded);
         if (space.tables.item.sharers == 0 && Source::has(space.tables.model)) {
-            const unsigned written =
-                project_item<Source, false>(space, nullptr, *in.items.counters, out, num_in_frustum);
+            const unsigned written = project_item<Source, false>(space, nullptr, *in.items.counters,
+                                                                 out, num_in_frustum);
             num_records += written;
             report_item(space.tables, i, written, out);
         }
@@ -422,27 +447,31 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
 // Most frames have few shared items, so a warp looks for them among 32 items at a time.
 template <class Source>
 __global__ void __launch_bounds__(32 * kWarps, kBlocks)
-    project_shared_kernel(ProjectInput in, const typename Source::Model* models, ProjectOutput out) {
+    project_shared_kernel(ProjectInput in, const typename Source::Model* models,
+                          ProjectOutput out) {
     await_kernel_before();
     if (!in.items.is_complete()) return;
     __shared__ WarpSpace<typename Source::Model> spaces[kWarps];
     WarpSpace<typename Source::Model>& space = spaces[threadIdx.x / 32];
-    const unsigned num_items = static_cast<unsigned>(in.items.counters->items), stride = gridDim.x * kWarps;
+    const unsigned num_items = static_cast<unsigned>(in.items.counters->items),
+                   stride = gridDim.x * kWarps;
     unsigned num_in_frustum = 0, num_records = 0;
     Loaded loaded;
     Source::prepare();
     space.tiles.count = 0;
     __syncwarp();  // A warp without an item reads it next.
-    for (unsigned first = blockIdx.x * kWarps + threadIdx.x / 32; first < num_items; first += 32 * stride) {
+    for (unsigned first = blockIdx.x * kWarps + threadIdx.x / 32; first < num_items;
+         first += 32 * stride) {
         const unsigned mine = first + threadIdx.x % 32 * stride;
-        unsigned todo = __ballot_sync(kAllLanes, mine < num_items && in.items.items[mine].sharers != 0);
+        unsigned todo =
+            __ballot_sync(kAllLanes, mine < num_items && in.items.items[mine].sharers != 0);
         for (; todo != 0; todo &= todo - 1) {
             const unsigned i = first + (__ffs(todo) - 1) * stride;
             const DrawItem& item = in.items.items[i];
             const Placement* sharers = in.placements + item.placement;
             __syncwarp();
-            store_tables(space.tables, load_word(item), load_word(sharers[__ffs(item.sharers) - 1]), in,
-                         models, loaded);
+            store_tables(space.tables, load_word(item), load_word(sharers[__ffs(item.sharers) - 1]),
+                         in, models, loaded);
             if (!Source::has(space.tables.model)) continue;
             const unsigned written =
                 project_item<Source, true>(space, sharers, *in.items.counters, out, num_in_frustum);
@@ -455,8 +484,8 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
 }
 
 // Packs a gaussian into a row of four planes of `num_rows`.
-__device__ void pack_row(const Gaussian3d<float>& gaussian, const float* sh, float4* planes, size_t num_rows,
-                         size_t row) {
+__device__ void pack_row(const Gaussian3d<float>& gaussian, const float* sh, float4* planes,
+                         size_t num_rows, size_t row) {
     const PackedGaussian p = pack_gaussian(gaussian);
     planes[row] = {p.mean[0], p.mean[1], p.mean[2], p.reach};
     planes[num_rows + row] = {p.f[0], p.f[1], p.f[2], p.f[3]};
@@ -478,11 +507,13 @@ __device__ Gaussian3d<float> gaussian_of(const GaussianRows<const float>& rows, 
 // A thread a gaussian.
 __global__ void pack_kernel(GaussianRows<const float> rows, float4* planes) {
     const size_t g = blockIdx.x * size_t(blockDim.x) + threadIdx.x;
-    if (g < rows.size) pack_row(gaussian_of(rows, g), rows.sh + g * rows.num_sh(), planes, rows.size, g);
+    if (g < rows.size)
+        pack_row(gaussian_of(rows, g), rows.sh + g * rows.num_sh(), planes, rows.size, g);
 }
 
 // Of the row of a page of codes; `sh` has room for all coefficients.
-__device__ Gaussian3d<float> decoded(const PageCodes<const uint32_t>& codes, size_t row, float* sh) {
+__device__ Gaussian3d<float> decoded(const PageCodes<const uint32_t>& codes, size_t row,
+                                     float* sh) {
     size_t cluster = codes.num_clusters() - 1;  // the last that begins at or before the row
     while (static_cast<size_t>(codes.offset[cluster]) > row) --cluster;
     const uint32_t* words = codes.ranges(cluster);
@@ -509,7 +540,8 @@ __global__ void pack_pages_kernel(const PageRows* pages, float4* planes, size_t 
         float own_sh[3 * kMaxShBases];
         const Gaussian3d<float> gaussian = decoded(page.codes, page.codes.first_row() + g, own_sh);
         pack_row(gaussian, own_sh, planes, num_rows, row);
-        for (unsigned k = 0; k < num_sh && page.rows.sh_degree > 0; ++k) sh[row * sh_stride + k] = own_sh[k];
+        for (unsigned k = 0; k < num_sh && page.rows.sh_degree > 0; ++k)
+            sh[row * sh_stride + k] = own_sh[k];
     }
     if (page.rows.sh_degree == 0 || page.codes.words != nullptr) return;
     for (unsigned i = threadIdx.x; i < num_sh * page.rows.size; i += blockDim.x)
@@ -533,8 +565,8 @@ PackedPlanes pack(const GaussianRows<const float>& rows, float* planes, cudaStre
 void pack_pages(const PageRows* pages, size_t num_pages, float* planes, size_t num_rows, float* sh,
                 int sh_stride, cudaStream_t stream) {
     constexpr unsigned kThreads = 128;
-    launch("pack_pages_kernel", pack_pages_kernel, static_cast<unsigned>(num_pages), kThreads, 0, stream,
-           pages, reinterpret_cast<float4*>(planes), num_rows, sh, sh_stride);
+    launch("pack_pages_kernel", pack_pages_kernel, static_cast<unsigned>(num_pages), kThreads, 0,
+           stream, pages, reinterpret_cast<float4*>(planes), num_rows, sh, sh_stride);
 }
 
 // Shared items have no weights below 1.
@@ -542,11 +574,11 @@ template <class Source, class SharedSource>
 static void project_from(const typename Source::Model* models, const ProjectInput& in,
                          const ProjectOutput& out, int taken, cudaStream_t stream) {
     const unsigned blocks = kBlocks * num_multiprocessors();
-    launch_early("project_kernel", project_kernel<Source>, blocks, 32 * kWarps, 0, stream, in, models, out,
-                 out.taken + taken);
+    launch_early("project_kernel", project_kernel<Source>, blocks, 32 * kWarps, 0, stream, in,
+                 models, out, out.taken + taken);
     if (in.has_shared_items)
-        launch_early("project_shared_kernel", project_shared_kernel<SharedSource>, blocks, 32 * kWarps, 0,
-                     stream, in, models, out);
+        launch_early("project_shared_kernel", project_shared_kernel<SharedSource>, blocks,
+                     32 * kWarps, 0, stream, in, models, out);
 }
 
 template <class Source>

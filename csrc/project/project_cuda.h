@@ -14,8 +14,8 @@ struct CodedGaussians {
     Palette palette;
 };
 
-// Models are rows, or of each one is either packed or coded, and not there in the other list. A list that
-// would have none is null.
+// Models are rows, or of each one is either packed or coded, and not there in the other list. A
+// list that would have none is null.
 struct ProjectInput {
     const GaussianRows<const float>* models;
     const PackedPlanes* packed;
@@ -32,16 +32,18 @@ struct ProjectOutput {
     FewTiles* few;           // of each record, as TileBinInput has it
     uint32_t* item_records;  // [items] how many of an item's gaussians became records
     ItemTiles* item_tiles;   // [items]
-    uint32_t* source;        // of each record, its gaussian's place in the model; null without records.box
+    uint32_t*
+        source;  // of each record, its gaussian's place in the model; null without records.box
     TileCounts tiles;
     LargeRecord* large;
     unsigned long long large_capacity;
-    unsigned* taken;  // [2] items beyond the first of each warp, of coded models in the second; 0 before
+    unsigned*
+        taken;  // [2] items beyond the first of each warp, of coded models in the second; 0 before
 };
 
-// As v3dg::project, for all items of a frame: writes a record, in the items' order, for each gaussian that
-// reaches a pixel centre, and counts into the tiles that it touches. Does nothing when the items are over a
-// capacity.
+// As v3dg::project, for all items of a frame: writes a record, in the items' order, for each
+// gaussian that reaches a pixel centre, and counts into the tiles that it touches. Does nothing
+// when the items are over a capacity.
 void project(const ProjectInput& in, const ProjectOutput& out, cudaStream_t stream);
 
 // `planes` has room for (4, N, 4).
@@ -49,12 +51,13 @@ PackedPlanes pack(const GaussianRows<const float>& rows, float* planes, cudaStre
 
 // The gaussians of a page on the device, and where they go.
 struct PageRows {
-    GaussianRows<const float> rows;   // at any multiple of 4 bytes
-    PageCodes<const uint32_t> codes;  // where they are coded; then `rows` has their number and degree alone
+    GaussianRows<const float> rows;  // at any multiple of 4 bytes
+    PageCodes<const uint32_t>
+        codes;  // where they are coded; then `rows` has their number and degree alone
     size_t first_row;
 };
-// The same for pages, into planes (4, num_rows, 4) and, where they have any, SH coefficients into rows of
-// `sh_stride` floats. `pages` is memory that the device can read.
+// The same for pages, into planes (4, num_rows, 4) and, where they have any, SH coefficients into
+// rows of `sh_stride` floats. `pages` is memory that the device can read.
 void pack_pages(const PageRows* pages, size_t num_pages, float* planes, size_t num_rows, float* sh,
                 int sh_stride, cudaStream_t stream);
 

@@ -1,6 +1,7 @@
 #pragma once
 
-// Where the project kernels read gaussians: from rows, from planes of packed gaussians, or from codes.
+// Where the project kernels read gaussians: from rows, from planes of packed gaussians, or from
+// codes.
 
 #include "base/launch.cuh"
 #include "project/project_cuda.h"
@@ -46,9 +47,10 @@ __device__ void color_of_row(const float* row, const float mean[3], const ModelV
     color_of<kDegree>(coefficient, mean, view, color);
 }
 
-// A source tells what a gaussian is, in steps, because most reach no pixel centre: a lane fetch()es what the
-// sphere around it follows from, early; sphere() is its mean and its reach; project() its ellipse, where s.p
-// is set, and its colour; shade() another colour, of models that has_shade() tells.
+// A source tells what a gaussian is, in steps, because most reach no pixel centre: a lane fetch()es
+// what the sphere around it follows from, early; sphere() is its mean and its reach; project() its
+// ellipse, where s.p is set, and its colour; shade() another colour, of models that has_shade()
+// tells.
 
 // Gaussians as rows.
 template <class RowModel>
@@ -60,7 +62,9 @@ struct OfRows {
 
     static __device__ Place start(const ItemTables<Model>&) { return {}; }
     static __device__ void prepare() {}
-    static __device__ float4 sphere(const Model&, Place&, uint32_t, const float4& fetched) { return fetched; }
+    static __device__ float4 sphere(const Model&, Place&, uint32_t, const float4& fetched) {
+        return fetched;
+    }
 };
 
 // As users hold them.
@@ -68,16 +72,18 @@ struct RowSource : OfRows<GaussianRows<const float>> {
     static __device__ bool has(const Model&) { return true; }
     static __device__ bool has_shade(const Model& m) { return m.sh_degree > 0; }
     static __device__ float4 fetch(const Model& m, uint32_t g) {
-        Gaussian3d<float> gaussian{{__ldg(m.means + 3 * size_t(g)), __ldg(m.means + 3 * size_t(g) + 1),
-                                    __ldg(m.means + 3 * size_t(g) + 2)},
-                                   {1, 0, 0, 0},
-                                   {},
-                                   __ldg(m.opacities + g)};
+        Gaussian3d<float> gaussian{
+            {__ldg(m.means + 3 * size_t(g)), __ldg(m.means + 3 * size_t(g) + 1),
+             __ldg(m.means + 3 * size_t(g) + 2)},
+            {1, 0, 0, 0},
+            {},
+            __ldg(m.opacities + g)};
         for (int k = 0; k < 3; ++k) gaussian.scale[k] = __ldg(m.scales + 3 * size_t(g) + k);
         return {gaussian.mean[0], gaussian.mean[1], gaussian.mean[2], reach_of(gaussian)};
     }
-    static __device__ Ellipse<float> project(const ItemTables<Model>& in, const ModelView<float>& view,
-                                             Place&, uint32_t g, Projection<float>& s, float color[3]) {
+    static __device__ Ellipse<float> project(const ItemTables<Model>& in,
+                                             const ModelView<float>& view, Place&, uint32_t g,
+                                             Projection<float>& s, float color[3]) {
         const GaussianRows<const float>& m = in.model;
         Gaussian3d<float> gaussian{{}, {}, {}, __ldg(m.opacities + g)};
         for (int k = 0; k < 3; ++k) gaussian.scale[k] = __ldg(m.scales + 3 * size_t(g) + k);
@@ -92,11 +98,11 @@ struct RowSource : OfRows<GaussianRows<const float>> {
         else if (m.sh_degree == kPlainColor)
             color_of_row<kPlainColor>(sh, gaussian.mean, view, color);
         const Appearance<float>& look = in.item.appearance;
-        return project_gaussian(gaussian, view, in.image.camera, look.filter_px2, look.antialiased, s,
-                                look.is_limited);
+        return project_gaussian(gaussian, view, in.image.camera, look.filter_px2, look.antialiased,
+                                s, look.is_limited);
     }
-    static __device__ void shade(const Model& m, const ModelView<float>& view, const Place&, uint32_t g,
-                                 float color[3]) {
+    static __device__ void shade(const Model& m, const ModelView<float>& view, const Place&,
+                                 uint32_t g, float color[3]) {
         shade_row(m.sh + size_t(g) * m.num_sh(), m.sh_degree, fetch(m, g), view, color);
     }
     static __device__ void shade_row(const float* row, int sh_degree, const float4& sphere,
@@ -112,10 +118,13 @@ struct RowSource : OfRows<GaussianRows<const float>> {
 
 struct PackedSource : OfRows<PackedPlanes> {
     static __device__ bool has(const Model& m) { return m.plane[0] != nullptr; }
-    static __device__ bool has_shade(const Model& m) { return m.palette.sh != nullptr || m.sh_degree > 0; }
+    static __device__ bool has_shade(const Model& m) {
+        return m.palette.sh != nullptr || m.sh_degree > 0;
+    }
     static __device__ float4 fetch(const Model& m, uint32_t g) { return load4(m.plane[0], g); }
-    static __device__ Ellipse<float> project(const ItemTables<Model>& in, const ModelView<float>& view,
-                                             Place&, uint32_t g, Projection<float>& s, float color[3]) {
+    static __device__ Ellipse<float> project(const ItemTables<Model>& in,
+                                             const ModelView<float>& view, Place&, uint32_t g,
+                                             Projection<float>& s, float color[3]) {
         const PackedPlanes& m = in.model;
         const float4 a = load4(m.plane[1], g), b = load4(m.plane[2], g), c = load4(m.plane[3], g);
         color[0] = c.y;
@@ -124,13 +133,15 @@ struct PackedSource : OfRows<PackedPlanes> {
         const PackedGaussian gaussian{{}, 0.0f, {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, c.x};
         return project_packed(gaussian, view, in.image.camera, in.limits, in.item.appearance, s);
     }
-    static __device__ void shade(const Model& m, const ModelView<float>& view, const Place&, uint32_t g,
-                                 float color[3]) {
+    static __device__ void shade(const Model& m, const ModelView<float>& view, const Place&,
+                                 uint32_t g, float color[3]) {
         const float anywhere[3] = {0, 0, 0};
         if (m.palette.sh != nullptr)
-            color_of_row<0>(m.palette.sh + 3 * size_t(m.palette.cluster_of(g)), anywhere, view, color);
+            color_of_row<0>(m.palette.sh + 3 * size_t(m.palette.cluster_of(g)), anywhere, view,
+                            color);
         else
-            RowSource::shade_row(m.sh + size_t(g) * m.sh_stride, m.sh_degree, fetch(m, g), view, color);
+            RowSource::shade_row(m.sh + size_t(g) * m.sh_stride, m.sh_degree, fetch(m, g), view,
+                                 color);
     }
 };
 
@@ -180,11 +191,12 @@ struct CodeSource {
     static __device__ uint4 fetch(const Model& m, uint32_t g) {
         return __ldg(reinterpret_cast<const uint4*>(m.codes.records) + g);
     }
-    static __device__ Gaussian3d<float> decoded(const Model& m, uint32_t cluster, const uint4& record,
-                                                float color[3]) {
+    static __device__ Gaussian3d<float> decoded(const Model& m, uint32_t cluster,
+                                                const uint4& record, float color[3]) {
         const uint32_t words[kRecordWords] = {record.x, record.y, record.z, record.w};
         const auto* at = reinterpret_cast<const float*>(&m.codes.ranges_of(cluster));
-        const float4 mean_first = load4(at, 0), mean_step = load4(at, 1), a = load4(at, 2), b = load4(at, 3);
+        const float4 mean_first = load4(at, 0), mean_step = load4(at, 1), a = load4(at, 2),
+                     b = load4(at, 3);
         const ClusterRanges ranges{{mean_first.x, mean_first.y, mean_first.z},
                                    __float_as_uint(mean_first.w),
                                    {mean_step.x, mean_step.y, mean_step.z},
@@ -204,10 +216,12 @@ struct CodeSource {
         const Gaussian3d<float> gaussian = decoded(m, place.cluster, record, color);
         const float sigmas = opacity_table()[record.x >> 24].reach_in_sigmas;
         const float most = max_of(gaussian.scale[0], max_of(gaussian.scale[1], gaussian.scale[2]));
-        return {gaussian.mean[0], gaussian.mean[1], gaussian.mean[2], sigmas < 0 ? -1.0f : most * sigmas};
+        return {gaussian.mean[0], gaussian.mean[1], gaussian.mean[2],
+                sigmas < 0 ? -1.0f : most * sigmas};
     }
-    static __device__ Ellipse<float> project(const ItemTables<Model>& in, const ModelView<float>& view,
-                                             Place& place, uint32_t g, Projection<float>& s, float color[3]) {
+    static __device__ Ellipse<float> project(const ItemTables<Model>& in,
+                                             const ModelView<float>& view, Place& place, uint32_t g,
+                                             Projection<float>& s, float color[3]) {
         const uint4 record = fetch(in.model, g);
         advance(in.model, place, g);
         float sh[3];
@@ -217,8 +231,8 @@ struct CodeSource {
         packed.log2_opacity = opacity_table()[record.x >> 24].log2_opacity;
         return project_packed(packed, view, in.image.camera, in.limits, in.item.appearance, s);
     }
-    static __device__ void shade(const Model& m, const ModelView<float>& view, const Place& place, uint32_t g,
-                                 float color[3]) {
+    static __device__ void shade(const Model& m, const ModelView<float>& view, const Place& place,
+                                 uint32_t g, float color[3]) {
         const float anywhere[3] = {0, 0, 0};
         if (m.palette.sh != nullptr) {
             color_of_row<0>(m.palette.sh + 3 * size_t(place.cluster), anywhere, view, color);
@@ -231,20 +245,21 @@ struct CodeSource {
         }
     }
     template <int kDegree>
-    static __device__ void shade_codes(const Model& m, const ModelView<float>& view, const Place& place,
-                                       uint32_t g, float color[3]) {
+    static __device__ void shade_codes(const Model& m, const ModelView<float>& view,
+                                       const Place& place, uint32_t g, float color[3]) {
         float sh[3 * num_sh_bases(kDegree)], step[3 * kDegree];
         const Gaussian3d<float> gaussian = decoded(m, place.cluster, fetch(m, g), sh);
         uint32_t words[num_sh_words(kDegree)];
 #pragma unroll
         for (int k = 0; k < kDegree; ++k) {
-            const uint2 pair =
-                __ldg(reinterpret_cast<const uint2*>(m.codes.sh) + m.codes.sh_stride * size_t(g) + k);
+            const uint2 pair = __ldg(reinterpret_cast<const uint2*>(m.codes.sh) +
+                                     m.codes.sh_stride * size_t(g) + k);
             words[2 * k] = pair.x;
             words[2 * k + 1] = pair.y;
         }
 #pragma unroll
-        for (int k = 0; k < 3 * kDegree; ++k) step[k] = __ldg(m.codes.ranges_of(place.cluster).sh_step + k);
+        for (int k = 0; k < 3 * kDegree; ++k)
+            step[k] = __ldg(m.codes.ranges_of(place.cluster).sh_step + k);
         decode_sh<float>(words, step, kDegree, sh + 3);
         color_of<kDegree>([&](int k) { return sh[k]; }, gaussian.mean, view, color);
     }
@@ -256,8 +271,9 @@ struct Faded : Source {
     static constexpr bool kFades = true;
 
     static __device__ Ellipse<float> project(const ItemTables<typename Source::Model>& in,
-                                             const ModelView<float>& view, typename Source::Place& place,
-                                             uint32_t g, Projection<float>& s, float color[3]) {
+                                             const ModelView<float>& view,
+                                             typename Source::Place& place, uint32_t g,
+                                             Projection<float>& s, float color[3]) {
         Ellipse<float> e = Source::project(in, view, place, g, s, color);
         fade(in.item.weight, e);
         return e;

@@ -12,10 +12,12 @@ namespace {
 
 constexpr size_t kBins = 4096;
 constexpr int kRounds = 16;
-// Of a table's entries, the share that is spread evenly over the range: rare values keep a neighbour.
+// Of a table's entries, the share that is spread evenly over the range: rare values keep a
+// neighbour.
 constexpr double kEven = 0.25;
 
-// Entries as dense as the cube root of the values' density: best for many entries (Panter and Dite).
+// Entries as dense as the cube root of the values' density: best for many entries (Panter and
+// Dite).
 void guess_codebook(const std::vector<double>& ordered, Span<double> table) {
     const double low = ordered.front(), width = (ordered.back() - low) / kBins;
     std::vector<double> density(kBins, 0.0);
@@ -49,8 +51,8 @@ struct Part {
     }
 };
 
-Part part_of(Span<const float> vectors, size_t width, const std::vector<uint32_t>& order, size_t first,
-             size_t last, uint32_t number) {
+Part part_of(Span<const float> vectors, size_t width, const std::vector<uint32_t>& order,
+             size_t first, size_t last, uint32_t number) {
     std::vector<double> mean(width, 0.0), errors(width, 0.0);
     for (size_t i = first; i < last; ++i)
         for (size_t d = 0; d < width; ++d) mean[d] += vectors[order[i] * width + d];
@@ -85,8 +87,9 @@ void make_codebook(Span<const double> values, Span<double> table) {
         auto first = ordered.begin();
         for (size_t k = 0; k < table.size; ++k) {
             const bool is_last = k + 1 == table.size;
-            const auto last = is_last ? ordered.end()
-                                      : std::lower_bound(first, ordered.end(), (table[k] + table[k + 1]) / 2);
+            const auto last =
+                is_last ? ordered.end()
+                        : std::lower_bound(first, ordered.end(), (table[k] + table[k + 1]) / 2);
             if (last != first)
                 table[k] = std::accumulate(first, last, 0.0) / static_cast<double>(last - first);
             first = last;

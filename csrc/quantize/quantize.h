@@ -9,8 +9,8 @@
 
 namespace v3dg {
 
-// A page of K clusters: the codes of its gaussians, a row of words each; those of their higher coefficients;
-// the ranges of its clusters. T is const where it is only read.
+// A page of K clusters: the codes of its gaussians, a row of words each; those of their higher
+// coefficients; the ranges of its clusters. T is const where it is only read.
 template <class T>
 struct PageCodes {
     Span<const int64_t> offset;  // [K + 1] rows of gaussians of each cluster, ascending
@@ -30,8 +30,9 @@ struct PageCodes {
 };
 
 // Writes one gaussian to a row.
-V3DG_HD inline void decode_row(const uint32_t* record, const uint32_t* sh_words, const ClusterRanges& ranges,
-                               const GaussianRows<float>& out, size_t row) {
+V3DG_HD inline void decode_row(const uint32_t* record, const uint32_t* sh_words,
+                               const ClusterRanges& ranges, const GaussianRows<float>& out,
+                               size_t row) {
     Gaussian3d<float> g;
     float* sh = out.sh + out.num_sh() * row;
     decode(record, ranges, g, sh);
@@ -47,8 +48,8 @@ V3DG_HD inline void decode_row(const uint32_t* record, const uint32_t* sh_words,
 // Pages of a bundle on the host, as its file has them. Borrows words and offsets, owns the ranges.
 class CodedPages {
   public:
-    // words: all pages, P of them; first_cluster: [P + 1]; offset: [C + 1]. Throws std::invalid_argument,
-    // naming the cluster, where ranges are not are_valid().
+    // words: all pages, P of them; first_cluster: [P + 1]; offset: [C + 1]. Throws
+    // std::invalid_argument, naming the cluster, where ranges are not are_valid().
     CodedPages(const uint32_t* words, Span<const int64_t> first_cluster, Span<const int64_t> offset,
                int sh_degree);
     const Codes& codes() const { return codes_; }
@@ -61,10 +62,11 @@ class CodedPages {
     Codes codes_;
 };
 
-// Memory for the codes of pages that come and go, which is drawn from as if it were one bundle. It is divided
-// into slots of a page each, which hold as many rows and as many clusters: the rows of all slots follow on
-// each other, and so do their clusters, with gaussians or without. A page's ranges move with it, its
-// gaussians and its clusters are neighbours as in its own bundle, and nothing else has to know where it is.
+// Memory for the codes of pages that come and go, which is drawn from as if it were one bundle. It
+// is divided into slots of a page each, which hold as many rows and as many clusters: the rows of
+// all slots follow on each other, and so do their clusters, with gaussians or without. A page's
+// ranges move with it, its gaussians and its clusters are neighbours as in its own bundle, and
+// nothing else has to know where it is.
 struct CodeSlots {
     uint32_t *records, *sh;
     unsigned char* ranges;
@@ -79,8 +81,12 @@ struct CodeSlots {
 };
 
 // What a slot takes for each row, and for each place of a cluster.
-constexpr size_t slot_row_bytes(int sh_degree) { return 4 * (kRecordWords + num_sh_words(sh_degree)); }
-constexpr size_t slot_cluster_bytes(int sh_degree) { return range_bytes(sh_degree) + sizeof(int64_t); }
+constexpr size_t slot_row_bytes(int sh_degree) {
+    return 4 * (kRecordWords + num_sh_words(sh_degree));
+}
+constexpr size_t slot_cluster_bytes(int sh_degree) {
+    return range_bytes(sh_degree) + sizeof(int64_t);
+}
 
 // A page, and the slot that it goes to.
 struct SlotPage {
@@ -92,15 +98,18 @@ struct SlotPage {
 // Writes what decodes the k-th cluster of a slot.
 V3DG_HD inline void write_cluster(const SlotPage& from, size_t k, const CodeSlots& to) {
     const PageCodes<const uint32_t>& page = from.page;
-    const size_t begin = static_cast<size_t>(page.offset[k < page.num_clusters() ? k : page.num_clusters()]);
+    const size_t begin =
+        static_cast<size_t>(page.offset[k < page.num_clusters() ? k : page.num_clusters()]);
     to.offset[from.cluster + k] = static_cast<int64_t>(from.row + begin - page.first_row());
     if (k >= page.num_clusters()) return;
     ClusterCode code;
     uint16_t sh_steps[9] = {};
     std::memcpy(&code, page.ranges(k), sizeof code);
-    std::memcpy(sh_steps, page.ranges(k) + sizeof code / 4, 6 * static_cast<size_t>(page.sh_degree));
+    std::memcpy(sh_steps, page.ranges(k) + sizeof code / 4,
+                6 * static_cast<size_t>(page.sh_degree));
     const ClusterRanges ranges = ranges_of(code, sh_steps, page.sh_degree);
-    std::memcpy(to.ranges + to.range_size * (from.cluster + k), &ranges, range_bytes(page.sh_degree));
+    std::memcpy(to.ranges + to.range_size * (from.cluster + k), &ranges,
+                range_bytes(page.sh_degree));
 }
 
 // Clusters, in any order, and where their gaussians are to be.
@@ -111,10 +120,10 @@ struct DecodeInput {
 };
 
 namespace cpu {
-// Codes gaussians to the nearest step of the ranges of their clusters; what was decoded from a page gives the
-// same page again. A scale of 0 becomes 2^-14 of the largest of its gaussian; scales are kept from 2^-64 to
-// 2^64, means within 2^126, colours within 32,768, higher coefficients within 1,024 and opacities from 0
-// to 1. Throws std::invalid_argument where a value is not finite.
+// Codes gaussians to the nearest step of the ranges of their clusters; what was decoded from a page
+// gives the same page again. A scale of 0 becomes 2^-14 of the largest of its gaussian; scales are
+// kept from 2^-64 to 2^64, means within 2^126, colours within 32,768, higher coefficients within
+// 1,024 and opacities from 0 to 1. Throws std::invalid_argument where a value is not finite.
 void encode_page(const GaussianRows<const float>& in, const PageCodes<uint32_t>& page);
 
 // The gaussians of a page. Throws std::invalid_argument, naming the cluster, where ranges are not
@@ -128,13 +137,13 @@ void decode(const DecodeInput& in, const GaussianRows<float>& out);
 void write_slot(const SlotPage& from, const CodeSlots& to);
 }  // namespace cpu
 
-// The same bits. The codes and `out` are on the device, all else on the host. Work is queued on the stream.
-// Throws std::runtime_error when CUDA reports an error.
+// The same bits. The codes and `out` are on the device, all else on the host. Work is queued on the
+// stream. Throws std::runtime_error when CUDA reports an error.
 namespace cuda {
 void decode(const DecodeInput& in, const GaussianRows<float>& out, Stream stream);
 
-// As cpu::write_slot() for several pages, in memory that the device can read; what they and the slots point
-// to is on the device.
+// As cpu::write_slot() for several pages, in memory that the device can read; what they and the
+// slots point to is on the device.
 void write_slots(const SlotPage* pages, size_t num_pages, const CodeSlots& to, Stream stream);
 }  // namespace cuda
 

@@ -35,7 +35,8 @@ double clamped(double x, double least, double most) { return std::min(std::max(x
 double float_spacing(double x) { return x == 0 ? 0 : std::ldexp(1, std::ilogb(x) - 23); }
 
 uint32_t code_of(double value, double first, double step, uint32_t most) {
-    return step > 0 ? static_cast<uint32_t>(clamped(std::rint((value - first) / step), 0, most)) : 0;
+    return step > 0 ? static_cast<uint32_t>(clamped(std::rint((value - first) / step), 0, most))
+                    : 0;
 }
 
 // The half of a number within 65,504 that `round`, such as std::floor, makes of it.
@@ -47,7 +48,8 @@ uint16_t half_of(double x, double (*round)(double)) {
     return static_cast<uint16_t>((fraction < 0 ? 0x8000u : 0u) | std::min(bits, 0x7bffu));
 }
 
-// The half of a step, in kStepUnit. Steps that are no normal halves are none: nobody sees ranges so small.
+// The half of a step, in kStepUnit. Steps that are no normal halves are none: nobody sees ranges so
+// small.
 uint16_t step_half(double step, double (*round)(double)) {
     return step < kStepUnit * 0x1p-14 ? uint16_t(0) : half_of(step / kStepUnit, round);
 }
@@ -63,8 +65,8 @@ void check_is_finite(const GaussianRows<const float>& in, size_t row) {
                                     std::to_string(row));
 }
 
-// Scales, as bits of floats, and the quaternion's x, y and z: as they are where that has codes, so that what
-// was decoded is coded as it was; else with other axes.
+// Scales, as bits of floats, and the quaternion's x, y and z: as they are where that has codes, so
+// that what was decoded is coded as it was; else with other axes.
 void prepare_shape(const float* quat, const float* scale, Prepared& out) {
     double length2 = 0, q[4] = {1, 0, 0, 0};
     for (int k = 0; k < 4; ++k) length2 += double(quat[k]) * quat[k];
@@ -123,8 +125,9 @@ struct Range {
     double magnitude() const { return std::max(std::abs(first), std::abs(last)); }
 };
 
-// The step of a range of float32 numbers that are coded from the first on, `most` steps at most. It is never
-// above what is wanted by more than the rounding of the last: so what was decoded has the same steps again.
+// The step of a range of float32 numbers that are coded from the first on, `most` steps at most. It
+// is never above what is wanted by more than the rounding of the last: so what was decoded has the
+// same steps again.
 double step_of(const Range& range, double first, uint32_t most) {
     return (range.last - first + float_spacing(range.magnitude()) / 2) / most;
 }
@@ -156,12 +159,15 @@ ClusterCode ranges_of(const std::vector<Prepared>& cluster) {
         out.color_first[k] = half_of(color[k].first, std::ceil);
         const double first = float_of_half(out.color_first[k]);
         const bool is_one = color[k].last - first < 1024 * float_spacing(color[k].magnitude());
-        out.color_step[k] = step_half(is_one ? 0 : step_of(color[k], first, kMostColor), std::floor);
+        out.color_step[k] =
+            step_half(is_one ? 0 : step_of(color[k], first, kMostColor), std::floor);
     }
-    const uint32_t first = std::min((least + (1u << kScaleFirstShift) - 1) >> kScaleFirstShift, 0xffffu);
+    const uint32_t first =
+        std::min((least + (1u << kScaleFirstShift) - 1) >> kScaleFirstShift, 0xffffu);
     out.scale_first = static_cast<uint16_t>(first);
     const uint32_t base = first << kScaleFirstShift;
-    out.scale_step = static_cast<uint16_t>(most > base ? ((most - base) / kMostScale) >> kScaleStepShift : 0);
+    out.scale_step =
+        static_cast<uint16_t>(most > base ? ((most - base) / kMostScale) >> kScaleStepShift : 0);
     return out;
 }
 
@@ -172,7 +178,8 @@ void encode(const Prepared& g, float opacity, const ClusterRanges& ranges, uint3
         color[k] = code_of(g.color[k], ranges.color_first[k], ranges.color_step[k], kMostColor);
         const double first = double(ranges.scale_first) - kLeastScaleBits;
         scale[k] = code_of(g.scale_bits[k], first, ranges.scale_step, kMostScale);
-        quat[k] = static_cast<uint32_t>(kZeroQuat + clamped(std::rint(g.quat[k]), -kZeroQuat, kZeroQuat));
+        quat[k] =
+            static_cast<uint32_t>(kZeroQuat + clamped(std::rint(g.quat[k]), -kZeroQuat, kZeroQuat));
     }
     const uint32_t alpha = code_of(opacity, 0, 1.0 / kMostOpacity, kMostOpacity);
     record[0] = mean[0] | mean[1] << 12 | alpha << 24;
@@ -193,9 +200,9 @@ int most_sh_code(int sh_degree, int basis, int channel) {
     return (1 << (sh_bits(sh_degree, basis, channel) - 1)) - 1;
 }
 
-// Halves: the largest value of each band and channel, over the square of the largest code. A channel of
-// values below 2^-11 of the brightness, less than that's least step, is left out: red, green and blue in
-// float32 do not keep it.
+// Halves: the largest value of each band and channel, over the square of the largest code. A
+// channel of values below 2^-11 of the brightness, less than that's least step, is left out: red,
+// green and blue in float32 do not keep it.
 void sh_steps_of(const GaussianRows<const float>& in, uint16_t* steps) {
     const int num_bases = num_sh_bases(in.sh_degree);
     double most[9] = {};
@@ -227,7 +234,8 @@ void encode_sh(const float* sh, const float* step, int sh_degree, uint32_t* word
             const double square = unit > 0 ? std::abs(value[c]) / unit : 0,
                          low = std::floor(std::sqrt(square));
             const double nearest = square > low * low + low + 0.5 ? low + 1 : low;
-            const int code = static_cast<int>(std::copysign(std::min(nearest, double(most)), value[c]));
+            const int code =
+                static_cast<int>(std::copysign(std::min(nearest, double(most)), value[c]));
             bits |= static_cast<uint64_t>(most + code) << num_bits;
             num_bits += sh_bits(sh_degree, basis, c);
             if (num_bits < 32) continue;
@@ -257,7 +265,8 @@ CodedRanges ranges_at(const uint32_t* words, int sh_degree) {
 }
 
 // Throws std::invalid_argument, which names the cluster, where they are not are_valid().
-ClusterRanges valid_ranges(const uint32_t* words, int sh_degree, size_t cluster, const char* whose) {
+ClusterRanges valid_ranges(const uint32_t* words, int sh_degree, size_t cluster,
+                           const char* whose) {
     const CodedRanges coded = ranges_at(words, sh_degree);
     if (!are_valid(coded.code, coded.sh_steps, sh_degree))
         throw std::invalid_argument("cluster " + std::to_string(cluster) + whose +
@@ -265,7 +274,8 @@ ClusterRanges valid_ranges(const uint32_t* words, int sh_degree, size_t cluster,
     return decoded(coded, sh_degree);
 }
 
-void encode_cluster(const GaussianRows<const float>& in, const PageCodes<uint32_t>& page, size_t c) {
+void encode_cluster(const GaussianRows<const float>& in, const PageCodes<uint32_t>& page,
+                    size_t c) {
     std::vector<Prepared> cluster;
     cluster.reserve(in.size);
     for (size_t row = 0; row < in.size; ++row) cluster.push_back(prepare(in, row));
@@ -286,31 +296,34 @@ void encode_cluster(const GaussianRows<const float>& in, const PageCodes<uint32_
 }  // namespace
 
 void cpu::encode_page(const GaussianRows<const float>& in, const PageCodes<uint32_t>& page) {
-    std::fill_n(page.words,
-                page_bytes(page.end_row() - page.first_row(), page.num_clusters(), page.sh_degree) / 4, 0u);
+    std::fill_n(
+        page.words,
+        page_bytes(page.end_row() - page.first_row(), page.num_clusters(), page.sh_degree) / 4, 0u);
     parallel_for(page.num_clusters(), kClustersAtOnce, [&](size_t c) {
         const auto first = static_cast<size_t>(page.offset[c]),
                    last = static_cast<size_t>(page.offset[c + 1]);
         for (size_t row = first; row < last; ++row) check_is_finite(in, row);
         if (first == last) return;
         const GaussianRows<const float> rows{
-            in.means + 3 * first,        in.quats + 4 * first, in.scales + 3 * first, in.opacities + first,
-            in.sh + in.num_sh() * first, last - first,         in.sh_degree};
+            in.means + 3 * first, in.quats + 4 * first,        in.scales + 3 * first,
+            in.opacities + first, in.sh + in.num_sh() * first, last - first,
+            in.sh_degree};
         encode_cluster(rows, page, c);
     });
 }
 
 void cpu::decode_page(const PageCodes<const uint32_t>& page, const GaussianRows<float>& out) {
     parallel_for(page.num_clusters(), kClustersAtOnce, [&](size_t c) {
-        const ClusterRanges ranges = valid_ranges(page.ranges(c), page.sh_degree, c, " of the page");
-        for (auto row = static_cast<size_t>(page.offset[c]); row < static_cast<size_t>(page.offset[c + 1]);
-             ++row)
+        const ClusterRanges ranges =
+            valid_ranges(page.ranges(c), page.sh_degree, c, " of the page");
+        for (auto row = static_cast<size_t>(page.offset[c]);
+             row < static_cast<size_t>(page.offset[c + 1]); ++row)
             decode_row(page.record(row), page.sh(row), ranges, out, row);
     });
 }
 
-CodedPages::CodedPages(const uint32_t* words, Span<const int64_t> first_cluster, Span<const int64_t> offset,
-                       int sh_degree)
+CodedPages::CodedPages(const uint32_t* words, Span<const int64_t> first_cluster,
+                       Span<const int64_t> offset, int sh_degree)
     : ranges_(size_t(range_bytes(sh_degree)) * (offset.size - 1)),
       first_cluster_(first_cluster),
       codes_{words,
@@ -330,7 +343,8 @@ CodedPages::CodedPages(const uint32_t* words, Span<const int64_t> first_cluster,
     for (size_t p = 0; p + 1 < place.size(); ++p) {
         const PageCodes<const uint32_t> page = page_at(p);
         place[p + 1] =
-            place[p] + page_bytes(page.end_row() - page.first_row(), page.num_clusters(), sh_degree) / 4;
+            place[p] +
+            page_bytes(page.end_row() - page.first_row(), page.num_clusters(), sh_degree) / 4;
     }
     parallel_for(place.size() - 1, kClustersAtOnce, [&](size_t p) {
         const PageCodes<const uint32_t> page = page_at(p);
@@ -340,8 +354,10 @@ CodedPages::CodedPages(const uint32_t* words, Span<const int64_t> first_cluster,
             ClusterRanges own = valid_ranges(page.ranges(k), sh_degree, c, "");
             own.record_base =
                 static_cast<uint32_t>((page.record(first_row) - words) / kRecordWords - first_row);
-            own.sh_base = static_cast<uint32_t>((page.sh(first_row) - words) / 2 - sh_degree * first_row);
-            std::memcpy(ranges_.data() + size_t(range_bytes(sh_degree)) * c, &own, range_bytes(sh_degree));
+            own.sh_base =
+                static_cast<uint32_t>((page.sh(first_row) - words) / 2 - sh_degree * first_row);
+            std::memcpy(ranges_.data() + size_t(range_bytes(sh_degree)) * c, &own,
+                        range_bytes(sh_degree));
         }
     });
 }
@@ -362,7 +378,8 @@ void cpu::decode(const DecodeInput& in, const GaussianRows<float>& out) {
         const auto first = static_cast<uint32_t>(in.codes.offset[in.cluster[s]]);
         for (int64_t row = in.offset[s]; row < in.offset[s + 1]; ++row) {
             const uint32_t from = first + static_cast<uint32_t>(row - in.offset[s]);
-            decode_row(in.codes.record_of(ranges, from), in.codes.sh_of(ranges, from), ranges, out, row);
+            decode_row(in.codes.record_of(ranges, from), in.codes.sh_of(ranges, from), ranges, out,
+                       row);
         }
     });
 }

@@ -51,13 +51,14 @@ void decode(const DecodeInput& in, const GaussianRows<float>& out, Stream stream
     DecodeInput on_device = in;
     on_device.cluster.data = cluster.data();
     on_device.offset.data = offset.data();
-    launch("decode", decode_kernel, blocks_for(out.size, kBlockSize), kBlockSize, 0, stream, on_device, out);
+    launch("decode", decode_kernel, blocks_for(out.size, kBlockSize), kBlockSize, 0, stream,
+           on_device, out);
 }
 
 void write_slots(const SlotPage* pages, size_t num_pages, const CodeSlots& to, Stream stream) {
     static_assert(kRecordWords == 4, "a record is a vector");
-    launch("write_slots", write_slots_kernel, static_cast<unsigned>(num_pages), kBlockSize, 0, stream, pages,
-           to);
+    launch("write_slots", write_slots_kernel, static_cast<unsigned>(num_pages), kBlockSize, 0,
+           stream, pages, to);
 }
 
 }  // namespace cuda

@@ -1,10 +1,12 @@
 #pragma once
 
-// What the codes of a gaussian mean: 128 bits for all that SH degree 0 needs, more words for the higher
-// degrees, relative to the ranges of its cluster. docs/format.md has the layout for those who write a reader.
+// What the codes of a gaussian mean: 128 bits for all that SH degree 0 needs, more words for the
+// higher degrees, relative to the ranges of its cluster. docs/format.md has the layout for those
+// who write a reader.
 //
-// Every device and every instruction set decodes to the same bits, whether products are contracted into sums
-// or not: a step has so few bits that its product with a code is exact in float32, so there is one rounding.
+// Every device and every instruction set decodes to the same bits, whether products are contracted
+// into sums or not: a step has so few bits that its product with a code is exact in float32, so
+// there is one rounding.
 
 #include "base/span.h"
 #include "math/gaussian.h"
@@ -15,12 +17,14 @@ constexpr int kRecordWords = 4;
 constexpr int kPageAlignment = 16;  // bytes: a record in one load
 
 constexpr uint32_t kMostMean = 4095, kMostScale = 1023, kMostColor = 511, kMostOpacity = 255;
-// A rotation is turned by one of the 24 of a cube until the largest component is w; the others are then at
-// most sin(22.5 degrees), which is 255 steps. A quaternion of codes has the length sqrt(kQuatLength2).
+// A rotation is turned by one of the 24 of a cube until the largest component is w; the others are
+// then at most sin(22.5 degrees), which is 255 steps. A quaternion of codes has the length
+// sqrt(kQuatLength2).
 constexpr int32_t kZeroQuat = 255, kQuatLength2 = 444016;
 constexpr float kQuatStep = 0.0015007235f;  // 1 / sqrt(kQuatLength2)
 constexpr float kOpacityStep = 1.0f / 255;
-// Scales are coded by the bits of the float, which rise about as the logarithm does: from 2^-64 to 2^64.
+// Scales are coded by the bits of the float, which rise about as the logarithm does: from 2^-64 to
+// 2^64.
 constexpr uint32_t kLeastScaleBits = 63u << 23, kMostScaleBits = (191u << 23) - 1;
 constexpr int kScaleFirstShift = 14, kScaleStepShift = 4;
 // So that the steps of small ranges are normal numbers in 16 bits.
@@ -35,7 +39,8 @@ struct ClusterCode {
 };
 static_assert(sizeof(ClusterCode) == 40, "a format of files");
 
-// Bytes of a cluster's ranges: a ClusterCode, and three halves for each band above the constant one.
+// Bytes of a cluster's ranges: a ClusterCode, and three halves for each band above the constant
+// one.
 V3DG_HD constexpr int cluster_code_bytes(int sh_degree) {
     return static_cast<int>(sizeof(ClusterCode)) + (6 * sh_degree + 3) / 4 * 4;
 }
@@ -52,7 +57,8 @@ V3DG_HD constexpr int sh_bits(int sh_degree, int basis, int channel) {
 }
 V3DG_HD constexpr int band_of(int basis) { return basis < 4 ? 1 : basis < 9 ? 2 : 3; }
 
-// Bytes of a page: codes of gaussians, those of their coefficients, ranges of clusters; filled up to 16.
+// Bytes of a page: codes of gaussians, those of their coefficients, ranges of clusters; filled up
+// to 16.
 V3DG_HD constexpr size_t page_bytes(size_t num_gaussians, size_t num_clusters, int sh_degree) {
     return (4 * (kRecordWords + num_sh_words(sh_degree)) * num_gaussians +
             cluster_code_bytes(sh_degree) * num_clusters + kPageAlignment - 1) /
@@ -67,7 +73,8 @@ V3DG_HD inline float float_of_half(uint32_t half) {
     return half & 0x8000 ? -size : size;
 }
 
-// The ranges of a cluster, ready to decode with, and where its codes are. In tables each takes range_bytes().
+// The ranges of a cluster, ready to decode with, and where its codes are. In tables each takes
+// range_bytes().
 struct alignas(16) ClusterRanges {
     float mean_first[3];
     uint32_t scale_first;
@@ -80,9 +87,9 @@ struct alignas(16) ClusterRanges {
 V3DG_HD constexpr uint32_t range_bytes(int sh_degree) { return 64 + (3 * sh_degree + 3) / 4 * 16; }
 static_assert(range_bytes(3) == sizeof(ClusterRanges), "all of it");
 
-// The gaussians of a bundle as codes, on the host or on a device. Row r, of cluster c, has four words from
-// 4 (record_base + r) of `records` on, and two words a degree from 2 (sh_base + sh_stride r) of `sh` on; what
-// is in brackets is modulo 2^32.
+// The gaussians of a bundle as codes, on the host or on a device. Row r, of cluster c, has four
+// words from 4 (record_base + r) of `records` on, and two words a degree from 2 (sh_base +
+// sh_stride r) of `sh` on; what is in brackets is modulo 2^32.
 struct Codes {
     const uint32_t *records, *sh;
     const unsigned char* ranges;  // [C]
@@ -104,7 +111,8 @@ struct Codes {
 };
 
 // `sh_steps` are the halves behind the code, three a band.
-V3DG_HD inline ClusterRanges ranges_of(const ClusterCode& code, const uint16_t* sh_steps, int sh_degree) {
+V3DG_HD inline ClusterRanges ranges_of(const ClusterCode& code, const uint16_t* sh_steps,
+                                       int sh_degree) {
     ClusterRanges out{};
     for (int k = 0; k < 3; ++k) {
         out.mean_first[k] = code.mean_first[k];
@@ -133,8 +141,8 @@ V3DG_HD V3DG_INLINE V number_at(Bits<V> word, int first, int num_bits) {
     return float_of_number<V>(word >> first & ((1u << num_bits) - 1));
 }
 
-// One gaussian, or one a lane, with the coefficients of its constant basis. A finite result follows from
-// ranges that are_valid().
+// One gaussian, or one a lane, with the coefficients of its constant basis. A finite result follows
+// from ranges that are_valid().
 template <class V>
 V3DG_HD V3DG_INLINE void decode(const Bits<V> record[kRecordWords], const ClusterRanges& ranges,
                                 Gaussian3d<V>& g, V color[3]) {
@@ -149,9 +157,11 @@ V3DG_HD V3DG_INLINE void decode(const Bits<V> record[kRecordWords], const Cluste
         color[k] = ranges.color_first[k] + colors[k] * ranges.color_step[k];
     }
     g.opacity = number_at<V>(a, 24, 8) * kOpacityStep;
-    const V x = number_at<V>(c, 10, 9) - float(kZeroQuat), y = number_at<V>(c, 19, 9) - float(kZeroQuat),
+    const V x = number_at<V>(c, 10, 9) - float(kZeroQuat),
+            y = number_at<V>(c, 19, 9) - float(kZeroQuat),
             z = number_at<V>(d, 23, 9) - float(kZeroQuat);
-    g.quat[0] = exact_sqrt(float(kQuatLength2) - x * x - y * y - z * z) * kQuatStep;  // of whole numbers
+    g.quat[0] =
+        exact_sqrt(float(kQuatLength2) - x * x - y * y - z * z) * kQuatStep;  // of whole numbers
     g.quat[1] = x * kQuatStep;
     g.quat[2] = y * kQuatStep;
     g.quat[3] = z * kQuatStep;
@@ -166,8 +176,8 @@ V3DG_HD V3DG_INLINE B bits_at(const B* words, int first, int num_bits) {
     return bits & ((1u << num_bits) - 1);
 }
 
-// The coefficients above the constant basis, three channels each, of one gaussian or of one a lane. A code is
-// a signed number whose square counts, so that small values have small steps.
+// The coefficients above the constant basis, three channels each, of one gaussian or of one a lane.
+// A code is a signed number whose square counts, so that small values have small steps.
 template <class V>
 V3DG_HD V3DG_INLINE void decode_sh(const Bits<V>* words, const float* step, int sh_degree, V* sh) {
     int first = 0;

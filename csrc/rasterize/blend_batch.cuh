@@ -2,11 +2,11 @@
 
 // A batch of records, nearest first, blended over the pixels of a tile.
 //
-// Many gaussians cover a few pixels. So a warp takes 32 records that may reach its sub-tile, each lane finds
-// which pixels one of them reaches, and the bits are transposed: a pixel then walks its own records only.
-// Where gaussians cover many pixels, a lane has two neighbours, which share most of their records and what is
-// loaded and computed for a row; a sub-tile has 16 x 4 pixels then, else 8 x 4. Either way a pixel gets the
-// same bits.
+// Many gaussians cover a few pixels. So a warp takes 32 records that may reach its sub-tile, each
+// lane finds which pixels one of them reaches, and the bits are transposed: a pixel then walks its
+// own records only. Where gaussians cover many pixels, a lane has two neighbours, which share most
+// of their records and what is loaded and computed for a row; a sub-tile has 16 x 4 pixels then,
+// else 8 x 4. Either way a pixel gets the same bits.
 
 #include <type_traits>
 
@@ -45,8 +45,8 @@ __device__ inline void store(const float (&from)[2], float* to) {
     *reinterpret_cast<float2*>(to) = {from[0], from[1]};
 }
 
-// Vectors of the record that begins at a place in shared memory. No clobber keeps these loads behind plain
-// stores: records are written by copy_async() only, which is waited for.
+// Vectors of the record that begins at a place in shared memory. No clobber keeps these loads
+// behind plain stores: records are written by copy_async() only, which is waited for.
 template <int kVector>
 __device__ float4 vector_at(uint32_t place) {
     float4 v{};
@@ -74,8 +74,8 @@ __device__ inline void list_record(uint32_t place, uint32_t record) {
 #endif
 }
 
-// An element of BlendShared::list, whose writing ends with a clobber. This load fills 32 bits; after a plain
-// one nvcc extends the number again.
+// An element of BlendShared::list, whose writing ends with a clobber. This load fills 32 bits;
+// after a plain one nvcc extends the number again.
 __device__ inline uint32_t listed_at(uint32_t place) {
     uint32_t listed = 0;
 #ifdef __CUDA_ARCH__
@@ -124,9 +124,12 @@ __device__ void publish_alive(bool is_alive, unsigned sub, BlendShared& s) {
 // Bit j of lane i becomes bit i of lane j.
 __device__ inline uint32_t transpose_bits(uint32_t bits) {
     const unsigned lane = threadIdx.x % 32;
-    // Halves and bytes are put together whole: lanes 16, then 8 apart exchange what belongs to the other.
-    bits = __byte_perm(bits, __shfl_xor_sync(kAllLanes, bits, 16), (lane & 16) != 0 ? 0x3276 : 0x5410);
-    bits = __byte_perm(bits, __shfl_xor_sync(kAllLanes, bits, 8), (lane & 8) != 0 ? 0x3715 : 0x6240);
+    // Halves and bytes are put together whole: lanes 16, then 8 apart exchange what belongs to the
+    // other.
+    bits =
+        __byte_perm(bits, __shfl_xor_sync(kAllLanes, bits, 16), (lane & 16) != 0 ? 0x3276 : 0x5410);
+    bits =
+        __byte_perm(bits, __shfl_xor_sync(kAllLanes, bits, 8), (lane & 8) != 0 ? 0x3715 : 0x6240);
     uint32_t low_half = 0x0f0f0f0f;
 #pragma unroll
     for (unsigned width = 4; width > 0; width /= 2) {
@@ -139,7 +142,8 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
     return bits;
 }
 
-// Where pixels stop, kept in a register. Of an argument of the kernel, nvcc loads it for each gaussian anew.
+// Where pixels stop, kept in a register. Of an argument of the kernel, nvcc loads it for each
+// gaussian anew.
 template <class Stop>
 __device__ Stop stop_of(const BlendShared& s) {
     if constexpr (std::is_same_v<Stop, StopsBefore>)
@@ -153,12 +157,13 @@ template <int kPixels, bool kWithDepth, class Stop>
 __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
     const Stop stop = stop_of<Stop>(s);
     unsigned lane = threadIdx.x % 32;
-    // Hidden from the compiler, which would keep what follows from the lane in registers from batch to batch
-    // and spill others.
+    // Hidden from the compiler, which would keep what follows from the lane in registers from batch
+    // to batch and spill others.
     asm volatile("" : "+r"(lane));
     // The list stands from its end to its begin.
     constexpr uint32_t kEach = sizeof(s.list[0][0]);
-    const auto list = static_cast<uint32_t>(__cvta_generic_to_shared(s.list[threadIdx.x / 32] + kBlendBatch));
+    const auto list =
+        static_cast<uint32_t>(__cvta_generic_to_shared(s.list[threadIdx.x / 32] + kBlendBatch));
     const auto record = static_cast<uint32_t>(__cvta_generic_to_shared(&s.record[0][lane]));
     const uint32_t own_blocks = blocks_of_sub<kPixels>(sub);
     int listed = 0;
@@ -179,7 +184,8 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
     TilePixels& pixels = s.pixels;
     const unsigned place = place_of<kPixels>(sub, lane);
     BlendedPixels<kPixels> p;
-    for (int k = 0; k < kPixels; ++k) p.x[k] = corner_x + static_cast<float>(kPixels * (lane % 8) + k);
+    for (int k = 0; k < kPixels; ++k)
+        p.x[k] = corner_x + static_cast<float>(kPixels * (lane % 8) + k);
     p.y = corner_y + static_cast<float>(lane / 8);
     load(pixels.transmittance + place, p.transmittance);
     for (int c = 0; c < 3; ++c) load(pixels.color[c] + place, p.color[c]);
@@ -193,7 +199,8 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
         else
             p.x[k] = kNowhere;
     }
-    // The last lane takes the first record of a group, which becomes the highest bit of a lane's pixels.
+    // The last lane takes the first record of a group, which becomes the highest bit of a lane's
+    // pixels.
     uint32_t last_of_group = list - 31 * kEach;
     for (; listed > 0; listed -= 32, last_of_group -= 32 * kEach) {
         uint32_t bits = 0;
@@ -208,8 +215,8 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
         int highest = 31 - __clz(static_cast<int>(bits));
         uint32_t next = listed_at(last_of_group + kEach * highest);
         while (bits != 0) {
-            // A record is used as its vectors (frame/record.cuh): taken apart first, nvcc rounds the falloff
-            // otherwise than for the other number of pixels, and in the backward pass.
+            // A record is used as its vectors (frame/record.cuh): taken apart first, nvcc rounds
+            // the falloff otherwise than for the other number of pixels, and in the backward pass.
             const float4 a = vector_at<0>(next), b = vector_at<1>(next);
             const float2 c = rest_at(next);
             bits = low_bits(bits, highest);
@@ -230,13 +237,14 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
             }
             if (!alive) bits = 0;
         }
-        // With StopsBefore one of two pixels that has stopped seems to go on: it is left with more light than
-        // a pixel stops at. So lanes of which both have stopped may walk up to here.
+        // With StopsBefore one of two pixels that has stopped seems to go on: it is left with more
+        // light than a pixel stops at. So lanes of which both have stopped may walk up to here.
         if (kPixels > 1) alive = p.x[0] != kNowhere || p.x[kPixels - 1] != kNowhere;
         __syncwarp();
     }
     for (int k = 0; k < kPixels; ++k)
-        if (kPixels > 1 ? p.x[k] == kNowhere : !alive) p.transmittance[k] = -fabsf(p.transmittance[k]);
+        if (kPixels > 1 ? p.x[k] == kNowhere : !alive)
+            p.transmittance[k] = -fabsf(p.transmittance[k]);
     store(p.transmittance, pixels.transmittance + place);
     for (int c = 0; c < 3; ++c) store(p.color[c], pixels.color[c] + place);
     if (kWithDepth) store(p.depth, s.depth + place);

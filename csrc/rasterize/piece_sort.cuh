@@ -1,7 +1,7 @@
 #pragma once
 
-// Pieces of a tile's list: taken from the list nearest first, without entries over pixels that have all
-// stopped, and sorted.
+// Pieces of a tile's list: taken from the list nearest first, without entries over pixels that have
+// all stopped, and sorted.
 
 #include "frame/record.cuh"
 #include "rasterize/tile_lists.cuh"
@@ -13,12 +13,12 @@ constexpr int kBlendThreads = 128;
 constexpr int kBlendWarps = kBlendThreads / 32;
 constexpr int kWindow = kEntriesAtOnce * kBlendThreads;  // entries looked at in one go
 constexpr int kPiece = 3 * kWindow / 2;                  // entries sorted at once, at most
-constexpr int kLog2SpreadAgain = 10;                     // buckets of what did not fit into a window
-constexpr int kLog2Sort = 9;                             // buckets of a piece
-constexpr uint32_t kMostAlike = 12;                      // entries of a bucket that is not crowded
-constexpr uint32_t kMostCrowded = kBlendThreads / 4;     // of an entry a thread, in crowded buckets
-constexpr int kFewEntries = 64;                          // sorted without buckets
-constexpr int kBlendBatch = 192;                         // records blended at once
+constexpr int kLog2SpreadAgain = 10;                  // buckets of what did not fit into a window
+constexpr int kLog2Sort = 9;                          // buckets of a piece
+constexpr uint32_t kMostAlike = 12;                   // entries of a bucket that is not crowded
+constexpr uint32_t kMostCrowded = kBlendThreads / 4;  // of an entry a thread, in crowded buckets
+constexpr int kFewEntries = 64;                       // sorted without buckets
+constexpr int kBlendBatch = 192;                      // records blended at once
 // Each takes some bits of depth or order, at least 4, after the first one, whose range is a guess.
 constexpr int kMostSpreadLevels = 1 + 26 / 4 + 28 / 4 + 2;
 constexpr uint32_t kNoBucket = ~0u;
@@ -28,7 +28,7 @@ template <int kPixels>
 struct SubTile {
     static constexpr int kWidth = 8 * kPixels, kHeight = 4, kColumns = kFrameTileWidth / kWidth;
     static constexpr int kCount = kColumns * kFrameTileHeight / kHeight;  // of a tile
-    static constexpr int kBlocks = kWidth / kEntryBlockSize;              // of a tile's, side by side
+    static constexpr int kBlocks = kWidth / kEntryBlockSize;  // of a tile's, side by side
 };
 constexpr int kFrameTilePixels = kFrameTileWidth * kFrameTileHeight;
 
@@ -41,15 +41,16 @@ struct SpreadLevel {
     Buckets buckets;
 };
 
-// Counts of the warps that look through a window of a list together. There are three: one is filled while the
-// one before is still read and the next one is emptied.
+// Counts of the warps that look through a window of a list together. There are three: one is filled
+// while the one before is still read and the next one is emptied.
 struct ListWindow {
     uint32_t taken;
     uint32_t end;  // the first entry that is beyond
 };
 
-// State of a tile's pixels, of 8 x 4 after each other. Of those with odd columns the upper and lower halves
-// are exchanged: the pixels of half a warp lie in different banks then, with one of them a lane and with two.
+// State of a tile's pixels, of 8 x 4 after each other. Of those with odd columns the upper and
+// lower halves are exchanged: the pixels of half a warp lie in different banks then, with one of
+// them a lane and with two.
 struct TilePixels {
     alignas(float2) float transmittance[kFrameTilePixels];
     alignas(float2) float color[3][kFrameTilePixels];
@@ -68,8 +69,8 @@ struct BlendShared {
     };
     uint16_t sorted[kPiece];       // places in `key`
     uint32_t blocks[kBlendBatch];  // live ones that the batch's records may reach
-    // Of the batch, those that may reach the sub-tile of a warp, as addresses in shared memory. They stand
-    // from the last place on backwards; the first place is read ahead only.
+    // Of the batch, those that may reach the sub-tile of a warp, as addresses in shared memory.
+    // They stand from the last place on backwards; the first place is read ahead only.
     uint16_t list[kBlendWarps][kBlendBatch + 1];
     TilePixels pixels;
     uint32_t alive_blocks;    // as blocks_of(TileEntry)
@@ -81,7 +82,8 @@ struct BlendShared {
     uint32_t crowded;          // of some of its entries, those with many in their bucket
     float stops_behind;        // StopsBehind::transmittance
     SpreadLevel level[kMostSpreadLevels];
-    // Sums of weight * depth, in the order of TilePixels. Frames without depth do not ask for this memory.
+    // Sums of weight * depth, in the order of TilePixels. Frames without depth do not ask for this
+    // memory.
     alignas(float2) float depth[kFrameTilePixels];
 };
 static_assert(sizeof(BlendShared) < 1 << 15,
@@ -94,14 +96,15 @@ __device__ inline uint32_t end_of_bucket(const TileEntry* entries, uint32_t firs
     const uint32_t bucket = buckets.of(entries[first].key);
     for (uint32_t at = first; at < last; at += kBlendThreads) {
         const uint32_t i = at + threadIdx.x;
-        const uint32_t inside = __syncthreads_count(i < last && buckets.of(entries[i].key) == bucket);
+        const uint32_t inside =
+            __syncthreads_count(i < last && buckets.of(entries[i].key) == bucket);
         if (inside < kBlendThreads) return at + inside;
     }
     return last;
 }
 
-// Adds those entries [first, end) to the piece that lie over live pixels. Takes none from the bucket `beyond`
-// on. Returns where it stopped and how many the piece now holds.
+// Adds those entries [first, end) to the piece that lie over live pixels. Takes none from the
+// bucket `beyond` on. Returns where it stopped and how many the piece now holds.
 __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, uint32_t end,
                                     const Buckets& buckets, uint32_t beyond, uint32_t held,
                                     uint32_t window_number, BlendShared& s) {
@@ -125,7 +128,8 @@ __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, ui
         bool inside = i < end;
         const uint32_t depth = key_depth(entry[k]);
         if (bounded) {
-            const bool is_beyond = inside && (by_order ? key_order(entry[k]) : depth) >= beyond_begin;
+            const bool is_beyond =
+                inside && (by_order ? key_order(entry[k]) : depth) >= beyond_begin;
             const uint32_t outside = __ballot_sync(kAllLanes, is_beyond);
             if (outside != 0 && lane == __ffs(outside) - 1) atomicMin(&window.end, i);
             inside = inside && !is_beyond;
@@ -148,7 +152,8 @@ __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, ui
         place = __shfl_sync(kAllLanes, place, 0);
 #pragma unroll
         for (int k = 0; k < kEntriesAtOnce; ++k) {
-            if (live[k] >> lane & 1) s.key[place + __popc(live[k] & ((1u << lane) - 1))] = entry[k].key;
+            if (live[k] >> lane & 1)
+                s.key[place + __popc(live[k] & ((1u << lane) - 1))] = entry[k].key;
             place += __popc(live[k]);
         }
     }
@@ -156,11 +161,12 @@ __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, ui
     return {min(end, window.end), held + window.taken};
 }
 
-// Whether the first entry is blended before the second: where their depths are alike and not exact, the
-// records' own decide.
+// Whether the first entry is blended before the second: where their depths are alike and not exact,
+// the records' own decide.
 __device__ inline bool precedes(EntryKey first, EntryKey second, const RecordPlanes& records) {
     const TileEntry one{first}, other{second};
-    if (records.depth_of(one) != records.depth_of(other) || records.is_exact(other)) return first < second;
+    if (records.depth_of(one) != records.depth_of(other) || records.is_exact(other))
+        return first < second;
     const uint32_t a = records.record_of(one), b = records.record_of(other);
     if (a == b) return false;
     const float depth_a = rest_of(records, a)->y, depth_b = rest_of(records, b)->y;
@@ -196,24 +202,26 @@ __device__ inline uint32_t count_before(uint32_t p, uint32_t first, uint32_t las
     return before;
 }
 
-// Sorts the piece by buckets. Their counters are 0, then say where each begins, and in the end where the next
-// one does.
+// Sorts the piece by buckets. Their counters are 0, then say where each begins, and in the end
+// where the next one does.
 template <class SomeBuckets>
-__device__ void count_buckets(const SomeBuckets& buckets, uint32_t* bucket, uint32_t count, BlendShared& s) {
+__device__ void count_buckets(const SomeBuckets& buckets, uint32_t* bucket, uint32_t count,
+                              BlendShared& s) {
     for (uint32_t i = threadIdx.x; i < count; i += kBlendThreads)
         atomicAdd(&bucket[buckets.of(s.key[i])], 1u);
     __syncthreads();
 }
 template <class SomeBuckets>
-__device__ void sort_buckets(const SomeBuckets& buckets, uint32_t* bucket, const RecordPlanes& records,
-                             uint32_t count, BlendShared& s) {
+__device__ void sort_buckets(const SomeBuckets& buckets, uint32_t* bucket,
+                             const RecordPlanes& records, uint32_t count, BlendShared& s) {
     for (uint32_t i = threadIdx.x; i < count; i += kBlendThreads)
         s.by_bucket[atomicAdd(&bucket[buckets.of(s.key[i])], 1u)] = static_cast<uint16_t>(i);
     __syncthreads();
     for (uint32_t p = threadIdx.x; p < count; p += kBlendThreads) {
         const uint32_t i = s.by_bucket[p], own = buckets.of(s.key[i]);
         const uint32_t first = own > 0 ? bucket[own - 1] : 0;
-        s.sorted[first + count_before(p, first, bucket[own], records, s)] = static_cast<uint16_t>(i);
+        s.sorted[first + count_before(p, first, bucket[own], records, s)] =
+            static_cast<uint16_t>(i);
     }
     __syncthreads();
 }
@@ -226,7 +234,8 @@ __device__ inline void sort_piece(const RecordPlanes& records, uint32_t count, B
         const uint32_t i = threadIdx.x / 2;
         const EntryKey key = s.key[i < count ? i : 0];
         uint32_t rank = 0;
-        for (uint32_t j = threadIdx.x % 2; j < count; j += 2) rank += precedes(s.key[j], key, records);
+        for (uint32_t j = threadIdx.x % 2; j < count; j += 2)
+            rank += precedes(s.key[j], key, records);
         rank += __shfl_xor_sync(kAllLanes, rank, 1);
         if (i < count && threadIdx.x % 2 == 0) s.sorted[rank] = static_cast<uint16_t>(i);
     } else {
@@ -239,8 +248,10 @@ __device__ inline void sort_piece(const RecordPlanes& records, uint32_t count, B
     }
     if (few) return;
     count_buckets(buckets, s.bucket, count, s);
-    // Some entries tell whether most have many others in their bucket, each of which costs them a comparison.
-    const bool is_crowded = threadIdx.x < count && s.bucket[buckets.of(s.key[threadIdx.x])] > kMostAlike;
+    // Some entries tell whether most have many others in their bucket, each of which costs them a
+    // comparison.
+    const bool is_crowded =
+        threadIdx.x < count && s.bucket[buckets.of(s.key[threadIdx.x])] > kMostAlike;
     if (is_crowded) atomicAdd(&s.crowded, 1u);
     scan_buckets<1 << kLog2Sort, kBlendThreads>(s.bucket, s.warp_sum);
     if (s.crowded <= kMostCrowded) {

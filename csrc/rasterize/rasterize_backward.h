@@ -1,7 +1,7 @@
 #pragma once
 
-// Backward pass of rasterization on CUDA, of one picture: from the picture's gradients to those of its
-// records.
+// Backward pass of rasterization on CUDA, of one picture: from the picture's gradients to those of
+// its records.
 
 #include "base/device.h"
 #include "frame/gradient_slots.h"
@@ -21,7 +21,8 @@ struct RasterizeBackwardInput {
     PictureGradient<float> d_picture;
 };
 
-// Writes the slots and the gradient of the background (3). `d_background_of_tile` is scratch, (num_tiles, 3).
+// Writes the slots and the gradient of the background (3). `d_background_of_tile` is scratch,
+// (num_tiles, 3).
 void rasterize_backward(const RasterizeBackwardInput& in, const GradientSlots& slots,
                         float* d_background_of_tile, float* d_background, cudaStream_t stream);
 

@@ -1,9 +1,9 @@
-// A block takes a tile, a warp 8 x 4 of its pixels, a lane one pixel; they walk the tile's list front to back
-// as the forward pass did.
+// A block takes a tile, a warp 8 x 4 of its pixels, a lane one pixel; they walk the tile's list
+// front to back as the forward pass did.
 //
-// The sums over a warp's pixels are made for kRows gaussians at once: a lane stores what its pixel gives to
-// each of them, then lanes take over a row of 8 pixels of one gaussian each. That costs a fifth of adding up
-// across lanes gaussian by gaussian.
+// The sums over a warp's pixels are made for kRows gaussians at once: a lane stores what its pixel
+// gives to each of them, then lanes take over a row of 8 pixels of one gaussian each. That costs a
+// fifth of adding up across lanes gaussian by gaussian.
 
 #include <cmath>
 
@@ -40,7 +40,8 @@ struct Share {
 };
 constexpr int kShareStride = 33;  // of the pixels of a gaussian; odd, against bank conflicts
 constexpr int kRowsStride = 40;   // of the sums of a value over rows of pixels; the same
-static_assert(kRowsStride * kValuesOf<true> * sizeof(float) <= kHeld * kShareStride * sizeof(Share), "");
+static_assert(kRowsStride * kValuesOf<true> * sizeof(float) <= kHeld * kShareStride * sizeof(Share),
+              "");
 
 // What is needed of a batch's entries until their pairs are added up.
 struct Batch {
@@ -66,17 +67,22 @@ struct Shared {
 
 static_assert(sizeof(Shared<true>) <= 99 * 1024, "the most that a block can have on every device");
 
-// Parts of the tile, one bit a warp, that the record may reach. Compares without rounding to pixel centres: a
-// tile marks the slots of all records that it lists for a warp, and those decide which gaussians get zeros.
+// Parts of the tile, one bit a warp, that the record may reach. Compares without rounding to pixel
+// centres: a tile marks the slots of all records that it lists for a warp, and those decide which
+// gaussians get zeros.
 __device__ uint32_t warps_of(const Record<float>& g, int left, int top) {
-    const int x0 = max(g.x0 - left, 0) / kWarpWidth, x1 = min(g.x1 - left, kFrameTileWidth - 1) / kWarpWidth;
-    const int y0 = max(g.y0 - top, 0) / kWarpHeight, y1 = min(g.y1 - top, kFrameTileHeight - 1) / kWarpHeight;
+    const int x0 = max(g.x0 - left, 0) / kWarpWidth,
+              x1 = min(g.x1 - left, kFrameTileWidth - 1) / kWarpWidth;
+    const int y0 = max(g.y0 - top, 0) / kWarpHeight,
+              y1 = min(g.y1 - top, kFrameTileHeight - 1) / kWarpHeight;
     const EllipseRows<float> ellipse = ellipse_rows(g.l11, g.l12, g.l22, g.log2_opacity);
-    const float u = g.u - left, v = g.v - top;  // from the tile's corner, whose pixels' centres are at 1/2
+    const float u = g.u - left,
+                v = g.v - top;  // from the tile's corner, whose pixels' centres are at 1/2
     uint32_t warps = 0;
     for (int y = y0; y <= y1; ++y) {
         float low, high;
-        row_extent(ellipse, kWarpHeight * y + 0.5f - v, kWarpHeight * y + kWarpHeight - 0.5f - v, low, high);
+        row_extent(ellipse, kWarpHeight * y + 0.5f - v, kWarpHeight * y + kWarpHeight - 0.5f - v,
+                   low, high);
         for (int x = x0; x <= x1; ++x)
             if (u + high >= kWarpWidth * x + 0.5f && u + low <= kWarpWidth * x + kWarpWidth - 0.5f)
                 warps |= 1u << (y * kWarpColumns + x);
@@ -88,7 +94,8 @@ __device__ uint32_t warps_of(const Record<float>& g, int left, int top) {
 struct PixelGradient {
     float x, y;
     float d_color[3], d_depth, d_weight;
-    float total, running;  // sum over gaussians of weight * (gradient by that weight): all, and so far
+    float total,
+        running;  // sum over gaussians of weight * (gradient by that weight): all, and so far
     float transmittance;
 };
 
@@ -118,11 +125,12 @@ __device__ PixelGradient read_pixel(const RasterizeBackwardInput& in, int column
     return p;
 }
 
-// Sums over the warp's pixels for the gaussians it holds; `entry` is the place in the batch of the one this
-// lane works on, (left, top) the centre of the warp's first pixel. Lane = row of pixels * kHeld + gaussian.
+// Sums over the warp's pixels for the gaussians it holds; `entry` is the place in the batch of the
+// one this lane works on, (left, top) the centre of the warp's first pixel. Lane = row of pixels *
+// kHeld + gaussian.
 template <bool kWithDepth, bool kWithSize>
-__device__ void add_up(Shared<kWithSize>& s, Batch& batch, int warp, int held, int entry, float left,
-                       float top) {
+__device__ void add_up(Shared<kWithSize>& s, Batch& batch, int warp, int held, int entry,
+                       float left, float top) {
     const int lane = threadIdx.x % 32, gaussian = lane % kHeld, row = lane / kHeld;
     __syncwarp();
     const Record<float>& g = s.record[entry];
@@ -147,10 +155,12 @@ __device__ void add_up(Shared<kWithSize>& s, Batch& batch, int warp, int held, i
     }
     const Ellipse<float> d = falloff_vjp(l11, l12, l22, sums.of_falloff(f));
 
-    // Over the rows, in the place of the shares: lane l adds up the values l / kHeld, l / kHeld + 4, ...
+    // Over the rows, in the place of the shares: lane l adds up the values l / kHeld, l / kHeld +
+    // 4, ...
     constexpr int kValues = kValuesOf<kWithSize>;
-    const float value[kValuesOf<true>] = {d.u,   d.v,      d.l11,    d.l12,    d.l22,  d.log2_opacity,
-                                          depth, color[0], color[1], color[2], size.u, size.v};
+    const float value[kValuesOf<true>] = {
+        d.u,   d.v,      d.l11,    d.l12,    d.l22,  d.log2_opacity,
+        depth, color[0], color[1], color[2], size.u, size.v};
     float* of_rows = reinterpret_cast<float*>(s.share[warp]);
     __syncwarp();
 #pragma unroll
@@ -184,15 +194,16 @@ __device__ Share blend_vjp(const Record<float>& g, PixelGradient& p) {
 
 // Takes this warp's pixels through the batch.
 template <bool kWithDepth, bool kWithSize>
-__device__ void blend_batch_vjp(Shared<kWithSize>& s, Batch& batch, int warp, int num, PixelGradient& p,
-                                float left, float top) {
+__device__ void blend_batch_vjp(Shared<kWithSize>& s, Batch& batch, int warp, int num,
+                                PixelGradient& p, float left, float top) {
     const int lane = threadIdx.x % 32;
     uint8_t* list = s.list[warp];
     int count = 0;
     for (int first = 0; first < num; first += 32) {
         const bool meets = first + lane < num && (s.warps[first + lane] >> warp & 1) != 0;
         const unsigned entries = __ballot_sync(kAllLanes, meets);
-        if (meets) list[count + __popc(entries & ((1u << lane) - 1))] = static_cast<uint8_t>(first + lane);
+        if (meets)
+            list[count + __popc(entries & ((1u << lane) - 1))] = static_cast<uint8_t>(first + lane);
         count += __popc(entries);
     }
     if (lane < kHeld) list[count + lane] = kBatch;
@@ -227,7 +238,8 @@ __device__ void add_up_pairs(const Shared<kWithSize>& s, const Batch& batch, int
         if (took_part == 0) continue;
         const float* pair = &s.pair[batch.first_pair[entry]][value];
         float sum = 0;
-        for (uint32_t todo = took_part; todo != 0; todo &= todo - 1) sum += pair[(__ffs(todo) - 1) * kValues];
+        for (uint32_t todo = took_part; todo != 0; todo &= todo - 1)
+            sum += pair[(__ffs(todo) - 1) * kValues];
         const uint32_t slot = batch.slot[entry];
         if (kWithSize && value >= kGradientValues)
             reinterpret_cast<float*>(slots.size + slot)[value - kGradientValues] = sum;
@@ -239,11 +251,12 @@ __device__ void add_up_pairs(const Shared<kWithSize>& s, const Batch& batch, int
 
 template <bool kWithDepth, bool kWithSize>
 __global__ void __launch_bounds__(kThreads, 2)
-    rasterize_backward_kernel(RasterizeBackwardInput in, GradientSlots slots, float* d_background_of_tile) {
+    rasterize_backward_kernel(RasterizeBackwardInput in, GradientSlots slots,
+                              float* d_background_of_tile) {
     Shared<kWithSize>& s = *reinterpret_cast<Shared<kWithSize>*>(shared_memory());
     const int lane = threadIdx.x % 32;
-    const int warp =
-        __shfl_sync(kAllLanes, static_cast<int>(threadIdx.x) / 32, 0);  // tells that all lanes agree
+    const int warp = __shfl_sync(kAllLanes, static_cast<int>(threadIdx.x) / 32,
+                                 0);  // tells that all lanes agree
     const uint32_t tile = in.plans[blockIdx.x].tile;
     const int tile_column = tile % in.image.tile_columns, tile_row = tile / in.image.tile_columns;
     const int left = tile_column * kFrameTileWidth, top = tile_row * kFrameTileHeight;
@@ -288,7 +301,8 @@ __global__ void __launch_bounds__(kThreads, 2)
                 const uint32_t r = order[first + i];
                 const Record<float> g = load_record(in.records, r, in.records.box[r]);
                 s.record[i] = g;
-                batch.slot[i] = slots.first[r] + slot_of_tile(in.records.box[r], tile_column, tile_row);
+                batch.slot[i] =
+                    slots.first[r] + slot_of_tile(in.records.box[r], tile_column, tile_row);
                 warps = warps_of(g, left, top) & s.alive;
             }
             s.warps[i] = warps;
@@ -304,18 +318,19 @@ __global__ void __launch_bounds__(kThreads, 2)
         }
         // The entries of the batch whose pairs there is room for.
         num = __syncthreads_count(i < min(kBatch, count - first) && end_pair <= kPairs);
-        blend_batch_vjp<kWithDepth, kWithSize>(s, batch, warp, num, p, warp_left + 0.5f, warp_top + 0.5f);
+        blend_batch_vjp<kWithDepth, kWithSize>(s, batch, warp, num, p, warp_left + 0.5f,
+                                               warp_top + 0.5f);
         first += num;
         __syncthreads();
     }
 }
 
 template <bool kWithDepth, bool kWithSize>
-void start(const RasterizeBackwardInput& in, const GradientSlots& slots, float* d_background_of_tile,
-           cudaStream_t stream) {
+void start(const RasterizeBackwardInput& in, const GradientSlots& slots,
+           float* d_background_of_tile, cudaStream_t stream) {
     launch("rasterize_backward_kernel", &rasterize_backward_kernel<kWithDepth, kWithSize>,
-           in.image.tile_columns * in.image.tile_rows, kThreads, sizeof(Shared<kWithSize>), stream, in, slots,
-           d_background_of_tile);
+           in.image.tile_columns * in.image.tile_rows, kThreads, sizeof(Shared<kWithSize>), stream,
+           in, slots, d_background_of_tile);
 }
 
 constexpr int kSumThreads = 256;
@@ -324,7 +339,8 @@ constexpr int kSumThreads = 256;
 __global__ void sum_over_tiles_kernel(const float* of_tile, uint32_t num_tiles, float* total) {
     __shared__ float of_warp[kSumThreads / 32];
     float sum = 0;
-    for (uint32_t t = threadIdx.x; t < num_tiles; t += kSumThreads) sum += of_tile[3 * t + blockIdx.x];
+    for (uint32_t t = threadIdx.x; t < num_tiles; t += kSumThreads)
+        sum += of_tile[3 * t + blockIdx.x];
     sum = warp_sum(sum);
     if (threadIdx.x % 32 == 0) of_warp[threadIdx.x / 32] = sum;
     __syncthreads();
@@ -343,8 +359,8 @@ void rasterize_backward(const RasterizeBackwardInput& in, const GradientSlots& s
                      : with_depth          ? &start<true, false>
                                            : &start<false, false>;
     run(in, slots, d_background_of_tile, stream);
-    launch("sum_over_tiles_kernel", &sum_over_tiles_kernel, 3, kSumThreads, 0, stream, d_background_of_tile,
-           num_tiles, d_background);
+    launch("sum_over_tiles_kernel", &sum_over_tiles_kernel, 3, kSumThreads, 0, stream,
+           d_background_of_tile, num_tiles, d_background);
 }
 
 }  // namespace cuda

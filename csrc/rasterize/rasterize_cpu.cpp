@@ -6,18 +6,22 @@ namespace v3dg {
 namespace V3DG_ISA {
 
 template <class T, Extra kExtra, class Stop>
-static void blend_entries(const Record<T>* records, EntryFormat format, const uint64_t* entry, size_t count,
-                          int left, int top, const Window& window, Stop stop, TilePlanes<T>& tile) {
+static void blend_entries(const Record<T>* records, EntryFormat format, const uint64_t* entry,
+                          size_t count, int left, int top, const Window& window, Stop stop,
+                          TilePlanes<T>& tile) {
     blend_tile<T, kExtra>(count, left, top, window, stop, tile, [&](size_t i) {
         return Listed<T>{records + format.record_of(entry[i]), EntryFormat::blocks_of(entry[i])};
     });
 }
 
-// Calls visit(place in the tile, place in the picture) for the pixels of a tile that are in the window.
+// Calls visit(place in the tile, place in the picture) for the pixels of a tile that are in the
+// window.
 template <class Visit>
-static V3DG_INLINE void for_each_pixel(int left, int top, const Window& window, const Visit& visit) {
+static V3DG_INLINE void for_each_pixel(int left, int top, const Window& window,
+                                       const Visit& visit) {
     for (int block = 0; block < kTileBlocks * kTileBlocks; ++block) {
-        const int x0 = left + block % kTileBlocks * kBlockSize, y0 = top + block / kTileBlocks * kBlockSize;
+        const int x0 = left + block % kTileBlocks * kBlockSize,
+                  y0 = top + block / kTileBlocks * kBlockSize;
         for (int y = max_of(y0, window.y0); y < min_of(y0 + kBlockSize, window.y1); ++y)
             for (int x = max_of(x0, window.x0); x < min_of(x0 + kBlockSize, window.x1); ++x)
                 visit(block * kBlockPixels + (y - y0) * kBlockSize + (x - x0),
@@ -26,19 +30,19 @@ static V3DG_INLINE void for_each_pixel(int left, int top, const Window& window, 
 }
 
 template <class T>
-void rasterize_tile(const Record<T>* records, EntryFormat format, const uint64_t* entry, size_t count,
-                    int left, int top, const Picture<T>& picture) {
+void rasterize_tile(const Record<T>* records, EntryFormat format, const uint64_t* entry,
+                    size_t count, int left, int top, const Picture<T>& picture) {
     TilePlanes<T> tile;
     with_stop<T>(picture.min_transmittance, [&](auto stop) {
         if (picture.count != nullptr)
-            blend_entries<T, Extra::kCount>(records, format, entry, count, left, top, picture.window, stop,
-                                            tile);
+            blend_entries<T, Extra::kCount>(records, format, entry, count, left, top,
+                                            picture.window, stop, tile);
         else if (picture.depth != nullptr)
-            blend_entries<T, Extra::kDepth>(records, format, entry, count, left, top, picture.window, stop,
-                                            tile);
+            blend_entries<T, Extra::kDepth>(records, format, entry, count, left, top,
+                                            picture.window, stop, tile);
         else
-            blend_entries<T, Extra::kNothing>(records, format, entry, count, left, top, picture.window, stop,
-                                              tile);
+            blend_entries<T, Extra::kNothing>(records, format, entry, count, left, top,
+                                              picture.window, stop, tile);
     });
     for_each_pixel(left, top, picture.window, [&](int p, size_t out) {
         const Finished<T> of = finished(tile.transmittance[p], picture.min_transmittance);
@@ -55,12 +59,14 @@ void rasterize_tile(const Record<T>* records, EntryFormat format, const uint64_t
 }
 
 template <class T, bool kWithDepth, bool kWithSize>
-static void backward(const Record<T>* records, EntryFormat format, const uint64_t* entry, size_t count,
-                     int left, int top, const Picture<T>& picture, const PictureGradient<T>& d_picture,
-                     RecordGradient<T>* d_entry, CenterSize<T>* size, T* d_background) {
+static void backward(const Record<T>* records, EntryFormat format, const uint64_t* entry,
+                     size_t count, int left, int top, const Picture<T>& picture,
+                     const PictureGradient<T>& d_picture, RecordGradient<T>* d_entry,
+                     CenterSize<T>* size, T* d_background) {
     TilePlanes<T> tile;
     constexpr Extra kExtra = kWithDepth ? Extra::kDepth : Extra::kNothing;
-    blend_entries<T, kExtra>(records, format, entry, count, left, top, picture.window, StopsBefore{}, tile);
+    blend_entries<T, kExtra>(records, format, entry, count, left, top, picture.window,
+                             StopsBefore{}, tile);
     TileGradient<T> grad = {};
     for_each_pixel(left, top, picture.window, [&](int p, size_t out) {
         const T t = tile.transmittance[p] < 0 ? -tile.transmittance[p] : tile.transmittance[p];
@@ -85,12 +91,15 @@ static void backward(const Record<T>* records, EntryFormat format, const uint64_
     const BlockPixels<T> pixels;
     uint64_t alive = clear_tile(tile, left, top, picture.window, Extra::kNothing);
     for (size_t i = 0; i < count && alive != 0; ++i) {
-        if (i + kPrefetch < count) prefetch_record(records + format.record_of(entry[i + kPrefetch]));
+        if (i + kPrefetch < count)
+            prefetch_record(records + format.record_of(entry[i + kPrefetch]));
         const Record<T>& g = records[format.record_of(entry[i])];
-        const uint64_t blocks = blocks_of_ellipse(g, left, top, EntryFormat::blocks_of(entry[i]) & alive);
+        const uint64_t blocks =
+            blocks_of_ellipse(g, left, top, EntryFormat::blocks_of(entry[i]) & alive);
         if (blocks != 0)
-            blend_record_vjp<T, kWithDepth, kWithSize>(g, blocks, left, top, pixels, grad, tile, alive,
-                                                       d_entry[i], kWithSize ? size + i : nullptr);
+            blend_record_vjp<T, kWithDepth, kWithSize>(g, blocks, left, top, pixels, grad, tile,
+                                                       alive, d_entry[i],
+                                                       kWithSize ? size + i : nullptr);
     }
 }
 
@@ -100,18 +109,19 @@ void rasterize_tile_backward(const Record<T>* records, EntryFormat format, const
                              const PictureGradient<T>& d_picture, RecordGradient<T>* d_entry,
                              CenterSize<T>* size, T* d_background) {
     const bool with_depth = d_picture.depth != nullptr;
-    const auto run = size != nullptr ? with_depth ? &backward<T, true, true> : &backward<T, false, true>
-                     : with_depth    ? &backward<T, true, false>
-                                     : &backward<T, false, false>;
+    const auto run = size != nullptr
+                         ? with_depth ? &backward<T, true, true> : &backward<T, false, true>
+                     : with_depth ? &backward<T, true, false>
+                                  : &backward<T, false, false>;
     run(records, format, entry, count, left, top, picture, d_picture, d_entry, size, d_background);
 }
 
-#define V3DG_INSTANTIATE(T)                                                                               \
-    template void rasterize_tile<T>(const Record<T>*, EntryFormat, const uint64_t*, size_t, int, int,     \
-                                    const Picture<T>&);                                                   \
-    template void rasterize_tile_backward<T>(const Record<T>*, EntryFormat, const uint64_t*, size_t, int, \
-                                             int, const Picture<T>&, const PictureGradient<T>&,           \
-                                             RecordGradient<T>*, CenterSize<T>*, T*);
+#define V3DG_INSTANTIATE(T)                                                                      \
+    template void rasterize_tile<T>(const Record<T>*, EntryFormat, const uint64_t*, size_t, int, \
+                                    int, const Picture<T>&);                                     \
+    template void rasterize_tile_backward<T>(                                                    \
+        const Record<T>*, EntryFormat, const uint64_t*, size_t, int, int, const Picture<T>&,     \
+        const PictureGradient<T>&, RecordGradient<T>*, CenterSize<T>*, T*);
 V3DG_INSTANTIATE(float)
 V3DG_INSTANTIATE(double)
 #undef V3DG_INSTANTIATE

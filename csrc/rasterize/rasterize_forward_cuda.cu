@@ -1,10 +1,11 @@
 // A block blends a tile, front to back; its warps take the tile's sub-tiles in turn.
 //
-// Lists are sorted piece by piece, nearest first. Entries over pixels that have all stopped by then are
-// dropped unsorted, and their records are never fetched. A list that does not fit into a piece is first
-// spread over buckets of depth: in its own place if shared memory holds it, else into scratch, so many
-// entries at a time as it holds. A bucket too long for a window is spread again. A list with far more than
-// its share of a frame's entries is blended in parts of the tile, side by side.
+// Lists are sorted piece by piece, nearest first. Entries over pixels that have all stopped by then
+// are dropped unsorted, and their records are never fetched. A list that does not fit into a piece
+// is first spread over buckets of depth: in its own place if shared memory holds it, else into
+// scratch, so many entries at a time as it holds. A bucket too long for a window is spread again. A
+// list with far more than its share of a frame's entries is blended in parts of the tile, side by
+// side.
 
 #include "rasterize/rasterize_cuda.h"
 
@@ -19,11 +20,12 @@ namespace cuda {
 namespace {
 
 constexpr int kBlocks = 8;  // on a multiprocessor with 228 KiB, of frames without depth
-// Blocks a record of a batch, on average, from which two pixels a lane are quicker. Measured: 4, 7 and 10
-// differ by a hundredth.
+// Blocks a record of a batch, on average, from which two pixels a lane are quicker. Measured: 4, 7
+// and 10 differ by a hundredth.
 constexpr int kBlocksForPairs = 5;
 
-static_assert(kBlocks * (offsetof(BlendShared, depth) + 1024) <= 228 << 10, "the driver keeps 1024 of each");
+static_assert(kBlocks * (offsetof(BlendShared, depth) + 1024) <= 228 << 10,
+              "the driver keeps 1024 of each");
 
 // A part of a tile: the whole, its left or right half, or a quarter. A bit for each of its blocks.
 __device__ uint32_t blocks_of_part(int part, int log2_parts) {
@@ -33,7 +35,8 @@ __device__ uint32_t blocks_of_part(int part, int log2_parts) {
 
 // Blends the sorted piece.
 template <bool kWithDepth, class Stop>
-__device__ void blend_piece(const RecordPlanes& records, uint32_t count, int left, int top, BlendShared& s) {
+__device__ void blend_piece(const RecordPlanes& records, uint32_t count, int left, int top,
+                            BlendShared& s) {
     for (uint32_t first = 0; first < count && s.alive_blocks != 0; first += kBlendBatch) {
         const uint32_t turn = first / kBlendBatch % 2;
         for (uint32_t i = threadIdx.x; i < kBlendBatch; i += kBlendThreads) {
@@ -73,8 +76,8 @@ __device__ void blend_piece(const RecordPlanes& records, uint32_t count, int lef
     if (threadIdx.x < 2) s.reached[threadIdx.x] = s.num_covered[threadIdx.x] = 0;
 }
 
-// Blends the list of a tile. Returns how many of its entries were not dropped. Of a list in windows, which
-// lies in the scratch, `window_ends` has where those end; it is null for others.
+// Blends the list of a tile. Returns how many of its entries were not dropped. Of a list in
+// windows, which lies in the scratch, `window_ends` has where those end; it is null for others.
 template <bool kWithDepth, class Stop>
 __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, TileEntry* scratch,
                                uint32_t count, const TilePlan& plan, const Buckets& spread_buckets,
@@ -98,7 +101,9 @@ __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, 
             if (window_ends != nullptr) {
                 if (room < kWindow) break;
                 const uint32_t end = window_ends[num_windows];
-                held = take_window(from, done, end, level.buckets, kNoBucket, held, num_windows++, s).y;
+                held =
+                    take_window(from, done, end, level.buckets, kNoBucket, held, num_windows++, s)
+                        .y;
                 done = end;
                 continue;
             }
@@ -113,8 +118,8 @@ __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, 
             if (room < kWindow) break;
             // As many whole buckets as a window holds.
             const uint32_t beyond = level.buckets.of(from[done + kWindow].key);
-            const uint2 taken =
-                take_window(from, done, done + kWindow, level.buckets, beyond, held, num_windows++, s);
+            const uint2 taken = take_window(from, done, done + kWindow, level.buckets, beyond, held,
+                                            num_windows++, s);
             if (taken.x > done) {
                 done = taken.x;
                 held = taken.y;
@@ -122,7 +127,8 @@ __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, 
             }
             // Not even one does.
             const uint32_t end = end_of_bucket(from, done, level.end, level.buckets);
-            const Buckets buckets = find_buckets<kBlendThreads>(from, done, end, false, false, s.spreading);
+            const Buckets buckets =
+                find_buckets<kBlendThreads>(from, done, end, false, false, s.spreading);
             spread<kBlendThreads>(from, level.in_scratch ? entries : scratch, done, end, buckets,
                                   s.spreading.bucket, s.spreading.warp_sum);
             if (threadIdx.x == 0) s.level[depth] = {end, !level.in_scratch, buckets};
@@ -147,8 +153,8 @@ __device__ const PicturePlanes& planes_of(const FrameLists& lists, const FrameIm
 
 template <bool kWithDepth, class Stop>
 __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, const TilePlan& plan,
-                           const Buckets& spread_buckets, uint32_t own_blocks, const FrameImage& image,
-                           BlendShared& s) {
+                           const Buckets& spread_buckets, uint32_t own_blocks,
+                           const FrameImage& image, BlendShared& s) {
     const uint32_t tile = plan.tile;
     const int in_image = static_cast<int>(tile - image.first_tile);
     const int left = in_image % image.tile_columns * kFrameTileWidth;
@@ -159,7 +165,8 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
     const auto for_each_pair = [&](const auto& visit) {
         for (int sub = warp; sub < Sub::kCount; sub += kBlendWarps)
             if ((own_blocks & blocks_of_sub<2>(sub)) != 0)
-                visit(sub, place_of<2>(sub, lane), left + sub % Sub::kColumns * Sub::kWidth + 2 * (lane % 8),
+                visit(sub, place_of<2>(sub, lane),
+                      left + sub % Sub::kColumns * Sub::kWidth + 2 * (lane % 8),
                       top + sub / Sub::kColumns * Sub::kHeight + lane / 8);
     };
 
@@ -175,7 +182,8 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
     __syncthreads();
     for_each_pair([&](int sub, int place, int x, int y) {
         for (int k = 0; k < 2; ++k) {
-            s.pixels.transmittance[place + k] = x + k < image.width && y < image.height ? 1.0f : -1.0f;
+            s.pixels.transmittance[place + k] =
+                x + k < image.width && y < image.height ? 1.0f : -1.0f;
             for (int c = 0; c < 3; ++c) s.pixels.color[c][place + k] = 0.0f;
             if (kWithDepth) s.depth[place + k] = 0.0f;
         }
@@ -186,9 +194,11 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
     const unsigned long long first = lists.tile_first[tile];
     const uint32_t count = static_cast<uint32_t>(lists.tile_first[tile + 1] - first);
     const uint32_t blended = blend_list<kWithDepth, Stop>(
-        lists.records, lists.entries + first, lists.scratch + plan.first_scratch, count, plan, spread_buckets,
-        plan.in_windows ? reinterpret_cast<const uint32_t*>(lists.scratch + plan.first_scratch + count)
-                        : nullptr,
+        lists.records, lists.entries + first, lists.scratch + plan.first_scratch, count, plan,
+        spread_buckets,
+        plan.in_windows
+            ? reinterpret_cast<const uint32_t*>(lists.scratch + plan.first_scratch + count)
+            : nullptr,
         tape.order == nullptr ? nullptr : tape.order + first, left, top, s);
     if (tape.blended != nullptr && threadIdx.x == 0) tape.blended[tile] = blended;
 
@@ -196,13 +206,15 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
     for_each_pair([&](int, int place, int x, int y) {
         for (int k = 0; k < 2 && x + k < image.width && y < image.height; ++k) {
             const size_t out = static_cast<size_t>(y) * image.width + x + k;
-            const Finished<float> of = finished(s.pixels.transmittance[place + k], lists.min_transmittance);
+            const Finished<float> of =
+                finished(s.pixels.transmittance[place + k], lists.min_transmittance);
             const float alpha = 1 - of.transmittance;
             for (int c = 0; c < 3; ++c)
                 planes.color[3 * out + c] =
                     of.gain * s.pixels.color[c][place + k] + of.transmittance * image.background[c];
             planes.alpha[out] = alpha;
-            if (kWithDepth) planes.depth[out] = alpha > 0 ? of.gain * s.depth[place + k] / alpha : 0.0f;
+            if (kWithDepth)
+                planes.depth[out] = alpha > 0 ? of.gain * s.depth[place + k] / alpha : 0.0f;
         }
     });
 }
@@ -211,7 +223,8 @@ template <class Stop>
 __global__ void __launch_bounds__(kBlendThreads, kBlocks)
     rasterize_kernel(FrameLists lists, RasterTape tape) {
     await_kernel_before();
-    if (blockIdx.x == 0 && threadIdx.x == 0 && lists.report != nullptr) *lists.report = *lists.counters;
+    if (blockIdx.x == 0 && threadIdx.x == 0 && lists.report != nullptr)
+        *lists.report = *lists.counters;
     if (!lists.capacity.holds(*lists.counters)) return;
     BlendShared& s = *reinterpret_cast<BlendShared*>(shared_memory());
     if (lists.plans[blockIdx.x].tile == kNoTile) return;
@@ -235,10 +248,12 @@ uint32_t most_plans(uint32_t num_tiles) { return most_plans(num_tiles, num_place
 
 void rasterize(const FrameLists& lists, const RasterTape* tape, cudaStream_t stream) {
     spread_lists(lists, num_places(), stream);
-    const size_t shared_bytes = lists.has_depth ? sizeof(BlendShared) : offsetof(BlendShared, depth);
+    const size_t shared_bytes =
+        lists.has_depth ? sizeof(BlendShared) : offsetof(BlendShared, depth);
     with_stop<float>(lists.min_transmittance, [&](auto stop) {
-        launch_early("rasterize_kernel", rasterize_kernel<decltype(stop)>, lists.num_plans, kBlendThreads,
-                     shared_bytes, stream, lists, tape == nullptr ? RasterTape{} : *tape);
+        launch_early("rasterize_kernel", rasterize_kernel<decltype(stop)>, lists.num_plans,
+                     kBlendThreads, shared_bytes, stream, lists,
+                     tape == nullptr ? RasterTape{} : *tape);
     });
 }
 

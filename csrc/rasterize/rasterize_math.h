@@ -1,7 +1,7 @@
 #pragma once
 
-// One gaussian over one pixel (or a vector of pixels): its falloff, the blend step, and the gradients of
-// both.
+// One gaussian over one pixel (or a vector of pixels): its falloff, the blend step, and the
+// gradients of both.
 //
 // A pixel's transmittance is negative once it has stopped; its magnitude is then the final value.
 
@@ -25,7 +25,8 @@ V3DG_HD V3DG_INLINE Falloff<V> falloff_at(V x, V y, V u, V v, V l11, V l12, V l2
     f.dy = y - v;
     f.t1 = l11 * f.dx + l12 * f.dy;
     f.t2 = l22 * f.dy;
-    f.exponent = log2_opacity - f.t2 * f.t2 - f.t1 * f.t1;  // pixels of a row share all but the last term
+    f.exponent =
+        log2_opacity - f.t2 * f.t2 - f.t1 * f.t1;  // pixels of a row share all but the last term
     return f;
 }
 
@@ -50,7 +51,8 @@ V3DG_HD V3DG_INLINE V alpha_of(const Falloff<V>& f) {
 template <class V>
 V3DG_HD V3DG_INLINE V transmittance_behind(V alpha, V t) {
 #ifdef __CUDA_ARCH__
-    return fma(-alpha, t, t);  // one operation, which is not left to the compiler: t - (alpha t) cancels
+    return fma(-alpha, t,
+               t);  // one operation, which is not left to the compiler: t - (alpha t) cancels
 #else
     return t * (1 - alpha);
 #endif
@@ -75,8 +77,8 @@ V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t, StopsBefore = {}) {
     return weight;
 }
 
-// Of a pixel that was blended to the end: how much light reaches the background, and what its colour is
-// multiplied by.
+// Of a pixel that was blended to the end: how much light reaches the background, and what its
+// colour is multiplied by.
 template <class T>
 struct Finished {
     T transmittance, gain;
@@ -88,8 +90,8 @@ V3DG_HD V3DG_INLINE Finished<T> finished(T t, float min_transmittance) {
     return {has_stopped ? -t : t, T(1)};
 }
 
-// blend_weight() for several gaussians, one behind the other; `before` is the transmittance at each. Most
-// pixels do not stop among them, and then the product of all tells that.
+// blend_weight() for several gaussians, one behind the other; `before` is the transmittance at
+// each. Most pixels do not stop among them, and then the product of all tells that.
 template <int kCount, class T>
 V3DG_HD V3DG_INLINE void blend_weights(const T (&alpha)[kCount], T& t, T (&before)[kCount],
                                        T (&weight)[kCount]) {
@@ -109,9 +111,9 @@ V3DG_HD V3DG_INLINE void blend_weights(const T (&alpha)[kCount], T& t, T (&befor
     }
 }
 
-// Gradient by the exponent of a gaussian that was blended with `alpha` and `weight` where the transmittance
-// was `before`. `by_weight` is the gradient by its weight, `behind` what all gaussians behind it give: the
-// sum of their weights times the gradients by them.
+// Gradient by the exponent of a gaussian that was blended with `alpha` and `weight` where the
+// transmittance was `before`. `by_weight` is the gradient by its weight, `behind` what all
+// gaussians behind it give: the sum of their weights times the gradients by them.
 template <class V>
 V3DG_HD V3DG_INLINE V exponent_vjp(V alpha, V before, V weight, V by_weight, V behind) {
     // alpha takes its weight and dims all that is behind.
@@ -127,8 +129,8 @@ struct FalloffSums {
     T t1_dx, t1_dy, t2_dy;  // gradient by t1 times dx, ...
 };
 
-// The same over the pixels of one row, which have dy and t2 in common: of the gradient by the exponent, and
-// of it times t1 and t1 dx.
+// The same over the pixels of one row, which have dy and t2 in common: of the gradient by the
+// exponent, and of it times t1 and t1 dx.
 template <class T>
 struct RowSums {
     T exponent, t1, t1_dx;
@@ -140,7 +142,8 @@ struct RowSums {
         t1_dx += d_t1 * f.dx;
     }
 
-    // `f` is that of any pixel of the row. The exponent contains -(t1² + t2²), hence the factors -2.
+    // `f` is that of any pixel of the row. The exponent contains -(t1² + t2²), hence the factors
+    // -2.
     V3DG_HD V3DG_INLINE FalloffSums<T> of_falloff(const Falloff<T>& f) const {
         FalloffSums<T> sums;
         sums.exponent = exponent;
@@ -153,9 +156,11 @@ struct RowSums {
     }
 };
 
-// What a pixel adds to the size of the gradient of the centre: both parts of falloff_vjp(), without sign.
+// What a pixel adds to the size of the gradient of the centre: both parts of falloff_vjp(), without
+// sign.
 template <class V>
-V3DG_HD V3DG_INLINE CenterSize<V> size_of_center_vjp(V l11, V l12, V l22, const Falloff<V>& f, V d_exponent) {
+V3DG_HD V3DG_INLINE CenterSize<V> size_of_center_vjp(V l11, V l12, V l22, const Falloff<V>& f,
+                                                     V d_exponent) {
     const V d_u = 2 * l11 * f.t1 * d_exponent, d_v = 2 * (l12 * f.t1 + l22 * f.t2) * d_exponent;
     return {max_of(d_u, -d_u), max_of(d_v, -d_v)};
 }
@@ -174,9 +179,9 @@ V3DG_HD V3DG_INLINE Ellipse<T> falloff_vjp(T l11, T l12, T l22, const FalloffSum
     return out;
 }
 
-// blend_weight() for a single pixel that has not stopped: calls add(weight) if there is one. Returns whether
-// the pixel goes on; `t` stays positive. As predicates these conditions cost next to nothing on a GPU, where
-// selecting between numbers is an operation each.
+// blend_weight() for a single pixel that has not stopped: calls add(weight) if there is one.
+// Returns whether the pixel goes on; `t` stays positive. As predicates these conditions cost next
+// to nothing on a GPU, where selecting between numbers is an operation each.
 template <class Add>
 V3DG_HD V3DG_INLINE bool blend_live(const Falloff<float>& f, float& t, StopsBehind<float> stop,
                                     const Add& add) {
@@ -188,7 +193,8 @@ V3DG_HD V3DG_INLINE bool blend_live(const Falloff<float>& f, float& t, StopsBehi
     return t > stop.transmittance;
 }
 template <class Add>
-V3DG_HD V3DG_INLINE bool blend_live(const Falloff<float>& f, float& t, StopsBefore, const Add& add) {
+V3DG_HD V3DG_INLINE bool blend_live(const Falloff<float>& f, float& t, StopsBefore,
+                                    const Add& add) {
     const float alpha = capped_alpha_of(f);
     const bool is_last =
         contributes(f) & !(transmittance_behind(alpha, t) > static_cast<float>(kMinTransmittance));
@@ -199,19 +205,20 @@ V3DG_HD V3DG_INLINE bool blend_live(const Falloff<float>& f, float& t, StopsBefo
     return !is_last;
 }
 
-// A window of 8 x 4 cells, each of kPixels side by side: the cells in which a gaussian may reach a pixel, a
-// bit each, row by row. (u, v) is its centre from that of the first pixel. Both axes have a margin, so that
-// the blend step alone decides.
+// A window of 8 x 4 cells, each of kPixels side by side: the cells in which a gaussian may reach a
+// pixel, a bit each, row by row. (u, v) is its centre from that of the first pixel. Both axes have
+// a margin, so that the blend step alone decides.
 template <int kPixels>
-V3DG_HD inline uint32_t reached_cells(float u, float v, float l11, float l12, float l22, float log2_opacity) {
+V3DG_HD inline uint32_t reached_cells(float u, float v, float l11, float l12, float l22,
+                                      float log2_opacity) {
     // In x, 1 is the width of the window, so that saturation cuts off what lies outside.
     constexpr float kScale = 0.125f / kPixels, kMargin = 1e-2f, kReachMargin = 1e-5f;
     const float reach = log2_opacity - static_cast<float>(kLog2MinAlpha) + kReachMargin;
     const float inverse = kScale * rough_reciprocal(l11), slope = -l12 * inverse,
                 wider = inverse * (1 + 2e-3f);
-    // The first cell is the first of which the last pixel is not before the ellipse, and the end is behind
-    // the last of which the first pixel is not behind it. Half a cell is added, as both are rounded to
-    // integers.
+    // The first cell is the first of which the last pixel is not before the ellipse, and the end is
+    // behind the last of which the first pixel is not behind it. Half a cell is added, as both are
+    // rounded to integers.
     const float first_u = kScale * u + kScale * (1 - 0.5f * kPixels - kMargin),
                 end_u = kScale * u + kScale * (0.5f * kPixels + kMargin);
     uint32_t cells = 0;
@@ -221,7 +228,8 @@ V3DG_HD inline uint32_t reached_cells(float u, float v, float l11, float l12, fl
         const float half = rough_sqrt(reach - t * t) * wider;
         const float first = saturated_fma(slope, y, first_u - half);
         const float end = fmaxf(saturated_fma(slope, y, end_u + half), first);
-        // In the last row an end of 1 shifts the bit out, which leaves the 0 that the subtraction needs.
+        // In the last row an end of 1 shifts the bit out, which leaves the 0 that the subtraction
+        // needs.
         const uint32_t row_begin = 1u << (8 * row);
         cells += shifted_by_eighths(row_begin, end) - shifted_by_eighths(row_begin, first);
     }

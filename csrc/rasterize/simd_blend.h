@@ -1,7 +1,7 @@
 #pragma once
 
-// Blending one tile, front to back: a batch of records is sorted into the blocks that they may change, then
-// each block takes its own, with its pixels in registers.
+// Blending one tile, front to back: a batch of records is sorted into the blocks that they may
+// change, then each block takes its own, with its pixels in registers.
 
 #include <cstddef>
 #include <cstring>
@@ -13,8 +13,8 @@ namespace V3DG_ISA {
 
 // So many that a block finds several of its own, so few that all stay in the first-level cache.
 constexpr int kBatchSize = 256;
-// And so few blocks of theirs in all, that where records are large, not many are taken that turn out to be
-// hidden.
+// And so few blocks of theirs in all, that where records are large, not many are taken that turn
+// out to be hidden.
 constexpr int kBatchBlocks = 1024;
 
 // What blending reads of a record, as it begins; its centre is in px from the tile's corner.
@@ -25,15 +25,17 @@ struct BatchRecord {
     T depth;
 
     V3DG_INLINE void take(const Record<T>& g, int left, int top) {
-        static_assert(sizeof *this <= sizeof g && offsetof(Record<T>, depth) == offsetof(BatchRecord, depth),
-                      "the first part of a record");
+        static_assert(
+            sizeof *this <= sizeof g && offsetof(Record<T>, depth) == offsetof(BatchRecord, depth),
+            "the first part of a record");
         std::memcpy(static_cast<void*>(this), &g, sizeof *this);
         u = g.u - T(left);
         v = g.v - T(top);
     }
 };
 
-// Into the second-level cache, which waits for more lines at once than the first. A record may lie on two.
+// Into the second-level cache, which waits for more lines at once than the first. A record may lie
+// on two.
 template <class T>
 V3DG_INLINE void prefetch_record(const Record<T>* record) {
     constexpr int kRead = 0, kSecondLevel = 2;
@@ -59,8 +61,9 @@ struct Listed {
     uint64_t blocks;
 };
 
-// Takes records from the i-th on until the batch is full: those whose boxes meet live blocks, and only those
-// are fetched from memory. Whether one does is as good as random, so there is no branch on it.
+// Takes records from the i-th on until the batch is full: those whose boxes meet live blocks, and
+// only those are fetched from memory. Whether one does is as good as random, so there is no branch
+// on it.
 template <class T, class ListedAt>
 V3DG_INLINE size_t take_live(size_t i, size_t count, uint64_t alive, const ListedAt& listed_at,
                              Batch<T>& batch) {
@@ -104,8 +107,8 @@ V3DG_INLINE void sort_into_blocks(int left, int top, Batch<T>& batch) {
 
 // Blends a batch's records over one block. Returns whether a pixel of it goes on.
 template <class T, Extra kExtra, class Stop>
-V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels<T>& pixels, Stop stop,
-                             TilePlanes<T>& tile) {
+V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels<T>& pixels,
+                             Stop stop, TilePlanes<T>& tile) {
     using V = Vec<T>;
     constexpr unsigned kAllStopped = (1u << kLanes<T>)-1;
     const V block_u = load(pixels.corner[block % kTileBlocks]),
@@ -116,14 +119,15 @@ V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels
     for (int part = 0; part < kBlockPixels / kLanes<T>; ++part) {
         const int p = kBlockPixels * block + part * kLanes<T>;
         const V x = load(pixels.x + part * kLanes<T>), y = load(pixels.y + part * kLanes<T>);
-        V t = load(tile.transmittance + p), red = load(tile.color[0] + p), green = load(tile.color[1] + p),
-          blue = load(tile.color[2] + p), extra = kExtra == Extra::kNothing ? V{} : load(tile.extra + p);
+        V t = load(tile.transmittance + p), red = load(tile.color[0] + p),
+          green = load(tile.color[1] + p), blue = load(tile.color[2] + p),
+          extra = kExtra == Extra::kNothing ? V{} : load(tile.extra + p);
         if (sign_bits_of(t) == kAllStopped) continue;
         for (const uint8_t* at = place; at != end; ++at) {
             const BatchRecord<T>& g = batch.record[*at];
-            const Falloff<V> f = falloff_at(x, y, all_lanes<V>(g.u) - block_u, all_lanes<V>(g.v) - block_v,
-                                            all_lanes<V>(g.l11), all_lanes<V>(g.l12), all_lanes<V>(g.l22),
-                                            all_lanes<V>(g.log2_opacity));
+            const Falloff<V> f = falloff_at(
+                x, y, all_lanes<V>(g.u) - block_u, all_lanes<V>(g.v) - block_v, all_lanes<V>(g.l11),
+                all_lanes<V>(g.l12), all_lanes<V>(g.l22), all_lanes<V>(g.log2_opacity));
             // Where a vector is a block, few are not reached.
             if (kLanes<T> < kBlockPixels && bits_of(contributes(f)) == 0) continue;
             const V weight = blend_weight(alpha_of(f), t, stop);
@@ -144,7 +148,8 @@ V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels
     return goes_on;
 }
 
-// Blends `count` records front to back over a tile, which starts empty. listed_at(i) is one of them.
+// Blends `count` records front to back over a tile, which starts empty. listed_at(i) is one of
+// them.
 template <class T, Extra kExtra, class Stop, class ListedAt>
 V3DG_INLINE void blend_tile(size_t count, int left, int top, const Window& window, Stop stop,
                             TilePlanes<T>& tile, const ListedAt& listed_at) {
@@ -156,7 +161,8 @@ V3DG_INLINE void blend_tile(size_t count, int left, int top, const Window& windo
         sort_into_blocks(left, top, batch);
         for (uint64_t blocks = alive; blocks != 0; blocks &= blocks - 1) {
             const int block = __builtin_ctzll(blocks);
-            if (batch.count[block] != 0 && !blend_block<T, kExtra>(batch, block, pixels, stop, tile))
+            if (batch.count[block] != 0 &&
+                !blend_block<T, kExtra>(batch, block, pixels, stop, tile))
                 alive &= ~(uint64_t(1) << block);
         }
     }

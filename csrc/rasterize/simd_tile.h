@@ -1,10 +1,11 @@
 #pragma once
 
-// The inner loops of the rasterizer, on one tile of 32 x 32 pixels that stays in the first-level cache.
+// The inner loops of the rasterizer, on one tile of 32 x 32 pixels that stays in the first-level
+// cache.
 //
-// A tile is 8 x 8 blocks of 4 x 4 pixels, one bit a block in a 64-bit mask: which blocks a gaussian may
-// touch, and which still have a pixel that has not stopped. A gaussian whose mask has no live block costs a
-// few integer operations.
+// A tile is 8 x 8 blocks of 4 x 4 pixels, one bit a block in a 64-bit mask: which blocks a gaussian
+// may touch, and which still have a pixel that has not stopped. A gaussian whose mask has no live
+// block costs a few integer operations.
 
 #include <cstdint>
 
@@ -34,9 +35,10 @@ struct TilePlanes {
 template <class T>
 struct TileGradient {
     alignas(64) T d_color[3][kTilePixels];
-    alignas(64) T d_depth[kTilePixels];   // by sum of weight * depth
-    alignas(64) T d_weight[kTilePixels];  // by every weight alike: alpha, and the background it hides
-    alignas(64) T total[kTilePixels];     // sum over gaussians of weight * (gradient by that weight)
+    alignas(64) T d_depth[kTilePixels];  // by sum of weight * depth
+    alignas(
+        64) T d_weight[kTilePixels];   // by every weight alike: alpha, and the background it hides
+    alignas(64) T total[kTilePixels];  // sum over gaussians of weight * (gradient by that weight)
 };
 
 // Blocks of the tile at (left, top) that the record's pixel box touches.
@@ -52,9 +54,9 @@ V3DG_INLINE uint64_t blocks_of(const Record<T>& g, int left, int top) {
 // Fewer touched blocks than this are not worth a closer look.
 constexpr int kFewBlocks = 5;
 
-// Those of `blocks` that the ellipse itself reaches, not just its box: for each row of blocks, the ellipse's
-// extent in x over the row's pixel centres, with the margin of row_extent(). Rounds by truncation, which is
-// one instruction for a vector on every instruction set.
+// Those of `blocks` that the ellipse itself reaches, not just its box: for each row of blocks, the
+// ellipse's extent in x over the row's pixel centres, with the margin of row_extent(). Rounds by
+// truncation, which is one instruction for a vector on every instruction set.
 template <class T>
 V3DG_INLINE uint64_t blocks_of_ellipse(const Record<T>& g, int left, int top, uint64_t blocks) {
     if (__builtin_popcountll(blocks) < kFewBlocks) return blocks;
@@ -85,14 +87,17 @@ V3DG_INLINE uint64_t live_blocks(const Record<T>& g, int left, int top, uint64_t
     return blocks_of_ellipse(g, left, top, blocks_of(g, left, top) & alive);
 }
 
-// Sets the planes to an empty picture and returns the blocks with a pixel in the window. Pixels outside count
-// as stopped.
+// Sets the planes to an empty picture and returns the blocks with a pixel in the window. Pixels
+// outside count as stopped.
 template <class T>
-inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, const Window& window, Extra extra) {
+inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, const Window& window,
+                           Extra extra) {
     uint64_t alive = 0;
     for (int block = 0; block < kTileBlocks * kTileBlocks; ++block) {
-        const int x = left + kBlockSize * (block % kTileBlocks), y = top + kBlockSize * (block / kTileBlocks);
-        if (x >= window.x1 || y >= window.y1 || x + kBlockSize <= window.x0 || y + kBlockSize <= window.y0)
+        const int x = left + kBlockSize * (block % kTileBlocks),
+                  y = top + kBlockSize * (block / kTileBlocks);
+        if (x >= window.x1 || y >= window.y1 || x + kBlockSize <= window.x0 ||
+            y + kBlockSize <= window.y0)
             continue;
         alive |= uint64_t(1) << block;
         for (int i = 0; i < kBlockPixels; ++i) {
@@ -109,7 +114,7 @@ inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, const Window&
 template <class T>
 struct BlockPixels {
     alignas(64) T x[kBlockPixels], y[kBlockPixels];  // centres, from the block's corner
-    alignas(64) T corner[kTileBlocks][kLanes<T>];    // of a block in the tile, the same in every lane
+    alignas(64) T corner[kTileBlocks][kLanes<T>];  // of a block in the tile, the same in every lane
     BlockPixels() {
         for (int k = 0; k < kTileBlocks; ++k)
             for (T& lane : corner[k]) lane = T(kBlockSize * k);
@@ -120,9 +125,10 @@ struct BlockPixels {
     }
 };
 
-// Gradients of one record. Takes the same steps on the same numbers as blend_block(), front to back, so that
-// the same pixels take part: `tile` starts empty again, and its color[0] holds the running sum. Returns false
-// where no pixel of the tile took part. `size` is written where kWithSize.
+// Gradients of one record. Takes the same steps on the same numbers as blend_block(), front to
+// back, so that the same pixels take part: `tile` starts empty again, and its color[0] holds the
+// running sum. Returns false where no pixel of the tile took part. `size` is written where
+// kWithSize.
 template <class T, bool kWithDepth, bool kWithSize = false>
 V3DG_INLINE bool blend_record_vjp(const Record<T>& g, uint64_t blocks, int left, int top,
                                   const BlockPixels<T>& pixels, const TileGradient<T>& grad,
@@ -187,8 +193,8 @@ V3DG_INLINE bool blend_record_vjp(const Record<T>& g, uint64_t blocks, int left,
     }
     if (!took_part) return false;
     out.ellipse = falloff_vjp(g.l11, g.l12, g.l22,
-                              FalloffSums<T>{sum_of(s_exponent), sum_of(s_t1), sum_of(s_t2), sum_of(s_t1_dx),
-                                             sum_of(s_t1_dy), sum_of(s_t2_dy)});
+                              FalloffSums<T>{sum_of(s_exponent), sum_of(s_t1), sum_of(s_t2),
+                                             sum_of(s_t1_dx), sum_of(s_t1_dy), sum_of(s_t2_dy)});
     for (int c = 0; c < 3; ++c) out.color[c] = sum_of(s_color[c]);
     out.ellipse.depth = kWithDepth ? sum_of(s_depth) : T(0);
     if (kWithSize) *size = {sum_of(s_size.u), sum_of(s_size.v)};

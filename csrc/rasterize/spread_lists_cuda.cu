@@ -1,6 +1,6 @@
-// Plans in which order, and in how many parts, tiles are blended, and spreads long lists over buckets of
-// depth: a list in its own place if shared memory holds it, else into scratch, so many entries at a time as
-// it holds, and that of a tile in parts into windows.
+// Plans in which order, and in how many parts, tiles are blended, and spreads long lists over
+// buckets of depth: a list in its own place if shared memory holds it, else into scratch, so many
+// entries at a time as it holds, and that of a tile in parts into windows.
 
 #include "rasterize/spread_lists_cuda.h"
 
@@ -26,11 +26,11 @@ __device__ uint32_t count_of(const FrameLists& lists, uint32_t tile) {
     return static_cast<uint32_t>(lists.tile_first[tile + 1] - lists.tile_first[tile]);
 }
 
-// How tiles are planned, by two kernels with a thread a tile: by falling load, so that no block is left with
-// a long list at the end. Loads of one class, half an octave wide, follow in any order. Where few tiles have
-// most of the entries, as of an asset in the middle of a picture, they are blended in parts, each by a block
-// that drops what does not reach it: there are `num_places` for blocks at a time, and no block is to have
-// much more than its share.
+// How tiles are planned, by two kernels with a thread a tile: by falling load, so that no block is
+// left with a long list at the end. Loads of one class, half an octave wide, follow in any order.
+// Where few tiles have most of the entries, as of an asset in the middle of a picture, they are
+// blended in parts, each by a block that drops what does not reach it: there are `num_places` for
+// blocks at a time, and no block is to have much more than its share.
 struct PlanRules {
     uint32_t share;
     bool has_parts;
@@ -48,8 +48,8 @@ struct PlanRules {
         const int octave = 31 - __clz(static_cast<int>(load));
         return kPlanClasses - 1 - 2 * octave - static_cast<int>(load >> (octave - 1) & 1);
     }
-    // Behind a plan of a lower load there is none of a list longer than kPiece: a part has half a share or
-    // more, and the loads of a class differ by less than half of the least.
+    // Behind a plan of a lower load there is none of a list longer than kPiece: a part has half a
+    // share or more, and the loads of a class differ by less than half of the least.
     __device__ uint32_t least_of_long() const {
         constexpr uint32_t kLongest = kPiece, kLeastOfPart = kPiece / kMostParts;
         return has_parts ? max(min(share / 3, kLongest), kLeastOfPart) : kLongest;
@@ -57,7 +57,8 @@ struct PlanRules {
 };
 
 // Counts the plans of each class.
-__global__ void __launch_bounds__(kPlanThreads) count_plans_kernel(FrameLists lists, uint32_t num_places) {
+__global__ void __launch_bounds__(kPlanThreads)
+    count_plans_kernel(FrameLists lists, uint32_t num_places) {
     await_kernel_before();
     __shared__ uint32_t in_block[kPlanClasses];
     if (!lists.capacity.holds(*lists.counters)) return;
@@ -105,7 +106,8 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, ui
         TilePlan* plan = lists.plans + place[own_class] + before;
         const uint32_t image = lists.image_of_tile[tile];
         for (int part = 0; part < 1 << log2_parts; ++part)
-            plan[part] = {tile, image, 0, 0, 0, uint8_t(part), uint8_t(log2_parts), false, false, 0};
+            plan[part] = {tile,  image, 0, 0, 0, uint8_t(part), uint8_t(log2_parts),
+                          false, false, 0};
     }
     for (uint32_t i = num_planned + tile; i < lists.num_plans; i += gridDim.x * kPlanThreads)
         lists.plans[i].tile = kNoTile;
@@ -114,7 +116,8 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, ui
 // Room in the scratch for entries, for the whole block.
 __device__ unsigned long long take_scratch(FrameCounters& counters, uint32_t count) {
     __shared__ unsigned long long first;
-    if (threadIdx.x == 0) first = atomicAdd(&counters.spread, static_cast<unsigned long long>(count));
+    if (threadIdx.x == 0)
+        first = atomicAdd(&counters.spread, static_cast<unsigned long long>(count));
     __syncthreads();
     const unsigned long long taken = first;
     __syncthreads();
@@ -124,7 +127,9 @@ __device__ unsigned long long take_scratch(FrameCounters& counters, uint32_t cou
 // Entries of a window of a list in windows; a window has up to a bucket more.
 constexpr uint32_t kWindowEntries = 3 * kWindow / 4;
 
-__device__ uint32_t num_window_ends(uint32_t count) { return (count + kWindowEntries - 1) / kWindowEntries; }
+__device__ uint32_t num_window_ends(uint32_t count) {
+    return (count + kWindowEntries - 1) / kWindowEntries;
+}
 
 // Room that a list in windows takes, with the ends of its windows behind it.
 __device__ uint32_t room_in_windows(uint32_t count) {
@@ -159,9 +164,10 @@ __device__ void write_window_ends(const uint32_t (&bucket)[1 << kLog2Spread], ui
     }
 }
 
-// Spreads a list into windows of whole buckets, to a place that has room_in_windows() of it; for a whole
-// block. Returns whether there are such windows. Where one step of depth is all of a list, there are none:
-// the order within a step depends on where pieces begin, which parts of a tile do not have in common.
+// Spreads a list into windows of whole buckets, to a place that has room_in_windows() of it; for a
+// whole block. Returns whether there are such windows. Where one step of depth is all of a list,
+// there are none: the order within a step depends on where pieces begin, which parts of a tile do
+// not have in common.
 __device__ bool spread_into_windows(const TileEntry* from, uint32_t count, TileEntry* to,
                                     SpreadSpace& space) {
     SpreadShared<kLog2Spread>& s = space.even;
@@ -192,15 +198,16 @@ struct ChunkCounts {
     }
 };
 
-// As spread(), for a list that does not fit into shared memory: chunks of it go through, so that those of a
-// bucket are written side by side. There is room for `most` entries: a chunk, and behind it the counts of all
-// chunks, if these are few enough; else each is counted when it is its turn.
-__device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t count, uint32_t most,
-                                 const Buckets& buckets, SpreadSpace& space) {
+// As spread(), for a list that does not fit into shared memory: chunks of it go through, so that
+// those of a bucket are written side by side. There is room for `most` entries: a chunk, and behind
+// it the counts of all chunks, if these are few enough; else each is counted when it is its turn.
+__device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t count,
+                                 uint32_t most, const Buckets& buckets, SpreadSpace& space) {
     SpreadShared<kLog2Spread>& s = space.even;
     uint32_t (&of_chunk)[1 << kLog2Spread] = space.finer;
     TileEntry* chunk = space.chunk;
-    const uint32_t num_buckets = buckets.last + 1, counts_room = num_buckets / 4;  // of a chunk, in entries
+    const uint32_t num_buckets = buckets.last + 1,
+                   counts_room = num_buckets / 4;  // of a chunk, in entries
     uint32_t num_chunks = 1;
     const auto size_of_chunk = [&] { return (count + num_chunks - 1) / num_chunks; };
     const auto has_room = [&] { return size_of_chunk() + num_chunks * counts_room <= most; };
@@ -240,8 +247,9 @@ __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t 
         } else {
             place_buckets<kSpreadThreads>(from, first, last, buckets, of_chunk, s.warp_sum);
         }
-        for_each_entry<kSpreadThreads>(
-            from, first, last, [&](TileEntry e) { chunk[atomicAdd(&of_chunk[buckets.of(e.key)], 1u)] = e; });
+        for_each_entry<kSpreadThreads>(from, first, last, [&](TileEntry e) {
+            chunk[atomicAdd(&of_chunk[buckets.of(e.key)], 1u)] = e;
+        });
         __syncthreads();
         for (uint32_t i = threadIdx.x; first + i < last; i += kSpreadThreads) {
             const TileEntry e = chunk[i];
@@ -255,12 +263,13 @@ __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t 
     }
 }
 
-// Spreads the list of a plan's tile if it is long; by a whole block. Where it is, if `most_held` entries in
-// shared memory are enough, else into the scratch. That of a tile in parts is spread into windows, in the
-// scratch, by the block that has the first part.
-__device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t count, uint32_t most_held,
-                            SpreadSpace& space) {
-    static_assert(offsetof(SpreadSpace, finer) % sizeof(TileEntry) == 0, "entries lie where `finer` does");
+// Spreads the list of a plan's tile if it is long; by a whole block. Where it is, if `most_held`
+// entries in shared memory are enough, else into the scratch. That of a tile in parts is spread
+// into windows, in the scratch, by the block that has the first part.
+__device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t count,
+                            uint32_t most_held, SpreadSpace& space) {
+    static_assert(offsetof(SpreadSpace, finer) % sizeof(TileEntry) == 0,
+                  "entries lie where `finer` does");
     SpreadShared<kLog2Spread>& s = space.even;
     auto* held = reinterpret_cast<TileEntry*>(&space.finer);
     if (count <= kPiece || plan.part != 0) return;
@@ -283,7 +292,8 @@ __device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t co
     Buckets buckets;
     if (is_held) {
         for (uint32_t k = threadIdx.x; k < count; k += kSpreadThreads)
-            copy_async(reinterpret_cast<float2*>(held + k), reinterpret_cast<const float2*>(entries + k));
+            copy_async(reinterpret_cast<float2*>(held + k),
+                       reinterpret_cast<const float2*>(entries + k));
         wait_for_copies();
         __syncthreads();
         buckets = find_buckets<kSpreadThreads>(held, 0, count, true, false, s);
@@ -342,13 +352,15 @@ uint32_t most_plans(uint32_t num_tiles, uint32_t num_places) {
 
 void spread_lists(const FrameLists& lists, uint32_t num_places, cudaStream_t stream) {
     const unsigned plan_blocks = std::max(blocks_for(lists.num_tiles, kPlanThreads), 1u);
-    launch_early("count_plans_kernel", count_plans_kernel, plan_blocks, kPlanThreads, 0, stream, lists,
+    launch_early("count_plans_kernel", count_plans_kernel, plan_blocks, kPlanThreads, 0, stream,
+                 lists, num_places);
+    launch_early("plan_kernel", plan_kernel, plan_blocks, kPlanThreads, 0, stream, lists,
                  num_places);
-    launch_early("plan_kernel", plan_kernel, plan_blocks, kPlanThreads, 0, stream, lists, num_places);
     const uint32_t held = most_held();
-    launch_early("spread_kernel", spread_kernel, std::min(2 * num_multiprocessors(), lists.num_tiles),
-                 kSpreadThreads, sizeof(SpreadShared<kLog2Spread>) + held * sizeof(TileEntry), stream, lists,
-                 held, num_places);
+    launch_early("spread_kernel", spread_kernel,
+                 std::min(2 * num_multiprocessors(), lists.num_tiles), kSpreadThreads,
+                 sizeof(SpreadShared<kLog2Spread>) + held * sizeof(TileEntry), stream, lists, held,
+                 num_places);
 }
 
 }  // namespace cuda

@@ -12,14 +12,17 @@ using EntryKey = unsigned long long;  // of a TileEntry
 
 constexpr int kEntriesAtOnce = 4;  // that a thread has in flight
 
-// Buckets of entries, of equal width in the bits of their depths, which are logarithmic over octaves and
-// linear within one; or, where all depths are equal, of equal width in what orders those.
+// Buckets of entries, of equal width in the bits of their depths, which are logarithmic over
+// octaves and linear within one; or, where all depths are equal, of equal width in what orders
+// those.
 struct Buckets {
     uint32_t lowest, last;  // `last` is the number of the last bucket
     int shift;
     bool by_order;
 
-    __device__ uint32_t part_of(EntryKey key) const { return by_order ? key_order({key}) : key_depth({key}); }
+    __device__ uint32_t part_of(EntryKey key) const {
+        return by_order ? key_order({key}) : key_depth({key});
+    }
     // Keys outside the range that the buckets were made for belong to the first or the last.
     __device__ uint32_t of(EntryKey key) const {
         return min((max(part_of(key), lowest) - lowest) >> shift, last);
@@ -30,13 +33,15 @@ struct Buckets {
     }
 };
 
-__device__ inline Buckets buckets_over(uint32_t lowest, uint32_t highest, int log2_buckets, bool by_order) {
+__device__ inline Buckets buckets_over(uint32_t lowest, uint32_t highest, int log2_buckets,
+                                       bool by_order) {
     const int bits = 32 - __clz(static_cast<int>(highest - lowest));
     return {lowest, (1u << log2_buckets) - 1, max(bits - log2_buckets, 0), by_order};
 }
 
-// Buckets for entries most of which lie in few buckets of equal width: by the place that an entry would have
-// if those of its bucket lay evenly in it. The buckets of equal width were made for all of them.
+// Buckets for entries most of which lie in few buckets of equal width: by the place that an entry
+// would have if those of its bucket lay evenly in it. The buckets of equal width were made for all
+// of them.
 struct FinerBuckets {
     Buckets even;
     const uint32_t* first;  // entry of each of those
@@ -47,12 +52,13 @@ struct FinerBuckets {
         const uint32_t bucket = even.of(key);
         const uint32_t begin = first[bucket], end = bucket < even.last ? first[bucket + 1] : count;
         const uint32_t above = even.part_of(key) - even.lowest - (bucket << even.shift);
-        return (begin + static_cast<uint32_t>(EntryKey(above) * (end - begin) >> even.shift)) >> shift;
+        return (begin + static_cast<uint32_t>(EntryKey(above) * (end - begin) >> even.shift)) >>
+               shift;
     }
 };
 
-__device__ inline FinerBuckets finer_buckets(const Buckets& even, const uint32_t* first, uint32_t count,
-                                             int log2_buckets) {
+__device__ inline FinerBuckets finer_buckets(const Buckets& even, const uint32_t* first,
+                                             uint32_t count, int log2_buckets) {
     const int bits = 32 - __clz(static_cast<int>(count - 1));
     return {even, first, count, max(bits - log2_buckets, 0)};
 }
@@ -92,7 +98,8 @@ __device__ void scan_buckets(uint32_t* bucket, uint32_t* warp_sum) {
 
 // Calls visit(entry) for entries [first, last), a thread's share of them.
 template <int kBlock, class Visit>
-__device__ void for_each_entry(const TileEntry* entries, uint32_t first, uint32_t last, const Visit& visit) {
+__device__ void for_each_entry(const TileEntry* entries, uint32_t first, uint32_t last,
+                               const Visit& visit) {
     for (; first < last; first += kEntriesAtOnce * kBlock) {
         TileEntry entry[kEntriesAtOnce];
 #pragma unroll
@@ -106,11 +113,11 @@ __device__ void for_each_entry(const TileEntry* entries, uint32_t first, uint32_
     }
 }
 
-// Buckets for entries [first, last): for the range of all of them, or of a sample when `roughly`. As many as
-// there can be when `finely`.
+// Buckets for entries [first, last): for the range of all of them, or of a sample when `roughly`.
+// As many as there can be when `finely`.
 template <int kBlock, int kLog2Buckets>
-__device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32_t last, bool roughly,
-                                bool finely, SpreadShared<kLog2Buckets>& s) {
+__device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32_t last,
+                                bool roughly, bool finely, SpreadShared<kLog2Buckets>& s) {
     if (threadIdx.x < 4) s.range[threadIdx.x] = threadIdx.x % 2 == 0 ? ~0u : 0u;
     uint32_t low[2] = {~0u, ~0u}, high[2] = {0, 0};  // of depths and orders
     const auto widen = [&](TileEntry e) {
@@ -137,18 +144,22 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
         }
     }
     __syncthreads();
-    // Some 64 entries a bucket; the fewer, the more of what is written together stays together in the cache.
+    // Some 64 entries a bucket; the fewer, the more of what is written together stays together in
+    // the cache.
     const int log2_buckets =
-        finely ? kLog2Buckets : min(max(31 - __clz(static_cast<int>(last - first)) - 6, 4), kLog2Buckets);
+        finely ? kLog2Buckets
+               : min(max(31 - __clz(static_cast<int>(last - first)) - 6, 4), kLog2Buckets);
     const bool by_order = !roughly && s.range[0] == s.range[1];
     const uint32_t* range = s.range + (by_order ? 2 : 0);
     return buckets_over(range[0], range[1], log2_buckets, by_order);
 }
 
-// Counts entries [first, last) into buckets, and turns the counts into the place of each bucket's first.
+// Counts entries [first, last) into buckets, and turns the counts into the place of each bucket's
+// first.
 template <int kBlock, int kCount, class SomeBuckets>
 __device__ void place_buckets(const TileEntry* entries, uint32_t first, uint32_t last,
-                              const SomeBuckets& buckets, uint32_t (&bucket)[kCount], uint32_t* warp_sum) {
+                              const SomeBuckets& buckets, uint32_t (&bucket)[kCount],
+                              uint32_t* warp_sum) {
     for (int i = threadIdx.x; i < kCount; i += kBlock) bucket[i] = 0;
     __syncthreads();
     for_each_entry<kBlock>(entries, first, last,
@@ -157,14 +168,15 @@ __device__ void place_buckets(const TileEntry* entries, uint32_t first, uint32_t
     scan_buckets<kCount, kBlock>(bucket, warp_sum);
 }
 
-// Spreads entries [first, last) into bucket order, from one place to another. In the end a bucket's counter
-// stands where the next one begins.
+// Spreads entries [first, last) into bucket order, from one place to another. In the end a bucket's
+// counter stands where the next one begins.
 template <int kBlock, int kCount, class SomeBuckets>
 __device__ void spread(const TileEntry* from, TileEntry* to, uint32_t first, uint32_t last,
                        const SomeBuckets& buckets, uint32_t (&bucket)[kCount], uint32_t* warp_sum) {
     place_buckets<kBlock>(from, first, last, buckets, bucket, warp_sum);
-    for_each_entry<kBlock>(from, first, last,
-                           [&](TileEntry e) { to[first + atomicAdd(&bucket[buckets.of(e.key)], 1u)] = e; });
+    for_each_entry<kBlock>(from, first, last, [&](TileEntry e) {
+        to[first + atomicAdd(&bucket[buckets.of(e.key)], 1u)] = e;
+    });
     __syncthreads();
 }
 

@@ -21,8 +21,8 @@ class Upload {
         num_bytes_ = first + span.size * sizeof(T);
         moves_.push_back([&span, first](unsigned char* start, cudaStream_t stream) {
             if (span.size > 0)
-                check(cudaMemcpyAsync(start + first, span.data, span.size * sizeof(T), cudaMemcpyHostToDevice,
-                                      stream),
+                check(cudaMemcpyAsync(start + first, span.data, span.size * sizeof(T),
+                                      cudaMemcpyHostToDevice, stream),
                       "cudaMemcpyAsync");
             span.data = reinterpret_cast<const T*>(start + first);
         });
@@ -42,8 +42,10 @@ class Upload {
 
 }  // namespace
 
-std::vector<uint8_t> joins_of_clusters(const ClusterTable& table, const ClusterAppearance& appearance) {
-    std::vector<uint8_t> joins((table.num_clusters() + kClustersOfBounds - 1) / kClustersOfBounds, 0);
+std::vector<uint8_t> joins_of_clusters(const ClusterTable& table,
+                                       const ClusterAppearance& appearance) {
+    std::vector<uint8_t> joins((table.num_clusters() + kClustersOfBounds - 1) / kClustersOfBounds,
+                               0);
     parallel_for(joins.size(), 512, [&](size_t i) {
         const size_t first = i * kClustersOfBounds;
         const size_t count = std::min(kClustersOfBounds, table.num_clusters() - first);

@@ -1,7 +1,7 @@
 #pragma once
 
-// The tables of a bundle on a device. They live as long as a scene that v3dg/residency.py keeps there has
-// them.
+// The tables of a bundle on a device. They live as long as a scene that v3dg/residency.py keeps
+// there has them.
 
 #include "base/device.h"
 #include "residency/cluster_bounds.h"
@@ -14,21 +14,24 @@ struct BundleOnDevice {
     ClusterTable table;
     ClusterAppearance appearance;
     Span<const ClusterBounds> bounds;
-    // A byte for each of the bounds; bit k: its cluster k is drawn together with the one before, since its
-    // rows follow and it looks the same.
+    // A byte for each of the bounds; bit k: its cluster k is drawn together with the one before,
+    // since its rows follow and it looks the same.
     const uint8_t* joins;
     ClusterRuns runs;
 };
 
 // A byte for each kClustersOfBounds clusters, as BundleOnDevice::joins has them.
-std::vector<uint8_t> joins_of_clusters(const ClusterTable& table, const ClusterAppearance& appearance);
+std::vector<uint8_t> joins_of_clusters(const ClusterTable& table,
+                                       const ClusterAppearance& appearance);
 
-// The tables of one bundle on the device that is current when they are made. They never change, so the
-// scenes, threads and streams of that device share them. They have to outlive the work that reads them.
+// The tables of one bundle on the device that is current when they are made. They never change, so
+// the scenes, threads and streams of that device share them. They have to outlive the work that
+// reads them.
 class BundleTables {
   public:
     // Returns when the tables are on the device; the host's memory may then be reused.
-    BundleTables(const ClusterTable& table, const ClusterAppearance& appearance, cudaStream_t stream);
+    BundleTables(const ClusterTable& table, const ClusterAppearance& appearance,
+                 cudaStream_t stream);
     BundleTables(const BundleTables&) = delete;
     BundleTables& operator=(const BundleTables&) = delete;
 

@@ -44,7 +44,8 @@ ClusterBounds bounds_of(const ClusterTable& table, size_t first, size_t last) {
         }
         if (parent >= 0) {
             parents[num_parents++] = table.ball[parent];
-            bounds.most_parent_radius = std::max(bounds.most_parent_radius, table.ball[parent].radius);
+            bounds.most_parent_radius =
+                std::max(bounds.most_parent_radius, table.ball[parent].radius);
             bounds.most_parent_weight = std::max(bounds.most_parent_weight, table.weight[parent]);
         }
     }
@@ -86,7 +87,9 @@ ClusterRuns runs_of_clusters(const ClusterTable& table) {
     runs.least_distance = least_radius >= kLeastRunRadius ? 2 * most_radius : INFINITY;
     runs.least_level = INT32_MAX;
     for (const int32_t level : table.level) runs.least_level = std::min(runs.least_level, level);
-    const auto size_of = [&](int32_t g) { return table.ball[g].radius * std::sqrt(table.weight[g]); };
+    const auto size_of = [&](int32_t g) {
+        return table.ball[g].radius * std::sqrt(table.weight[g]);
+    };
     for (uint32_t k = 0; k < runs.count; ++k) {
         float most_parent = 0, least_own = INFINITY;
         for (size_t c = runs.begin[k]; c < std::min<size_t>(count, runs.begin[k + 1]); ++c) {

@@ -13,7 +13,8 @@ HostTable::HostTable(const ClusterTable& given, const ClusterAppearance& appeara
     table_.bounds = no_box();
     for (const Box& box : table_.box) grow(table_.bounds, box);
     float most_filter_px2 = kFadeFilterPx2;
-    for (const float value : appearance.filter_px2) most_filter_px2 = std::max(most_filter_px2, value);
+    for (const float value : appearance.filter_px2)
+        most_filter_px2 = std::max(most_filter_px2, value);
     table_.pad_px = static_cast<float>(kReachSigmas) * std::sqrt(most_filter_px2) + 1.0f;
 }
 

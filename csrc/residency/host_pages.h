@@ -1,6 +1,7 @@
 #pragma once
 
-// The slots of a page pool on the host: rows, as planes that the bundles of the pool share, or codes.
+// The slots of a page pool on the host: rows, as planes that the bundles of the pool share, or
+// codes.
 
 #include <memory>
 #include <vector>

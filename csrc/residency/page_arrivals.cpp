@@ -7,7 +7,8 @@ namespace v3dg {
 // Of a page that left, and may still be among those that wait.
 constexpr int32_t kHasLeft = kNeverBegins - 1;
 
-PageArrivals::PageArrivals(const PagePolicy& policy) : policy_(policy), begins_(policy.num_pages()) {
+PageArrivals::PageArrivals(const PagePolicy& policy)
+    : policy_(policy), begins_(policy.num_pages()) {
     for (uint32_t page = 0; page < begins_.size(); ++page)
         begins_[page] = policy.page_above(page) < 0 ? kBegunLongAgo : kNeverBegins;
     waiting_.reserve(2 * policy.num_slots());

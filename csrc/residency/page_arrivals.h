@@ -18,8 +18,8 @@ struct Arrival {
     int32_t begins;
 };
 
-// A page waits until the one above it has faded in, so that none is ever farther than those above it, in
-// whichever frame one asks. The state follows from the changes of each frame alone.
+// A page waits until the one above it has faded in, so that none is ever farther than those above
+// it, in whichever frame one asks. The state follows from the changes of each frame alone.
 class PageArrivals {
   public:
     // The coarsest pages are there from the start.

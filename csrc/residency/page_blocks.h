@@ -16,12 +16,13 @@ struct BlockMemory {
 
 class PageBlocks {
   public:
-    // About so many bytes in at most so many blocks, for pages that are as large as these samples, and four
-    // of the most bytes that a page has.
+    // About so many bytes in at most so many blocks, for pages that are as large as these samples,
+    // and four of the most bytes that a page has.
     void allocate(const std::vector<size_t>& samples, size_t most_page_bytes, size_t num_bytes,
                   size_t most_blocks, BlockMemory& memory) {
         constexpr size_t kNumSizes = 8, kLeast = 64;
-        const size_t step = (most_page_bytes + kNumSizes * kLeast - 1) / (kNumSizes * kLeast) * kLeast;
+        const size_t step =
+            (most_page_bytes + kNumSizes * kLeast - 1) / (kNumSizes * kLeast) * kLeast;
         std::vector<size_t> count(kNumSizes);
         size_t sum = 0;
         for (const size_t size : samples) {

@@ -13,23 +13,23 @@ namespace v3dg {
 
 namespace {
 
-// A page above one that is asked for is more urgent by so much, and none below it is as urgent: those around
-// the eye, whose priority has no bound, count as this.
+// A page above one that is asked for is more urgent by so much, and none below it is as urgent:
+// those around the eye, whose priority has no bound, count as this.
 constexpr float kAbove = 2.0f, kMostPriority = 1073741824.0f;
-constexpr size_t kMostLeaving = 4096;            // slots that make room before they are looked for again
+constexpr size_t kMostLeaving = 4096;  // slots that make room before they are looked for again
 constexpr size_t kMostChosen = size_t(1) << 14;  // that are read before the next choice
 constexpr int32_t kRootSlot = -2, kNoSlot = -1;
 constexpr size_t kAhead = 16;  // needs whose memory is fetched before their turn
 
-// Urgencies are told apart by a sixteenth of a power of two, from 1/2 on: a float has 23 bits within one, of
-// which the upper four are looked at.
+// Urgencies are told apart by a sixteenth of a power of two, from 1/2 on: a float has 23 bits
+// within one, of which the upper four are looked at.
 constexpr uint32_t kNumKeys = 1024, kKeyShift = 19, kFirstKey = 0x3f000000u >> kKeyShift;
 constexpr uint32_t kKeyOfMissed =
     (0x3f800000u >> kKeyShift) - kFirstKey;  // of 1: those below are asked ahead
 
-// A disk is quicker the more it reads at once, and neighbours in a file are neighbours in space, of one
-// level: mostly of about the same urgency. So about so many bytes of them are a stretch, which is as urgent
-// as the most urgent page of it that is wanted.
+// A disk is quicker the more it reads at once, and neighbours in a file are neighbours in space, of
+// one level: mostly of about the same urgency. So about so many bytes of them are a stretch, which
+// is as urgent as the most urgent page of it that is wanted.
 constexpr size_t kStretchBytes = size_t(512) << 10;
 constexpr uint32_t kNoStretch = UINT32_MAX;
 
@@ -50,7 +50,8 @@ void PagesComing::clear() {
 std::vector<int64_t> SlotPlan::empty_offsets() const {
     std::vector<int64_t> offset(first_slot_cluster, 0);
     for (size_t s = 0; s < num_slots; ++s)
-        offset.insert(offset.end(), slot_clusters, static_cast<int64_t>(first_slot_row + s * slot_rows));
+        offset.insert(offset.end(), slot_clusters,
+                      static_cast<int64_t>(first_slot_row + s * slot_rows));
     offset.push_back(static_cast<int64_t>(num_rows()));
     return offset;
 }
@@ -60,8 +61,9 @@ PagePolicy::PagePolicy(const std::vector<PagedBundle>& bundles, const PoolMemory
     size_t num_pages = 0;
     for (const PagedBundle& bundle : bundles) num_pages += bundle.table.num_pages();
     if (num_pages > INT32_MAX)
-        throw std::invalid_argument("memory: expected bundles of fewer than 2^31 pages together, got " +
-                                    std::to_string(num_pages));
+        throw std::invalid_argument(
+            "memory: expected bundles of fewer than 2^31 pages together, got " +
+            std::to_string(num_pages));
     slot_of_page_ = {slot_storage_.reserve(num_pages), num_pages};
     pages_ = {page_storage_.reserve(num_pages), num_pages};
     states_ = std::make_unique<std::atomic<PageState>[]>(num_pages);
@@ -81,7 +83,8 @@ void PagePolicy::add_pages(Bundle& bundle, const ClusterTable& table) {
     std::fill_n(pages_.data + first, root + 1, Page{});
     for (size_t c = 0; c < table.num_clusters(); ++c)
         if (table.own_group[c] >= 0)
-            pages_[first + table.own_group[c]].parent = static_cast<int32_t>(first + table.page_of(c));
+            pages_[first + table.own_group[c]].parent =
+                static_cast<int32_t>(first + table.page_of(c));
     slot_of_page_[first + root] = kRootSlot;
     if (table.num_clusters() > 0) states_[first + root] = PageState::resident;
     for (size_t p = 0; p < root; ++p) {
@@ -108,16 +111,19 @@ void PagePolicy::plan_memory(const PoolMemory& memory) {
     const size_t slot = memory.bytes_of(plan_.slot_rows, plan_.slot_clusters);
     const size_t least = roots + (num_pages > 0 ? bundles_.size() * slot : 0);
     if (memory.num_bytes < least || memory.most_rows < plan_.num_rows())
-        throw std::invalid_argument("memory: expected room for at least " + std::to_string(least) +
-                                    " bytes of gaussians, the coarsest of all bundles and a page more of "
-                                    "each, got room for " +
-                                    std::to_string(memory.num_bytes));
-    plan_.num_slots = std::min({(memory.num_bytes - roots) / slot,
-                                (memory.most_rows - plan_.first_slot_row) / plan_.slot_rows, num_pages});
+        throw std::invalid_argument(
+            "memory: expected room for at least " + std::to_string(least) +
+            " bytes of gaussians, the coarsest of all bundles and a page more of "
+            "each, got room for " +
+            std::to_string(memory.num_bytes));
+    plan_.num_slots =
+        std::min({(memory.num_bytes - roots) / slot,
+                  (memory.most_rows - plan_.first_slot_row) / plan_.slot_rows, num_pages});
     slots_.resize(plan_.num_slots);
     uses_.resize(plan_.num_slots);
     leaving_.reserve(plan_.num_slots);
-    for (size_t s = plan_.num_slots; s > 0; --s) free_slots_.push_back(static_cast<uint32_t>(s - 1));
+    for (size_t s = plan_.num_slots; s > 0; --s)
+        free_slots_.push_back(static_cast<uint32_t>(s - 1));
 }
 
 PageChange PagePolicy::root(size_t bundle) const {
@@ -158,8 +164,8 @@ int32_t PagePolicy::block_above(int32_t id) const {
     return blocked;
 }
 
-// Adds an absent page and those above it to what is wanted. Returns how many of them the cut misses that it
-// was not known to miss.
+// Adds an absent page and those above it to what is wanted. Returns how many of them the cut misses
+// that it was not known to miss.
 size_t PagePolicy::ask(const PageRequest& request, bool has_failures) {
     auto id = static_cast<int32_t>(id_of(request.bundle, request.page));
     const int32_t blocked = has_failures ? block_above(id) : -1;
@@ -206,8 +212,8 @@ void PagePolicy::note(Span<const PageRequest> needs, size_t num_left_out, bool h
     num_needed_ = needed_.now;
 }
 
-// Has the keys of what is wanted be those of its stretches, and the pages in the order of the files. No
-// stretch has a page and one below it, and that above is the more urgent.
+// Has the keys of what is wanted be those of its stretches, and the pages in the order of the
+// files. No stretch has a page and one below it, and that above is the more urgent.
 void PagePolicy::find_stretches() {
     std::sort(wanted_.begin(), wanted_.end(), [](const Wanted& a, const Wanted& b) {
         return a.bundle != b.bundle ? a.bundle < b.bundle : a.page < b.page;
@@ -220,7 +226,8 @@ void PagePolicy::find_stretches() {
         const auto id = static_cast<int32_t>(id_of(w.bundle, w.page));
         if (w.bundle != bundle)
             pages_of_stretch = std::max<size_t>(1, kStretchBytes / bundles_[w.bundle].most_bytes);
-        const bool is_next = w.bundle != bundle || w.page / pages_of_stretch != number || id >= least_above;
+        const bool is_next =
+            w.bundle != bundle || w.page / pages_of_stretch != number || id >= least_above;
         if (is_next) {
             key_of_stretch_.push_back(0);
             bundle = w.bundle;
@@ -232,7 +239,8 @@ void PagePolicy::find_stretches() {
         least_above = std::min(least_above, page.parent);
         key_of_stretch_.back() = std::max(key_of_stretch_.back(), w.key);
     }
-    // Pages come after those below them, so what a stretch is raised to is known when its first page is.
+    // Pages come after those below them, so what a stretch is raised to is known when its first
+    // page is.
     for (Wanted& w : wanted_) {
         const Page& page = pages_[id_of(w.bundle, w.page)];
         const Page& above = pages_[page.parent];

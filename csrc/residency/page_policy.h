@@ -1,11 +1,12 @@
 #pragma once
 
-// What a pool of pages decides: which pages are read, which become resident, which make room, and in what
-// order. It knows no threads and no bytes: whoever asks is one thread at a time, and tells what was read.
+// What a pool of pages decides: which pages are read, which become resident, which make room, and
+// in what order. It knows no threads and no bytes: whoever asks is one thread at a time, and tells
+// what was read.
 //
-// Memory is rows of gaussians, and places of clusters: those of the coarsest pages of all bundles first,
-// which stay, then slots that hold any other page. What is resident is closed towards the root at every
-// moment: a page comes after the page above it, and goes when none below it is there.
+// Memory is rows of gaussians, and places of clusters: those of the coarsest pages of all bundles
+// first, which stay, then slots that hold any other page. What is resident is closed towards the
+// root at every moment: a page comes after the page above it, and goes when none below it is there.
 
 #include <atomic>
 #include <cstdint>
@@ -18,8 +19,8 @@
 
 namespace v3dg {
 
-// A bundle of which pages are resident: its tables, of which only those of groups and clusters are read and
-// only at the start, and where its pages come from.
+// A bundle of which pages are resident: its tables, of which only those of groups and clusters are
+// read and only at the start, and where its pages come from.
 struct PagedBundle {
     ClusterTable table;
     std::shared_ptr<const PageSource> source;
@@ -80,8 +81,8 @@ struct PagesComing {
 
 class PagePolicy {
   public:
-    // Throws std::invalid_argument where there is no room for the coarsest pages and one page more of each
-    // bundle.
+    // Throws std::invalid_argument where there is no room for the coarsest pages and one page more
+    // of each bundle.
     PagePolicy(const std::vector<PagedBundle>& bundles, const PoolMemory& memory);
 
     size_t num_slots() const { return slots_.size(); }
@@ -91,30 +92,35 @@ class PagePolicy {
     size_t num_pages() const { return slot_of_page_.size; }
     size_t most_page_bytes() const { return most_page_bytes_; }
     const PageSource& source(size_t bundle) const { return *bundles_[bundle].source; }
-    // The place of a page among those of all bundles, and that of the page above it; below 0: none is.
+    // The place of a page among those of all bundles, and that of the page above it; below 0: none
+    // is.
     uint32_t id_of(size_t bundle, size_t page) const {
         return bundles_[bundle].first_page + static_cast<uint32_t>(page);
     }
     int32_t page_above(uint32_t id) const { return pages_[id].parent; }
 
-    // Any thread may ask for the state of a page, and change it from absent to loading and from that on.
-    std::atomic<PageState>& state(size_t bundle, size_t page) { return states_[id_of(bundle, page)]; }
+    // Any thread may ask for the state of a page, and change it from absent to loading and from
+    // that on.
+    std::atomic<PageState>& state(size_t bundle, size_t page) {
+        return states_[id_of(bundle, page)];
+    }
     void forget_failures();
     // Takes the memory for as many loaded pages, so that bring() never wants for it.
     void reserve(size_t num_loaded) { left_.reserve(num_loaded); }
 
-    // Takes note of what the cut of a frame needed, absent or resident, in any order. So many more pages are
-    // needed as are left out, which is more than there is room for. `has_failures`: some pages cannot be had.
+    // Takes note of what the cut of a frame needed, absent or resident, in any order. So many more
+    // pages are needed as are left out, which is more than there is room for. `has_failures`: some
+    // pages cannot be had.
     void note(Span<const PageRequest> needs, size_t num_left_out, bool has_failures);
-    // What is read next for that, the most urgent stretch last and each from its end, those above before
-    // those below: no more than there will be room for, beside what is under way.
+    // What is read next for that, the most urgent stretch last and each from its end, those above
+    // before those below: no more than there will be room for, beside what is under way.
     void choose(size_t under_way, std::vector<PageRequest>& todo);
     // Of that frame: pages that it misses, and slots that it would take.
     size_t missing() const { return missing_; }
     size_t needed() const { return missing_ + num_needed_; }
 
-    // Brings loaded pages to slots, the most urgent first, of about so many bytes; at least one. What it
-    // leaves has to wait: for bytes, or for a page above that is under way.
+    // Brings loaded pages to slots, the most urgent first, of about so many bytes; at least one.
+    // What it leaves has to wait: for bytes, or for a page above that is under way.
     void bring(std::vector<LoadedPage>& loaded, size_t most_bytes, PagesComing& out);
 
   private:
@@ -134,7 +140,8 @@ class PagePolicy {
         int32_t bundle = -1;
         uint32_t page = 0;
     };
-    // Of a slot: one more than the view that needed its page last, and that used it: needed it, or nearly.
+    // Of a slot: one more than the view that needed its page last, and that used it: needed it, or
+    // nearly.
     struct Use {
         uint32_t last_needed = 0, last_used = 0;
         int32_t above = 0;          // slot of the page above; below 0: that is the coarsest
@@ -202,8 +209,8 @@ class PagePolicy {
     std::vector<Wanted> wanted_;
     std::vector<uint32_t> key_of_stretch_;
     std::vector<Places> places_of_key_;
-    // A heap, those first that were not used for longest. It lasts from frame to frame: what comes to be old
-    // meanwhile is younger than what it has.
+    // A heap, those first that were not used for longest. It lasts from frame to frame: what comes
+    // to be old meanwhile is younger than what it has.
     std::vector<Leaving> leaving_;
     bool finds_none_ = false;  // that may go, until the next view is noted
     std::vector<LoadedPage> left_;

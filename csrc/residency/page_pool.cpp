@@ -21,9 +21,10 @@ namespace {
 constexpr float kToleranceStep = 1.02f, kToleranceLeap = 1.189207f;
 constexpr double kRoomyShare = 0.7;
 constexpr int kTries = 3;
-constexpr size_t kMostAtOnce = 64;                        // pages that a thread asks the disk for together
-constexpr size_t kMostBytesTogether = size_t(512) << 10;  // of those, that it then reads and hashes together
-constexpr size_t kSamples = 1 << 14;                      // of the sizes of pages
+constexpr size_t kMostAtOnce = 64;  // pages that a thread asks the disk for together
+constexpr size_t kMostBytesTogether = size_t(512)
+                                      << 10;  // of those, that it then reads and hashes together
+constexpr size_t kSamples = 1 << 14;          // of the sizes of pages
 constexpr int kSpins = 64;  // before a frame does without what another thread holds
 
 // A page that a thread reads.
@@ -82,8 +83,9 @@ struct PagePool::State {
     bool has_begun = false, has_looked = false;  // has_looked: the frame before was not bounded
     float least_of_frame = 0;
     std::vector<PageChange> changes;
-    std::vector<unsigned char*> taken, returned;  // blocks of those changes; blocks to be used again
-    std::vector<std::vector<int64_t>> shift;      // [P] of each bundle
+    std::vector<unsigned char*> taken,
+        returned;                             // blocks of those changes; blocks to be used again
+    std::vector<std::vector<int64_t>> shift;  // [P] of each bundle
     PageArrivals arrivals;
     std::vector<FrameNeeds*> idle_needs;
     FrameNeeds* to_note = nullptr;
@@ -104,7 +106,8 @@ struct PagePool::State {
 
     bool read_some(std::unique_lock<std::mutex>& lock, size_t most);
     void read_batch(Reading* batch, size_t count, std::unique_lock<std::mutex>& lock);
-    void read_together(uint32_t bundle, Span<PageReading> pages, std::unique_lock<std::mutex>& lock);
+    void read_together(uint32_t bundle, Span<PageReading> pages,
+                       std::unique_lock<std::mutex>& lock);
     void finish(uint32_t bundle, const PageReading& of);
     void read_always();
 
@@ -119,7 +122,8 @@ struct PagePool::State {
     void check_process() const {
         if (getpid() != process)
             throw std::runtime_error(
-                "memory: expected a renderer of this process, got one from before a fork; make another");
+                "memory: expected a renderer of this process, got one from before a fork; make "
+                "another");
     }
     std::unique_lock<std::mutex> locked() const {
         check_process();
@@ -168,18 +172,21 @@ void PagePool::State::allocate(size_t num_bundles) {
         for (size_t p = b % step; p + 1 < source.num_pages(); p += step)
             samples.push_back(source.num_bytes(p));
     }
-    blocks.allocate(samples, policy.most_page_bytes(), limits.block_bytes, policy.num_slots(), *memory);
+    blocks.allocate(samples, policy.most_page_bytes(), limits.block_bytes, policy.num_slots(),
+                    *memory);
     most_bytes += blocks.num_bytes();
     const size_t count = blocks.num_blocks();
     policy.reserve(count);
     for (auto* pages : {&loaded, &read}) pages->reserve(count);
     for (auto* of_blocks : {&coming.dropped, &taken, &returned}) of_blocks->reserve(count);
-    for (auto* of_changes : {&coming.changes, &ready, &changes}) of_changes->reserve(2 * count + num_bundles);
+    for (auto* of_changes : {&coming.changes, &ready, &changes})
+        of_changes->reserve(2 * count + num_bundles);
     // A page has two clusters, unless groups are larger, and each may ask for another page.
     most_needs = std::min(policy.num_pages(), 8 * policy.num_slots() + 1024);
     all_needs.resize(limits.most_frames + 2);  // and those that wait, and are decided about
     for (FrameNeeds& needs : all_needs) {
-        needs.list = reinterpret_cast<PageRequest*>(memory->allocate(most_needs * sizeof(PageRequest)));
+        needs.list =
+            reinterpret_cast<PageRequest*>(memory->allocate(most_needs * sizeof(PageRequest)));
         idle_needs.push_back(&needs);
     }
     free_needs.reserve(all_needs.size());
@@ -190,7 +197,9 @@ void PagePool::State::start_threads(const std::shared_ptr<State>& shared) {
     try {
         for (unsigned t = 0; t <= limits.num_threads; ++t) {
             const std::unique_lock<std::mutex> lock(busy);
-            std::thread([shared, t] { t == 0 ? shared->decide_always() : shared->read_always(); }).detach();
+            std::thread([shared, t] {
+                t == 0 ? shared->decide_always() : shared->read_always();
+            }).detach();
             ++num_threads;
         }
     } catch (...) {
@@ -207,9 +216,9 @@ void PagePool::State::stop_threads() {
     has_changed.wait_for(lock, std::chrono::seconds(2), [&] { return num_threads == 0; });
 }
 
-// Under the lock, as all from here to who reads. What is ready for a frame was needed by the last view or the
-// one before, and so is not to leave before that frame has it: changes that are taken together bring at most
-// one page to a slot.
+// Under the lock, as all from here to who reads. What is ready for a frame was needed by the last
+// view or the one before, and so is not to leave before that frame has it: changes that are taken
+// together bring at most one page to a slot.
 bool PagePool::State::may_note() const { return noted != nullptr && (!has_noted || ready.empty()); }
 
 bool PagePool::State::has_to_decide() const {
@@ -217,7 +226,8 @@ bool PagePool::State::has_to_decide() const {
            ((num_left > 0 || !read.empty()) && ready_bytes < most_bytes_a_frame);
 }
 
-// Decides without the lock about what is there; what threads and frames do meanwhile is seen the next time.
+// Decides without the lock about what is there; what threads and frames do meanwhile is seen the
+// next time.
 void PagePool::State::decide(std::unique_lock<std::mutex>& lock) {
     ++rounds_begun;
     wants_round = false;
@@ -264,7 +274,8 @@ void PagePool::State::decide(std::unique_lock<std::mutex>& lock) {
     has_changed.notify_all();
 }
 
-// From what the frame was drawn with, so that it makes one step for all frames that were under way meanwhile.
+// From what the frame was drawn with, so that it makes one step for all frames that were under way
+// meanwhile.
 void PagePool::State::adapt_tolerance(const FrameNeeds& of) {
     const size_t slots = policy.num_slots();
     const float least = least_tolerance;
@@ -324,10 +335,12 @@ bool PagePool::State::read_some(std::unique_lock<std::mutex>& lock, size_t most)
     return true;
 }
 
-// Without the lock: has all read in the order of files, a few together, the disk begins with all at once.
+// Without the lock: has all read in the order of files, a few together, the disk begins with all at
+// once.
 void PagePool::State::read_batch(Reading* batch, size_t count, std::unique_lock<std::mutex>& lock) {
     std::sort(batch, batch + count, [](const Reading& a, const Reading& b) {
-        return a.page.bundle != b.page.bundle ? a.page.bundle < b.page.bundle : a.page.page < b.page.page;
+        return a.page.bundle != b.page.bundle ? a.page.bundle < b.page.bundle
+                                              : a.page.page < b.page.page;
     });
     PageReading pages[kMostAtOnce];
     for (size_t k = 0; k < count; ++k) {
@@ -349,7 +362,8 @@ void PagePool::State::read_batch(Reading* batch, size_t count, std::unique_lock<
     for_each(kMostBytesTogether, [&](uint32_t b, auto of) { read_together(b, of, lock); });
 }
 
-// Without the lock: has pages of a bundle read. Those that are there are loaded at once, others tried again.
+// Without the lock: has pages of a bundle read. Those that are there are loaded at once, others
+// tried again.
 void PagePool::State::read_together(uint32_t bundle, Span<PageReading> pages,
                                     std::unique_lock<std::mutex>& lock) {
     policy.source(bundle).read_pages(pages);
@@ -468,8 +482,9 @@ void PagePool::State::take_changes(bool is_bounded) {
     changes.swap(ready);
     ready_bytes = 0;
     has_noted = false;
-    // A look waits until the pool has decided about its own view. An earlier one that was decided about in
-    // between would bring pages to `ready`, and then no other view may be noted before the next frame.
+    // A look waits until the pool has decided about its own view. An earlier one that was decided
+    // about in between would bring pages to `ready`, and then no other view may be noted before the
+    // next frame.
     if (!is_bounded) forget_noted();
     if (has_to_decide()) to_decide.notify_one();
     lock.unlock();
@@ -485,8 +500,8 @@ PagePool::PagePool(const std::vector<PagedBundle>& bundles, const PoolLimits& li
     state_->start_threads(state_);
 }
 
-// A thread that a disk never answers is left behind, with what it writes to. So is all in a child of fork(),
-// whose copy of the threads' locks can never be destroyed.
+// A thread that a disk never answers is left behind, with what it writes to. So is all in a child
+// of fork(), whose copy of the threads' locks can never be destroyed.
 PagePool::~PagePool() {
     if (getpid() != state_->process)
         static_cast<void>(new std::shared_ptr<State>(state_));
@@ -509,10 +524,11 @@ const PageArrivals& PagePool::arrivals() const { return state_->arrivals; }
 const PageSource& PagePool::source(uint32_t b) const { return state_->policy.source(b); }
 SlotPage PagePool::slot_page(const PageChange& change) const {
     const PageSource& of = source(change.bundle);
-    return {{of.clusters(change.page), reinterpret_cast<const uint32_t*>(change.bytes), of.sh_degree()},
-            static_cast<size_t>(change.row),
-            change.cluster,
-            plan().num_clusters_at(change.cluster, of.num_clusters(change.page))};
+    return {
+        {of.clusters(change.page), reinterpret_cast<const uint32_t*>(change.bytes), of.sh_degree()},
+        static_cast<size_t>(change.row),
+        change.cluster,
+        plan().num_clusters_at(change.cluster, of.num_clusters(change.page))};
 }
 size_t PagePool::most_changes() const { return 2 * state_->blocks.num_blocks() + num_bundles(); }
 size_t PagePool::most_needs() const { return state_->most_needs; }
@@ -591,7 +607,8 @@ bool PagePool::wait(double seconds) {
     State& state = *state_;
     auto lock = state.locked();
     state.has_changed.wait_for(lock, std::chrono::duration<double>(seconds), [&] {
-        const bool is_decided = state.decides_itself || (!state.has_to_decide() && !state.is_deciding());
+        const bool is_decided =
+            state.decides_itself || (!state.has_to_decide() && !state.is_deciding());
         return is_decided && (state.lacks_blocks || (state.todo.empty() && state.num_loading == 0));
     });
     return !state.ready.empty() || !state.read.empty();

@@ -14,12 +14,13 @@ constexpr size_t kFew = 8;  // pages that a thread reads at once: as many as are
 
 static std::string name_of(const PageRun& run, size_t page) {
     const Span<const int64_t> clusters = run.clusters(page);
-    return "page " + std::to_string(run.first_page + page) + " (gaussians " + std::to_string(clusters[0]) +
-           " to " + std::to_string(clusters[clusters.size - 1] - 1) + ")";
+    return "page " + std::to_string(run.first_page + page) + " (gaussians " +
+           std::to_string(clusters[0]) + " to " + std::to_string(clusters[clusters.size - 1] - 1) +
+           ")";
 }
 
-// Reads so many pages to memory, one behind another, and calls use(page, bytes) for those up to the first
-// that cannot be had.
+// Reads so many pages to memory, one behind another, and calls use(page, bytes) for those up to the
+// first that cannot be had.
 template <class Use>
 static void read_few(const PosixFile& file, const PageRun& run, size_t first, size_t count,
                      unsigned char* bytes, const Use& use) {
@@ -71,11 +72,14 @@ static void decode(const PageRun& run, size_t page, PageCodec codec, const unsig
     copy(rows.sh, out.sh, out.num_sh());
 }
 
-void read_pages(const PosixFile& file, const PageRun& run, PageCodec codec, const GaussianRows<float>& out) {
+void read_pages(const PosixFile& file, const PageRun& run, PageCodec codec,
+                const GaussianRows<float>& out) {
     for_few_pages(run, [&](size_t first, size_t count) {
-        Buffer<uint32_t> words((run.places[first + count] - run.places[first]) / sizeof(uint32_t) + 1);
-        read_few(file, run, first, count, reinterpret_cast<unsigned char*>(words.data()),
-                 [&](size_t page, const unsigned char* bytes) { decode(run, page, codec, bytes, out); });
+        Buffer<uint32_t> words((run.places[first + count] - run.places[first]) / sizeof(uint32_t) +
+                               1);
+        read_few(
+            file, run, first, count, reinterpret_cast<unsigned char*>(words.data()),
+            [&](size_t page, const unsigned char* bytes) { decode(run, page, codec, bytes, out); });
     });
 }
 

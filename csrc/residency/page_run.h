@@ -13,9 +13,9 @@ namespace v3dg {
 struct PageRun {
     size_t first_page;                  // number in the bundle
     Span<const int64_t> first_cluster;  // [n + 1] of each page, in the run, and the end
-    Span<const int64_t> offset;         // gaussians of each cluster of the run, in the bundle, and the end
-    Span<const int64_t> places;         // [n + 1] first byte of each page in the file, and the end
-    Span<const uint8_t> hashes;         // [n][16]
+    Span<const int64_t> offset;  // gaussians of each cluster of the run, in the bundle, and the end
+    Span<const int64_t> places;  // [n + 1] first byte of each page in the file, and the end
+    Span<const uint8_t> hashes;  // [n][16]
 
     size_t size() const { return places.size - 1; }
     size_t num_bytes(size_t page) const { return places[page + 1] - places[page]; }
@@ -26,9 +26,10 @@ struct PageRun {
     }
 };
 
-// The gaussians of all pages, verified. A page has at least the bytes that its codec needs. Throws PageError,
-// which names the first page that cannot be had, without the file.
-void read_pages(const PosixFile& file, const PageRun& run, PageCodec codec, const GaussianRows<float>& out);
+// The gaussians of all pages, verified. A page has at least the bytes that its codec needs. Throws
+// PageError, which names the first page that cannot be had, without the file.
+void read_pages(const PosixFile& file, const PageRun& run, PageCodec codec,
+                const GaussianRows<float>& out);
 
 // The words of all pages, verified.
 void read_codes(const PosixFile& file, const PageRun& run, Span<int32_t> words);

@@ -31,14 +31,16 @@ GaussianRows<const float> PageSource::rows(size_t page, const unsigned char* byt
     const GaussianRows<const float> rows =
         rows_of_page(reinterpret_cast<const unsigned char*>(decoded.data()), count, sh_degree_);
     const auto written = [](const float* to) { return const_cast<float*>(to); };
-    cpu::decode_page({{offset.data(), offset.size()}, reinterpret_cast<const uint32_t*>(bytes), sh_degree_},
-                     {written(rows.means), written(rows.quats), written(rows.scales), written(rows.opacities),
-                      written(rows.sh), count, sh_degree_});
+    cpu::decode_page(
+        {{offset.data(), offset.size()}, reinterpret_cast<const uint32_t*>(bytes), sh_degree_},
+        {written(rows.means), written(rows.quats), written(rows.scales), written(rows.opacities),
+         written(rows.sh), count, sh_degree_});
     return rows;
 }
 
 FilePages::FilePages(const ClusterTable& table, int sh_degree, PageCodec codec, std::string name,
-                     int descriptor, Span<const int64_t> place, Span<const uint8_t> hash, Fetch fetch)
+                     int descriptor, Span<const int64_t> place, Span<const uint8_t> hash,
+                     Fetch fetch)
     : PageSource(table, sh_degree, codec),
       name_(std::move(name)),
       file_(PosixFile::duplicate(descriptor)),
@@ -53,18 +55,21 @@ static void read_one(const PosixFile& file, Span<const int64_t> places, PageRead
         if (file.read_at(places[of.page], reinterpret_cast<char*>(of.bytes), size) < size)
             of.error.emplace(name_of(of.page) + " is not there; the file was truncated", true);
     } catch (const std::system_error& error) {
-        of.error.emplace(name_of(of.page) + ": " + error.code().message(), false, error.code().value());
+        of.error.emplace(name_of(of.page) + ": " + error.code().message(), false,
+                         error.code().value());
     }
 }
 
-// Bytes between two pages that are read and thrown away rather than asked for twice around: a page or two.
+// Bytes between two pages that are read and thrown away rather than asked for twice around: a page
+// or two.
 constexpr size_t kMostSkippedBytes = size_t(32) << 10;
 
 // Where the pages end that are read at once with the first.
 static size_t end_of_run(Span<const int64_t> places, Span<const PageReading> pages, size_t first) {
     size_t end = first + 1;
-    while (end < pages.size && static_cast<size_t>(places[pages[end].page] -
-                                                   places[pages[end - 1].page + 1]) <= kMostSkippedBytes)
+    while (end < pages.size &&
+           static_cast<size_t>(places[pages[end].page] - places[pages[end - 1].page + 1]) <=
+               kMostSkippedBytes)
         ++end;
     return end;
 }
@@ -111,7 +116,8 @@ void read_verified(const PosixFile& file, Span<const int64_t> places, const uint
     blake2b({messages, count}, found);
     for (size_t k = 0; k < count; ++k)
         if (!std::equal(found[k].begin(), found[k].end(), hashes + kPageHashBytes * read[k]->page))
-            read[k]->error.emplace(name_of(read[k]->page) + ": the hash does not match; " + kDamaged, true);
+            read[k]->error.emplace(
+                name_of(read[k]->page) + ": the hash does not match; " + kDamaged, true);
 }
 
 void PageSource::read(size_t page, unsigned char* bytes) const {
@@ -151,12 +157,13 @@ void FilePages::read_pages(Span<PageReading> pages) const {
                   [this](size_t page) { return name_of(page); });
     if (codec() == PageCodec::float32) return;
     for (PageReading& of : pages) {
-        const PageCodes<const uint32_t> codes{clusters(of.page), reinterpret_cast<const uint32_t*>(of.bytes),
-                                              sh_degree()};
+        const PageCodes<const uint32_t> codes{
+            clusters(of.page), reinterpret_cast<const uint32_t*>(of.bytes), sh_degree()};
         for (size_t c = 0; c < codes.num_clusters() && !of.error; ++c) {
             const uint32_t* words = codes.ranges(c);
             if (!are_valid(*reinterpret_cast<const ClusterCode*>(words),
-                           reinterpret_cast<const uint16_t*>(words + sizeof(ClusterCode) / 4), sh_degree()))
+                           reinterpret_cast<const uint16_t*>(words + sizeof(ClusterCode) / 4),
+                           sh_degree()))
                 of.error.emplace(name_of(of.page) + ": cluster " + std::to_string(c) +
                                      " has ranges that are not finite; " + kDamaged,
                                  true);
@@ -187,7 +194,8 @@ void MemoryPages::copy(size_t page, unsigned char* bytes) const {
     add(rows_.sh, rows_.num_sh());
 }
 
-GaussianRows<const float> rows_of_page(const unsigned char* bytes, size_t num_gaussians, int sh_degree) {
+GaussianRows<const float> rows_of_page(const unsigned char* bytes, size_t num_gaussians,
+                                       int sh_degree) {
     const float* means = reinterpret_cast<const float*>(bytes);
     const float* quats = means + 3 * num_gaussians;
     const float* scales = quats + 4 * num_gaussians;

@@ -1,7 +1,7 @@
 #pragma once
 
-// Where the bytes of a bundle's pages come from: a file, which may have to be fetched first, or memory. Read
-// on any thread.
+// Where the bytes of a bundle's pages come from: a file, which may have to be fetched first, or
+// memory. Read on any thread.
 
 #include <cstdint>
 #include <functional>
@@ -34,11 +34,13 @@ struct PageReading {
     unsigned char* bytes;  // room for all of it
     std::optional<PageError> error;
 };
-constexpr size_t kMostPagesTogether = 64;  // that are read at once, so that nothing is allocated for it
+constexpr size_t kMostPagesTogether =
+    64;  // that are read at once, so that nothing is allocated for it
 
-// Reads pages of a file, ascending and no more than that: those that lie side by side at once, with what of
-// the file is between them where that is little, and compares their hashes side by side. `places` are the
-// first byte of each page and the end, `hashes` [16] of each. Errors begin with name_of(page).
+// Reads pages of a file, ascending and no more than that: those that lie side by side at once, with
+// what of the file is between them where that is little, and compares their hashes side by side.
+// `places` are the first byte of each page and the end, `hashes` [16] of each. Errors begin with
+// name_of(page).
 void read_verified(const PosixFile& file, Span<const int64_t> places, const uint8_t* hashes,
                    Span<PageReading> pages, const std::function<std::string(size_t)>& name_of);
 
@@ -53,17 +55,21 @@ class PageSource {
     PageCodec codec() const { return codec_; }
     size_t num_pages() const { return first_cluster_.size() - 1; }
     size_t num_clusters() const { return offset_.size() - 1; }
-    size_t num_clusters(size_t page) const { return first_cluster_[page + 1] - first_cluster_[page]; }
+    size_t num_clusters(size_t page) const {
+        return first_cluster_[page + 1] - first_cluster_[page];
+    }
     size_t first_cluster(size_t page) const { return first_cluster_[page]; }
     // [K + 1] where the clusters of a page begin among the rows of the bundle, and the end.
     Span<const int64_t> clusters(size_t page) const;
     int64_t first_row(size_t page) const { return offset_[first_cluster_[page]]; }
-    size_t num_rows(size_t page) const { return offset_[first_cluster_[page + 1]] - first_row(page); }
+    size_t num_rows(size_t page) const {
+        return offset_[first_cluster_[page + 1]] - first_row(page);
+    }
 
     // With what it is filled up with.
     virtual size_t num_bytes(size_t page) const = 0;
-    // Writes all bytes of pages, ascending, at most kMostPagesTogether, verified; it is quickest for those
-    // that lie side by side.
+    // Writes all bytes of pages, ascending, at most kMostPagesTogether, verified; it is quickest
+    // for those that lie side by side.
     virtual void read_pages(Span<PageReading> pages) const = 0;
     // The same of one page. Throws PageError.
     void read(size_t page, unsigned char* bytes) const;
@@ -83,17 +89,18 @@ class PageSource {
     std::vector<int64_t> offset_;        // [C + 1]
 };
 
-// Brings parts of a file to where they are read, before they are: of each two numbers, the bytes from the
-// first to the second. Returns what went wrong, or nothing. Called on any thread.
+// Brings parts of a file to where they are read, before they are: of each two numbers, the bytes
+// from the first to the second. Returns what went wrong, or nothing. Called on any thread.
 using Fetch = std::function<std::string(Span<const int64_t>)>;
 
-// Pages of a file that stays open as long as this lives; one that is renamed or removed meanwhile stays
-// readable, one that is cut or written to is found out.
+// Pages of a file that stays open as long as this lives; one that is renamed or removed meanwhile
+// stays readable, one that is cut or written to is found out.
 class FilePages : public PageSource {
   public:
-    // `place` is [P + 1], `hash` is [P][16], as docs/format.md has them. `fetch` is empty where all is there.
-    FilePages(const ClusterTable& table, int sh_degree, PageCodec codec, std::string name, int descriptor,
-              Span<const int64_t> place, Span<const uint8_t> hash, Fetch fetch);
+    // `place` is [P + 1], `hash` is [P][16], as docs/format.md has them. `fetch` is empty where all
+    // is there.
+    FilePages(const ClusterTable& table, int sh_degree, PageCodec codec, std::string name,
+              int descriptor, Span<const int64_t> place, Span<const uint8_t> hash, Fetch fetch);
     size_t num_bytes(size_t page) const override { return place_[page + 1] - place_[page]; }
     void read_pages(Span<PageReading> pages) const override;
     void expect(Span<const PageReading> pages) const override;
@@ -125,6 +132,7 @@ class MemoryPages : public PageSource {
 };
 
 // The rows of a page of so many gaussians in float32, borrowed from its bytes.
-GaussianRows<const float> rows_of_page(const unsigned char* bytes, size_t num_gaussians, int sh_degree);
+GaussianRows<const float> rows_of_page(const unsigned char* bytes, size_t num_gaussians,
+                                       int sh_degree);
 
 }  // namespace v3dg

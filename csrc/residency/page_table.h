@@ -12,20 +12,20 @@ constexpr int64_t kAbsentPage = INT64_MIN;
 constexpr int32_t kArrivalFrames = 8;
 constexpr int32_t kNeverBegins = INT32_MAX, kBegunLongAgo = -kArrivalFrames;
 
-// Where the pages of a bundle lie in memory, and which of them are there. Page g holds the clusters that
-// group g replaces, the last page those that nothing replaces.
+// Where the pages of a bundle lie in memory, and which of them are there. Page g holds the clusters
+// that group g replaces, the last page those that nothing replaces.
 //
-// The cut refines only what is there. It stays exact as long as a page is resident only together with the
-// pages above it, of which the last one is resident always.
+// The cut refines only what is there. It stays exact as long as a page is resident only together
+// with the pages above it, of which the last one is resident always.
 struct PageTable {
-    // [G + 1] by how many rows a page lies behind its place in the bundle, or kAbsentPage. Empty: all pages
-    // are there, in the order of the bundle.
+    // [G + 1] by how many rows a page lies behind its place in the bundle, or kAbsentPage. Empty:
+    // all pages are there, in the order of the bundle.
     Span<const int64_t> shift;
-    // The same of its clusters, modulo 2^32, for who reads ranges by cluster. Empty: they are where the
-    // bundle has them.
+    // The same of its clusters, modulo 2^32, for who reads ranges by cluster. Empty: they are where
+    // the bundle has them.
     Span<const uint32_t> cluster_shift;
-    // [G + 1] the frame after which a page begins to fade in, of cuts with a fade. No page is farther than
-    // the one above it, in whichever frame. Empty: all pages have faded in.
+    // [G + 1] the frame after which a page begins to fade in, of cuts with a fade. No page is
+    // farther than the one above it, in whichever frame. Empty: all pages have faded in.
     Span<const int32_t> begins;
 
     V3DG_HD bool is_whole() const { return shift.empty(); }

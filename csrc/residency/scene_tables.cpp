@@ -8,13 +8,14 @@
 namespace v3dg {
 namespace cuda {
 
-void SceneTables::set_bundles(std::vector<std::shared_ptr<const BundleTables>> bundles, cudaStream_t stream) {
+void SceneTables::set_bundles(std::vector<std::shared_ptr<const BundleTables>> bundles,
+                              cudaStream_t stream) {
     std::vector<BundleOnDevice> on_device;
     for (const auto& bundle : bundles) {
         if (bundle->device() != device_)
-            throw std::invalid_argument("bundles: expected tables on device " + std::to_string(device_) +
-                                        ", as the scene is, got some on device " +
-                                        std::to_string(bundle->device()));
+            throw std::invalid_argument(
+                "bundles: expected tables on device " + std::to_string(device_) +
+                ", as the scene is, got some on device " + std::to_string(bundle->device()));
         on_device.push_back(bundle->on_device());
     }
     const DeviceGuard guard(device_);
@@ -35,8 +36,8 @@ void SceneTables::set_instances(Span<const int32_t> bundle, Span<const float> im
     importance_.copy_from(importance, stream);
 }
 
-void SceneTables::set_poses(const PoseSpan& position, const PoseSpan& quaternion, const PoseSpan& scale,
-                            cudaStream_t stream) {
+void SceneTables::set_poses(const PoseSpan& position, const PoseSpan& quaternion,
+                            const PoseSpan& scale, cudaStream_t stream) {
     const DeviceGuard guard(device_);
     const StreamLock lock(busy_, stream);
     const auto on_device = [&](const PoseSpan& from, int k) {

@@ -23,19 +23,23 @@ struct SceneOnDevice {
 
 // The bundles and the instances of a scene on the device that is current when it is made.
 //
-// Everything is enqueued on the stream that is passed, which belongs to that device. Several threads and
-// streams take turns: whoever reads the scene on a stream holds turn() while it enqueues that.
+// Everything is enqueued on the stream that is passed, which belongs to that device. Several
+// threads and streams take turns: whoever reads the scene on a stream holds turn() while it
+// enqueues that.
 class SceneTables {
   public:
     SceneTables() = default;
 
-    // The bundles that instances name by their places in this list. Uploads no more than where their tables
-    // are. What instances there are already keep their places, so a longer list that begins with the last one
-    // adds bundles. Throws std::invalid_argument where tables are on another device.
+    // The bundles that instances name by their places in this list. Uploads no more than where
+    // their tables are. What instances there are already keep their places, so a longer list that
+    // begins with the last one adds bundles. Throws std::invalid_argument where tables are on
+    // another device.
     void set_bundles(std::vector<std::shared_ptr<const BundleTables>> bundles, cudaStream_t stream);
     // Replaces all instances; set_poses() has to follow. Host memory may be reused on return.
-    void set_instances(Span<const int32_t> bundle, Span<const float> importance, cudaStream_t stream);
-    // Each of the three is either the host's, which may be reused on return, or the device's, which stays.
+    void set_instances(Span<const int32_t> bundle, Span<const float> importance,
+                       cudaStream_t stream);
+    // Each of the three is either the host's, which may be reused on return, or the device's, which
+    // stays.
     void set_poses(const PoseSpan& position, const PoseSpan& quaternion, const PoseSpan& scale,
                    cudaStream_t stream);
 

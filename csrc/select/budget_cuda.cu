@@ -1,8 +1,10 @@
-// Chooses the tolerance of a budget. change_kernel adds up by how many gaussians the cuts of neighbouring
-// tolerances differ; choose_kernel chooses the least tolerance from which on no cut has too many.
+// Chooses the tolerance of a budget. change_kernel adds up by how many gaussians the cuts of
+// neighbouring tolerances differ; choose_kernel chooses the least tolerance from which on no cut
+// has too many.
 //
-// Both run for two rounds. The first looks at no tolerance below half of the last choice, so that it need not
-// look at the tables of what is far away. The second does nothing unless that was too much.
+// Both run for two rounds. The first looks at no tolerance below half of the last choice, so that
+// it need not look at the tables of what is far away. The second does nothing unless that was too
+// much.
 
 #include "base/scan.cuh"
 #include "select/cut_parts.cuh"
@@ -17,7 +19,8 @@ constexpr unsigned kChooseThreads = 1024;
 constexpr uint32_t kWarpBins = (kNumBudgetBins + kChooseThreads - 1) / kChooseThreads * 32;
 constexpr float kMostGuess = 1 << 20;
 
-// Adds the numbers of gaussians by which the cut of each tolerance differs from that of the tolerance before.
+// Adds the numbers of gaussians by which the cut of each tolerance differs from that of the
+// tolerance before.
 __global__ void change_kernel(PlacedScene scene, SelectRule rule, BudgetRound round,
                               const unsigned* num_parts, Count* change) {
     if (round.is_over()) return;
@@ -54,8 +57,8 @@ __global__ void change_kernel(PlacedScene scene, SelectRule rule, BudgetRound ro
     if (threadIdx.x == 0 && at_first > 0) atomicAdd(&change[0], at_first);
 }
 
-// One block. Chooses the tolerance after the last one whose cut exceeds the budget, or in steps one that is
-// not below. Where there is none, no parts are left to cut.
+// One block. Chooses the tolerance after the last one whose cut exceeds the budget, or in steps one
+// that is not below. Where there is none, no parts are left to cut.
 __global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change, CutChoice* choice,
                               BudgetState* state, unsigned* num_parts) {
     if (round.is_over()) return;
@@ -83,21 +86,25 @@ __global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change,
         const Count upto = bin < last ? count + here : 0;
         const unsigned beyond = __ballot_sync(kAllLanes, upto > rule.budget),
                        beyond_goal = __ballot_sync(kAllLanes, upto > goal_of_budget(rule.budget));
-        if (lane == 0 && beyond != 0) atomicMax(&chosen, from + 32 - __clz(static_cast<int>(beyond)));
-        if (lane == 0 && beyond_goal != 0) atomicMax(&goal, from + 32 - __clz(static_cast<int>(beyond_goal)));
+        if (lane == 0 && beyond != 0)
+            atomicMax(&chosen, from + 32 - __clz(static_cast<int>(beyond)));
+        if (lane == 0 && beyond_goal != 0)
+            atomicMax(&goal, from + 32 - __clz(static_cast<int>(beyond_goal)));
         count += __shfl_sync(kAllLanes, here, 31);
     }
     __syncthreads();
     const bool is_first_in_vain = chosen == 0 && least_tolerance > rule.tolerance_px2;
     if (is_first_in_vain)
-        for (uint32_t bin = threadIdx.x; bin < kNumBudgetBins; bin += kChooseThreads) change[bin] = 0;
+        for (uint32_t bin = threadIdx.x; bin < kNumBudgetBins; bin += kChooseThreads)
+            change[bin] = 0;
     if (threadIdx.x != 0) return;
     const bool fits_budget = chosen < kNumBudgetBins;
     const float least = fits_budget ? tolerance_of_bin(chosen, least_tolerance) : INFINITY;
     state->guess = fminf(0.5f * least, kMostGuess);
     state->again = is_first_in_vain || round.is_second;
     const bool is_chosen = fits_budget && !is_first_in_vain;
-    const float tolerance = is_chosen ? tolerance_of_budget(rule, chosen, goal, state->last_bin) : least;
+    const float tolerance =
+        is_chosen ? tolerance_of_budget(rule, chosen, goal, state->last_bin) : least;
     *choice = {tolerance, !fits_budget, before_warp[kChooseThreads / 32]};
     if (!fits_budget) *num_parts = 0;
 }
@@ -107,10 +114,10 @@ __global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change,
 void choose_tolerance(const PlacedScene& scene, const SelectRule& rule, const BudgetRound& round,
                       unsigned num_blocks, unsigned* num_parts, Count* change, CutChoice* choice,
                       BudgetState* state, cudaStream_t stream) {
-    launch("change_kernel", change_kernel, num_blocks, kCutThreads, 0, stream, scene, rule, round, num_parts,
-           change);
-    launch("choose_kernel", choose_kernel, 1, kChooseThreads, 0, stream, rule, round, change, choice, state,
-           num_parts);
+    launch("change_kernel", change_kernel, num_blocks, kCutThreads, 0, stream, scene, rule, round,
+           num_parts, change);
+    launch("choose_kernel", choose_kernel, 1, kChooseThreads, 0, stream, rule, round, change,
+           choice, state, num_parts);
 }
 
 }  // namespace cuda

@@ -8,14 +8,14 @@
 
 namespace v3dg {
 
-// What pictures that follow each other, of one camera, know of the ones before: where the tolerance of a
-// budget is, and for how long nothing has moved. A copy goes on by itself.
+// What pictures that follow each other, of one camera, know of the ones before: where the tolerance
+// of a budget is, and for how long nothing has moved. A copy goes on by itself.
 class BudgetSteps {
   public:
     uint32_t last_bin = kNoBin;  // on the host, what tolerance_of_budget() keeps
 
-    // The rule of the next picture, which shows `scene`: an object that stays as it is, and that a change
-    // makes another of. Without a fade nothing follows from the pictures before.
+    // The rule of the next picture, which shows `scene`: an object that stays as it is, and that a
+    // change makes another of. Without a fade nothing follows from the pictures before.
     SelectRule next(SelectRule rule, const Eyes& eyes, const std::shared_ptr<const void>& scene) {
         if (!rule.fade.is_on()) return rule;
         const bool is_same_scene = !scene_.owner_before(scene) && !scene.owner_before(scene_);
@@ -38,8 +38,8 @@ class BudgetSteps {
     int32_t frames_at_rest_ = 0;
 };
 
-// What body(rule, last_bin) returns for the next of the pictures that `steps` knows, which count it unless it
-// throws. Null: nothing came before, and the rule is as it is.
+// What body(rule, last_bin) returns for the next of the pictures that `steps` knows, which count it
+// unless it throws. Null: nothing came before, and the rule is as it is.
 template <class Body>
 auto in_steps(BudgetSteps* steps, const SelectRule& rule, const Eyes& eyes,
               const std::shared_ptr<const void>& scene, const Body& body) {

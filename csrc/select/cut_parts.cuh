@@ -15,8 +15,8 @@ constexpr unsigned kPartSize = 32 * kLaneClusters;
 constexpr unsigned kCutThreads = 256, kCutWarps = kCutThreads / 32;
 static_assert(kLaneClusters == 8, "a byte says which of them are drawn");
 
-// Clusters [first, first + kPartSize) of one instance's table; or where `lanes` is not zero, for its bits k a
-// lane of instance + k: its top clusters, or the last of its table.
+// Clusters [first, first + kPartSize) of one instance's table; or where `lanes` is not zero, for
+// its bits k a lane of instance + k: its top clusters, or the last of its table.
 struct CutPart {
     uint32_t instance, first, lanes;
 };
@@ -31,8 +31,8 @@ struct PlacedScene {
     const BundleOnDevice* bundles;
     InstanceTable instances;
     InstanceView* views;  // of instances whose tables are asked
-    // Of instances with a lane of their own: a bit for each top that is drawn, or 0 where the lane asks the
-    // last clusters of the table.
+    // Of instances with a lane of their own: a bit for each top that is drawn, or 0 where the lane
+    // asks the last clusters of the table.
     uint8_t* tops;
     CutPart* parts;
 };
@@ -44,8 +44,8 @@ struct BudgetState {
     uint32_t last_bin = kNoBin;  // as tolerance_of_budget() keeps it
 };
 
-// One search for the tolerance of a budget: the first round looks at no tolerance below the guess, the second
-// at all. Without a budget there is one round, and no state.
+// One search for the tolerance of a budget: the first round looks at no tolerance below the guess,
+// the second at all. Without a budget there is one round, and no state.
 struct BudgetRound {
     const BudgetState* state;
     bool is_second;
@@ -53,18 +53,19 @@ struct BudgetRound {
     // Whether there is nothing to do, because the first round was enough.
     __device__ bool is_over() const { return is_second && state->again == 0; }
     __device__ float least_tolerance(const SelectRule& rule) const {
-        return state == nullptr || is_second ? rule.tolerance_px2 : fmaxf(rule.tolerance_px2, state->guess);
+        return state == nullptr || is_second ? rule.tolerance_px2
+                                             : fmaxf(rule.tolerance_px2, state->guess);
     }
 };
 
-// Enqueues the choice of the tolerance. `change`: kNumBudgetBins zeros before the first round. num_parts: on
-// the device; becomes 0 where no cut fits the budget.
+// Enqueues the choice of the tolerance. `change`: kNumBudgetBins zeros before the first round.
+// num_parts: on the device; becomes 0 where no cut fits the budget.
 void choose_tolerance(const PlacedScene& scene, const SelectRule& rule, const BudgetRound& round,
                       unsigned num_blocks, unsigned* num_parts, Count* change, CutChoice* choice,
                       BudgetState* state, cudaStream_t stream);
 
-// Weights of a lane's clusters, kWhole or less each: 16 bits for each, from the lowest on. The lane picks one
-// by shifting, for an index would put them into memory.
+// Weights of a lane's clusters, kWhole or less each: 16 bits for each, from the lowest on. The lane
+// picks one by shifting, for an index would put them into memory.
 struct alignas(16) LaneWeights {
     uint64_t low, high;
 
@@ -78,8 +79,8 @@ struct alignas(16) LaneWeights {
 };
 static_assert(kLaneClusters == 8 && kWhole < 1 << 16, "two words hold the weights of a lane");
 
-// What a lane has of a part: clusters of one instance, and a bit for each that is drawn. Weights are of cuts
-// with a fade alone.
+// What a lane has of a part: clusters of one instance, and a bit for each that is drawn. Weights
+// are of cuts with a fade alone.
 struct LaneClusters {
     const BundleOnDevice* bundle;
     uint32_t instance;
@@ -104,7 +105,8 @@ struct LaneClusters {
 __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const CutPart& part) {
     const unsigned lane = threadIdx.x % 32;
     const bool is_alone = part.lanes != 0;
-    LaneClusters mine{nullptr, part.instance, part.first + kLaneClusters * lane, is_alone, false, 0, {}};
+    LaneClusters mine{nullptr, part.instance, part.first + kLaneClusters * lane, is_alone, false, 0,
+                      {}};
     if (is_alone) {
         if ((part.lanes >> lane & 1) == 0) return mine;
         mine.instance += lane;
@@ -117,14 +119,14 @@ __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const 
     return mine;
 }
 
-// Asks the clusters of the tables that the warps of a block have parts of, for the lanes whose bounds do not
-// tell that none of theirs is drawn; for the whole block. All warps ask together, a lane a cluster and four
-// owners at a time, so that none waits long for another whose part has more to ask. Gives each owner a bit
-// for each of its clusters for which ask(bundle, view, cluster) was positive, and what that was where it
-// `kKeepsWeights`.
+// Asks the clusters of the tables that the warps of a block have parts of, for the lanes whose
+// bounds do not tell that none of theirs is drawn; for the whole block. All warps ask together, a
+// lane a cluster and four owners at a time, so that none waits long for another whose part has more
+// to ask. Gives each owner a bit for each of its clusters for which ask(bundle, view, cluster) was
+// positive, and what that was where it `kKeepsWeights`.
 template <bool kKeepsWeights, class Ask>
-__device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule, Tolerances tolerances,
-                             LaneClusters& mine, const Ask& ask) {
+__device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
+                             Tolerances tolerances, LaneClusters& mine, const Ask& ask) {
     struct Table {
         const BundleOnDevice* bundle;  // null: each lane has an instance of its own
         uint32_t first;                // cluster; there, the instance of the first lane
@@ -132,7 +134,8 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule, T
     __shared__ InstanceView views[kCutWarps];
     __shared__ Table tables[kCutWarps];
     __shared__ unsigned num_owners[kCutWarps];
-    __shared__ uint8_t owners[kCutThreads], drawn[kCutThreads];  // threads that own clusters; of each thread
+    __shared__ uint8_t owners[kCutThreads],
+        drawn[kCutThreads];  // threads that own clusters; of each thread
     __shared__ LaneWeights weights[kKeepsWeights ? kCutThreads : 1];
     static_assert(kCutThreads <= 256, "a byte says which thread");
     const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
@@ -148,8 +151,8 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule, T
     if (mine.bundle != nullptr && !mine.are_tops) {
         const ClusterTable& table = mine.bundle->table;
         const InstanceView& view = mine.is_alone ? scene.views[mine.instance] : views[warp];
-        is_owner =
-            mine.first < table.num_clusters() && may_draw(table, mine.bounds(), view, rule, tolerances);
+        is_owner = mine.first < table.num_clusters() &&
+                   may_draw(table, mine.bounds(), view, rule, tolerances);
     }
     const unsigned in_warp = __ballot_sync(kAllLanes, is_owner);
     if (lane == 0) num_owners[warp] = __popc(in_warp);
@@ -159,7 +162,8 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule, T
         if (w < warp) before += num_owners[w];
         total += num_owners[w];
     }
-    if (is_owner) owners[before + __popc(in_warp & ((1u << lane) - 1))] = static_cast<uint8_t>(threadIdx.x);
+    if (is_owner)
+        owners[before + __popc(in_warp & ((1u << lane) - 1))] = static_cast<uint8_t>(threadIdx.x);
     __syncthreads();
     constexpr unsigned kAtOnce = 32 / kLaneClusters;
     for (unsigned first = kAtOnce * warp; first < total; first += kAtOnce * kCutWarps) {
@@ -174,8 +178,8 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule, T
             const BundleOnDevice* bundle =
                 is_alone ? &scene.bundles[scene.instances.bundle[instance]] : of.bundle;
             const InstanceView& view = is_alone ? scene.views[instance] : views[owner / 32];
-            const uint32_t c =
-                k + (is_alone ? last_of_table(bundle->table) : of.first + kLaneClusters * (owner % 32));
+            const uint32_t c = k + (is_alone ? last_of_table(bundle->table)
+                                             : of.first + kLaneClusters * (owner % 32));
             if (c < bundle->table.num_clusters())
                 answer = static_cast<int32_t>(ask(*bundle, view, static_cast<int32_t>(c)));
         }

@@ -1,7 +1,7 @@
 #pragma once
 
-// Where a cut is written: as pairs, or as the items of a frame. A lane first counts what it will write of its
-// clusters, and writes that once it knows what is before it.
+// Where a cut is written: as pairs, or as the items of a frame. A lane first counts what it will
+// write of its clusters, and writes that once it knows what is before it.
 
 #include "select/cut_parts.cuh"
 
@@ -45,8 +45,8 @@ struct PairOutput {
     }
 };
 
-// Neighbouring clusters that are drawn together, for the lane's instance; or one that is drawn for all
-// instances of `sharers`, bits above the first of the part.
+// Neighbouring clusters that are drawn together, for the lane's instance; or one that is drawn for
+// all instances of `sharers`, bits above the first of the part.
 struct DrawnRun {
     unsigned k, num_clusters;
     uint32_t sharers;
@@ -55,14 +55,16 @@ struct DrawnRun {
     __device__ unsigned gaussians_an_item() const { return kItemSize / num_instances; }
 };
 
-// Whether a warp is quicker when it goes through a cluster's gaussians one by one, each for all instances at
-// once, than when it goes through the instances one by one. An item costs as much as two more rounds.
+// Whether a warp is quicker when it goes through a cluster's gaussians one by one, each for all
+// instances at once, than when it goes through the instances one by one. An item costs as much as
+// two more rounds.
 __device__ inline bool is_worth_sharing(unsigned num_gaussians, unsigned num_instances) {
-    return num_instances > 1 && num_gaussians <= num_instances * (blocks_for(num_gaussians, 32) + 2);
+    return num_instances > 1 &&
+           num_gaussians <= num_instances * (blocks_for(num_gaussians, 32) + 2);
 }
 
-// Calls visit(DrawnRun) in the lane that writes the run; for whole warps. With a fade, clusters of different
-// weights are not drawn together.
+// Calls visit(DrawnRun) in the lane that writes the run; for whole warps. With a fade, clusters of
+// different weights are not drawn together.
 template <bool kFades, class Visit>
 __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
     if (!mine.is_alone) {
@@ -94,8 +96,8 @@ __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
     }
 }
 
-// Selected clusters as items. Neighbouring clusters are drawn by the same items, and so are coarse ones that
-// neighbouring instances have in common. Each is written for every picture.
+// Selected clusters as items. Neighbouring clusters are drawn by the same items, and so are coarse
+// ones that neighbouring instances have in common. Each is written for every picture.
 template <bool kHasFade>
 struct ItemOutput {
     static constexpr bool kFades = kHasFade;
@@ -115,8 +117,10 @@ struct ItemOutput {
         for_each_drawn<kFades>(mine, [&](const DrawnRun& run) {
             static_assert(kLaneClusters <= kItemClusters, "a run may be as long");
             const int32_t cluster = mine.cluster(run.k);
-            const unsigned size = mine.size(run.k, run.num_clusters), step = run.gaussians_an_item();
-            const uint32_t placement = run.sharers == 0 ? mine.instance : mine.instance - threadIdx.x % 32;
+            const unsigned size = mine.size(run.k, run.num_clusters),
+                           step = run.gaussians_an_item();
+            const uint32_t placement =
+                run.sharers == 0 ? mine.instance : mine.instance - threadIdx.x % 32;
             const uint32_t gaussian = static_cast<uint32_t>(mine.bundle->table.first_row(cluster));
             const uint32_t place = mine.bundle->table.place_of(cluster);
             const ClusterAppearance& appearances = mine.bundle->appearance;

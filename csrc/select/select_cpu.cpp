@@ -1,5 +1,5 @@
-// Threads work on chunks of instances. What the decision asks of a group is answered once; its clusters then
-// look it up.
+// Threads work on chunks of instances. What the decision asks of a group is answered once; its
+// clusters then look it up.
 
 #include "select/select.h"
 
@@ -16,7 +16,8 @@ namespace {
 
 constexpr size_t kChunk = 16;
 constexpr size_t kBudgetParts = 16;
-constexpr size_t kManyInstances = 16;  // of a bundle, for which its runs pay: those cost about one instance
+constexpr size_t kManyInstances =
+    16;  // of a bundle, for which its runs pay: those cost about one instance
 
 // Answers for the groups of one instance: how far each is refined, or its bins.
 struct KnownRefinements {
@@ -37,8 +38,8 @@ struct KnownBins {
 // What to select from, with what all instances share.
 struct View {
     const SelectInput& in;
-    std::vector<FrustumSides> sides;            // of each bundle
-    std::vector<ClusterRuns> runs;              // likewise, once found; none where it has few instances
+    std::vector<FrustumSides> sides;  // of each bundle
+    std::vector<ClusterRuns> runs;    // likewise, once found; none where it has few instances
     size_t most_groups = 0, most_clusters = 0;  // of any bundle
 
     explicit View(const SelectInput& input) : in(input) {
@@ -100,7 +101,8 @@ struct SeenInstance {
                     {0, static_cast<uint32_t>(table.ball.size)}};
         if (runs.count == 0 || !table.pages.is_whole()) return asked;
         asked.clusters = clusters_to_ask(table, runs, view, rule, tolerances);
-        // Of most clusters, these are most groups, and to find them out costs more than to ask the rest.
+        // Of most clusters, these are most groups, and to find them out costs more than to ask the
+        // rest.
         if (asked.clusters.end - asked.clusters.first > table.num_clusters() / 2) return asked;
         int32_t first = static_cast<int32_t>(table.ball.size), last = -1;
         for (uint32_t c = asked.clusters.first; c < asked.clusters.end; ++c) {
@@ -108,7 +110,8 @@ struct SeenInstance {
             first = std::min(first, own >= 0 ? own : parent >= 0 ? parent : first);
             last = std::max({last, own, parent});
         }
-        asked.groups = {static_cast<uint32_t>(std::min(first, last + 1)), static_cast<uint32_t>(last + 1)};
+        asked.groups = {static_cast<uint32_t>(std::min(first, last + 1)),
+                        static_cast<uint32_t>(last + 1)};
         return asked;
     }
 };
@@ -125,19 +128,21 @@ struct Scratch {
           priority(view.in.needs.empty() ? 0 : view.most_groups) {}
 };
 
-// Answers for all groups of an instance. What it reads comes as copies, which nothing that it writes can
-// change, so that the compiler works on several groups at once. Those that are absent, which it could not ask
-// for at once, are not refined whatever the answer, and those that fade in no further than they have.
+// Answers for all groups of an instance. What it reads comes as copies, which nothing that it
+// writes can change, so that the compiler works on several groups at once. Those that are absent,
+// which it could not ask for at once, are not refined whatever the answer, and those that fade in
+// no further than they have.
 template <Footprint footprint, bool kFades>
-void ask_groups(ClusterTable table, const InstanceView view, SelectRule rule, const ClusterRange asked,
-                uint16_t* __restrict refinement) {
+void ask_groups(ClusterTable table, const InstanceView view, SelectRule rule,
+                const ClusterRange asked, uint16_t* __restrict refinement) {
     rule.footprint = footprint;
     if (!kFades) rule.fade = {};
     const PageTable pages = table.pages;
     table.pages = {};
     const AskedGroups groups{table, view, rule};
     const auto first = static_cast<int32_t>(asked.first), end = static_cast<int32_t>(asked.end);
-    for (int32_t g = first; g < end; ++g) refinement[g] = static_cast<uint16_t>(groups.refinement(g));
+    for (int32_t g = first; g < end; ++g)
+        refinement[g] = static_cast<uint16_t>(groups.refinement(g));
     for (int32_t g = first; g < end && !pages.is_whole(); ++g) {
         const int32_t most = pages.is_resident(g) ? arrival(pages, g, rule) : 0;
         refinement[g] = static_cast<uint16_t>(min_of<int32_t>(refinement[g], most));
@@ -172,17 +177,19 @@ size_t find_sufficient(const ClusterTable table, const InstanceView view, const 
 void raise(uint32_t& need, float priority) {
     uint32_t bits, before = __atomic_load_n(&need, __ATOMIC_RELAXED);
     std::memcpy(&bits, &priority, sizeof bits);
-    while (before < bits &&
-           !__atomic_compare_exchange_n(&need, &before, bits, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+    while (before < bits && !__atomic_compare_exchange_n(&need, &before, bits, true,
+                                                         __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
     }
 }
 
 // Tells which pages an instance needs whose table is asked.
 template <class Cut>
-void tell_needs(const Cut& cut, const SelectRule& rule, Span<uint32_t> needs, std::vector<float>& priority) {
+void tell_needs(const Cut& cut, const SelectRule& rule, Span<uint32_t> needs,
+                std::vector<float>& priority) {
     const ClusterTable& table = cut.table;
     for (size_t g = 0; g < table.ball.size; ++g)
-        priority[g] = priority_of(wanted_metric_px2(table, static_cast<int32_t>(g), cut.view, rule), rule);
+        priority[g] =
+            priority_of(wanted_metric_px2(table, static_cast<int32_t>(g), cut.view, rule), rule);
     for (size_t c = 0; c < table.num_clusters(); ++c) {
         const PageNeed need = page_need(table, c, [&](int32_t g) { return priority[g]; });
         if (need.page >= 0 && !cut.is_culled(c)) raise(needs[need.page], need.priority);
@@ -214,13 +221,15 @@ void select_instance(const View& view, const SelectRule& rule, size_t i, Scratch
     if (rule.fade.is_on())
         for (const int32_t* c = chosen; c != end; ++c)
             out.weight.push_back(source == CutSource::tops ? 1.0f : share_of(cut.weight(*c)));
-    out.num_gaussians += std::accumulate(
-        chosen, end, int64_t(0), [&](int64_t sum, int32_t c) { return sum + seen.table.num_gaussians(c); });
+    out.num_gaussians += std::accumulate(chosen, end, int64_t(0), [&](int64_t sum, int32_t c) {
+        return sum + seen.table.num_gaussians(c);
+    });
 }
 
-// Adds to `change`, for each tolerance that a budget chooses from, by how many gaussians the cut of instance
-// i differs from that of the tolerance before. `bins` has room for those of its groups.
-void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins, std::vector<int64_t>& change) {
+// Adds to `change`, for each tolerance that a budget chooses from, by how many gaussians the cut of
+// instance i differs from that of the tolerance before. `bins` has room for those of its groups.
+void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins,
+                    std::vector<int64_t>& change) {
     const SelectRule& rule = view.in.rule;
     const SeenInstance seen(view, i);
     const CutSource source = seen.source(rule);
@@ -245,8 +254,8 @@ void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins, st
     }
 }
 
-// Sets the tolerance of `rule`. Returns whether a cut fits; if none does, `least_count` is what the coarsest
-// one has.
+// Sets the tolerance of `rule`. Returns whether a cut fits; if none does, `least_count` is what the
+// coarsest one has.
 bool meet_budget(const View& view, SelectRule& rule, int64_t& least_count) {
     const size_t num_instances = view.in.instances.bundle.size;
     // Each part takes every kBudgetParts-th instance, because neighbours cost about the same.
@@ -300,13 +309,16 @@ void cpu::select(const SelectInput& in, SelectOutput& out) {
     out.cluster.resize(first[num_chunks]);
     out.weight.resize(rule.fade.is_on() ? first[num_chunks] : 0);
     for (size_t k = 0; k < num_chunks; ++k) {
-        std::copy(chunks[k].instance.begin(), chunks[k].instance.end(), out.instance.begin() + first[k]);
-        std::copy(chunks[k].cluster.begin(), chunks[k].cluster.end(), out.cluster.begin() + first[k]);
+        std::copy(chunks[k].instance.begin(), chunks[k].instance.end(),
+                  out.instance.begin() + first[k]);
+        std::copy(chunks[k].cluster.begin(), chunks[k].cluster.end(),
+                  out.cluster.begin() + first[k]);
         std::copy(chunks[k].weight.begin(), chunks[k].weight.end(), out.weight.begin() + first[k]);
     }
 }
 
-void cpu::group_metrics(const SelectInput& in, Span<const int64_t> metric_offset, Span<float> metric) {
+void cpu::group_metrics(const SelectInput& in, Span<const int64_t> metric_offset,
+                        Span<float> metric) {
     const View view(in);
     parallel_for(in.instances.bundle.size, kChunk, [&](size_t i) {
         const SeenInstance seen(view, i);
@@ -340,7 +352,8 @@ void cpu::bounds_may_draw(const SelectInput& in, Tolerances tolerances, Span<con
         const SeenInstance seen(view, i);
         if (!seen.is_placed) return;
         const int32_t bundle = in.instances.bundle[i];
-        const ClusterRange asked = clusters_to_ask(seen.table, runs[bundle], seen.view, in.rule, tolerances);
+        const ClusterRange asked =
+            clusters_to_ask(seen.table, runs[bundle], seen.view, in.rule, tolerances);
         for (size_t k = asked.first / kClustersOfBounds; k * kClustersOfBounds < asked.end; ++k)
             may_draw[first[i] + k] =
                 v3dg::may_draw(seen.table, bounds[bundle][k], seen.view, in.rule, tolerances);

@@ -7,9 +7,9 @@
 
 namespace v3dg {
 
-// The side planes of a frustum in camera coordinates: right, left, bottom, top. Outside: sign * x > slope *
-// z, or y for x. Of two eyes each plane has the larger slope, so that what lies outside it as seen from both
-// lies outside of both frusta.
+// The side planes of a frustum in camera coordinates: right, left, bottom, top. Outside: sign * x >
+// slope * z, or y for x. Of two eyes each plane has the larger slope, so that what lies outside it
+// as seen from both lies outside of both frusta.
 struct FrustumSides {
     double slope[4];
     float guard[4];  // Plane::guard
@@ -42,7 +42,8 @@ V3DG_HD inline FrustumSides frustum_sides(const Eyes& eyes, double pad_px) {
 
 // `in` are the axes of the first eye.
 V3DG_HD inline InstanceView view_from_instance(const Eyes& eyes, const FrustumSides& sides,
-                                               const InstanceAxes& in, const Pose& pose, float importance) {
+                                               const InstanceAxes& in, const Pose& pose,
+                                               float importance) {
     const Camera& camera = eyes.camera[0];
     double near = camera.near * (1.0 / pose.scale) - in.origin[2], px2 = camera.fx * camera.fy;
     InstanceAxes other = in;
@@ -71,8 +72,9 @@ V3DG_HD inline InstanceView view_from_instance(const Eyes& eyes, const FrustumSi
         for (int k = 0; k < 3; ++k)
             plane.normal[k] = static_cast<float>(sign * axis[k] - slope * in.axes[6 + k]);
         const int across = side < 2 ? 0 : 1;
-        plane.offset = static_cast<float>(min_of(sign * in.origin[across] - slope * in.origin[2],
-                                                 sign * other.origin[across] - slope * other.origin[2]));
+        plane.offset =
+            static_cast<float>(min_of(sign * in.origin[across] - slope * in.origin[2],
+                                      sign * other.origin[across] - slope * other.origin[2]));
         plane.guard = sides.guard[side];
     }
     return view;

@@ -1,5 +1,6 @@
-// Merging: a block takes a group through all its rounds. Nodes are in device memory, where a group of
-// hundreds stays in the caches, and pass through shared memory in tiles while partners are sought.
+// Merging: a block takes a group through all its rounds. Nodes are in device memory, where a group
+// of hundreds stays in the caches, and pass through shared memory in tiles while partners are
+// sought.
 
 #include <algorithm>
 #include <cfloat>
@@ -14,15 +15,17 @@ namespace cuda {
 namespace {
 
 constexpr int kBlockSize = 256, kWarps = kBlockSize / 32;
-constexpr int kTileSize = 128;                   // nodes in shared memory
-constexpr int64_t kMostRows = int64_t(1) << 21;  // of the groups that are merged at once: 350 MiB of scratch
+constexpr int kTileSize = 128;  // nodes in shared memory
+constexpr int64_t kMostRows = int64_t(1)
+                              << 21;  // of the groups that are merged at once: 350 MiB of scratch
 
 // Scratch for one row of a group.
 struct Scratch {
     MergeNode* nodes;
     double* row_weight;
     MergePair *pairs, *sorted;
-    int *alive, *next, *last;  // a node is known by the first row it holds; its other rows follow in a list
+    int *alive, *next,
+        *last;  // a node is known by the first row it holds; its other rows follow in a list
     uint8_t* is_used;
 
     __device__ Scratch at(int64_t row) const {
@@ -32,8 +35,8 @@ struct Scratch {
 };
 
 // Makes each row a node; returns the scale of distances.
-__device__ double start_nodes(const GaussianRows<const float>& in, int64_t first, int count, int64_t wanted,
-                              const Scratch& group) {
+__device__ double start_nodes(const GaussianRows<const float>& in, int64_t first, int count,
+                              int64_t wanted, const Scratch& group) {
     double low[3] = {DBL_MAX, DBL_MAX, DBL_MAX}, minus_high[3] = {DBL_MAX, DBL_MAX, DBL_MAX};
     for (int i = threadIdx.x; i < count; i += kBlockSize) {
         const MergeNode node = merge_node_of(in, first + i);
@@ -91,7 +94,8 @@ __device__ void find_partners(const Scratch& group, int n, double inverse_spacin
                 }
             }
         }
-        if (i < n) group.pairs[i] = {cheapest, i < partner ? i : partner, i < partner ? partner : i};
+        if (i < n)
+            group.pairs[i] = {cheapest, i < partner ? i : partner, i < partner ? partner : i};
     }
 }
 
@@ -120,8 +124,8 @@ __device__ void sort_pairs(const Scratch& group, int n) {
     }
 }
 
-// Takes the sorted pairs whose gaussians no pair before has, `allowed` at most, to the front of `pairs`;
-// returns how many. One warp does it.
+// Takes the sorted pairs whose gaussians no pair before has, `allowed` at most, to the front of
+// `pairs`; returns how many. One warp does it.
 __device__ int choose_pairs(const Scratch& group, int n, int64_t allowed) {
     const int lane = static_cast<int>(threadIdx.x % 32);
     int chosen = 0;
@@ -176,8 +180,8 @@ __device__ void drop_joined(const Scratch& group, int n) {
     }
 }
 
-__device__ void write_rows(const GaussianRows<const float>& in, int64_t first, const Scratch& group, int n,
-                           const GaussianRows<float>& out, int64_t to) {
+__device__ void write_rows(const GaussianRows<const float>& in, int64_t first, const Scratch& group,
+                           int n, const GaussianRows<float>& out, int64_t to) {
     for (int i = threadIdx.x; i < n; i += kBlockSize) {
         const int node = group.alive[i];
         if (group.next[node] < 0)
@@ -186,7 +190,8 @@ __device__ void write_rows(const GaussianRows<const float>& in, int64_t first, c
             write_joined(group.nodes[node], out, to + i);
     }
     for (int64_t item = threadIdx.x; item < int64_t(n) * in.num_sh(); item += kBlockSize) {
-        const int i = static_cast<int>(item / in.num_sh()), k = static_cast<int>(item % in.num_sh());
+        const int i = static_cast<int>(item / in.num_sh()),
+                  k = static_cast<int>(item % in.num_sh());
         const int node = group.alive[i];
         float value = in.sh[in.num_sh() * (first + node) + k];
         if (group.next[node] >= 0) {
@@ -231,8 +236,8 @@ __global__ void __launch_bounds__(kBlockSize)
 
 }  // namespace
 
-void merge(const GaussianRows<const float>& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset,
-           const GaussianRows<float>& out, Stream stream) {
+void merge(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
+           Span<const int64_t> out_offset, const GaussianRows<float>& out, Stream stream) {
     const size_t num_groups = in_offset.size - 1;
     // Runs of groups that share the scratch.
     const auto end_of_run = [&](size_t first) {
@@ -252,8 +257,8 @@ void merge(const GaussianRows<const float>& in, Span<const int64_t> in_offset, S
     const Scratch scratch{nodes.data(), row_weight.data(), pairs.data(), sorted.data(),
                           alive.data(), next.data(),       last.data(),  is_used.data()};
     for (size_t first = 0; first < num_groups; first = end_of_run(first))
-        launch("merge", merge_kernel, static_cast<unsigned>(end_of_run(first) - first), kBlockSize, 0, stream,
-               in, in_offsets.data(), out_offsets.data(), first, scratch, out);
+        launch("merge", merge_kernel, static_cast<unsigned>(end_of_run(first) - first), kBlockSize,
+               0, stream, in, in_offsets.data(), out_offsets.data(), first, scratch, out);
 }
 
 }  // namespace cuda

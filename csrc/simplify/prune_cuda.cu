@@ -1,5 +1,5 @@
-// Pruning: a block ranks the gaussians of one cell, of which the median split has eight a group; the rows
-// that are kept are then gathered in ascending order.
+// Pruning: a block ranks the gaussians of one cell, of which the median split has eight a group;
+// the rows that are kept are then gathered in ascending order.
 
 #include <cub/device/device_select.cuh>
 
@@ -48,9 +48,10 @@ __global__ void keep_kernel(const Cell* cells, const int64_t* order, const doubl
 
 }  // namespace
 
-void prune(const GaussianRows<const float>& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset,
-           Span<int64_t> kept, Stream stream) {
-    const size_t num_groups = in_offset.size - 1, count = static_cast<size_t>(in_offset[num_groups]);
+void prune(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
+           Span<const int64_t> out_offset, Span<int64_t> kept, Stream stream) {
+    const size_t num_groups = in_offset.size - 1,
+                 count = static_cast<size_t>(in_offset[num_groups]);
     if (count == 0) return;
     std::vector<int64_t> cell_offset(num_groups * kPruneCells + 1);
     DeviceBuffer<int64_t> order(count, stream), rows(count, stream), num_kept(1, stream);
@@ -60,7 +61,8 @@ void prune(const GaussianRows<const float>& in, Span<const int64_t> in_offset, S
     for (size_t c = 0; c < cells.size(); ++c) {
         const size_t g = c / kPruneCells;
         const CellShares shares{in_offset[g], in_offset[g + 1], out_offset[g + 1] - out_offset[g]};
-        cells[c] = {cell_offset[c], cell_offset[c + 1], shares.of(cell_offset[c], cell_offset[c + 1])};
+        cells[c] = {cell_offset[c], cell_offset[c + 1],
+                    shares.of(cell_offset[c], cell_offset[c + 1])};
     }
     const DeviceBuffer<Cell> cells_on_device(Span<const Cell>{cells.data(), cells.size()}, stream);
     DeviceBuffer<double> score_at(count, stream);

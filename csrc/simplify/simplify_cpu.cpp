@@ -17,15 +17,17 @@ void cpu::prune(const GaussianRows<const float>& in, Span<const int64_t> in_offs
     median_split({reinterpret_cast<const Point*>(in.means), count}, in_offset, kPruneHalvings,
                  {order.data(), count}, {cell.data(), cell.size()});
     std::vector<double> score(count);
-    parallel_for(count, 4096, [&](size_t i) { score[i] = prune_score(in.scales + 3 * i, in.opacities[i]); });
+    parallel_for(count, 4096,
+                 [&](size_t i) { score[i] = prune_score(in.scales + 3 * i, in.opacities[i]); });
     parallel_for(num_groups, 1, [&](size_t g) {
         const CellShares shares{in_offset[g], in_offset[g + 1], out_offset[g + 1] - out_offset[g]};
         int64_t* out = kept.data + out_offset[g];
         for (size_t c = g * kPruneCells; c < (g + 1) * kPruneCells; ++c) {
             const int64_t share = shares.of(cell[c], cell[c + 1]);
-            std::sort(order.begin() + cell[c], order.begin() + cell[c + 1], [&](int64_t a, int64_t b) {
-                return score[a] != score[b] ? score[a] > score[b] : a < b;
-            });
+            std::sort(order.begin() + cell[c], order.begin() + cell[c + 1],
+                      [&](int64_t a, int64_t b) {
+                          return score[a] != score[b] ? score[a] > score[b] : a < b;
+                      });
             out = std::copy_n(order.begin() + cell[c], share, out);
         }
         std::sort(kept.data + out_offset[g], out);

@@ -10,10 +10,10 @@
 
 namespace v3dg {
 
-// Importance by which pruning decides: the cube of opacity * (s1 s2 s3)^(2/3) (V3DG, section 3.2: product of
-// scale and opacity), which orders gaussians as that does and needs no roots, whose last bits differ from
-// library to library. Squares of volumes of float32 scales do not overflow float64; what vanishes is smaller
-// than anything that is seen.
+// Importance by which pruning decides: the cube of opacity * (s1 s2 s3)^(2/3) (V3DG, section 3.2:
+// product of scale and opacity), which orders gaussians as that does and needs no roots, whose last
+// bits differ from library to library. Squares of volumes of float32 scales do not overflow
+// float64; what vanishes is smaller than anything that is seen.
 V3DG_HD inline double prune_score(const float scale[3], float opacity) {
     const double volume = static_cast<double>(scale[0]) * scale[1] * scale[2];
     const double o = opacity;
@@ -23,7 +23,8 @@ V3DG_HD inline double prune_score(const float scale[3], float opacity) {
 // Pruning keeps the same share of each of these cells of a median split.
 constexpr int kPruneHalvings = 3, kPruneCells = 1 << kPruneHalvings;
 
-// How many of a cell's gaussians are kept when `wanted` of first .. last are: rounded so that they add up.
+// How many of a cell's gaussians are kept when `wanted` of first .. last are: rounded so that they
+// add up.
 struct CellShares {
     int64_t first, last, wanted;
     V3DG_HD int64_t of(int64_t cell_first, int64_t cell_last) const {
@@ -33,9 +34,10 @@ struct CellShares {
     }
 };
 
-// Surface area of an ellipsoid over 4 pi, within 1.2 %: the mean of its shadow, sqrt(b2c2 x2 + a2c2 y2 +
-// a2b2 z2), over directions along axes, between two and between all three, with the weights that make the
-// largest error of any shape the smallest. Roots alone, whose bits no library decides.
+// Surface area of an ellipsoid over 4 pi, within 1.2 %: the mean of its shadow, sqrt(b2c2 x2 + a2c2
+// y2 + a2b2 z2), over directions along axes, between two and between all three, with the weights
+// that make the largest error of any shape the smallest. Roots alone, whose bits no library
+// decides.
 V3DG_HD inline double ellipsoid_area(double a, double b, double c) {
     constexpr double kAlongOne = 0.0604247, kBetweenTwo = 0.1013528, kBetweenThree = 0.5029995;
     const double bc = b * c, ac = a * c, ab = a * b;
@@ -53,12 +55,14 @@ V3DG_HD inline void covariance_of(const double quat[4], const double scale[3], d
     for (int i = 0; i < 3; ++i)
         for (int k = i; k < 3; ++k) {
             cov[at] = 0;
-            for (int j = 0; j < 3; ++j) cov[at] += r[3 * i + j] * r[3 * k + j] * scale[j] * scale[j];
+            for (int j = 0; j < 3; ++j)
+                cov[at] += r[3 * i + j] * r[3 * k + j] * scale[j] * scale[j];
             ++at;
         }
 }
 
-// Scales of a covariance and the rotation to its axes, whose columns they belong to: cyclic Jacobi rotations.
+// Scales of a covariance and the rotation to its axes, whose columns they belong to: cyclic Jacobi
+// rotations.
 V3DG_HD inline void scale_and_axes_of(const double cov[6], double scale[3], double e[3][3]) {
     double a[3][3] = {{cov[0], cov[1], cov[2]}, {cov[1], cov[3], cov[4]}, {cov[2], cov[4], cov[5]}};
     for (int i = 0; i < 3; ++i)
@@ -106,8 +110,10 @@ V3DG_HD inline void quat_of_axes(const double e[3][3], double quat[4]) {
     for (int k = 1; k < 4; ++k)
         if (four[k] > four[largest]) largest = k;
     const double h = sqrt(four[largest]) / 2, f = 1 / (4 * h);
-    const double yz = (e[2][1] - e[1][2]) * f, zx = (e[0][2] - e[2][0]) * f, xy = (e[1][0] - e[0][1]) * f;
-    const double sxy = (e[0][1] + e[1][0]) * f, sxz = (e[0][2] + e[2][0]) * f, syz = (e[1][2] + e[2][1]) * f;
+    const double yz = (e[2][1] - e[1][2]) * f, zx = (e[0][2] - e[2][0]) * f,
+                 xy = (e[1][0] - e[0][1]) * f;
+    const double sxy = (e[0][1] + e[1][0]) * f, sxz = (e[0][2] + e[2][0]) * f,
+                 syz = (e[1][2] + e[2][1]) * f;
     const double by_largest[4][4] = {
         {h, yz, zx, xy}, {yz, h, sxy, sxz}, {zx, sxy, h, syz}, {xy, sxz, syz, h}};
     for (int k = 0; k < 4; ++k) quat[k] = by_largest[largest][k];
@@ -140,27 +146,30 @@ V3DG_HD inline MergeNode merge_node_of(const GaussianRows<const float>& in, int6
     return node;
 }
 
-// What a pair loses: the variance that joining adds, in place (over the area that each gaussian that is left
-// stands for) and in colour. Ward's criterion, weighted by what the gaussians cover.
-V3DG_HD inline double merge_cost(const MergeFeature& a, const MergeFeature& b, double inverse_spacing2) {
+// What a pair loses: the variance that joining adds, in place (over the area that each gaussian
+// that is left stands for) and in colour. Ward's criterion, weighted by what the gaussians cover.
+V3DG_HD inline double merge_cost(const MergeFeature& a, const MergeFeature& b,
+                                 double inverse_spacing2) {
     constexpr double kColorWeight = 6;
     double place = 0, color = 0;
     for (int k = 0; k < 3; ++k) {
         place += (a.mean[k] - b.mean[k]) * (a.mean[k] - b.mean[k]);
         color += (a.color[k] - b.color[k]) * (a.color[k] - b.color[k]);
     }
-    return a.weight * b.weight / (a.weight + b.weight) * (place * inverse_spacing2 + kColorWeight * color);
+    return a.weight * b.weight / (a.weight + b.weight) *
+           (place * inverse_spacing2 + kColorWeight * color);
 }
 
 // One over the squared size of the box around the means, per gaussian that is wanted.
-V3DG_HD inline double inverse_spacing2_of(const double low[3], const double high[3], int64_t wanted) {
+V3DG_HD inline double inverse_spacing2_of(const double low[3], const double high[3],
+                                          int64_t wanted) {
     double extent2 = 0;
     for (int k = 0; k < 3; ++k) extent2 += (high[k] - low[k]) * (high[k] - low[k]);
     return extent2 > 0 ? static_cast<double>(wanted) / extent2 : 0;
 }
 
-// Two gaussians, a before b, and what joining them costs. The cheaper pair is before the other; ties by
-// index.
+// Two gaussians, a before b, and what joining them costs. The cheaper pair is before the other;
+// ties by index.
 struct MergePair {
     double cost;
     int a, b;
@@ -169,9 +178,11 @@ V3DG_HD inline bool is_before(const MergePair& x, const MergePair& y) {
     return x.cost != y.cost ? x.cost < y.cost : (x.a != y.a ? x.a < y.a : x.b < y.b);
 }
 
-// Most pairs that one round joins of `count` gaussians: half of what is still to go, so that what was joined
-// is weighed again.
-V3DG_HD inline int64_t pairs_in_round(int64_t count, int64_t wanted) { return (count - wanted + 1) / 2; }
+// Most pairs that one round joins of `count` gaussians: half of what is still to go, so that what
+// was joined is weighed again.
+V3DG_HD inline int64_t pairs_in_round(int64_t count, int64_t wanted) {
+    return (count - wanted + 1) / 2;
+}
 
 // Makes `a` what both are together.
 V3DG_HD inline void join(MergeNode& a, const MergeNode& b) {
@@ -197,7 +208,8 @@ V3DG_HD inline void join(MergeNode& a, const MergeNode& b) {
 }
 
 // Writes place, shape and opacity of a joined gaussian.
-V3DG_HD inline void write_joined(const MergeNode& node, const GaussianRows<float>& out, int64_t to) {
+V3DG_HD inline void write_joined(const MergeNode& node, const GaussianRows<float>& out,
+                                 int64_t to) {
     double scale[3], axes[3][3], quat[4];
     scale_and_axes_of(node.cov, scale, axes);
     quat_of_axes(axes, quat);

@@ -6,8 +6,9 @@
 #include "base/parallel_for.h"
 #include "base/stop.h"
 
-// Each chunk is counted, scanned and scattered alone, and most reach few tiles; then each tile takes what is
-// its own, chunk by chunk, so the order of the entries does not depend on which thread took which chunk.
+// Each chunk is counted, scanned and scattered alone, and most reach few tiles; then each tile
+// takes what is its own, chunk by chunk, so the order of the entries does not depend on which
+// thread took which chunk.
 
 namespace v3dg {
 
@@ -16,10 +17,14 @@ static constexpr EntryFormat kChunkFormat = EntryFormat::of(kMostChunkRecords, 0
 
 // Calls visit(tile, box in it) for the tiles that a record's box meets; most meet one.
 template <class T, class Visit>
-static V3DG_INLINE void for_each_tile(const Record<T>& r, const TileGrid& grid, const Visit& visit) {
-    const int x0 = r.x0 / kTileSize, x1 = r.x1 / kTileSize, y0 = r.y0 / kTileSize, y1 = r.y1 / kTileSize;
-    const uint32_t left = r.x0 / kBlockSize % kTileBlocks, right = r.x1 / kBlockSize % kTileBlocks << 3;
-    const uint32_t top = r.y0 / kBlockSize % kTileBlocks << 6, bottom = r.y1 / kBlockSize % kTileBlocks << 9;
+static V3DG_INLINE void for_each_tile(const Record<T>& r, const TileGrid& grid,
+                                      const Visit& visit) {
+    const int x0 = r.x0 / kTileSize, x1 = r.x1 / kTileSize, y0 = r.y0 / kTileSize,
+              y1 = r.y1 / kTileSize;
+    const uint32_t left = r.x0 / kBlockSize % kTileBlocks,
+                   right = r.x1 / kBlockSize % kTileBlocks << 3;
+    const uint32_t top = r.y0 / kBlockSize % kTileBlocks << 6,
+                   bottom = r.y1 / kBlockSize % kTileBlocks << 9;
     size_t row = static_cast<size_t>(y0 - grid.first_row) * grid.columns - grid.first_column;
     if (x0 == x1 && y0 == y1) return visit(row + x0, left | right | top | bottom);
     constexpr uint32_t kLast = kTileBlocks - 1;
@@ -31,11 +36,11 @@ static V3DG_INLINE void for_each_tile(const Record<T>& r, const TileGrid& grid, 
 }
 
 template <class T>
-void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const TileGrid& grid, size_t chunk,
-               TileLists& out) {
+void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const TileGrid& grid,
+               size_t chunk, TileLists& out) {
     const size_t num_tiles = grid.size();
-    // Counts, then where a tile's entries begin, then where the next one goes, which ends where the next
-    // tile's begin.
+    // Counts, then where a tile's entries begin, then where the next one goes, which ends where the
+    // next tile's begin.
     uint32_t* offset = out.chunk_offset.data() + chunk * (num_tiles + 1);
     std::memset(offset, 0, (num_tiles + 1) * sizeof *offset);
     const Record<T>* record = records + first;
@@ -55,7 +60,8 @@ void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const T
         least = std::min(least, depth);
         most = std::max(most, depth);
         const uint64_t whole = kChunkFormat.entry(depth, i, 0);
-        for_each_tile(r, grid, [&](size_t t, uint32_t box) { entry[offset[t + 1]++] = whole | box; });
+        for_each_tile(r, grid,
+                      [&](size_t t, uint32_t box) { entry[offset[t + 1]++] = whole | box; });
     }
     out.chunk[chunk].first = first;
     out.chunk[chunk].count = count;
@@ -76,7 +82,8 @@ static EntryFormat format_of(const TileLists::Chunk* chunk, size_t num_chunks) {
     return EntryFormat::of(end, std::min(least, most), most);
 }
 
-void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out, const std::atomic<bool>* stop) {
+void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out,
+                 const std::atomic<bool>* stop) {
     const size_t num_tiles = grid.size(), stride = num_tiles + 1;
     const uint32_t* from = out.chunk_offset.data();
     uint64_t* offset = out.offset.reserve(stride);
@@ -103,9 +110,10 @@ void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out, const 
             for (size_t t = first; t < last; ++t) {
                 uint64_t* to = entry + next[t - first];
                 for (uint32_t i = here[t]; i < here[t + 1]; ++i)
-                    *to++ = format.entry(static_cast<uint32_t>(source[i] >> kChunkFormat.depth_shift),
-                                         first_record, 0) +
-                            (source[i] & kLow);
+                    *to++ =
+                        format.entry(static_cast<uint32_t>(source[i] >> kChunkFormat.depth_shift),
+                                     first_record, 0) +
+                        (source[i] & kLow);
                 next[t - first] += here[t + 1] - here[t];
             }
         }
@@ -125,8 +133,8 @@ static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_
         for (size_t i = 0; i < count; ++i) entry[i] = (entry[i] & ~low) | scratch[entry[i] & low];
         return;
     }
-    // Least significant digit first over the bits in which depths differ once the least is taken away;
-    // stable.
+    // Least significant digit first over the bits in which depths differ once the least is taken
+    // away; stable.
     constexpr int kMostBits = 12;
     const int most_bits = count < 1024 ? 8 : kMostBits;  // few entries for few counters
     uint64_t least = ~uint64_t(0), most = 0;
@@ -160,15 +168,16 @@ static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_
 
 // Sorts entries by their records' depths; equal ones stay in their order.
 template <class T>
-static void sort_by_records(const Record<T>* records, EntryFormat format, uint64_t* first, uint64_t* last) {
+static void sort_by_records(const Record<T>* records, EntryFormat format, uint64_t* first,
+                            uint64_t* last) {
     std::stable_sort(first, last, [&](uint64_t a, uint64_t b) {
         return records[format.record_of(a)].depth < records[format.record_of(b)].depth;
     });
 }
 
 template <>
-void sort_tile<float>(const Record<float>* records, EntryFormat format, uint64_t* entry, size_t count,
-                      uint64_t* scratch) {
+void sort_tile<float>(const Record<float>* records, EntryFormat format, uint64_t* entry,
+                      size_t count, uint64_t* scratch) {
     const int depth_shift = format.depth_shift;
     sort_by_bits(depth_shift, entry, count, scratch);
     if (format.dropped_bits == 0) return;
@@ -182,12 +191,13 @@ void sort_tile<float>(const Record<float>* records, EntryFormat format, uint64_t
 
 // What entries hold of depths is less than a double.
 template <>
-void sort_tile<double>(const Record<double>* records, EntryFormat format, uint64_t* entry, size_t count,
-                       uint64_t*) {
+void sort_tile<double>(const Record<double>* records, EntryFormat format, uint64_t* entry,
+                       size_t count, uint64_t*) {
     sort_by_records(records, format, entry, entry + count);
 }
 
-template void bin_chunk<float>(const Record<float>*, uint64_t, uint32_t, const TileGrid&, size_t, TileLists&);
+template void bin_chunk<float>(const Record<float>*, uint64_t, uint32_t, const TileGrid&, size_t,
+                               TileLists&);
 template void bin_chunk<double>(const Record<double>*, uint64_t, uint32_t, const TileGrid&, size_t,
                                 TileLists&);
 

@@ -1,6 +1,6 @@
-// Count, scan, scatter. Records over few tiles have been counted where they were projected; here those over
-// many are, their rows of tiles spread over a warp. Compiled without contraction, so that the counting and
-// the scattering kernel see the same ellipse.
+// Count, scan, scatter. Records over few tiles have been counted where they were projected; here
+// those over many are, their rows of tiles spread over a warp. Compiled without contraction, so
+// that the counting and the scattering kernel see the same ellipse.
 
 #include "tile_bin/tile_bin_cuda.h"
 
@@ -20,7 +20,8 @@ constexpr unsigned kBlocks = 5;  // on a multiprocessor with 164 KiB of shared m
 
 // Of the kernel that counts large records.
 constexpr unsigned kCountThreads = 512, kCountBlocks = 3;
-constexpr unsigned kLeastLarge = 16;  // large records for each tile, for blocks to count on their own
+constexpr unsigned kLeastLarge =
+    16;  // large records for each tile, for blocks to count on their own
 
 // Large records that a warp takes together; lanes 16 apart have the same one.
 struct LargeBatch {
@@ -48,12 +49,12 @@ __device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long firs
 __device__ RecordBox box_of_lane(const RecordBox& box, int lane) {
     const uint32_t columns = __shfl_sync(kAllLanes, box.x0 | uint32_t(box.x1) << 16, lane),
                    rows = __shfl_sync(kAllLanes, box.y0 | uint32_t(box.y1) << 16, lane);
-    return {static_cast<uint16_t>(columns), static_cast<uint16_t>(columns >> 16), static_cast<uint16_t>(rows),
-            static_cast<uint16_t>(rows >> 16)};
+    return {static_cast<uint16_t>(columns), static_cast<uint16_t>(columns >> 16),
+            static_cast<uint16_t>(rows), static_cast<uint16_t>(rows >> 16)};
 }
 
-// The first of `kCount` lanes whose number, which does not fall from lane to lane, is above `at`; the last
-// one if none is.
+// The first of `kCount` lanes whose number, which does not fall from lane to lane, is above `at`;
+// the last one if none is.
 template <int kCount>
 __device__ int first_lane_above(int number, int at) {
     int lane = 0;
@@ -63,13 +64,15 @@ __device__ int first_lane_above(int number, int at) {
     return lane;
 }
 
-// Calls begin_row(number, record) for 32 rows of a batch's records, a lane a row, and then visit(from, row,
-// column) for each 32 tiles of those rows: a lane a tile, in the row of lane `from`; a column below 0 is of
-// no tile.
+// Calls begin_row(number, record) for 32 rows of a batch's records, a lane a row, and then
+// visit(from, row, column) for each 32 tiles of those rows: a lane a tile, in the row of lane
+// `from`; a column below 0 is of no tile.
 template <class BeginRow, class Visit>
-__device__ void for_each_tile(const TileBinInput& in, const LargeBatch& batch, const LargePart& part,
-                              const BeginRow& begin_row, const Visit& visit) {
-    const int lane = threadIdx.x % 32, total = __shfl_sync(kAllLanes, batch.rows_after, kLargeAtOnce - 1);
+__device__ void for_each_tile(const TileBinInput& in, const LargeBatch& batch,
+                              const LargePart& part, const BeginRow& begin_row,
+                              const Visit& visit) {
+    const int lane = threadIdx.x % 32,
+              total = __shfl_sync(kAllLanes, batch.rows_after, kLargeAtOnce - 1);
     const int end = total * (part.number + 1) >> part.log2_parts;
     for (int first = total * part.number >> part.log2_parts; first < end; first += 32) {
         const int at = min(first + lane, end - 1);
@@ -91,8 +94,8 @@ __device__ void for_each_tile(const TileBinInput& in, const LargeBatch& batch, c
     }
 }
 
-// Calls visit(batch, part) for all large records, batch by batch; for whole warps of the grid. Where there
-// are few batches, several warps take parts of each.
+// Calls visit(batch, part) for all large records, batch by batch; for whole warps of the grid.
+// Where there are few batches, several warps take parts of each.
 template <class Visit>
 __device__ void for_each_part(const TileBinInput& in, const Visit& visit) {
     constexpr int kLog2MostParts = 2;
@@ -120,7 +123,8 @@ __device__ void for_each_large_tile(const TileBinInput& in, const Visit& visit) 
     });
 }
 
-// Where there are many large records, a block counts in its shared memory first, if the tiles fit into it.
+// Where there are many large records, a block counts in its shared memory first, if the tiles fit
+// into it.
 __global__ void __launch_bounds__(kCountThreads, kCountBlocks)
     count_large_kernel(TileBinInput in, bool has_room) {
     await_kernel_before();
@@ -191,7 +195,8 @@ struct Places {
     uint32_t left;  // of the first of the peers
 
     // For a whole warp; kNoTile has none.
-    __device__ Places(const Scatter& to, uint32_t tile) : peers(__match_any_sync(kAllLanes, tile)), left(0) {
+    __device__ Places(const Scatter& to, uint32_t tile)
+        : peers(__match_any_sync(kAllLanes, tile)), left(0) {
         if (tile != kNoTile && threadIdx.x % 32 + 1 == unsigned(__ffs(peers)))
             left = atomicSub(to.left + tile, unsigned(__popc(peers)));
     }
@@ -202,8 +207,8 @@ struct Places {
     }
 };
 
-// Entries of records over few tiles that a warp scatters at once: each lane two, as a place takes a while to
-// come.
+// Entries of records over few tiles that a warp scatters at once: each lane two, as a place takes a
+// while to come.
 constexpr unsigned kAtOnce = 2, kFewAtOnce = 32 * kAtOnce;
 
 // A record over few tiles, and which of them.
@@ -222,7 +227,8 @@ struct WaitingPlaces {
 static_assert(kFewTiles <= 1u << (32 - kMostRecordBits), "a tile fits above a record");
 
 // For a whole warp.
-__device__ void scatter_few(const Scatter& to, const ItemTiles& item, const FewPlace (&places)[kAtOnce]) {
+__device__ void scatter_few(const Scatter& to, const ItemTiles& item,
+                            const FewPlace (&places)[kAtOnce]) {
     EntryBox box[kAtOnce];
     uint32_t column[kAtOnce], row[kAtOnce], tile[kAtOnce];
 #pragma unroll
@@ -232,8 +238,9 @@ __device__ void scatter_few(const Scatter& to, const ItemTiles& item, const FewP
         const TileBox tiles = tile_box(box[j]);
         column[j] = tiles.columns_to(places[j].tile);
         row[j] = tiles.rows_to(places[j].tile);
-        tile[j] =
-            few == kManyTiles ? kNoTile : item.first_tile + tile_of(few) + row[j] * item.columns + column[j];
+        tile[j] = few == kManyTiles
+                      ? kNoTile
+                      : item.first_tile + tile_of(few) + row[j] * item.columns + column[j];
     }
     static_assert(kAtOnce == 2, "`found` has two");
     const Places found[kAtOnce] = {{to, tile[0]}, {to, tile[1]}};
@@ -258,8 +265,8 @@ __device__ void scatter_item(const TileBinInput& in, const Scatter& to, const It
             const unsigned at = first + 32 * j + lane;
             const bool is_there = at < num_waiting;
             const uint32_t record = is_there ? waiting.record[at] : 0;
-            places[j] = {is_there ? waiting.few[at] : kManyTiles, record & uint32_t(kMostFrameRecords - 1),
-                         record >> kMostRecordBits};
+            places[j] = {is_there ? waiting.few[at] : kManyTiles,
+                         record & uint32_t(kMostFrameRecords - 1), record >> kMostRecordBits};
         }
         scatter_few(to, item, places);
     };
@@ -277,7 +284,8 @@ __device__ void scatter_item(const TileBinInput& in, const Scatter& to, const It
         scatter_few(to, item, places);
 #pragma unroll
         for (unsigned j = 0; j < kAtOnce; ++j) {
-            const unsigned count = places[j].few == kManyTiles ? 0 : tile_box(box_of(places[j].few)).count;
+            const unsigned count =
+                places[j].few == kManyTiles ? 0 : tile_box(box_of(places[j].few)).count;
             let_wait(count, num_waiting, [&](unsigned k, unsigned at) {
                 waiting.few[at] = places[j].few;
                 waiting.record[at] = places[j].record | k << kMostRecordBits;
@@ -311,7 +319,8 @@ __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const L
             const uint32_t record = __shfl_sync(kAllLanes, record_of_row, from),
                            depth = __shfl_sync(kAllLanes, depth_of_row, from);
             const RecordBox box = box_of_lane(blocks_of_row, from);
-            const uint32_t tile = column < 0 ? kNoTile : image.first_tile + row * image.tile_columns + column;
+            const uint32_t tile =
+                column < 0 ? kNoTile : image.first_tile + row * image.tile_columns + column;
             const uint32_t place = Places(to, tile).own();
             if (tile == kNoTile) return;
             to.entries[to.tile_first[tile] + place] =
@@ -320,7 +329,8 @@ __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const L
 }
 
 // A warp asks for another item as it begins with one; then come the records over many tiles.
-__global__ void __launch_bounds__(kThreads, kBlocks) scatter_kernel(TileBinInput in, TileBinOutput out) {
+__global__ void __launch_bounds__(kThreads, kBlocks)
+    scatter_kernel(TileBinInput in, TileBinOutput out) {
     await_kernel_before();
     if (!in.capacity.holds(*in.counters)) return;
     __shared__ WaitingPlaces waiting[kWarps];
@@ -332,8 +342,9 @@ __global__ void __launch_bounds__(kThreads, kBlocks) scatter_kernel(TileBinInput
         scatter_item(in, to, item, waiting[threadIdx.x / 32]);
         i = __shfl_sync(kAllLanes, next, 0);
     }
-    for_each_part(
-        in, [&](const LargeBatch& batch, const LargePart& part) { scatter_large(in, to, batch, part); });
+    for_each_part(in, [&](const LargeBatch& batch, const LargePart& part) {
+        scatter_large(in, to, batch, part);
+    });
 }
 
 }  // namespace
@@ -346,8 +357,8 @@ void tile_bin(const TileBinInput& in, const TileBinOutput& out, cudaStream_t str
     const bool has_room = kCountBlocks * (counts_bytes + 1024) <= shared_memory_of_multiprocessor();
     launch_early("count_large_kernel", count_large_kernel, kCountBlocks * num_multiprocessors(),
                  kCountThreads, has_room ? counts_bytes : 0, stream, in, has_room);
-    launch_early("scan_kernel", scan_kernel, blocks_for(in.num_tiles, kThreads), kThreads, 0, stream, in,
-                 out);
+    launch_early("scan_kernel", scan_kernel, blocks_for(in.num_tiles, kThreads), kThreads, 0,
+                 stream, in, out);
     launch_early("scatter_kernel", scatter_kernel, resident, kThreads, 0, stream, in, out);
 }
 

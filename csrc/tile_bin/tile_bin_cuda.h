@@ -20,7 +20,8 @@ struct TileBinInput {
     Capacity capacity;
     const LargeRecord* large;
     TileCounts counts;
-    FrameCounters* counters;  // sets `entries`; without the large ones where they had too little room
+    FrameCounters*
+        counters;  // sets `entries`; without the large ones where they had too little room
 };
 
 struct TileBinOutput {

@@ -12,16 +12,18 @@ struct TileRun {
     int row, first, count;
 };
 
-// `row` counts from the record's first row of tiles. Rounds to pixels without care for their centres, and so
-// that NaN keeps the box: the same comparisons count and scatter, and a tile too many costs an entry only.
+// `row` counts from the record's first row of tiles. Rounds to pixels without care for their
+// centres, and so that NaN keeps the box: the same comparisons count and scatter, and a tile too
+// many costs an entry only.
 V3DG_HD inline TileRun tile_run(const Record<float>& r, int row) {
     row += r.y0 / kFrameTileHeight;
     const int top = max_of(static_cast<int>(r.y0), row * kFrameTileHeight);
-    const int bottom = min_of(static_cast<int>(r.y1), row * kFrameTileHeight + kFrameTileHeight - 1);
+    const int bottom =
+        min_of(static_cast<int>(r.y1), row * kFrameTileHeight + kFrameTileHeight - 1);
     const EllipseRows<float> ellipse = ellipse_rows(r.l11, r.l12, r.l22, r.log2_opacity);
     float low, high;
-    row_extent(ellipse, static_cast<float>(top) + 0.5f - r.v, static_cast<float>(bottom) + 0.5f - r.v, low,
-               high);
+    row_extent(ellipse, static_cast<float>(top) + 0.5f - r.v,
+               static_cast<float>(bottom) + 0.5f - r.v, low, high);
     // Pixels whose centres lie in between, cut to the box.
     const float x0 = r.u + low - 0.5f, x1 = r.u + high - 0.5f;
     const int first = x0 > static_cast<float>(r.x0) ? static_cast<int>(min_of(x0, 65536.0f)) : r.x0;

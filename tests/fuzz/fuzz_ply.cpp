@@ -24,7 +24,8 @@ bool is_printable(const std::string& text) {
 }
 
 // Means, quaternions and so on of gaussians first .. last.
-std::vector<float> read(const v3dg::PlyFile& ply, size_t first, size_t last, v3dg::PlyPlace& place) {
+std::vector<float> read(const v3dg::PlyFile& ply, size_t first, size_t last,
+                        v3dg::PlyPlace& place) {
     const size_t n = last - first;
     std::vector<float> memory(n * (11 + 3 * ply.num_sh));
     float* next = memory.data();
@@ -49,9 +50,12 @@ void read(const char* path, size_t file_bytes) {
     read(ply, 0, n, end);
     // The second half is the same whether the first was read before it or skipped.
     read(ply, 0, n / 2, middle);
-    const std::vector<float> after = read(ply, n / 2, n, middle), skipped = read(ply, n / 2, n, start);
-    require(after.size() == skipped.size() && middle.offset == end.offset && start.offset == end.offset);
-    require(after.empty() || std::memcmp(after.data(), skipped.data(), after.size() * sizeof(float)) == 0);
+    const std::vector<float> after = read(ply, n / 2, n, middle),
+                             skipped = read(ply, n / 2, n, start);
+    require(after.size() == skipped.size() && middle.offset == end.offset &&
+            start.offset == end.offset);
+    require(after.empty() ||
+            std::memcmp(after.data(), skipped.data(), after.size() * sizeof(float)) == 0);
 }
 
 }  // namespace

@@ -48,7 +48,7 @@ def compiled(folder):
     checks = ["-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=undefined"]
     program = folder / "fuzz_ply"
     compiler = os.environ.get("CLANG", "clang++")
-    options = ["-std=c++17", "-g", "-O1", *checks, "-fopenmp", "-I", str(ROOT / "csrc")]
+    options = ["-std=c++20", "-g", "-O1", *checks, "-fopenmp", "-I", str(ROOT / "csrc")]
     subprocess.run([compiler, *options, *map(str, sources), "-o", str(program)], check=True)
     return str(program)
 

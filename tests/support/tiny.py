@@ -7,7 +7,7 @@ from dataclasses import replace
 import v3dg
 from benchmarks import __main__ as benchmarks
 from benchmarks import worlds
-from v3dg import build, cli, demo
+from v3dg import cli, demo, levels
 
 WORLDS = {
     "donut_sea": {"instances": 12, "num_gaussians": 1000},
@@ -35,15 +35,15 @@ def shrink(set_attribute=setattr, set_item=dict.__setitem__):
 
     def quickly(build_whole):
         def build_quickly(*what, config=None, **options):
-            quick = replace(config or build.BuildConfig(), steps=0)
+            quick = replace(config or levels.BuildConfig(), steps=0)
             return build_whole(*what, config=quick, **{"progress": False, **options})
 
         return build_quickly
 
-    bundle_quickly, file_quickly = quickly(build.build_bundle), quickly(build.build_file)
-    for module in (v3dg, build, demo):
+    bundle_quickly, file_quickly = quickly(levels.build_bundle), quickly(levels.build_file)
+    for module in (v3dg, levels, demo):
         set_attribute(module, "build_bundle", bundle_quickly)
-    for module in (build, worlds):
+    for module in (levels, worlds):
         set_attribute(module, "build_file", file_quickly)
 
 
