@@ -1,4 +1,20 @@
+"""What all tests share: both devices, Chromium, and a small bundle for the viewer.
+
+Tests stand in the folder of their kind:
+
+    unit     one module or operation in this process; named after what it tests
+    files    formats and places of files: reading, writing, and what is refused
+    system   commands, servers, pools, threads and builds at work as a whole
+    browser  pages in Chromium
+    attack   hostile input, and programs that are stopped at any moment
+    docs     the tree, the types and the pages say what is true
+
+Those of `system`, `browser` and `attack` are slow: `pytest -m "not slow"` leaves them
+out, and with them single tests elsewhere that take more than a few seconds.
+"""
+
 import gc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -53,7 +69,16 @@ def collected_connections():
     gc.collect()
 
 
+TESTS = Path(__file__).parent
+SLOW_KINDS = {"system", "browser", "attack"}
+
+
 def pytest_collection_modifyitems(items):
+    for item in items:
+        kind = item.path.relative_to(TESTS).parts[0]
+        item.add_marker(kind)
+        if kind in SLOW_KINDS:
+            item.add_marker("slow")
     missing = _device.missing_for_cuda()
     if missing is None:
         return

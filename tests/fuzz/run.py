@@ -5,7 +5,7 @@ it reached.
 
 It is guided by coverage and needs clang++ (CLANG names another one). It works in
 build/fuzz; what stops it is there as crash-*. Inputs go to tests/fuzz/corpus, which
-test_fuzz.py replays. What is not C++ is attack.py's.
+attack/test_fuzz.py replays. What is not C++ is attack.py's.
 """
 
 import os
@@ -14,7 +14,7 @@ import sys
 import zipfile
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent.parent))
+sys.path.insert(0, str(Path(__file__).parents[1] / "files"))
 
 
 import numpy as np

@@ -10,12 +10,11 @@ import v3dg
 PACKAGE = str(Path(v3dg.__file__).parents[1])
 # The package under test, wherever the command starts.
 ENVIRONMENT = os.environ | {"PYTHONPATH": PACKAGE}
-# And what tests import, for a Python that runs a part of one.
-SUPPORT = Path(__file__).parent
+# And what tests import, for a Python that runs a part of one: pytest's `pythonpath`.
+TESTS = Path(__file__).parents[1]
+IMPORTED = [entry for entry in sys.path if Path(entry).is_relative_to(TESTS)]
 TESTS_ENVIRONMENT = os.environ | {
-    "PYTHONPATH": os.pathsep.join(
-        [str(SUPPORT.parent), str(SUPPORT), PACKAGE, os.environ.get("PYTHONPATH", "")]
-    )
+    "PYTHONPATH": os.pathsep.join([*IMPORTED, PACKAGE, os.environ.get("PYTHONPATH", "")])
 }
 COMMAND = [sys.executable, "-m", "v3dg"]
 

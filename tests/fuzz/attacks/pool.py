@@ -46,7 +46,8 @@ def environment():
     given = [
         os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path
     ]
-    paths = [*given, TESTS, TESTS / "support", TESTS.parent if has_module() else None]
+    imported = [TESTS, TESTS / "support", TESTS / "files"]
+    paths = [*given, *imported, TESTS.parent if has_module() else None]
     return os.environ | {
         "PYTHONPATH": os.pathsep.join(str(path) for path in paths if path),
         "OMP_NUM_THREADS": "1",

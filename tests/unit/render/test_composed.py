@@ -1,8 +1,6 @@
 """Composed scenes: instances that come, go and move, budgets, cuts that are kept, false
 colours."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -13,7 +11,6 @@ from random_bundle import random_bundle
 from reference import select as reference
 from scenes_lod import blob, lod_bundle, random_camera, random_scene
 from v3dg import Scene, select
-from v3dg.false_color import palette_of
 
 # Of the tolerances that a budget chooses from, neighbours differ by this in their
 # float32 bits.
@@ -338,96 +335,6 @@ def test_cut_of_another_scene_is_refused(device):
         render(scene, camera, cut=everything, device=device)
 
 
-@pytest.mark.parametrize("by", ["level", "cluster"])
-def test_palette_draws_what_a_recoloured_copy_does(device, by):
-    """Bit for bit, also where neighbouring clusters of several instances are drawn
-    together."""
-    rng = np.random.default_rng(21)
-    bundle = lod_bundle(rng, blob(rng, 300, sh_degree=2), 16)
-    clusters = bundle.clusters
-    sh = np.repeat(palette_of(bundle, by), np.diff(clusters.offset), axis=0)[:, None]
-    recoloured = v3dg.Bundle(clusters, bundle.groups, replace(bundle.gaussians, sh=sh))
-    camera = v3dg.Camera.look_at((0, -6, 0), (0, 0, 0), width=64, height=48)
-    poses = rng.normal(size=(3, 3))
-    pictures = []
-    for subject, color_by in ((bundle, by), (recoloured, "appearance")):
-        scene = Scene()
-        scene.add(subject, positions=poses)
-        pictures.append(render(scene, camera, tolerance=5.0, color_by=color_by, device=device))
-    np.testing.assert_array_equal(host(pictures[0].color), host(pictures[1].color))
-
-
-@pytest.mark.parametrize("by", ["level", "cluster"])
-def test_false_colors_show_what_was_chosen(device, by):
-    rng = np.random.default_rng(14)
-    bundle = lod_bundle(rng, blob(rng, 200), 16)
-    camera = v3dg.Camera.look_at((0, -6, 0), (0, 0, 0), width=48, height=40)
-    palette = palette_of(bundle, by)
-    clusters = bundle.clusters
-    assert palette.shape == (len(clusters), 3)
-    key = clusters.level if by == "level" else np.arange(len(clusters.level))
-    rgb = (0.28209479177387814 * palette + 0.5).clip(0)
-    seen = {}
-    for name, color in zip(key.tolist(), rgb, strict=True):
-        assert seen.setdefault(name, color.tobytes()) == color.tobytes()
-    assert len(set(list(seen.values())[:9])) == min(len(seen), 9)
-    top = render(bundle, camera, tolerance=np.inf, color_by=by, device=device)
-    color, alpha = host(top.color), host(top.alpha)
-    shown = color[alpha > 0.5] / alpha[alpha > 0.5, None]
-    last = rgb[-1]
-    np.testing.assert_allclose(shown, np.broadcast_to(last, shown.shape), atol=2e-3)
-    with pytest.raises(ValueError, match=r"color_by: expected .* or 'residency', got 'size'"):
-        render(bundle, camera, color_by="size", device=device)
-    with pytest.raises(ValueError, match="color_by: expected 'appearance' for an asset"):
-        render(bundle.level_gaussians(0), camera, color_by=by, device=device)
-
-
-def test_depth_is_drawn_where_it_is_asked_for(device):
-    rng = np.random.default_rng(11)
-    bundle = lod_bundle(rng, blob(rng, 500), 32)
-    for subject in (bundle, blob(rng, 500)):
-        camera = random_camera(rng)
-        with_depth, without = (
-            render(subject, camera, depth=asked, device=device) for asked in (True, False)
-        )
-        assert host(with_depth.depth).shape == host(with_depth.alpha).shape
-        for one, other in ((without.color, with_depth.color), (without.alpha, with_depth.alpha)):
-            np.testing.assert_array_equal(host(one), host(other))
-        with pytest.raises(
-            AttributeError, match="depth: expected a picture that was drawn with depth=True"
-        ):
-            without.depth  # noqa: B018
-
-
-def test_asset_and_bundle_are_seen_from_the_same_place(device):
-    """Also with a rotation that is off by what float32 text loses, far from the
-    origin."""
-    rng = np.random.default_rng(20)
-    center = np.array([300.0, -200.0, 50.0])
-    asset = blob(rng, 200, origin=center, sh_degree=3)
-    bundle = lod_bundle(rng, asset, 16)
-    exact = v3dg.Camera.look_at(center - [0, 6, 1], center, width=64, height=48)
-    viewmat = exact.viewmat.copy()
-    viewmat[:3, :3] += rng.uniform(-3e-5, 3e-5, (3, 3))
-    viewmat[:3, 3] = -viewmat[:3, :3] @ exact.position
-    camera = v3dg.Camera(viewmat, exact.K, 64, 48)
-    # Where the rotation is taken for one, the eye is elsewhere, and colours change with
-    # the direction.
-    np.testing.assert_allclose(camera.position, exact.position, atol=1e-9)
-    assert np.linalg.norm(-viewmat[:3, :3].T @ viewmat[:3, 3] - camera.position) > 5e-3
-    as_bundle = render(bundle, camera, tolerance=0.0, depth=True, device=device)
-    as_asset = render(asset, camera, depth=True, device=device)
-    raster = v3dg.rasterize(asset.torch("cuda") if device == "cuda" else asset, camera)
-    assert host(as_bundle.alpha).max() > 0.9
-    for picture in (as_asset, raster):
-        for name in ("color", "alpha", "depth"):
-            error = np.abs(host(getattr(picture, name)) - host(getattr(as_bundle, name)))
-            assert error.max() < 2e-4, name
-            # Depths are of 6, where float32 has steps of 5e-7; what is packed is
-            # rounded once more.
-            assert error.mean() < 3e-6, name
-
-
 @pytest.mark.gpu
 def test_both_devices_choose_the_same():
     rng = np.random.default_rng(15)
@@ -472,55 +379,3 @@ def test_picture_under_way_shows_the_scene_as_it_was():
     after = renderer.render(camera, tolerance=0.0)
     same_picture(before, expected)
     assert not np.array_equal(host(before.color), host(after.color))
-
-
-def test_pick_finds_what_a_pixel_shows():
-    rng = np.random.default_rng(17)
-    scene, camera = composed(rng, 15), random_camera(rng, distance=8)
-    options = {"tolerance": 0.3}
-    image = render(scene, camera, device="cpu", **options)
-    full = select(scene, camera, device="cpu", **options)
-    seen = 0
-    for x, y in rng.integers(0, (camera.width, camera.height), (40, 2)):
-        found = v3dg.pick(scene, camera, x, y, **options)
-        if found is None:
-            assert image.alpha[y, x] < 1 / 255
-            continue
-        seen += 1
-        assert (found.instance, found.cluster) in pairs(full)
-        assert 0 < found.weight <= image.alpha[y, x] + 1e-6
-        # Without its cluster the pixel loses at least as much as the picked gaussian
-        # gave, behind or not.
-        keep = (full.instance_ids != found.instance) | (full.cluster_ids != found.cluster)
-        rest = replace(
-            full, instance_ids=full.instance_ids[keep], cluster_ids=full.cluster_ids[keep]
-        )
-        assert image.alpha[y, x] != render(scene, camera, cut=rest, device="cpu").alpha[y, x]
-        ray = camera.viewmat[:3, :3] @ (found.position - camera.position)
-        np.testing.assert_allclose(
-            ray[:2] / ray[2] * [camera.fx, camera.fy] + [camera.cx, camera.cy],
-            [x + 0.5, y + 0.5],
-            atol=1e-6,
-        )
-        assert ray[2] == pytest.approx(found.depth)
-    assert seen > 10
-
-
-def test_pick_takes_the_one_in_front():
-    rng = np.random.default_rng(18)
-    asset = replace(
-        blob(rng, 50, size=0.3),
-        opacities=np.full(50, 0.99, np.float32),
-        scales=np.full((50, 3), 0.3, np.float32),
-    )
-    bundle = lod_bundle(rng, asset, 8)
-    scene = Scene()
-    scene.add(bundle, [[0, 3, 0], [0, 1, 0], [50, 0, 0]])
-    camera = v3dg.Camera.look_at((0, -5, 0), (0, 0, 0), width=64, height=64)
-    found = v3dg.pick(scene, camera, 32, 32, budget=len(bundle.level_gaussians(0)))
-    assert found is not None
-    assert found.instance == 1
-    assert abs(found.position[1] - 1) < 1.5
-    assert v3dg.pick(scene, camera, 0, 0) is None
-    with pytest.raises(ValueError, match=r"x, y: expected a pixel of 64 x 64, got \(64, 0\)"):
-        v3dg.pick(scene, camera, 64, 0)

@@ -6,7 +6,7 @@ Each of these counts falls only when code is unpacked. `LIMITS` holds what each 
 counts today: a count above its limit fails, and so does one that is well below, so that
 the limit is lowered.
 
-`python tests/test_shape.py` prints the counts of all packages, and with files as
+`python tests/docs/test_shape.py` prints the counts of all packages, and with files as
 arguments each place.
 """
 
@@ -23,7 +23,7 @@ from typing import NamedTuple, TypeAlias
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 LIBRARY = ROOT / "v3dg"
 TOP = "v3dg"
 
@@ -268,7 +268,7 @@ def test_every_package_has_its_limits(packages):
 def test_packing_may_only_fall(packages, package):
     for kind, limit in zip(LIMITED, LIMITS[package], strict=True):
         count = packages[package][kind]
-        advice = "`python tests/test_shape.py FILES` lists them"
+        advice = "`python tests/docs/test_shape.py FILES` lists them"
         assert count <= limit, (
             f"{package}: {count} of {kind} ({KINDS[kind]}), at most {limit}; {advice}"
         )

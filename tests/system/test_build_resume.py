@@ -74,7 +74,9 @@ def whole(asset, device, tmp_path_factory):
 @contextmanager
 def started_build(config, device, folder):
     """A build in a process of its own; killed at the end if it still runs."""
-    roots = os.pathsep.join(str(Path(file).parents[1]) for file in (v3dg.__file__, __file__))
+    roots = os.pathsep.join(
+        str(Path(file).parents[1]) for file in (v3dg.__file__, Path(__file__).parent)
+    )
     environment = os.environ | {"PYTHONPATH": roots}
     arguments = [str(config.steps), str(folder / "levels"), str(folder / "out.v3dg"), device]
     process = subprocess.Popen(

@@ -12,7 +12,7 @@ import pytest
 
 from v3dg import _core
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 SOURCE = (ROOT / "v3dg" / "_core.pyi").read_text(encoding="utf-8")
 BINDINGS = "\n".join(p.read_text(encoding="utf-8") for p in (ROOT / "csrc" / "bindings").iterdir())
 

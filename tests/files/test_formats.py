@@ -26,7 +26,7 @@ from test_ply import random_gaussians
 from v3dg import Gaussians, read_asset, write_asset
 from v3dg.formats import _reading
 
-FIXTURES = Path(__file__).parent / "fixtures"
+FIXTURES = Path(__file__).parents[1] / "fixtures"
 SH_C0 = 0.28209479177387814
 
 # The most that a component of a unit quaternion changes by when three are stored with

@@ -121,7 +121,7 @@ def test_same_file_on_any_number_of_threads(asset, tmp_path):
         files.append(tmp_path / f"{threads}.v3dg")
         environment = os.environ | {
             "PYTHONPATH": os.pathsep.join(
-                str(Path(file).parents[1]) for file in (v3dg.__file__, __file__)
+                str(Path(file).parents[1]) for file in (v3dg.__file__, Path(__file__).parent)
             ),
             "OMP_NUM_THREADS": str(threads),
         }

@@ -195,3 +195,13 @@ def test_cut_of_instances_that_are_gone_is_refused():
             ValueError, match="cut: instances were removed from the scene after this selection"
         ):
             use()
+
+
+def test_an_axis_that_is_none_is_refused_where_it_is_set():
+    scene = Scene.of(random_bundle(0))
+    scene.up = "-y"
+    with pytest.raises(ValueError, match=r"^up: expected 'x' or .*, got 'q'"):
+        scene.up = "q"
+    assert scene.up == "-y"
+    scene.up = None
+    assert scene.up is None

@@ -13,7 +13,7 @@ import pytest
 import v3dg
 from v3dg._extras import EXTRAS
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 CSRC = ROOT / "csrc"
 # What each folder of csrc/ may include beside itself. A folder includes only what
 # stands before it here.
@@ -74,6 +74,7 @@ MAY_INCLUDE = {
 }
 NOT_OPERATIONS = {"base", "math", "io", "frame", "residency", "draw", "levels", "bindings"}
 TESTED_WITH = {"tile_bin": "rasterize"}
+KINDS = {"unit", "files", "system", "browser", "attack", "docs"}
 
 OPERATIONS = sorted(p.name for p in CSRC.iterdir() if p.is_dir() and p.name not in NOT_OPERATIONS)
 SOURCES = sorted(str(p.relative_to(ROOT)) for p in CSRC.rglob("*") if p.suffix in {".cpp", ".cu"})
@@ -106,7 +107,13 @@ def test_operation_has_a_contract_and_both_halves(operation):
 @pytest.mark.parametrize("operation", OPERATIONS)
 def test_operation_has_a_test(operation):
     name = TESTED_WITH.get(operation, operation)
-    assert (ROOT / "tests" / f"test_{name}.py").is_file()
+    assert (ROOT / "tests" / "unit" / "core" / f"test_{name}.py").is_file()
+
+
+def test_every_test_has_its_kind():
+    """Markers go by the folder; conftest.py says which kind is what."""
+    tests = (path.relative_to(ROOT / "tests") for path in (ROOT / "tests").rglob("test_*.py"))
+    assert [str(path) for path in tests if path.parts[0] not in KINDS] == []
 
 
 def test_headers_are_included_once():

@@ -30,7 +30,7 @@ from v3dg.gaussians import Gaussians
 
 TABLE_NAMES = [name for name, *_ in SCHEMA]
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh")
-FORMAT_PAGE = Path(__file__).parent.parent / "docs" / "format.md"
+FORMAT_PAGE = Path(__file__).parents[2] / "docs" / "format.md"
 DTYPES = {"I64": "<i8", "I32": "<i4", "F32": "<f4", "U8": "u1"}
 some_bundles = st.builds(
     random_bundle,

@@ -22,7 +22,7 @@ import tiny
 import v3dg
 from v3dg.donut import make_donut
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PAGES = [
     "README.md",
     *sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").rglob("*.md")),

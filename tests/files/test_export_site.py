@@ -1,5 +1,5 @@
-"""`v3dg export`: scenes and bundles as web pages; tests/test_export_browser.py opens
-them in a browser."""
+"""`v3dg export`: scenes and bundles as web pages, which browser/test_export_browser.py
+opens in a browser."""
 
 import json
 import os

@@ -1,5 +1,5 @@
-"""3D Tiles of bundles and scenes, and `.glb` files; tests/test_export_browser.py opens
-them in CesiumJS."""
+"""3D Tiles of bundles and scenes, and `.glb` files, which
+browser/test_export_browser.py opens in CesiumJS."""
 
 import json
 import math

@@ -7,7 +7,7 @@ import pytest
 
 from fuzz.targets import READERS
 
-CORPUS = Path(__file__).parent / "fuzz" / "corpus"
+CORPUS = Path(__file__).parents[1] / "fuzz" / "corpus"
 
 
 @pytest.mark.parametrize("name", READERS)

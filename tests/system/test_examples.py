@@ -15,7 +15,7 @@ from v3dg.camera_file import write_cameras
 from v3dg.metrics import psnr
 from v3dg.pictures import to_8bit, write_picture
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def load_example(name):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 # What .ci/run and the presets of CMake make.
 BUILDS = [path for name in ("ci/cpp", "dev", "cpu") if (path := ROOT / "build" / name).is_dir()]
 
