@@ -32,6 +32,8 @@ class Report:
     """Leave the plots in the folders as they are; drawing them needs matplotlib."""
 
 
+BY_HAND = "<!-- written by hand from here on -->"
+
 HOW = (
     "Error is FLIP (67 pixels per degree) and PSNR to the full scene at twice the resolution, "
     "box-averaged. Times are medians of single frames after a warm-up, selection included, from an "
@@ -91,7 +93,8 @@ def page(folders: Sequence[Path], output: Path, tables: Path) -> str:
         "",
         HOW,
         "",
-        "This page is written by `python -m benchmarks report` from recorded JSON, never by hand. "
+        "This part of the page is written by `python -m benchmarks report` from recorded JSON, "
+        "never by hand. "
         f"It was measured on {'. What was not measured there was measured on '.join(machines)}.",
     ]
     return "\n".join(lines) + "\n"
@@ -196,10 +199,18 @@ def draw_plots(folder: Path) -> None:
             figure.savefig(folder / f"{name}.png", dpi=90, metadata={"Software": None})
 
 
+def written_by_hand(page: Path) -> str:
+    """The part of a page behind its marker, with the marker; empty without one."""
+    text = page.read_text(encoding="utf-8") if page.exists() else ""
+    _, marker, rest = text.partition(BY_HAND)
+    return "\n" + marker + rest if marker else ""
+
+
 def run(options: Report) -> None:
     for folder in options.folders:
         if not options.no_plots:
             draw_plots(folder)
     short = page(options.folders, options.output, options.tables)
+    short += written_by_hand(options.output)
     options.output.write_text(short, encoding="utf-8")
     options.tables.write_text(tables_page(options.folders, options.tables), encoding="utf-8")

@@ -1,5 +1,5 @@
 """Frames drawn from codes beside frames drawn from float32 rows, on a GPU;
-docs/notes/codecs.md has results.
+docs/notes/experiments/2026-11-22-codecs-drawing.md has results.
 
     python -m benchmarks.studies.code_frames donut.ply donutsea.json NAME=OTHER.ply
 

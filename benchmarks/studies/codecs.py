@@ -1,5 +1,6 @@
-"""What a bundle's codec costs in bytes and in pictures; docs/notes/codecs.md has
-results.
+"""What a bundle's codec costs in bytes and in pictures.
+
+docs/notes/experiments/2026-11-22-codecs-error-and-size.md has results.
 
     python -m benchmarks.studies.codecs --up 0 -1 0 --assets angel.sog st-peter.sog
 

@@ -3,8 +3,8 @@ assets, rooms from within.
 
 A picture is looked at in windows of some pixels, each of which drifts towards and away
 from what is in its own middle: what moves slowly there hides nothing. All windows
-together are the picture. The cuts are those of `fades`. docs/notes/steadiness.md is
-about the result.
+together are the picture. The cuts are those of `fades`.
+docs/notes/experiments/2026-11-23-fades-scenes-unfiltered.md is about the result.
 
 A subject is one of
 

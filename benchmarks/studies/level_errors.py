@@ -5,7 +5,7 @@ finer and the leaves under it (4 x 4 samples). What is gained per gaussian by go
 level finer, at the size at which each group is seen, then decides a cut: the pruning of
 the tree with the least sum of error and lambda x gaussians (Chou, Lookabaugh and Gray
 1989). It is compared with the metric at equal numbers of gaussians, from outside of an
-object; docs/notes/levels.md has the table.
+object; docs/notes/experiments/2026-11-22-selection-measured-error.md has the table.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ fade in, other ramps.
 The first is beside the tolerance that each view would have alone, also in the frames
 after the camera has stopped where steps are farthest behind. Hysteresis is a trial, and
 so are pages beside what a pool does: cuts with a state, made of the metrics that
-selection has. So are ramps, which have none. docs/notes/steadiness.md is about the
-results.
+selection has. So are ramps, which have none. docs/notes/experiments/index.md
+lists the results.
 """
 
 from __future__ import annotations

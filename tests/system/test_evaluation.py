@@ -415,6 +415,18 @@ def test_page_begins_with_a_table_and_lists_wins_and_losses(results):
     assert "](notes/evaluation.md)" in text
 
 
+def test_what_is_written_by_hand_stays_behind_a_new_page(tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "page", lambda *_: "# Results\n\nnew\n")
+    monkeypatch.setattr(report, "tables_page", lambda *_: "tables\n")
+    output = tmp_path / "results.md"
+    output.write_text(f"# Results\n\nold\n\n{report.BY_HAND}\n\n## By hand\n", encoding="utf-8")
+    options = report.Report((tmp_path,), output, tmp_path / "tables.md", no_plots=True)
+    for _ in range(2):  # again and again
+        report.run(options)
+        text = output.read_text(encoding="utf-8")
+        assert text == f"# Results\n\nnew\n\n{report.BY_HAND}\n\n## By hand\n"
+
+
 @pytest.mark.slow
 def test_page_of_tables_has_every_part(results):
     folder, _ = results

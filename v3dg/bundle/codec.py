@@ -1,7 +1,7 @@
 """Codecs, which define the bytes of a page.
 
 Pages are encoded here and decoded in the core, which has a `PageCodec` for each codec
-(csrc/residency/page_source.h). CONTRIBUTING.md says how to add one.
+(csrc/residency/page_source.h). docs/extending.md says how to add one.
 """
 
 from collections.abc import Sequence

@@ -3,7 +3,7 @@
 An asset that does not fit in memory is read twice, in blocks. The first pass writes its
 means to scratch files, where they are split (`external_split`) down to *buckets*: nodes
 that are small enough to be sorted when they are read. The second pass writes every
-gaussian to its bucket. docs/size.md counts the bytes.
+gaussian to its bucket. docs/results.md counts the bytes.
 """
 
 import math
