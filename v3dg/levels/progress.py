@@ -54,4 +54,4 @@ class Bar(_progress.Bar):
     def _update(self, key: tuple[int, int], num_gaussians: float, text: str = "") -> None:
         with self._lock:
             self._fitted[key] = num_gaussians
-            self.update(self._initial + int(sum(self._fitted.values())) - self.done, text)
+            self.update(self._initial + int(sum(self._fitted.values())) - self.num_done, text)
