@@ -5,13 +5,15 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core, _extras
 from v3dg.gaussians import Array, Gaussians
+
+HostArray: TypeAlias = npt.NDArray[Any]
 
 _MUCH_MEMORY = 1 << 30
 
@@ -153,11 +155,11 @@ def library_of(array: Array) -> ModuleType:
     return torch
 
 
-def to_host(array: Array) -> npt.NDArray[Any]:
+def to_host(array: Array) -> HostArray:
     """The array as one of NumPy's."""
     if isinstance(array, np.ndarray):
         return array
-    return cast(npt.NDArray[Any], array.cpu().numpy())
+    return cast(HostArray, array.cpu().numpy())
 
 
 @contextmanager

@@ -9,16 +9,22 @@ import os
 import unicodedata
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn, TypeAlias, TypeVar
 
 from v3dg import _files
 
 T = TypeVar("T")
 
+Json: TypeAlias = Any
+"""A JSON value. A union would make every use of a field a type error; what is read from
+a file is checked by `Node`."""
+
+JsonObject: TypeAlias = dict[str, Json]
+
 _LARGEST_SIDE = 1 << 20  # px of a picture
 
 
-def parse_json(text: str | bytes) -> Any:
+def parse_json(text: str | bytes) -> Json:
     """Parse strict JSON: no NaN, no key twice, no unbounded nesting; ValueError
     otherwise."""
     try:
@@ -85,7 +91,7 @@ class Node:
     """A JSON value with its place: the name of the file, and its path in the
     document."""
 
-    def __init__(self, value: Any, file: str, path: str) -> None:
+    def __init__(self, value: Json, file: str, path: str) -> None:
         self.value = value
         self.file = file
         self.path = path

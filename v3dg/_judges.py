@@ -10,8 +10,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import NamedTuple, TypeVar, cast
 
+from v3dg._json import JsonObject
 from v3dg._start import SIGNALS
 
 T = TypeVar("T")
@@ -107,7 +108,7 @@ def _answer(pipe: Connection) -> object:
     return result
 
 
-def mean_of(rows: Sequence[Mapping[str, float | None]], *names: str) -> dict[str, Any]:
+def mean_of(rows: Sequence[Mapping[str, float | None]], *names: str) -> JsonObject:
     """Means of columns, to six digits; None where every value is missing."""
     means: dict[str, float | None] = {}
     for name in names:

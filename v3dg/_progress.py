@@ -31,7 +31,7 @@ class Bar:
         if not isinstance(progress, bool) and not callable(progress):
             raise TypeError(f"progress: expected True, False or a function, got {progress!r}")
         self.total = total
-        self.done = initial
+        self.num_done = initial
         self._name = name
         self._text = name
         self._num_logged = self._num_lines
@@ -54,7 +54,7 @@ class Bar:
 
     @property
     def _num_lines(self) -> int:
-        return _LINES * self.done // max(self.total, 1)
+        return _LINES * self.num_done // max(self.total, 1)
 
     def __enter__(self: T) -> T:
         return self
@@ -67,17 +67,17 @@ class Bar:
 
     def update(self, count: int, text: str = "") -> None:
         """Add `count` to the work done, and show `text` about the work in progress."""
-        self.done += count
+        self.num_done += count
         if text:
             self._text = f"{self._name}, {text}"
         if self._bar is not None:
             self._bar.set_description(self._text, refresh=False)
             self._bar.update(count)
         if self._call is not None:
-            self._call(self.done, self.total, self._text)
+            self._call(self.num_done, self.total, self._text)
         if self._num_lines > self._num_logged:
             self._num_logged = self._num_lines
-            line = f"{self._text}: {100 * self.done // max(self.total, 1)} %"
+            line = f"{self._text}: {100 * self.num_done // max(self.total, 1)} %"
             _LOG.info(line)
             if self._is_shown and self._bar is None:
                 print(line, file=sys.stderr, flush=True)

@@ -2,10 +2,10 @@
 on a turntable."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, TypeAlias, TypeVar, get_args
+from typing import Literal, TypeAlias, TypeVar, cast, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -236,11 +236,14 @@ def check_camera(camera: object) -> None:
         check_type("camera", camera, Camera, "a Camera")
 
 
-def for_each(camera: Any, make: Callable[[Any], T]) -> T | list[T]:
+def for_each(
+    camera: Camera | StereoCamera | Sequence[Camera],
+    make: Callable[[Camera | StereoCamera], T],
+) -> T | list[T]:
     """The result of ``make`` for one camera, or a list of its results for several."""
     if hasattr(camera, "__iter__") and getattr(camera, "ndim", 1) > 0:
-        return [make(view) for view in camera]
-    return make(camera)
+        return [make(view) for view in cast(Iterable[Camera], camera)]
+    return make(cast(Camera, camera))
 
 
 def check_cameras(cameras: object) -> None:
@@ -280,15 +283,10 @@ def turntable(
     n = whole(n, "n", "0 cameras or more", 0, _MAX_TURNTABLE_CAMERAS)
     if not max(1e-150, 1e-12 * np.abs(middle).max()) < radius < 1e150:
         expected = "a circle that double precision resolves"
-        raise ValueError(
-            f"center, radius: expected {expected}, got {radius} around {_text(middle)}"
-        )
+        refuse("center, radius", f"{expected}, got {radius} around {_text(middle)}")
     elevation = real(elevation, "elevation")
-    check(
-        "elevation",
-        abs(elevation) < math.pi / 2,
-        f"an angle between -pi/2 and pi/2, got {elevation}",
-    )
+    if not abs(elevation) < math.pi / 2:
+        refuse("elevation", f"an angle between -pi/2 and pi/2, got {elevation}")
     check("up", axis.any(), f"a direction, got {_text(axis)}")
     axis /= np.abs(axis).max()  # squares neither overflow nor underflow
     axis /= np.linalg.norm(axis)

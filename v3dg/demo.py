@@ -9,10 +9,11 @@ twice the resolution.
 import math
 import os
 import time
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 from v3dg import _device
 from v3dg._device import Device
+from v3dg._json import JsonObject
 from v3dg._progress import Progress, counted
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
@@ -23,8 +24,6 @@ from v3dg.pictures import Picture, check_picture_path, contact_sheet, to_8bit, w
 from v3dg.render import render
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
-
-JsonObject: TypeAlias = dict[str, Any]
 
 # Distance from the eye to the donut in the middle, in radii of a donut, and height of
 # the view in radians.
@@ -69,16 +68,14 @@ def run_demo(
     build_seconds = time.perf_counter() - start
     scene = _field(bundle, instances, seed)
     columns: list[JsonObject] = []
-    full_row: list[tuple[str, Picture]] = []
-    bundle_row: list[tuple[str, Picture]] = []
+    rows: list[list[tuple[str, Picture]]] = [[], []]
     for distance, elevation in counted(views, len(views), "draw", progress):
-        full, selected = _panels(
-            scene, _camera(distance, elevation, size), tolerance, chosen_device
-        )
-        full_row.append((f"full, distance {distance:g}: {full.text}", full.picture))
-        bundle_row.append((f"bundle, distance {distance:g}: {selected.text}", selected.picture))
+        camera = _camera(distance, elevation, size)
+        full, selected = _panels(scene, camera, tolerance, chosen_device)
+        rows[0].append((f"full, distance {distance:g}: {full.text}", full.picture))
+        rows[1].append((f"bundle, distance {distance:g}: {selected.text}", selected.picture))
         columns.append({"distance": distance, "full": full.numbers, "bundle": selected.numbers})
-    write_picture(path, contact_sheet([full_row, bundle_row]))
+    write_picture(path, contact_sheet(rows))
     return {
         "picture": str(path),
         "asset_gaussians": len(asset),

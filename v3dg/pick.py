@@ -79,7 +79,7 @@ def pick(
             scene, camera, tolerance=tolerance, budget=budget, min_level=min_level, device=CPU
         )
         tolerance = cut.tolerance
-    rule = rule_of(tolerance, None, min_level, "solid_angle", True)
+    rule = rule_of(tolerance, None, min_level)
     pixel = camera.core.window(x, y, x + 1, y + 1)
     if renderer is not None:
         hit = _pick_from_pool(renderer, scene, pixel, rule)

@@ -145,7 +145,8 @@ class _Cuts:
         ball = self._bundle.groups.ball
         radius = np.where(clusters.own_group < 0, np.float32(1), ball[clusters.own_group, 3])
         radius = np.repeat(radius, np.diff(clusters.offset))
-        target = _core.FitTarget(self._gaussians.subset(self._leaves).rows, 0.0, False)
+        leaves = self._gaussians.subset(self._leaves).rows
+        target = _core.FitTarget(leaves, filter_px2=0.0, antialiased=False)
         self.run("refine", steps, partial(_core.refine_cuts, target=target, radius=radius))
         return self._gaussians.numpy()
 
@@ -171,7 +172,7 @@ class _Cuts:
         with Bar(steps, name, self._progress) as bar:
 
             def show(state: _core.FitProgress) -> None:
-                bar.update(state.groups_done - bar.done)
+                bar.update(state.groups_done - bar.num_done)
 
             return run_fit(lambda state: work(progress=state), self._device, show)
 

@@ -1,7 +1,5 @@
 """Rotations and quaternions."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,7 +11,7 @@ _LEAST = 1e-140
 _MOST = 1e140
 
 
-def in_range(quaternions: NDArray[np.floating[Any]]) -> Floats:
+def in_range(quaternions: NDArray[np.floating]) -> Floats:
     """Return quaternions (..., 4) as doubles whose squares neither vanish nor overflow.
 
     The shortest and the longest are multiplied by a power of two, which rounds nothing.
@@ -28,7 +26,7 @@ def in_range(quaternions: NDArray[np.floating[Any]]) -> Floats:
     return scaled
 
 
-def normalised(quaternions: NDArray[np.floating[Any]]) -> Floats:
+def normalised(quaternions: NDArray[np.floating]) -> Floats:
     """Return quaternions (..., 4) of length one, in double precision.
 
     Those of length zero stay, and those that are not finite contain NaN. No length is

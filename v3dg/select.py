@@ -282,7 +282,7 @@ def select(
     Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the
     budget is ours.
     """
-    rule = rule_of(tolerance, budget, min_level, footprint, cull, fade)
+    rule = rule_of(tolerance, budget, min_level, footprint, cull=cull, fade=fade)
     target = _device.resolve(device)
     scene = opened(subject)
     return for_each(camera, lambda view: select_by(rule, scene, view, budget, target))
@@ -327,6 +327,7 @@ def rule_of(
     budget: int | None,
     min_level: int,
     footprint: Footprint = "solid_angle",
+    *,
     cull: bool = True,
     fade: float | None = None,
 ) -> _core.Rule:

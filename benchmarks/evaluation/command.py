@@ -78,4 +78,4 @@ def run(options: Evaluate) -> None:
             [*sections, f"Plots and a page: python -m benchmarks report {options.output}"]
         )
 
-    print_result(options.json, results, text().splitlines())
+    print_result(results, text().splitlines(), as_json=options.json)

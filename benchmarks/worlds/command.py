@@ -68,4 +68,4 @@ def run(options: World) -> None:
         f"{world.num_gaussians:,} gaussians, {result['seconds']:.0f} s\n"
         f"draw it with `v3dg render {path} --camera 059_camera_19`"
     )
-    print_result(options.json, result, text.splitlines())
+    print_result(result, text.splitlines(), as_json=options.json)

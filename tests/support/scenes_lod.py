@@ -181,6 +181,6 @@ def group_metrics(subject, camera, *, footprint="solid_angle"):
     px²."""
     scene = Scene.of(subject)
     tables = [residency.table(bundle) for bundle in scene.bundles]
-    rule = rule_of(0.0, None, 0, footprint, False)
+    rule = rule_of(0.0, None, 0, footprint, cull=False)
     metric, offset = _core.group_metrics(tables, instances_of(scene), camera.core, rule)
     return np.split(metric, offset[1:-1]) if len(scene) else []

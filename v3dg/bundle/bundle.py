@@ -6,17 +6,17 @@ import html
 import os
 from collections.abc import Iterable
 from dataclasses import fields, replace
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core, _files
-from v3dg._json import parse_json
+from v3dg._json import JsonObject, parse_json
 from v3dg._numbers import check, check_all, check_type
 from v3dg._urls import in_parts, is_url, shown
 from v3dg.bundle.codec import Codec, codec_of
-from v3dg.bundle.file import BundleFile, BundlePlan, write_pages
+from v3dg.bundle.file import BundleFile, BundlePlan, PageSource, write_pages
 from v3dg.bundle.format import HASH_BYTES, VERSION, config_to_json, page_tables
 from v3dg.bundle.pages import (
     CodePages,
@@ -50,14 +50,12 @@ class Bundle:
             a value.
     """
 
-    _file: BundleFile | None = None
-
     def __init__(
         self,
         clusters: Clusters,
         groups: Groups,
         gaussians: Gaussians,
-        config: dict[str, Any] | None = None,
+        config: JsonObject | None = None,
         codec: str = Codec.name,
     ) -> None:
         check_type("clusters", clusters, Clusters, "Clusters")
@@ -81,7 +79,12 @@ class Bundle:
         self._set(clusters, groups, parse_json(config_to_json(config or {})), pages)
 
     def _set(
-        self, clusters: Clusters, groups: Groups, config: dict[str, Any], pages: _Pages
+        self,
+        clusters: Clusters,
+        groups: Groups,
+        config: JsonObject,
+        pages: _Pages,
+        file: BundleFile | None = None,
     ) -> None:
         self.config = config
         self._clusters = clusters
@@ -91,6 +94,7 @@ class Bundle:
         self.sh_degree = pages.codec.sh_degree
         self._layout = pages.layout
         self._pages = pages
+        self._file = file
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Bundle:
@@ -145,8 +149,7 @@ class Bundle:
             pages = FilePages(PageLayout.of(clusters), file)
             _check_page_tables(pages, file)
             bundle = cls.__new__(cls)
-            bundle._set(clusters, groups, file.config, pages)
-            bundle._file = file
+            cls._set(bundle, clusters, groups, file.config, pages, file)
         except ValueError as error:
             file.verify()  # wrong tables are mostly damage, which this reports instead
             raise ValueError(f"{file.path}: {error}") from None
@@ -287,7 +290,7 @@ class Bundle:
         return not isinstance(self._pages, FilePages)
 
     @property
-    def page_source(self) -> Any:
+    def page_source(self) -> _core.Rows | PageSource:
         """The source of single pages for the core: the file, or all gaussians if they
         are in memory."""
         if self._file is None or isinstance(self._pages, MemoryPages):
@@ -316,7 +319,7 @@ class Bundle:
         first, last = np.searchsorted(self._layout.first_cluster, [clusters.start, clusters.stop])
         return self._pages.read(int(first), int(last))
 
-    def info(self) -> dict[str, Any]:
+    def info(self) -> JsonObject:
         """Describe the bundle in JSON values, without reading gaussians; sizes are
         those of its file."""
         page_level = self.clusters.level[self._layout.first_cluster[:-1]]
@@ -328,8 +331,11 @@ class Bundle:
         else:
             version = VERSION
             num_bytes = BundlePlan(self._layout, self._codec, self.config).num_bytes
+        path = None
+        if self.path is not None:
+            path = shown(self.path)
         return {
-            "path": None if self.path is None else shown(self.path),
+            "path": path,
             "version": version,
             "codec": self.codec,
             "bytes": num_bytes,
@@ -343,7 +349,7 @@ class Bundle:
             "config": self.config,
         }
 
-    def _level_info(self, level: int, size: int) -> dict[str, Any]:
+    def _level_info(self, level: int, size: int) -> JsonObject:
         clusters = self.level_range(level)
         first, last = self.clusters.offset[[clusters.start, clusters.stop]].tolist()
         error_color: float | None = 0.0

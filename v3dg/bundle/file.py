@@ -9,13 +9,13 @@ import os
 import re
 import weakref
 from collections.abc import Callable, Iterable
-from typing import Any, NoReturn, TypeAlias
+from typing import NoReturn, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core, _files, _urls
-from v3dg._json import parse_json, shown
+from v3dg._json import JsonObject, parse_json, shown
 from v3dg._numbers import check
 from v3dg._urls import FileAtUrl
 from v3dg.bundle import format as file_format
@@ -24,13 +24,14 @@ from v3dg.bundle.format import (
     DTYPES,
     HASH_BYTES,
     VERSION,
+    Entry,
     entries_of,
     page_hash,
     page_tables,
     schema_of,
 )
 from v3dg.bundle.pages import PageLayout, PageRun, on_threads
-from v3dg.bundle.tables import Clusters, Groups, check_tables, columns_of
+from v3dg.bundle.tables import Clusters, Column, Groups, check_tables, columns_of
 from v3dg.gaussians import Gaussians
 
 _FIRST_BYTES = 4096  # of the header: what a disk writes at once
@@ -39,7 +40,7 @@ _FIRST_BYTES = 4096  # of the header: what a disk writes at once
 _MOST_FETCHED_TABLE_BYTES = 1 << 30
 _FREE_CLUSTERS = 1 << 18  # that may all be empty; others have a gaussian each
 
-_PageSource: TypeAlias = tuple[
+PageSource: TypeAlias = tuple[
     str,
     int,
     str,
@@ -56,7 +57,7 @@ class BundlePlan:
     """The places of all parts of a bundle's file, which follow from the layout, the
     codec and the config."""
 
-    def __init__(self, layout: PageLayout, codec: Codec, config: dict[str, Any]) -> None:
+    def __init__(self, layout: PageLayout, codec: Codec, config: JsonObject) -> None:
         self.layout = layout
         self.codec = codec
         self.config = config
@@ -224,7 +225,7 @@ class BundleFile:
             self._fail(f"config: expected a string of JSON, got {shown(config)}")
         self.config = self._object("config", config)
 
-    def _object(self, name: str, text: str | bytes) -> dict[str, Any]:
+    def _object(self, name: str, text: str | bytes) -> JsonObject:
         try:
             value = parse_json(text)
         except ValueError as error:
@@ -232,7 +233,7 @@ class BundleFile:
         self._check(name, isinstance(value, dict), f"a JSON object, got {shown(value)}")
         return dict(value)
 
-    def _check_entries(self, header: dict[str, Any]) -> dict[str, Any]:
+    def _check_entries(self, header: JsonObject) -> dict[str, Entry]:
         """Compare the header with the one that its own counts and the file's size call
         for."""
         counts = []
@@ -288,7 +289,7 @@ class BundleFile:
         )
 
     def _read_tables(
-        self, entries: dict[str, Any], text: bytes, reader: _core.HashedReader
+        self, entries: dict[str, Entry], text: bytes, reader: _core.HashedReader
     ) -> None:
         place = self._data_start + self.pages_bytes
         num_bytes = self.num_bytes - place
@@ -301,7 +302,7 @@ class BundleFile:
         self._fetch(place, self.num_bytes)
         self._reading = reader.read(self.path, self._fd, text, place, num_bytes, self.version > 2)
         data = self._reading.wait()  # with the hash at the end
-        self.tables: dict[str, NDArray[Any]] = {}  # whose types `schema_of` has
+        self.tables: dict[str, Column] = {}  # whose types `schema_of` has
         for name, dtype, _, _ in schema_of(self.codec):
             first, last = (offset - self.pages_bytes for offset in entries[name]["data_offsets"])
             self.tables[name] = data[first:last].view(DTYPES[dtype]).reshape(entries[name]["shape"])
@@ -328,7 +329,7 @@ class BundleFile:
         return self._data_start + np.append(self.tables["pages.offset"], self.pages_bytes)
 
     @property
-    def source(self) -> _PageSource:
+    def source(self) -> PageSource:
         """The source of pages for the core."""
         fetch = None
         if self._at_url is not None:

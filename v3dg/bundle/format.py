@@ -5,12 +5,13 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core
+from v3dg._json import JsonObject
 from v3dg._numbers import check, check_type
 
 if TYPE_CHECKING:
@@ -20,9 +21,8 @@ if TYPE_CHECKING:
 FORMAT = "v3dg"
 VERSION = 3  # the newest one, which is written
 HASH_BYTES = 16
-MAX_HEADER_BYTES = (
-    1 << 20
-)  # the header holds 20 entries and the config; a longer one is damage or an attack
+# The header holds 20 entries and the config; a longer one is damage or an attack.
+MAX_HEADER_BYTES = 1 << 20
 
 DTYPES = {"I64": "<i8", "F32": "<f4", "I32": "<i4", "U8": "|u1"}
 SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
@@ -49,10 +49,16 @@ SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
 )
 
 
-_ONLY_OF_FLOATS = (
-    "pages.bytes",
-    "pages.num_clusters",
-)  # with codes, they follow from the other tables
+# With codes, they follow from the other tables.
+_ONLY_OF_FLOATS = ("pages.bytes", "pages.num_clusters")
+
+
+class Entry(TypedDict):
+    """The entry of a tensor in the header, as safetensors has it."""
+
+    dtype: str
+    shape: list[int]
+    data_offsets: list[int]
 
 
 def schema_of(codec: "Codec") -> list[tuple[str, str, str, tuple[int, ...]]]:
@@ -97,7 +103,7 @@ def hash_of_pieces(message: bytes) -> bytes:
 
 def entries_of(
     codec: "Codec", num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int
-) -> dict[str, Any]:
+) -> dict[str, Entry]:
     """The entries of the header: dtype, shape and place of every tensor of the file, in
     file order."""
     num_rows = {"C": num_clusters, "C+1": num_clusters + 1, "G": num_groups, "P": num_pages}
@@ -105,7 +111,7 @@ def entries_of(
     for name, dtype, rows, row_shape in schema_of(codec):
         tensors.append((name, dtype, [num_rows[rows], *row_shape]))
     tensors.append(("hash", "U8", [HASH_BYTES]))
-    entries: dict[str, Any] = {}
+    entries: dict[str, Entry] = {}
     start = 0
     for name, dtype, shape in tensors:
         end = start + math.prod(shape) * np.dtype(DTYPES[dtype]).itemsize
@@ -114,7 +120,7 @@ def entries_of(
     return entries
 
 
-def header_of(entries: dict[str, Any], codec: "Codec", config: dict[str, Any]) -> bytes:
+def header_of(entries: dict[str, Entry], codec: "Codec", config: JsonObject) -> bytes:
     """The length and the JSON of the header, padded with spaces so that the data starts
     aligned.
 
@@ -137,7 +143,7 @@ def header_of(entries: dict[str, Any], codec: "Codec", config: dict[str, Any]) -
     return len(text).to_bytes(8, "little") + text
 
 
-def config_to_json(config: dict[str, Any]) -> str:
+def config_to_json(config: JsonObject) -> str:
     """The config as JSON; TypeError unless it is a dict, ValueError if JSON cannot hold
     a value."""
     check_type("config", config, dict, "a dict")

@@ -2,7 +2,7 @@
 cut."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,8 @@ from v3dg import _core
 from v3dg._numbers import check, check_type, refuse, shown, whole_number
 from v3dg.bundle.format import DTYPES, SCHEMA
 from v3dg.gaussians import Gaussians
+
+Column: TypeAlias = NDArray[Any]  # of the type that `bundle.format.SCHEMA` has for it
 
 NESTING_MARGIN = _core.nesting_margin
 """A group's ball contains the balls of the groups below it with this relative margin;
@@ -113,7 +115,7 @@ def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
             object.__setattr__(part, name.removeprefix(prefix), copy)
 
 
-def columns_of(clusters: Clusters, groups: Groups) -> dict[str, NDArray[Any]]:
+def columns_of(clusters: Clusters, groups: Groups) -> dict[str, Column]:
     """All tables, by their names in files."""
     columns = {f"clusters.{name}": array for name, array in vars(clusters).items()}
     columns.update({f"groups.{name}": array for name, array in vars(groups).items()})

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 import tyro
 
@@ -34,7 +34,9 @@ def failure_text(error: BaseException) -> str:
             return f"{error.filename}: {error.strerror}"
         return error.strerror
     if isinstance(error, MemoryError):
-        numbers = f" ({error})" if str(error) else ""
+        numbers = ""
+        if str(error):
+            numbers = f" ({error})"
         return f"not enough memory{numbers}; use smaller pictures or a smaller asset"
     return str(error)
 
@@ -42,7 +44,13 @@ def failure_text(error: BaseException) -> str:
 def printable(line: str) -> str:
     """A line with its control characters escaped, because file names and texts of files
     may hold any."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    return "".join(map(_printable_letter, line))
+
+
+def _printable_letter(letter: str) -> str:
+    if letter.isprintable():
+        return letter
+    return letter.encode("unicode_escape").decode()
 
 
 def tell(text: str) -> None:
@@ -50,7 +58,7 @@ def tell(text: str) -> None:
     print(printable(" ".join(cleaned(text).split())), file=sys.stderr)
 
 
-def option(metavar: str, *aliases: str) -> Any:
+def option(metavar: str, *aliases: str) -> object:
     """Annotation of an option that is None by default; its help says what None
     means."""
     return tyro.conf.arg(metavar=metavar, aliases=aliases or None, help_behavior_hint="")
@@ -111,8 +119,8 @@ def check_usage(name: str, holds: object, expected: str) -> None:
         raise UsageError(f"{name}: expected {expected}")
 
 
-def check_range(name: str, value: float, least: float, most: float) -> None:
-    check_usage(name, least <= value <= most, f"{least:,} to {most:,}, got {value}")
+def check_range(name: str, value: float, minimum: float, maximum: float) -> None:
+    check_usage(name, minimum <= value <= maximum, f"{minimum:,} to {maximum:,}, got {value}")
 
 
 def require_file(path: Path, *suffixes: str) -> None:
@@ -121,9 +129,11 @@ def require_file(path: Path, *suffixes: str) -> None:
         is_url(path) or path.exists(),
         f"a file, got a path that does not exist{_similar(path)}",
     )
-    got = "a folder" if path.is_dir() else "another name"
+    problem = "another name"
+    if path.is_dir():
+        problem = "a folder"
     is_known = beside(path).name.lower().endswith(suffixes)
-    check(shown(path), is_known, f"a file ending in {', '.join(suffixes)}, got {got}")
+    check(shown(path), is_known, f"a file ending in {', '.join(suffixes)}, got {problem}")
 
 
 def _similar(path: Path) -> str:
@@ -166,7 +176,8 @@ def finite(number: float) -> float | None:
     return None
 
 
-def print_result(as_json: bool, result: dict[str, Any], lines: Iterable[str]) -> None:
+def print_result(result: Mapping[str, object], lines: Iterable[str], *, as_json: bool) -> None:
+    """Print a result on stdout: its JSON values, or lines of text."""
     if as_json:
         print(json.dumps(result, indent=1), flush=True)
     else:
@@ -181,7 +192,7 @@ class Column:
     head: str
     form: str
 
-    def cell(self, row: Mapping[str, Any]) -> str:
+    def cell(self, row: Mapping[str, object]) -> str:
         """The cell of a row; `-` if the row lacks a value."""
         try:
             return printable(self.form.format_map(row))
@@ -189,7 +200,7 @@ class Column:
             return "-"
 
 
-def table_lines(columns: Sequence[Column], rows: Iterable[Mapping[str, Any]]) -> list[str]:
+def table_lines(columns: Sequence[Column], rows: Iterable[Mapping[str, object]]) -> list[str]:
     """Lines of a table, whose first column is aligned to the left, the others to the
     right."""
     table = [[column.head for column in columns]]

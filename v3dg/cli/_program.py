@@ -22,8 +22,10 @@ from v3dg import _start
 from v3dg._version import __version__
 from v3dg.cli._common import FAILURES, UsageError, check_range, failure_text, tell
 
-# Options and what runs on them, by the command's name, in the order of the help.
-Commands: TypeAlias = Mapping[str, tuple[type[Any], Callable[[Any], None]]]
+# Each command has a class of options of its own, with the function that runs on them.
+Options: TypeAlias = Any
+# By the command's name, in the order of the help.
+Commands: TypeAlias = Mapping[str, tuple[type[Options], Callable[[Options], None]]]
 
 INTERRUPTED = 130  # exit code
 
@@ -42,15 +44,15 @@ class Program:
     description: str
     commands: Commands
 
-    def parse(self, arguments: Sequence[str]) -> Any:
+    def parse(self, arguments: Sequence[str]) -> Options:
         """Parse the command line; tyro's boxed message becomes one line."""
-        subcommands: Any = [
+        subcommands: list[Options] = [
             Annotated[options, tyro.conf.subcommand(name)]
             for name, (options, _) in self.commands.items()
         ]
         if "" in arguments:  # as a path it would be the working folder, and everything in it
-            place = list(arguments).index("") + 1
-            raise UsageError(f"argument {place} is empty; is a shell variable unset?")
+            number = list(arguments).index("") + 1
+            raise UsageError(f"argument {number} is empty; is a shell variable unset?")
         caught = io.StringIO()
         try:
             with contextlib.redirect_stderr(caught), _legible_width():
@@ -73,21 +75,21 @@ class Program:
             return f"{_text_of_first_box(boxed)}; run {self.name} --help"
         command = arguments[0]
         if command not in self.commands:
-            known = list(self.commands)
-            text = f"COMMAND: expected {', '.join(known)}, got {command}"
-            return f"{text}{_suggestion(command, known)}; run {self.name} --help"
+            names = list(self.commands)
+            text = f"COMMAND: expected {', '.join(names)}, got {command}"
+            return f"{text}{_suggestion(command, names)}; run {self.name} --help"
         text = self._unknown_option(command, arguments[1:]) or _text_of_first_box(boxed)
         return f"{text}; run {self.name} {command} --help"
 
     def _unknown_option(self, command: str, arguments: Sequence[str]) -> str | None:
         """The message for the first option that a command does not have, if there is
         one."""
-        known = self._options(command)
+        options = self._options(command)
         for argument in arguments:
             name = argument.partition("=")[0].replace("_", "-")
-            if name.startswith("--") and name not in known:
+            if name.startswith("--") and name not in options:
                 text = f"{name}: expected an option of {self.name} {command}, got none"
-                return f"{text}{_suggestion(name, known)}"
+                return f"{text}{_suggestion(name, options)}"
         return None
 
     def _options(self, command: str) -> list[str]:
@@ -117,7 +119,9 @@ class Program:
         return code
 
     def _run(self, arguments: Sequence[str] | None) -> int:
-        words = sys.argv[1:] if arguments is None else list(arguments)
+        words = sys.argv[1:]
+        if arguments is not None:
+            words = list(arguments)
         try:
             if words == ["--version"]:
                 print(f"v3dg {__version__}")
@@ -157,10 +161,10 @@ def _legible_width() -> Iterator[None]:
             os.environ["COLUMNS"] = columns
 
 
-def _suggestion(name: str, known: Sequence[str]) -> str:
-    """The known name that is most like an unknown one, as the end of a message; empty
-    if none is."""
-    similar = difflib.get_close_matches(name, known, 1, 0.7)
+def _suggestion(name: str, choices: Sequence[str]) -> str:
+    """The choice that is most like an unknown name, as the end of a message; empty if
+    none is."""
+    similar = difflib.get_close_matches(name, choices, 1, 0.7)
     if similar:
         return f"; perhaps you meant {similar[0]}"
     return ""
@@ -177,13 +181,15 @@ def _plainly(text: str) -> str:
     """A message of tyro without types of Python, with its choices in a fixed order and
     without None."""
     if match := re.match(r"Error parsing (--[a-z-]+): (.*)", text):
-        expected = "numbers" if "float" in match[2].lower() else "whole numbers"
+        expected = "whole numbers"
+        if "float" in match[2].lower():
+            expected = "numbers"
         return f"{match[1]}: expected {expected}, got " + ", ".join(re.findall("'.*?'", match[2]))
     if match := re.match(r"Missing from [^:]*: (\S+) (.*?)\.? \(required\)", text):
         return f"{match[1]}: expected {match[2][:1].lower()}{match[2][1:]}, got nothing"
     if match := re.match(r"invalid choice (.*) for argument '(.*)'. Expected one of (.*)", text):
-        known = set(re.findall(r"'(.*?)'", match[3])) - {"None"}
-        expected = ", ".join(sorted(known, key=lambda name: (name[0] == "-", name)))
+        choices = set(re.findall(r"'(.*?)'", match[3])) - {"None"}
+        expected = ", ".join(sorted(choices, key=lambda name: (name[0] == "-", name)))
         return f"{match[2]}: expected one of {expected}, got {match[1]}"
     if match := re.match(
         r"Missing value for argument '(?:.*/)?(--.*)'. Expected (\d) values", text

@@ -3,11 +3,12 @@ subject."""
 
 import math
 import os
+import re
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 import tyro
@@ -16,7 +17,7 @@ from v3dg._numbers import check, refuse
 from v3dg._urls import beside, shown
 from v3dg.bundle import Bundle
 from v3dg.camera_file import read_cameras
-from v3dg.cameras import AXES, DEFAULT_FOV_X, Axis, Camera, turntable
+from v3dg.cameras import AXES, DEFAULT_FOV_X, Axis, Camera, VectorLike, turntable
 from v3dg.cleaning import ball_of_most, examine
 from v3dg.cli._common import (
     check_range,
@@ -26,7 +27,7 @@ from v3dg.cli._common import (
     printable,
     require_subject,
 )
-from v3dg.gaussians import Gaussians
+from v3dg.gaussians import Array, Gaussians
 from v3dg.pictures import MOST_SIDE, check_size
 from v3dg.scene import Scene, Subject
 from v3dg.scene.file import is_scene
@@ -35,6 +36,8 @@ from v3dg.upright import ASSUMED, direction_of, up_of
 # Gaussians of the level that a turntable is centred on: enough to find the centre, and
 # quick to read.
 _ENOUGH_TO_FRAME = 50_000
+
+_DEFAULT_ELEVATION = 20.0  # degrees
 
 # All cameras are made before the first picture is drawn.
 _MOST_VIEWS = 10_000
@@ -94,7 +97,8 @@ class ViewOptions(CameraFile):
                 f"a turntable to set with it, got the cameras of {shown(file or '')}; leave it out"
             )
             check_usage(name, value is None or not file, expected)
-        check_range("--views", 1 if self.views is None else self.views, 1, _MOST_VIEWS)
+        if self.views is not None:
+            check_range("--views", self.views, 1, _MOST_VIEWS)
         check_range("--elevation", self.elevation or 0, -89.99, 89.99)
 
     def turntable(self) -> dict[str, object]:
@@ -135,10 +139,10 @@ def _camera_name(text: str, names: Sequence[str]) -> str:
         return text
     if text.isdecimal() and int(text) < len(names):
         return names[int(text)]
-    known = ", ".join(names[:8])
+    choices = ", ".join(names[:8])
     if len(names) > 8:
-        known += " ..."
-    raise ValueError(f"--camera: expected one of {known}, or 0 to {len(names) - 1}, got {text}")
+        choices += " ..."
+    raise ValueError(f"--camera: expected one of {choices}, or 0 to {len(names) - 1}, got {text}")
 
 
 def _around(
@@ -146,22 +150,21 @@ def _around(
 ) -> dict[str, Camera]:
     """Cameras around the ball of most gaussians, at a distance that shows nearly all of
     it."""
-    if isinstance(subject, Gaussians):
-        means = subject.means[examine(subject).drawable]
-    else:
-        levels = range(subject.num_levels)
-        level = next(
-            (i for i in levels if level_size(subject, i) <= _ENOUGH_TO_FRAME), len(levels) - 1
-        )
-        means = subject.level_gaussians(level).means if levels else np.zeros((0, 3), np.float32)
-    centre, radius = ball_of_most(means) if len(means) else (np.zeros(3), 1.0)
+    means = _means_to_frame(subject)
+    centre: VectorLike = (0.0, 0.0, 0.0)
+    radius = 1.0
+    if len(means):
+        centre, radius = ball_of_most(means)
     narrow = math.tan(DEFAULT_FOV_X / 2) * min(1.0, options.size[1] / options.size[0])
     distance = 0.9 * radius / math.sin(math.atan(narrow))
+    elevation = _DEFAULT_ELEVATION
+    if options.elevation is not None:
+        elevation = options.elevation
     cameras = turntable(
         centre,
         distance,
         views,
-        math.radians(20.0 if options.elevation is None else options.elevation),
+        math.radians(elevation),
         up=direction_of(options.up or up_of(subject, path=path)[0]),
         width=options.size[0],
         height=options.size[1],
@@ -169,6 +172,17 @@ def _around(
     )
     digits = len(str(views - 1))
     return {f"{i:0{digits}}": camera for i, camera in enumerate(cameras)}
+
+
+def _means_to_frame(subject: Bundle | Gaussians) -> Array:
+    """(N, 3) positions of gaussians that show where the subject is."""
+    if isinstance(subject, Gaussians):
+        return subject.means[examine(subject).drawable]
+    if not subject.num_levels:
+        return np.zeros((0, 3), np.float32)
+    levels = range(subject.num_levels)
+    small_levels = (i for i in levels if level_size(subject, i) <= _ENOUGH_TO_FRAME)
+    return subject.level_gaussians(next(small_levels, levels[-1])).means
 
 
 def choose_up(
@@ -209,9 +223,10 @@ def ask_up(path: Path, axis: Axis) -> Axis:
     while True:
         question = printable(f"{beside(path).name}: which way is up, {', '.join(AXES)}? [{axis}] ")
         print(question, end="", file=sys.stderr, flush=True)
-        answer: Any = sys.stdin.readline().strip() or axis
-        if answer in AXES:
-            return answer  # type: ignore[no-any-return]
+        answer = sys.stdin.readline().strip() or axis
+        for choice in AXES:
+            if answer == choice:
+                return choice
 
 
 def picture_paths(output: Path, cameras: Collection[str]) -> list[Path]:
@@ -223,9 +238,7 @@ def picture_paths(output: Path, cameras: Collection[str]) -> list[Path]:
     """
     if len(cameras) == 1:
         return [output]
-    names = [
-        "".join(c if c.isalnum() or c in "-_." else "_" for c in name)[:100] for name in cameras
-    ]
+    names = [re.sub(r"[^\w.-]", "_", name)[:100] for name in cameras]
     if len(set(names)) < len(names):
         names = [str(place) for place in range(len(names))]
     return [output.with_name(f"{output.stem}_{name}{output.suffix}") for name in names]

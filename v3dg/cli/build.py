@@ -4,18 +4,20 @@ import logging
 import time
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Sized
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from v3dg import _extras
+from v3dg._json import JsonObject
 from v3dg._numbers import check
 from v3dg._urls import beside, cleaned, shown
+from v3dg.bundle import Bundle
 from v3dg.cameras import Axis
 from v3dg.cleaning import AssetWarning, describe
 from v3dg.cli import _common
@@ -85,7 +87,7 @@ def run(options: Build) -> None:
             if options.up is None and not options.resume:
                 options.up = _asked_up(files[0])
             result = _build(options, files, output, executor)
-            _common.print_result(options.json, result, _lines(result))
+            _common.print_result(result, _lines(result), as_json=options.json)
         else:
             _run_many(options, assets, executor)
 
@@ -174,23 +176,22 @@ def _greet(address: str) -> None:
 def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor | None) -> None:
     outputs = _outputs(list(assets), options.output)
     start = time.perf_counter()
-    results: list[dict[str, Any]] = []
+    results: list[JsonObject] = []
     for asset, output in outputs.items():
         if not options.quiet:
             _common.tell(f"[{len(results) + 1}/{len(outputs)}] {shown(asset)}")
         try:
             results.append(_build(options, assets[asset], output, executor))
         except SchedulerError as error:  # which the others would wait for, too
-            done = f"{len(results)} of {len(outputs)} assets done"
-            raise SchedulerError(f"{error}; {done}") from None
+            raise SchedulerError(f"{error}; {_progress_text(results, outputs)}") from None
         except _common.FAILURES as error:
             failure = cleaned(_common.failure_text(error))
             results.append({"asset": shown(asset), "status": "failed", "error": failure})
             if not options.quiet:
                 _common.tell(f"failed: {results[-1]['error']}")
         except KeyboardInterrupt:
-            done = f"{len(results)} of {len(outputs)} assets done"
-            raise KeyboardInterrupt(f"interrupted with {done}; `--resume` continues") from None
+            text = f"interrupted with {_progress_text(results, outputs)}; `--resume` continues"
+            raise KeyboardInterrupt(text) from None
     _print_many(options, results, time.perf_counter() - start)
     failed = [result for result in results if result["status"] == "failed"]
     if failed:
@@ -200,7 +201,11 @@ def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor
         raise RuntimeError(text)
 
 
-def _print_many(options: Build, results: list[dict[str, Any]], seconds: float) -> None:
+def _progress_text(results: Sized, outputs: Sized) -> str:
+    return f"{len(results)} of {len(outputs)} assets done"
+
+
+def _print_many(options: Build, results: list[JsonObject], seconds: float) -> None:
     columns = [
         _common.Column("asset", "{asset}"),
         _common.Column("bundle", "{status}"),
@@ -223,7 +228,8 @@ def _print_many(options: Build, results: list[dict[str, Any]], seconds: float) -
         ", ".join(f"{count} {name}" for name, count in summary.items()) + f", {seconds:.1f} s"
     )
     lines = [*_common.table_lines(columns, rows), "", last_line]
-    _common.print_result(options.json, {**summary, "seconds": seconds, "assets": results}, lines)
+    result = {**summary, "seconds": seconds, "assets": results}
+    _common.print_result(result, lines, as_json=options.json)
 
 
 def _assets_of(paths: Sequence[Path]) -> dict[Path, list[Path]]:
@@ -275,34 +281,72 @@ def _outputs(assets: Sequence[Path], folder: Path | None) -> dict[Path, Path]:
 
 def _build(
     options: Build, paths: Sequence[Path], output: Path, executor: Executor | None
-) -> dict[str, Any]:
+) -> JsonObject:
     """Build and write one bundle; returns its description, as JSON values."""
     for path in paths:
         _common.require_file(path, *SUFFIXES)
-    advice = f", got a folder; {output / paths[0].stem}.v3dg is one" if output.is_dir() else ""
+    advice = ""
+    if output.is_dir():
+        advice = f", got a folder; {output / paths[0].stem}.v3dg is one"
     check(output, output.suffix == ".v3dg", f"a file name ending in .v3dg{advice}")
     _common.check_output(output, *paths)
     start = time.perf_counter()
-    config = BuildConfig.paper() if options.config == "paper" else BuildConfig()
+    with _resume_advised(output):
+        bundle, is_built = _build_file(options, paths, output, executor)
+    asset: str | list[str] = [shown(path) for path in paths]
+    if len(paths) == 1:
+        asset = shown(paths[0])
+    status = "kept"
+    if is_built:
+        status = "built"
+    return {
+        "asset": asset,
+        "output": str(output),
+        "status": status,
+        "asset_gaussians": bundle.config["asset_gaussians"],
+        "dropped": bundle.config["dropped"],
+        "gaussians": bundle.num_gaussians,
+        "clusters": len(bundle.clusters),
+        "levels": bundle.num_levels,
+        "bytes": output.stat().st_size,
+        "seconds": time.perf_counter() - start,
+    }
+
+
+def _build_file(
+    options: Build, paths: Sequence[Path], output: Path, executor: Executor | None
+) -> tuple[Bundle, bool]:
+    config = BuildConfig()
+    if options.config == "paper":
+        config = BuildConfig.paper()
     if options.cluster_size is not None:
         config = replace(config, cluster_size=options.cluster_size)
+    unusable: Literal["drop", "refuse"] = "drop"
+    if options.strict:
+        unusable = "refuse"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AssetWarning)  # the result says it
+        return build_file(
+            paths,
+            output,
+            config=config,
+            seed=options.seed,
+            progress=not options.quiet,
+            device=options.device,
+            resume=options.resume,
+            unusable=unusable,
+            memory=options.memory,
+            executor=executor,
+            codec=options.codec,
+            up=options.up,
+        )
+
+
+@contextmanager
+def _resume_advised(output: Path) -> Iterator[None]:
+    """Add to errors and interrupts of a build where it can continue."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", AssetWarning)  # the result says it
-            bundle, is_built = build_file(
-                paths,
-                output,
-                config=config,
-                seed=options.seed,
-                progress=not options.quiet,
-                device=options.device,
-                resume=options.resume,
-                unusable="refuse" if options.strict else "drop",
-                memory=options.memory,
-                executor=executor,
-                codec=options.codec,
-                up=options.up,
-            )
+        yield
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted{_resume_advice(output)}") from None
     except SchedulerError as error:
@@ -312,18 +356,6 @@ def _build(
             raise type(error)(f"{error}{_resume_advice(output)}") from None
         text = f"{error.strerror}{_resume_advice(output)}"
         raise OSError(error.errno, text, error.filename) from None
-    return {
-        "asset": shown(paths[0]) if len(paths) == 1 else [shown(path) for path in paths],
-        "output": str(output),
-        "status": "built" if is_built else "kept",
-        "asset_gaussians": bundle.config["asset_gaussians"],
-        "dropped": bundle.config["dropped"],
-        "gaussians": bundle.num_gaussians,
-        "clusters": len(bundle.clusters),
-        "levels": bundle.num_levels,
-        "bytes": output.stat().st_size,
-        "seconds": time.perf_counter() - start,
-    }
 
 
 def _resume_advice(output: Path) -> str:
@@ -335,8 +367,10 @@ def _resume_advice(output: Path) -> str:
     return ""
 
 
-def _lines(result: dict[str, Any]) -> list[str]:
-    time_text = "kept as it was" if result["status"] == "kept" else f"{result['seconds']:.1f} s"
+def _lines(result: JsonObject) -> list[str]:
+    time_text = f"{result['seconds']:.1f} s"
+    if result["status"] == "kept":
+        time_text = "kept as it was"
     lines = [
         f"{result['output']}: {result['levels']} levels, {result['clusters']:,} clusters, "
         f"{result['gaussians']:,} gaussians ({result['asset_gaussians']:,} in the asset), "

@@ -5,12 +5,13 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import tyro
 
 from v3dg import _device, pictures
+from v3dg._json import JsonObject
 from v3dg._judges import Judges, mean_of
 from v3dg._numbers import check
 from v3dg._progress import counted
@@ -30,6 +31,14 @@ _ENOUGH_TO_SHARE = 6
 # Smaller pictures are enlarged to about this width, in px, when they are shown side by
 # side.
 _LEAST_WIDTH = 300
+
+_COLUMNS = (
+    _common.Column("view", "{camera}"),
+    _common.Column("FLIP", "{flip:.4f}"),
+    _common.Column("PSNR", "{psnr:.2f}"),
+    _common.Column("SSIM", "{ssim:.4f}"),
+    _common.Column("gaussians", "{gaussians_selected:,.0f}"),
+)
 
 
 @dataclass
@@ -82,29 +91,27 @@ def run(options: Compare) -> None:
     are_pictures = [beside(path).suffix.lower() in pictures.SUFFIXES for path in subjects]
     is_pair = any(are_pictures) == all(are_pictures)
     _common.check_usage("PATH", is_pair, "two pictures, or two subjects to draw, got one of each")
-    pairs = _read_pictures(options) if all(are_pictures) else _draw(options)
+    if all(are_pictures):
+        pairs = _read_pictures(options)
+    else:
+        pairs = _draw(options)
     rows, worst = _measure(options, pairs, output)
     mean = mean_of(rows, "flip", "psnr", "ssim", "gaussians_selected")
-    result: dict[str, Any] = {
+    result = {
         "reference": shown(options.reference),
         "test": shown(options.test),
         "mean": mean,
         "worst": worst["camera"],
         "views": rows,
     }
-    columns = [
-        _common.Column("view", "{camera}"),
-        _common.Column("FLIP", "{flip:.4f}"),
-        _common.Column("PSNR", "{psnr:.2f}"),
-        _common.Column("SSIM", "{ssim:.4f}"),
-        _common.Column("gaussians", "{gaussians_selected:,.0f}"),
-    ]
     table_rows = list(rows)
     if len(rows) > 1:
         table_rows.append({"camera": "mean", **mean})
-    titles = "reference and test" if mean["flip"] is None else "reference, test and FLIP"
+    titles = "reference, test and FLIP"
+    if mean["flip"] is None:
+        titles = "reference and test"
     lines = [
-        *_common.table_lines(columns, table_rows),
+        *_common.table_lines(_COLUMNS, table_rows),
         "",
         f"{worst['picture']}: {titles} of view {worst['camera']}, which differs most",
     ]
@@ -114,19 +121,17 @@ def run(options: Compare) -> None:
         lines.append(
             "every view needs the finest level; a smaller `--size` shows the test as from far away"
         )
-    _common.print_result(options.json, result, lines)
+    _common.print_result(result, lines, as_json=options.json)
 
 
-def _measure(
-    options: Compare, pairs: _Pairs, output: Path
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def _measure(options: Compare, pairs: _Pairs, output: Path) -> tuple[list[JsonObject], JsonObject]:
     """Measure all pairs and write their pictures; the rows of the result, and the one
     that differs most."""
     paths = [output] * len(pairs.names)
     if options.pictures == "all":
         paths = picture_paths(output, pairs.names)
-    rows: list[dict[str, Any]] = []
-    worst: tuple[_Pair, dict[str, Any]] | None = None
+    rows: list[JsonObject] = []
+    worst: tuple[_Pair, JsonObject] | None = None
     with contextlib.closing(Judges()) as judges:
         measured: Iterable[tuple[_Pair, dict[str, float | None]]]
         if len(pairs.names) >= _ENOUGH_TO_SHARE:
@@ -134,7 +139,7 @@ def _measure(
         else:
             measured = ((pair, _errors(pair)) for pair in pairs.pairs)
         for pair, errors in counted(measured, len(pairs.names), "compare", not options.quiet):
-            row = {"camera": pair.name, **errors, "gaussians_selected": pair.gaussians}
+            row: JsonObject = {"camera": pair.name, **errors, "gaussians_selected": pair.gaussians}
             if options.pictures == "all":
                 row["picture"] = str(paths[len(rows)])
                 _write(options, pair, row)
@@ -208,7 +213,7 @@ def _errors(pair: _Pair) -> dict[str, float | None]:
     return errors_of(pair.reference, pair.test)
 
 
-def _difference(row: dict[str, Any]) -> float:
+def _difference(row: JsonObject) -> float:
     """The order of views: FLIP, or the negative PSNR if FLIP is missing."""
     if row["flip"] is not None:
         return float(row["flip"])
@@ -217,7 +222,7 @@ def _difference(row: dict[str, Any]) -> float:
     return -math.inf
 
 
-def _write(options: Compare, pair: _Pair, row: dict[str, Any]) -> None:
+def _write(options: Compare, pair: _Pair, row: JsonObject) -> None:
     named = ((options.reference, pair.reference), (options.test, pair.test))
     titled = [(_common.printable(beside(path).name), picture) for path, picture in named]
     if row["flip"] is not None:

@@ -35,4 +35,6 @@ def run(options: Completion) -> None:
     with contextlib.redirect_stdout(script), contextlib.suppress(SystemExit):
         parse(["--tyro-write-completion", options.shell, "-"])
     text = script.getvalue().replace(*_OR_FILES[options.shell])
-    print(json.dumps({"shell": options.shell, "script": text}) if options.json else text)
+    if options.json:
+        text = json.dumps({"shell": options.shell, "script": text})
+    print(text)

@@ -93,7 +93,8 @@ def run(options: Convert) -> None:
         **part.description,
     }
     text = f"{output}: {len(part.gaussians):,} gaussians, SH degree {part.gaussians.sh_degree}"
-    _common.print_result(options.json, result, [f"{text}, {_common.bytes_text(num_bytes)}"])
+    line = f"{text}, {_common.bytes_text(num_bytes)}"
+    _common.print_result(result, [line], as_json=options.json)
 
 
 def _is_bundle(path: Path) -> bool:
@@ -142,10 +143,11 @@ def _level(options: Convert, bundle: Bundle) -> _Part:
 
 def _cut(options: Convert, subject: Scene | Bundle, own_cameras: dict[str, Camera] | None) -> _Part:
     cameras = choose_cameras(options.view, options.subject, subject, own_cameras)
+    option_name = "--camera"
+    if options.view.views:
+        option_name = "--views"
     expected = f"one camera to look from, got {len(cameras)}; choose one"
-    _common.check_usage(
-        "--views" if options.view.views else "--camera", len(cameras) == 1, expected
-    )
+    _common.check_usage(option_name, len(cameras) == 1, expected)
     name, camera = next(iter(cameras.items()))
     selection = select(
         subject,

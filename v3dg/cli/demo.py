@@ -36,7 +36,7 @@ def run(options: Demo) -> None:
     for side in options.size:
         check_range("--size", side, 16, 4096)
     check_range("--seed", options.seed, 0, (1 << 58) - 1)
-    rule_of(options.tolerance, None, 0, "solid_angle", True)
+    rule_of(options.tolerance, budget=None, min_level=0)
     result = run_demo(
         options.output,
         num_gaussians=options.gaussians,
@@ -67,4 +67,4 @@ def run(options: Demo) -> None:
         "",
         f"wrote {result['picture']} in {result['seconds']:.0f} s",
     ]
-    print_result(options.json, result, lines)
+    print_result(result, lines, as_json=options.json)

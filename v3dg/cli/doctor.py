@@ -30,14 +30,16 @@ def run(options: Doctor) -> None:
     findings = list(_findings())
     result = []
     for finding in findings:
-        missing = None if finding.version else finding.advice
+        missing = None
+        if not finding.version:
+            missing = finding.advice
         result.append({"part": finding.part, "found": finding.version, "missing": missing})
     width = max(len(finding.part) for finding in findings)
     lines = []
     for finding in findings:
         text = finding.version or f"missing, {finding.advice}"
         lines.append(f"{finding.part:<{width}}  {text}")
-    print_result(options.json, {"parts": result}, lines)
+    print_result({"parts": result}, lines, as_json=options.json)
 
 
 class _Finding(NamedTuple):
@@ -49,7 +51,9 @@ class _Finding(NamedTuple):
 
 
 def _findings() -> Iterator[_Finding]:
-    cuda = "with CUDA" if _core.has_cuda else "without CUDA"
+    cuda = "without CUDA"
+    if _core.has_cuda:
+        cuda = "with CUDA"
     folder = os.path.dirname(_core.__file__)
     version = f"{__version__} {cuda}, {_core.isa()}, {os.cpu_count()} CPU cores, in {folder}"
     yield _Finding("v3dg", version, "")
@@ -65,7 +69,10 @@ def _findings() -> Iterator[_Finding]:
     gpu = _answer("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader")
     yield _Finding("GPU, driver", gpu, "to draw and build with CUDA; the CPU can do all of it, too")
     missing = _device.missing_for_cuda()
-    yield _Finding("CUDA", None if missing else "works", f"to draw and build on a GPU: {missing}")
+    status = None
+    if not missing:
+        status = "works"
+    yield _Finding("CUDA", status, f"to draw and build on a GPU: {missing}")
     for extra in EXTRAS.values():
         name = re.split(r"[\[>]", extra.requirement)[0]
         installed: str | None = None
@@ -82,8 +89,8 @@ def _findings() -> Iterator[_Finding]:
 def _answer(*command: str, line: int = 0) -> str | None:
     """A line of the output of a program; None if the program is missing or fails."""
     with contextlib.suppress(OSError, subprocess.SubprocessError, IndexError):
-        done = subprocess.run(
+        process = subprocess.run(
             command, capture_output=True, text=True, timeout=_PATIENCE_S, check=True
         )
-        return done.stdout.splitlines()[line].strip()
+        return process.stdout.splitlines()[line].strip()
     return None

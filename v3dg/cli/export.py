@@ -2,20 +2,23 @@
 
 import shlex
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from v3dg import export
 from v3dg._urls import beside, shown
-from v3dg.cameras import Axis
+from v3dg.bundle import Bundle
+from v3dg.cameras import Axis, Camera
 from v3dg.cli import _common
 from v3dg.cli._views import choose_up
 from v3dg.formats.usd import SUFFIXES as USD_SUFFIXES
 from v3dg.gaussians import Gaussians
 from v3dg.opening import open_with_cameras
+from v3dg.scene import Scene
 
 
 @dataclass
@@ -63,38 +66,80 @@ def run(options: Export) -> None:
             "--to", options.to == "sog", f"none for {folder}, got {options.to}; leave it out"
         )
         size = export.write_usd(subject, folder, up=up)
-        written = {"output": str(folder), "bytes": size, "seconds": time.perf_counter() - start}
-        line = f"{folder}: {_common.bytes_text(size)}, {written['seconds']:.1f} s"
-        _common.print_result(options.json, written, [line, *notes])
+        seconds = time.perf_counter() - start
+        usd_result = {"output": str(folder), "bytes": size, "seconds": seconds}
+        line = f"{folder}: {_common.bytes_text(size)}, {seconds:.1f} s"
+        _common.print_result(usd_result, [line, *notes], as_json=options.json)
         return
-    common: dict[str, Any] = {
-        "up": up,
-        "progress": not options.quiet,
-        "overwrite": options.overwrite,
-    }
-    there = shlex.quote(str(folder))
-    done: export.Site | export.Tiles
     if options.to == "tiles":
-        done = export.write_tiles(subject, folder, **common)
-        text, needs = (
-            f"{done.tiles:,} tiles",
-            () if (folder / export.CESIUM).exists() else export.TILES_NEED,
-        )
+        written = _write_tiles(options, subject, folder, up)
     else:
-        done = export.write_site(subject, folder, cameras, chunk=options.chunk, **common)
-        text = f"{done.gaussians:,} gaussians, {done.coarsest:,} at the coarsest"
-        needs = () if done.has_engine else export.SITE_NEEDS
-    result = {"output": str(folder), **asdict(done), "seconds": time.perf_counter() - start}
-    seconds = f"{result['seconds']:.1f} s"
-    instances = f"{done.instances:,} instance{'s' * (done.instances != 1)}"
-    lines = [f"{folder}: {instances}, {text}, {_common.bytes_text(done.bytes)}, {seconds}", *notes]
-    if needs:
-        lines += [
-            "it needs its engine beside it, once:",
-            *(f"  {line.format(there)}" for line in needs),
-        ]
-    lines += [f"to look at it: python -m http.server --bind 127.0.0.1 --directory {there}"]
-    _common.print_result(options.json, result, [*lines, "  then open http://127.0.0.1:8000/"])
+        written = _write_site(options, subject, folder, up, cameras)
+    seconds = time.perf_counter() - start
+    result = {"output": str(folder), **asdict(written.export), "seconds": seconds}
+    lines = [*_lines(folder, written, seconds), *notes, *_advice(folder, written)]
+    _common.print_result(result, lines, as_json=options.json)
+
+
+@dataclass(frozen=True)
+class _Written:
+    """An export to a folder."""
+
+    export: export.Site | export.Tiles
+    text: str  # what it consists of
+    needs: Sequence[str]  # commands that bring the missing engine to the folder
+
+
+def _write_tiles(options: Export, subject: Scene | Bundle, folder: Path, up: Axis) -> _Written:
+    tiles = export.write_tiles(
+        subject, folder, up=up, progress=not options.quiet, overwrite=options.overwrite
+    )
+    needs: Sequence[str] = ()
+    if not (folder / export.CESIUM).exists():
+        needs = export.TILES_NEED
+    return _Written(tiles, f"{tiles.tiles:,} tiles", needs)
+
+
+def _write_site(
+    options: Export,
+    subject: Scene | Bundle,
+    folder: Path,
+    up: Axis,
+    cameras: Mapping[str, Camera] | None,
+) -> _Written:
+    site = export.write_site(
+        subject,
+        folder,
+        cameras,
+        chunk=options.chunk,
+        up=up,
+        progress=not options.quiet,
+        overwrite=options.overwrite,
+    )
+    needs: Sequence[str] = ()
+    if not site.has_engine:
+        needs = export.SITE_NEEDS
+    text = f"{site.gaussians:,} gaussians, {site.coarsest:,} at the coarsest"
+    return _Written(site, text, needs)
+
+
+def _lines(folder: Path, written: _Written, seconds: float) -> list[str]:
+    num_instances = written.export.instances
+    instances = f"{num_instances:,} instance{'s' * (num_instances != 1)}"
+    size = _common.bytes_text(written.export.bytes)
+    return [f"{folder}: {instances}, {written.text}, {size}, {seconds:.1f} s"]
+
+
+def _advice(folder: Path, written: _Written) -> list[str]:
+    """How to look at an export."""
+    quoted = shlex.quote(str(folder))
+    lines = []
+    if written.needs:
+        lines.append("it needs its engine beside it, once:")
+        lines += [f"  {line.format(quoted)}" for line in written.needs]
+    lines.append(f"to look at it: python -m http.server --bind 127.0.0.1 --directory {quoted}")
+    lines.append("  then open http://127.0.0.1:8000/")
+    return lines
 
 
 def _web_folder(subject: Path) -> Path:

@@ -2,27 +2,28 @@
 
 import json
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 import tyro
 
+from v3dg._json import Json, JsonObject
 from v3dg._urls import shown
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cleaning import OUTLIER_DISTANCE, describe, examine, outliers
 from v3dg.cli import _common
-from v3dg.gaussians import Gaussians
+from v3dg.gaussians import Array, Gaussians
 from v3dg.io import asset_bytes
 from v3dg.levels import BuildConfig
 from v3dg.opening import open_with_cameras
 from v3dg.scene import Scene
 
 # JSON values, and lines of text.
-_Description = tuple[dict[str, Any], list[str]]
+_Description: TypeAlias = tuple[JsonObject, list[str]]
 
 _MOST_SHOWN = 20  # cameras in a list: with hundreds, nothing else is left on the screen
 
@@ -44,7 +45,8 @@ def run(options: Info) -> None:
         description = _bundle_info(subject)
     else:
         description = _asset_info(options.file, subject)
-    _common.print_result(options.json, *description)
+    result, lines = description
+    _common.print_result(result, lines, as_json=options.json)
 
 
 def _asset_info(path: Path, asset: Gaussians) -> _Description:
@@ -59,7 +61,7 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
         for name, array in values.items()
         if len(array)
     }
-    result: dict[str, Any] = {
+    result: JsonObject = {
         "path": shown(path),
         "kind": "asset",
         "gaussians": len(asset),
@@ -75,25 +77,39 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
     lines += [f"{len(asset):,} gaussians, SH degree {asset.sh_degree}"]
     if findings.counts:
         lines.append(f"{findings.num_dropped:,} cannot be drawn: {describe(findings.counts)}")
-    if len(drawable):
-        lines.append("means from {} to {}".format(*map(_point, boxes["box"])))
-    if far.any():
+    return result, [*lines, *_extent_lines(result), *_spread_lines(spread)]
+
+
+def _extent_lines(result: JsonObject) -> list[str]:
+    """Lines about the positions of the gaussians that can be drawn."""
+    lines = []
+    if result["drawable"]:
+        lines.append("means from {} to {}".format(*map(_point, result["box"])))
+    if result["outliers"]:
         lines.append(
-            "without outliers from {} to {}".format(*map(_point, boxes["box_without_outliers"]))
+            "without outliers from {} to {}".format(*map(_point, result["box_without_outliers"]))
         )
         lines.append(
-            f"{far.sum():,} outliers, {OUTLIER_DISTANCE:g} median distances from the median or "
-            "farther"
+            f"{result['outliers']:,} outliers, {OUTLIER_DISTANCE:g} median distances from the "
+            "median or farther"
         )
+    return lines
+
+
+def _spread_lines(spread: Mapping[str, Sequence[float]]) -> list[str]:
+    """A line about the percentiles of each value."""
+    lines = []
     for name, (p5, p50, p95) in spread.items():
-        name = name.replace("_", " ")
-        lines.append(f"{name}: 5 % below {p5:.3g}, half below {p50:.3g}, 95 % below {p95:.3g}")
-    return result, lines
+        text = name.replace("_", " ")
+        lines.append(f"{text}: 5 % below {p5:.3g}, half below {p50:.3g}, 95 % below {p95:.3g}")
+    return lines
 
 
-def _box(means: Any) -> list[list[float]]:
+def _box(means: Array) -> list[list[float]]:
     """Lower and upper corner of positions; nothing for none."""
-    return [means.min(axis=0).tolist(), means.max(axis=0).tolist()] if len(means) else []
+    if not len(means):
+        return []
+    return [means.min(axis=0).tolist(), means.max(axis=0).tolist()]
 
 
 def _point(values: list[float]) -> str:
@@ -112,10 +128,12 @@ def _bundle_info(bundle: Bundle) -> _Description:
     ]
     levels = [{**level, "size": _common.bytes_text(level["bytes"])} for level in result["levels"]]
     leaves = _leaves(bundle)
-    each = f", {result['bytes'] / leaves:.1f} bytes a gaussian of level 0" if leaves else ""
+    density = ""
+    if leaves:
+        density = f", {result['bytes'] / leaves:.1f} bytes a gaussian of level 0"
     lines = [
         f"{result['path']}: bundle, version {result['version']} ({result['codec']}), "
-        f"{_common.bytes_text(result['bytes'])}{each}",
+        f"{_common.bytes_text(result['bytes'])}{density}",
         f"{bundle.num_gaussians:,} gaussians, SH degree {bundle.sh_degree}, "
         f"{len(bundle.clusters):,} clusters, {len(bundle.groups):,} groups, "
         f"{result['num_pages']:,} pages",
@@ -125,27 +143,36 @@ def _bundle_info(bundle: Bundle) -> _Description:
         "errors: what the fits were left with, a pixel, at the size at which a level is drawn",
     ]
     if bundle.config:
-        usual = asdict(BuildConfig())
-        others = [
-            f"{name}={value if isinstance(value, str) else json.dumps(value)}"
-            for name, value in _settings(bundle.config)
-            if name not in usual or value != usual[name]
-        ]
-        text = (
-            f"built with {', '.join(others)}, all else by default" if others else "built by default"
-        )
-        lines += textwrap.wrap(_common.printable(text), 100, break_on_hyphens=False)
+        text = _common.printable(_config_text(bundle.config))
+        lines += textwrap.wrap(text, 100, break_on_hyphens=False)
     return result, lines
+
+
+def _config_text(config: JsonObject) -> str:
+    """The settings of a build that are not the default ones."""
+    defaults = asdict(BuildConfig())
+    changes = []
+    for name, value in _settings(config):
+        if name not in defaults or value != defaults[name]:
+            text = value
+            if not isinstance(value, str):
+                text = json.dumps(value)
+            changes.append(f"{name}={text}")
+    if not changes:
+        return "built by default"
+    return f"built with {', '.join(changes)}, all else by default"
 
 
 def _leaves(bundle: Bundle) -> int:
     """Gaussians of level 0."""
-    return _common.level_size(bundle, 0) if len(bundle.level_range(0)) else 0
+    if not len(bundle.level_range(0)):
+        return 0
+    return _common.level_size(bundle, 0)
 
 
 def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Description:
     counts = np.bincount(scene.instance_bundle, minlength=len(scene.bundles)).tolist()
-    bundles: list[dict[str, Any]] = [
+    bundles: list[JsonObject] = [
         {"path": shown(bundle.path or ""), "instances": count, "asset_gaussians": _leaves(bundle)}
         for bundle, count in zip(scene.bundles, counts, strict=True)
     ]
@@ -183,11 +210,14 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
     return result, lines
 
 
-def _settings(config: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _settings(config: JsonObject, prefix: str = "") -> Iterator[tuple[str, Json]]:
     """Names and values of a bundle's config; names of nested settings, but for the
     build's, have a prefix."""
     for name, value in config.items():
         if isinstance(value, dict):
-            yield from _settings(value, "" if name == "build" else f"{name} ")
+            nested_prefix = f"{name} "
+            if name == "build":
+                nested_prefix = ""
+            yield from _settings(value, nested_prefix)
         else:
             yield f"{prefix}{name}", value

@@ -58,4 +58,4 @@ def run(options: Refine) -> None:
     seconds = time.perf_counter() - start
     result = {"output": str(options.output), "steps": options.steps, "seconds": seconds}
     line = f"{options.output}: {options.steps:,} steps, {seconds:.1f} s"
-    _common.print_result(options.json, result, [line])
+    _common.print_result(result, [line], as_json=options.json)

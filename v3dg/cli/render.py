@@ -1,14 +1,17 @@
 """`v3dg render`."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
 from v3dg import _device
+from v3dg._json import JsonObject
 from v3dg._progress import counted
 from v3dg._urls import beside, shown
+from v3dg.cameras import Camera
 from v3dg.cli._common import (
     Column,
     Cut,
@@ -71,28 +74,10 @@ def run(options: Render) -> None:
     fade = options.fade
     if fade is None and is_turntable and len(cameras) > 1:
         fade = DEFAULT_FADE
-    pictures: list[dict[str, Any]] = []
-    views = list(zip(picture_paths(output, cameras), cameras.items(), strict=True))
-    show = len(views) > 1 and not options.quiet
     # With a fade the pictures are a sequence, in which the tolerance of a budget
     # changes in steps.
     renderer = Renderer(subject, color_by=options.color_by, device=device, memory=options.pool())
-    cut = CutOptions(
-        tolerance=options.tolerance, budget=options.budget, min_level=options.min_level, fade=fade
-    )
-    for path, (name, camera) in counted(views, len(views), "render", show):
-        renderer.settle(camera, **cut)
-        image = renderer.render(camera, **cut, background=options.background)
-        write_picture(path, _device.to_host(image.color))
-        picture: dict[str, Any] = {
-            "picture": str(path),
-            "camera": name,
-            "width": camera.width,
-            "height": camera.height,
-            **image.stats._asdict(),
-        }
-        picture["tolerance"] = finite(image.stats.tolerance)
-        pictures.append(picture)
+    pictures = _draw(options, renderer, cameras, output, fade)
     columns = [
         Column("picture", "{picture}"),
         Column("size", "{width} x {height}"),
@@ -102,4 +87,34 @@ def run(options: Render) -> None:
         Column("draw ms", "{draw_ms:.1f}"),
     ]
     result = {"subject": shown(options.subject), "pictures": pictures}
-    print_result(options.json, result, [*table_lines(columns, pictures), *notes])
+    print_result(result, [*table_lines(columns, pictures), *notes], as_json=options.json)
+
+
+def _draw(
+    options: Render,
+    renderer: Renderer,
+    cameras: Mapping[str, Camera],
+    output: Path,
+    fade: float | None,
+) -> list[JsonObject]:
+    """Draw and write the picture of each camera; returns their descriptions."""
+    views = list(zip(picture_paths(output, cameras), cameras.items(), strict=True))
+    show = len(views) > 1 and not options.quiet
+    cut = CutOptions(
+        tolerance=options.tolerance, budget=options.budget, min_level=options.min_level, fade=fade
+    )
+    pictures: list[JsonObject] = []
+    for path, (name, camera) in counted(views, len(views), "render", show):
+        renderer.settle(camera, **cut)
+        image = renderer.render(camera, **cut, background=options.background)
+        write_picture(path, _device.to_host(image.color))
+        picture: JsonObject = {
+            "picture": str(path),
+            "camera": name,
+            "width": camera.width,
+            "height": camera.height,
+            **image.stats._asdict(),
+        }
+        picture["tolerance"] = finite(image.stats.tolerance)
+        pictures.append(picture)
+    return pictures

@@ -12,7 +12,7 @@ import webbrowser
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -32,6 +32,9 @@ from v3dg.cli._common import (
 from v3dg.cli._views import CameraFile, lines_of_up
 from v3dg.opening import open_with_cameras
 from v3dg.upright import ASSUMED, direction_of, up_of
+
+if TYPE_CHECKING:
+    from v3dg.viewer.server import Site
 
 # Time between checks for a signal: an endless wait would miss one that comes just
 # before it.
@@ -61,32 +64,22 @@ def run(options: View) -> None:
     require_subject(options.subject)
     check_usage("--port", 0 <= options.port <= 65535, f"0 to 65535, got {options.port}")
     from v3dg.gaussians import Gaussians
-    from v3dg.select import DEFAULT_TOLERANCE, rule_of
     from v3dg.viewer.frame import SceneView
     from v3dg.viewer.server import Site
 
-    tolerance = options.tolerance
-    if tolerance is None:
-        tolerance = DEFAULT_TOLERANCE if options.budget is None else 0.0
-    rule_of(tolerance, options.budget, 0, "solid_angle", True)
-    check_usage("--tolerance", math.isfinite(tolerance), f"a number, got {tolerance}")
+    tolerance = _tolerance_of(options)
     subject, cameras = open_with_cameras(options.subject)
     cameras = options.read() or cameras
-    photographs = None
-    if options.cameras is not None:
-        photographs = _photographs(options.cameras, cameras or {})
+    photographs = _photographs(options.cameras, cameras or {})
     expected = f"a bundle or a scene, got the asset {shown(options.subject)}; build a bundle of it"
     check_usage("--budget", options.budget is None or not isinstance(subject, Gaussians), expected)
-    if options.up:
-        up = options.up
-        reason = ""
-    else:
+    up = options.up
+    reason = ""
+    if up is None:
         up, reason = up_of(subject, cameras, options.subject)
-    lines = lines_of_up(options.subject, up, reason)
     scene_view = SceneView(subject, device=options.device, memory=options.pool())
-    with contextlib.suppress(
-        ImportError
-    ):  # imported early because it takes long; the site reports errors
+    # Imported early because it takes long; the site reports errors.
+    with contextlib.suppress(ImportError):
         importlib.import_module("v3dg.viewer.tab")
     with _interrupts() as interrupts:
         site = Site(
@@ -102,18 +95,38 @@ def run(options: View) -> None:
             asks_up=reason == ASSUMED,
         )
         try:
-            if options.port not in (0, site.port) and not options.quiet:
-                tell(f"port {options.port} is taken, listening at {site.port}")
-            name = shown(options.subject)
-            result = {"url": site.url, "subject": name}
-            print_result(options.json, result, [f"{site.url} shows {name}; Ctrl-C ends it", *lines])
-            if not options.no_browser and not site.is_secret and _has_browser():
-                threading.Thread(target=webbrowser.open, args=(site.url,), daemon=True).start()
+            _announce(options, site, lines_of_up(options.subject, up, reason))
             while not interrupts:
                 time.sleep(_SECONDS)
         finally:
             site.close()
     raise KeyboardInterrupt
+
+
+def _tolerance_of(options: View) -> float:
+    """The tolerance to begin with; UsageError or ValueError for one that is not
+    finite, or a wrong budget."""
+    from v3dg.select import DEFAULT_TOLERANCE, rule_of
+
+    tolerance = options.tolerance
+    if tolerance is None:
+        tolerance = 0.0
+        if options.budget is None:
+            tolerance = DEFAULT_TOLERANCE
+    rule_of(tolerance, options.budget, 0)
+    check_usage("--tolerance", math.isfinite(tolerance), f"a number, got {tolerance}")
+    return tolerance
+
+
+def _announce(options: View, site: "Site", notes: list[str]) -> None:
+    """Print the address of a site, and open it in a browser."""
+    if options.port not in (0, site.port) and not options.quiet:
+        tell(f"port {options.port} is taken, listening at {site.port}")
+    name = shown(options.subject)
+    lines = [f"{site.url} shows {name}; Ctrl-C ends it", *notes]
+    print_result({"url": site.url, "subject": name}, lines, as_json=options.json)
+    if not options.no_browser and not site.is_secret and _has_browser():
+        threading.Thread(target=webbrowser.open, args=(site.url,), daemon=True).start()
 
 
 def _has_browser() -> bool:
@@ -125,10 +138,14 @@ def _has_browser() -> bool:
     return has_display or sys.platform in ("darwin", "win32")
 
 
-def _photographs(cameras: Path, names: Iterable[str]) -> dict[str, Path]:
+def _photographs(cameras: Path | None, names: Iterable[str]) -> dict[str, Path]:
     """The photographs of cameras by name, beside the file of the cameras or in a folder
     `images` near it."""
-    folder = cameras if cameras.is_dir() else cameras.parent
+    if cameras is None:
+        return {}
+    folder = cameras
+    if not folder.is_dir():
+        folder = folder.parent
     nearby = (folder, *folder.resolve().parents[:2])
     places = [place / part for place in nearby for part in ("", "images")]
     photographs = {}
@@ -156,5 +173,8 @@ def _interrupts() -> Iterator[list[int]]:
     try:
         yield received
     finally:
-        for number, handler in old_handlers.items():
-            signal.signal(number, signal.SIG_IGN if received else handler)
+        for number, old_handler in old_handlers.items():
+            handler = old_handler
+            if received:
+                handler = signal.SIG_IGN
+            signal.signal(number, handler)

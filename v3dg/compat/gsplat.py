@@ -7,10 +7,10 @@ Pictures and gradients are those of `v3dg.rasterize`, on the CPU and on CUDA dev
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import EllipsisType
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypeAlias
 
 from v3dg import _core
 from v3dg._numbers import check, one_of, real, shown, whole
@@ -28,6 +28,18 @@ from v3dg.rasterize import (
 if TYPE_CHECKING:
     import torch
 
+Info: TypeAlias = dict[str, Any]  # gsplat's dict, of tensors and numbers
+
+_LOCATED = (
+    "means2d",
+    "depths",
+    "conics",
+    "opacities",
+    "radii",
+    "camera_ids",
+    "gaussian_ids",
+    "is_seen",
+)
 _FARTHEST = 1e10
 _IGNORED = {"tile_size", "channel_chunk", "segmented"}  # they only affect how gsplat computes
 # Arguments of gsplat that are not supported, and what to do instead.
@@ -69,7 +81,7 @@ def rasterization(
     absgrad: bool = False,
     rasterize_mode: str = "classic",
     **options: object,
-) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+) -> tuple[torch.Tensor, torch.Tensor, Info]:
     """Draw N gaussians for C cameras, as the function of this name in gsplat 1.5 does.
 
     Takes torch tensors that are float32, or on the CPU all float64.
@@ -125,18 +137,17 @@ def rasterization(
         rasterize_mode=rasterize_mode,
     )
     shape = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
-    for name, value in {**shape, "colors": colors, "viewmats": viewmats, "Ks": Ks}.items():
+    _check_tensors({**shape, "colors": colors, "viewmats": viewmats, "Ks": Ks})
+    cameras = _cameras(viewmats, Ks, width, height, near_plane)
+    return _draw(look, cameras, list(shape.values()), colors, size=(width, height))
+
+
+def _check_tensors(tensors: Mapping[str, torch.Tensor]) -> None:
+    """Raise TypeError unless all are tensors, on a device that can draw."""
+    for name, value in tensors.items():
         if not hasattr(value, "requires_grad"):
             raise TypeError(f"{name}: expected a torch tensor, got {type(value).__name__}")
-    check_device(means)
-    cameras = _cameras(viewmats, Ks, width, height, near_plane)
-    pictures, alphas, info = _draw(
-        look, cameras, [tensor.contiguous() for tensor in shape.values()], colors
-    )
-    info["width"] = width
-    info["height"] = height
-    info["n_cameras"] = len(cameras)
-    return pictures, alphas, info
+    check_device(tensors["means"])
 
 
 def rasterization_2dgs(*arguments: object, **options: object) -> NoReturn:
@@ -244,23 +255,18 @@ def _background_of_views(look: _Look, num_cameras: int, dtype: torch.dtype) -> l
 
 
 def _draw(
-    look: _Look, cameras: list[_core.Camera], shape: list[torch.Tensor], colors: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    look: _Look,
+    cameras: list[_core.Camera],
+    shape: list[torch.Tensor],
+    colors: torch.Tensor,
+    size: tuple[int, int],
+) -> tuple[torch.Tensor, torch.Tensor, Info]:
     """Pictures, alphas and the dict of gsplat; ``shape`` is means, quats, scales and
-    opacities."""
-    *geometry, opacity = shape
+    opacities, ``size`` the width and the height in px."""
+    *geometry, opacity = (tensor.contiguous() for tensor in shape)
     gradient = CenterGradient()
-    names = (
-        "means2d",
-        "depths",
-        "conics",
-        "opacities",
-        "radii",
-        "camera_ids",
-        "gaussian_ids",
-        "is_seen",
-    )
-    info: dict[str, Any] = dict(zip(names, _locate()(look, cameras, gradient, *shape), strict=True))
+    located = _locate()(look, cameras, gradient, *geometry, opacity)
+    info: Info = dict(zip(_LOCATED, located, strict=True))
     is_seen = info.pop("is_seen")
     pairs: tuple[torch.Tensor, torch.Tensor] | EllipsisType = ...
     if look.packed:
@@ -284,6 +290,8 @@ def _draw(
         _picture(look, color, alpha, depth)
         for color, alpha, depth in zip(planes[::3], alphas, planes[2::3], strict=True)
     ]
+    info["width"], info["height"] = size
+    info["n_cameras"] = len(cameras)
     return joined(pictures), joined(alphas)[..., None], info
 
 
@@ -302,6 +310,15 @@ def _picture(
     return torch.cat([color, depth[..., None]], dim=-1)
 
 
+class _Context(Protocol):
+    """What torch passes between the two passes of a `torch.autograd.Function`."""
+
+    gradient: CenterGradient
+
+    def set_materialize_grads(self, value: object) -> None: ...
+    def mark_non_differentiable(self, *tensors: torch.Tensor) -> None: ...
+
+
 @functools.cache
 def _locate() -> Callable[..., tuple[torch.Tensor | None, ...]]:
     """The operation that locates gaussians on the images, whose results are the tensors
@@ -316,29 +333,15 @@ def _locate() -> Callable[..., tuple[torch.Tensor | None, ...]]:
     class Locate(torch.autograd.Function):
         @staticmethod
         def forward(
-            ctx: Any,
+            ctx: _Context,
             look: _Look,
             cameras: list[_core.Camera],
             gradient: CenterGradient,
             *shape: torch.Tensor,
         ) -> tuple[torch.Tensor | None, ...]:
-            ctx.set_materialize_grads(False)
+            ctx.set_materialize_grads(value=False)
             ctx.gradient = gradient
-            means, quats, scales, opacities = shape
-            any_colors = means[:, None]
-            rows = Gaussians(means, quats, scales, opacities, any_colors).rows
-            columns = zip(*(_ellipses(rows, camera, look) for camera in cameras), strict=True)
-            arrays = [joined([torch.as_tensor(part) for part in column]) for column in columns]
-            is_seen = None
-            camera_ids = None
-            gaussian_ids = None
-            if look.packed or look.clips:
-                is_seen = (arrays[4] > 0).all(-1)
-            if look.packed and is_seen is not None:
-                camera_ids, gaussian_ids = torch.where(is_seen)
-                arrays = [array[camera_ids, gaussian_ids] for array in arrays]
-            means2d, depths, *constants = arrays
-            optional = (camera_ids, gaussian_ids, is_seen)
+            (means2d, depths, *constants), optional = _located(look, cameras, *shape)
             ctx.mark_non_differentiable(
                 *constants, *(tensor for tensor in optional if tensor is not None)
             )
@@ -346,7 +349,7 @@ def _locate() -> Callable[..., tuple[torch.Tensor | None, ...]]:
 
         @staticmethod
         def backward(
-            ctx: Any, d_means2d: torch.Tensor | None, d_depths: torch.Tensor | None, *_: None
+            ctx: _Context, d_means2d: torch.Tensor | None, d_depths: torch.Tensor | None, *_: None
         ) -> tuple[None, ...]:
             gradient = ctx.gradient.value
             ctx.gradient.value = None
@@ -364,6 +367,33 @@ def _locate() -> Callable[..., tuple[torch.Tensor | None, ...]]:
             return (None,) * 7
 
     return Locate.apply
+
+
+def _located(
+    look: _Look,
+    cameras: list[_core.Camera],
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+) -> tuple[list[torch.Tensor], list[torch.Tensor | None]]:
+    """Centres, depths, conics, opacities and radii; then, where they are needed, the
+    cameras and gaussians of the pairs, and which gaussians are in sight."""
+    import torch
+
+    unused_colors = means[:, None]
+    rows = Gaussians(means, quats, scales, opacities, unused_colors).rows
+    columns = zip(*(_ellipses(rows, camera, look) for camera in cameras), strict=True)
+    arrays = [joined([torch.as_tensor(part) for part in column]) for column in columns]
+    is_seen = None
+    camera_ids = None
+    gaussian_ids = None
+    if look.packed or look.clips:
+        is_seen = (arrays[4] > 0).all(-1)
+    if look.packed and is_seen is not None:
+        camera_ids, gaussian_ids = torch.where(is_seen)
+        arrays = [array[camera_ids, gaussian_ids] for array in arrays]
+    return arrays, [camera_ids, gaussian_ids, is_seen]
 
 
 def _ellipses(rows: _core.Rows, camera: _core.Camera, look: _Look) -> tuple[Array, ...]:

@@ -97,7 +97,7 @@ def replacing_export(
     check_outside(folder, (bundle.path for bundle in scene.bundles))
     with _made(folder) as target, _naming_errors(folder, target), Folder(target, folder) as root:
         lock(root.descriptor, folder, "export")
-        place = _Place(folder, target, root, overwrite)
+        place = _Place(folder, target, root, overwrite=overwrite)
         place.check(certain)
         try:
             os.mkdir(place.hidden, 0o700, dir_fd=root.descriptor)
@@ -163,7 +163,7 @@ def _naming_errors(folder: Path, target: Path) -> Iterator[None]:
 class _Place:
     """A folder that an export is written to, and what an earlier one wrote there."""
 
-    def __init__(self, folder: Path, target: Path, root: Folder, overwrite: bool) -> None:
+    def __init__(self, folder: Path, target: Path, root: Folder, *, overwrite: bool) -> None:
         self._folder = folder
         self._root = root
         self._overwrite = overwrite

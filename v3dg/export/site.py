@@ -100,7 +100,7 @@ def write_site(
     check_cameras(cameras)
     scene = Scene.of(cast(Scene | Bundle, content))  # which refuses all else
     is_scene = isinstance(content, Scene)
-    axes = _axes(is_scene, up or up_of(cast(Subject, content), cameras)[0])
+    axes = _axes(up or up_of(cast(Subject, content), cameras)[0], is_scene=is_scene)
     turn = _common.turn_upright(axes.asset)
     check("scene", len(scene), "instances to export, got none")
     plans = [Plan.of(bundle, chunk) for bundle in scene.bundles]
@@ -111,10 +111,7 @@ def write_site(
         certain = [SITE, "index.html"]
     with replacing_export(Path(folder), scene, certain, overwrite=overwrite) as new:
         levels = _write_bundles(plans, names, new.path, turn, progress)
-        bundles = [
-            _bundle(name, plan, export)
-            for name, plan, export in zip(names, plans, levels, strict=True)
-        ]
+        bundles = list(map(_bundle, names, plans, levels))
         _common.write_document(new.path / SITE, _document(scene, bundles, axes, cameras))
         _common.write_page(new.path, "site.html")
         has_engine = _bring_engine(Path(folder), new)
@@ -132,7 +129,7 @@ class _Axes(NamedTuple):
     cameras: Axis
 
 
-def _axes(is_scene: bool, up: Axis) -> _Axes:
+def _axes(up: Axis, *, is_scene: bool) -> _Axes:
     """A bundle alone is turned to what viewers take to be up; a scene's stay as its
     instances have them."""
     if is_scene:

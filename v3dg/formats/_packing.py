@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,8 @@ from v3dg._numbers import check_all
 from v3dg.gaussians import Gaussians, empty
 from v3dg.rotations import normalised
 
-Floats: TypeAlias = NDArray[np.floating[Any]]
-Integers: TypeAlias = NDArray[np.integer[Any]]
+Floats: TypeAlias = NDArray[np.floating]
+Integers: TypeAlias = NDArray[np.integer]
 
 SQRT2 = math.sqrt(2.0)
 SH_C0 = _core.sh_base0
@@ -22,9 +22,8 @@ SH_C0 = _core.sh_base0
 DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
 """SH degree by the number of coefficients a channel past the first."""
 
-_BLOCK = (
-    1 << 16
-)  # gaussians decoded at once: the double precision of a block stays in the cache's reach
+# Gaussians decoded at once: a block fits into the cache in double precision.
+_BLOCK = 1 << 16
 _MIN_LOG_SCALE = -20.0  # 2e-9: stands for scales of 0, whose log no quantised format can hold
 _LEAST_VISIBLE_OPACITY = np.float32(_core.min_alpha)
 

@@ -57,9 +57,9 @@ _ALLOWED_MODULES = (
 
 
 # A value that a pickle builds: None, a number, text, a tuple, a dict, a _Named or a
-# _Tensor.
-_Value: TypeAlias = object
-_Numbers: TypeAlias = NDArray[np.number[Any]]
+# _Tensor. `telling` turns the errors of operations on another kind into ValueErrors.
+_Value: TypeAlias = Any
+_Numbers: TypeAlias = NDArray[np.number]
 
 
 class _Named(NamedTuple):
@@ -185,7 +185,7 @@ def _array(path: Path, name: str, tensor: _Tensor, archive: Archive, root: str) 
     is_inside = count <= stored_count and (not count or last < stored_count)
     layout = (tensor.offset, tensor.shape, tensor.strides)
     check(path, is_inside, f"{name} within the {stored_count} numbers of its storage, got {layout}")
-    dtype: np.dtype[np.number[Any]] = np.dtype(_TYPES[tensor.kind])
+    dtype: np.dtype[np.number] = np.dtype(_TYPES[tensor.kind])
     content = archive.read(f"{root}data/{tensor.key}")
     size = stored_count * dtype.itemsize
     check(path, len(content) == size, f"{size} bytes of {name}, got {len(content)}")
@@ -218,7 +218,7 @@ class _Unpickler:
                 raise ValueError(f"one with the {operation}, which this reader does not allow")
         return self._stack.pop()
 
-    def _push(self, operation: str, argument: Any) -> bool:
+    def _push(self, operation: str, argument: _Value) -> bool:
         """Apply an operation that leaves the values on the stack as they are; whether
         it is one."""
         match operation:
@@ -260,9 +260,8 @@ class _Unpickler:
             case "APPENDS":
                 self._above_mark()
             case "REDUCE" | "NEWOBJ":
-                arguments: Any = self._stack.pop()
-                function: Any = self._stack[-1]
-                self._stack[-1] = _called(function.name, arguments)
+                arguments = self._stack.pop()
+                self._stack[-1] = _called(self._stack[-1].name, arguments)
             case _:
                 return False
         return True
@@ -274,9 +273,8 @@ class _Unpickler:
         return values
 
     def _set_items(self, items: list[_Value]) -> None:
-        target: Any = self._stack[-1]
         pairs = zip(items[::2], items[1::2], strict=True)
-        target.update((key, value) for key, value in pairs if isinstance(key, str))
+        self._stack[-1].update((key, value) for key, value in pairs if isinstance(key, str))
 
 
 def _allowed_name(argument: str) -> _Named:
@@ -289,13 +287,12 @@ def _allowed_name(argument: str) -> _Named:
     return _Named(short)
 
 
-def _called(name: str, arguments: tuple[Any, ...]) -> _Value:
+def _called(name: str, arguments: tuple[_Value, ...]) -> _Value:
     """The result of a call, without calling anything."""
     if name.startswith("collections."):
         return {}
     if name == "torch._utils._rebuild_parameter":
-        parameter: _Value = arguments[0]
-        return parameter
+        return arguments[0]
     if name != "torch._utils._rebuild_tensor_v2":
         return _Named(name)
     (_, storage, key, _, num_stored), offset, shape, strides = arguments[:4]

@@ -80,32 +80,36 @@ def open_file(path: Path) -> AssetFile:
         chunk_from_row = np.arange(first, last) // _CHUNK - first_chunk
 
         def decode(rows: slice) -> tuple[Floats, ...]:
-            block = packed[rows]
-            chunks = chunk_from_row[rows]
-
-            def interpolated(kind: str, fractions: Floats) -> Floats:
-                low, high = ranges[kind]
-                return np.asarray(low[chunks] * (1.0 - fractions) + high[chunks] * fractions)
-
-            rotation = block["packed_rotation"]
-            three = (_fractions(rotation, _THREE) - 0.5) * SQRT2
-            rgba = _fractions(block["packed_color"], _RGBA)
-            color = (interpolated("color", rgba[:, :3]) - 0.5) / SH_C0
-            means = interpolated("", _fractions(block["packed_position"], _XYZ))
-            scales = np.exp(interpolated("scale_", _fractions(block["packed_scale"], _XYZ)))
-            quats = _packing.quats_from_three(three, rotation >> 30)
-            higher = _SH_VALUE[sh_bytes[rows]].reshape(len(block), 3, -1).transpose(0, 2, 1)
-            return (
-                means,
-                quats,
-                scales,
-                rgba[:, 3],
-                np.concatenate([color[:, None], higher], axis=1),
-            )
+            return _decoded(packed[rows], chunk_from_row[rows], ranges, sh_bytes[rows])
 
         return assemble(last - first, degree, decode)
 
     return AssetFile(path, count, degree, read_rows)
+
+
+def _decoded(
+    block: NDArray[np.void],
+    chunks: NDArray[np.int64],
+    ranges: dict[str, tuple[Floats, Floats]],
+    sh_bytes: NDArray[np.uint8],
+) -> tuple[Floats, ...]:
+    """Means, quats, scales, opacities and sh of rows of `vertex` and `sh`, which are in
+    these chunks."""
+
+    def interpolated(kind: str, fractions: Floats) -> Floats:
+        low, high = ranges[kind]
+        return np.asarray(low[chunks] * (1.0 - fractions) + high[chunks] * fractions)
+
+    rotation = block["packed_rotation"]
+    three = (_fractions(rotation, _THREE) - 0.5) * SQRT2
+    rgba = _fractions(block["packed_color"], _RGBA)
+    color = (interpolated("color", rgba[:, :3]) - 0.5) / SH_C0
+    means = interpolated("", _fractions(block["packed_position"], _XYZ))
+    scales = np.exp(interpolated("scale_", _fractions(block["packed_scale"], _XYZ)))
+    quats = _packing.quats_from_three(three, rotation >> 30)
+    higher = _SH_VALUE[sh_bytes].reshape(len(block), 3, -1).transpose(0, 2, 1)
+    sh = np.concatenate([color[:, None], higher], axis=1)
+    return means, quats, scales, rgba[:, 3], sh
 
 
 def write(path: Path, gaussians: Gaussians) -> None:

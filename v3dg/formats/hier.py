@@ -37,11 +37,7 @@ def open_file(path: Path) -> AssetFile:
     if signed < 0:
         kind = "<f2"
         node = _HALF_NODE
-    position_width, *other_widths = _WIDTHS
-    dtypes = [
-        np.dtype(("<f4", position_width)),
-        *(np.dtype((kind, width)) for width in other_widths),
-    ]
+    dtypes = [np.dtype(("<f4", _WIDTHS[0])), *(np.dtype((kind, width)) for width in _WIDTHS[1:])]
     column_starts = 4 + np.cumsum([0, *(count * dtype.itemsize for dtype in dtypes)])
     columns_end = int(column_starts[-1])
     check(path, columns_end + 4 <= file.num_bytes, f"{count} gaussians, got {file.num_bytes} bytes")

@@ -134,11 +134,17 @@ def _section(
         path, end <= len(content), f"section {number} to end within {len(content)} bytes, got {end}"
     )
     rows = np.frombuffer(content, record, count, rows_start)
-    if not compression:
-        return rows, None, end
-    partial_sizes = np.frombuffer(content, "<u4", section.num_partial_buckets, start).astype(
-        np.int64
-    )
+    buckets = None
+    if compression:
+        buckets = _buckets(path, content, start, number, section)
+    return rows, buckets, end
+
+
+def _buckets(path: Path, content: bytes, start: int, number: int, section: _Section) -> _Buckets:
+    """The buckets of a section that begins at ``start``."""
+    count = section.num_gaussians
+    sizes = np.frombuffer(content, "<u4", section.num_partial_buckets, start)
+    partial_sizes = sizes.astype(np.int64)
     num_used = section.num_full_buckets + section.num_partial_buckets
     fits = section.bucket_bytes >= 12 and num_used <= section.num_buckets
     check(path, fits, f"{section.num_buckets} buckets in section {number}, got {num_used}")
@@ -148,6 +154,7 @@ def _section(
     check(path, is_enough, f"buckets for {count} gaussians in section {number}, got fewer")
     bucket_from_row = np.searchsorted(ends, np.arange(count), side="right")
     bucket = np.dtype((np.void, section.bucket_bytes))
+    buckets_start = start + 4 * section.num_partial_buckets
     stored = np.frombuffer(content, bucket, section.num_buckets, buckets_start)
     strides = (section.bucket_bytes, 4)
     centers: NDArray[np.float32] = np.ndarray(
@@ -155,7 +162,7 @@ def _section(
     )
     num_steps = section.num_steps or _DEFAULT_STEPS
     step_world = section.bucket_side / 2 / num_steps
-    return rows, _Buckets(centers[bucket_from_row], step_world, num_steps), end
+    return _Buckets(centers[bucket_from_row], step_world, num_steps)
 
 
 def _decoded(

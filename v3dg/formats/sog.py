@@ -14,7 +14,7 @@ import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,12 +105,7 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
     labels: _packing.Integers = np.zeros(count, np.uint16)
     if "shN" in meta:
         higher = _palette(path, meta["shN"], names["shN"][0], pictures, degree)
-        label_pixels = pixels(names["shN"][1])
-        labels = label_pixels[:, 0] | (label_pixels[:, 1].astype(np.uint16) << 8)
-        largest = labels.max(initial=0)
-        check(
-            path, largest < len(higher.entries), f"labels below {higher.num_entries}, got {largest}"
-        )
+        labels = _labels(path, pixels(names["shN"][1]), higher)
 
     def decode(rows: slice) -> tuple[Floats, ...]:
         steps = lower[rows, :3] | (upper[rows, :3].astype(np.uint16) << 8)
@@ -152,6 +147,15 @@ def _palette(
     centroids = _decoded(path, name, pictures[name], num_rows * width, width)
     entries = centroids[:num_rows, :, :3].reshape(num_rows * _PALETTE_COLUMNS, -1, 3)
     return _Palette(table, entries, num_entries)
+
+
+def _labels(path: Path, pixels: _Pixels, palette: _Palette) -> _packing.Integers:
+    """(N,) the entry of the palette that each gaussian refers to."""
+    labels: _packing.Integers = pixels[:, 0] | (pixels[:, 1].astype(np.uint16) << 8)
+    largest = labels.max(initial=0)
+    expected = f"labels below {palette.num_entries}"
+    check(path, largest < len(palette.entries), f"{expected}, got {largest}")
+    return labels
 
 
 def _meta(path: Path, text: bytes) -> dict[str, Node]:
@@ -272,17 +276,9 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
     def picture(*columns: _packing.Integers) -> bytes:
         return _webp(np.stack(columns, axis=1), width, height)
 
-    means = gaussians.means.astype(np.float64)
-    logs = np.sign(means) * np.log1p(np.abs(means))
-    low = np.zeros(3)
-    high = np.zeros(3)
-    if count:
-        low = logs.min(axis=0)
-        high = logs.max(axis=0)
-    steps = _packing.to_integers(
-        (logs - low) / np.where(high > low, high - low, 1.0) * 65535.0, 65535
-    )
+    steps, low, high = _encoded_means(gaussians.means)
     three, largest = _packing.three_of_quats(gaussians.quats)
+    three_bytes = _packing.to_integers((three * SQRT2 + 1.0) * 127.5, 255)
     log_widths = _packing.log_scales(gaussians.scales)
     scale_table = _table_of(log_widths)
     color_table = _table_of(gaussians.sh[:, 0])
@@ -290,14 +286,12 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
         "means_l.webp": picture(*(steps & 255).T),
         "means_u.webp": picture(*(steps >> 8).T),
         "scales.webp": picture(*_nearest(scale_table, log_widths).T),
-        "quats.webp": picture(
-            *_packing.to_integers((three * SQRT2 + 1.0) * 127.5, 255).T, largest + 252
-        ),
+        "quats.webp": picture(*three_bytes.T, largest + 252),
         "sh0.webp": picture(
             *_nearest(color_table, gaussians.sh[:, 0]).T, opacity_bytes(gaussians.opacities)
         ),
     }
-    meta: dict[str, Any] = {
+    meta: dict[str, object] = {
         "version": 2,
         "asset": {"generator": f"v3dg {__version__}"},
         "count": count,
@@ -316,6 +310,22 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
         contents["shN_centroids.webp"] = centroids
         contents["shN_labels.webp"] = picture(labels & 255, labels >> 8, np.zeros(count, np.uint8))
     return {"meta.json": json.dumps(meta, separators=(",", ":")).encode(), **contents}
+
+
+def _encoded_means(
+    means: NDArray[np.float32],
+) -> tuple[NDArray[np.uint32], NDArray[np.float64], NDArray[np.float64]]:
+    """Positions as 16-bit steps (N, 3) between the lowest and the highest logs; these
+    bounds, (3,) each."""
+    doubles = means.astype(np.float64)
+    logs = np.sign(doubles) * np.log1p(np.abs(doubles))
+    low = np.zeros(3)
+    high = np.zeros(3)
+    if len(logs):
+        low = logs.min(axis=0)
+        high = logs.max(axis=0)
+    fractions = (logs - low) / np.where(high > low, high - low, 1.0)
+    return _packing.to_integers(fractions * 65535.0, 65535), low, high
 
 
 def _encoded_palette(gaussians: Gaussians) -> tuple[dict[str, object], bytes, _packing.Integers]:

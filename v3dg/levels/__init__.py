@@ -78,7 +78,8 @@ def build_bundle(
     """
     asset = loaded(asset)
     check_type("asset", asset, Gaussians, "Gaussians")
-    config = BuildConfig() if config is None else config
+    if config is None:
+        config = BuildConfig()
     check_type("config", config, BuildConfig, "a BuildConfig")
     devices = devices_for(device, asset)
     leaves = MemoryLeaves(asset, config, unusable, devices[0])

@@ -17,10 +17,8 @@ def assemble(
     """The tables of all levels, in order."""
     levels = plan.levels
     num_clusters = [level.num_clusters for level in levels]
-    num_groups = [
-        0,
-        *(level.num_groups for level in levels[1:]),
-    ]  # a bundle has no groups of level 0
+    # A bundle has no groups of level 0.
+    num_groups = [0, *(level.num_groups for level in levels[1:])]
     sizes = np.concatenate([np.diff(level.offset) for level in levels])
     level = np.repeat(np.arange(len(levels), dtype=np.int32), num_clusters)
     last_px2 = 0.0
@@ -29,6 +27,8 @@ def assemble(
         # whole pixel, 1/12.
         last_px2 = max(config.filter_px2, 1 / 12)
     coarse_px2 = np.where(level < len(levels) - 1, config.filter_px2, last_px2)
+    antialiased = np.ones(len(level), np.uint8)
+    antialiased[level == 0] = config.asset_antialiased
     clusters = Clusters(
         offset=np.concatenate([[0], np.cumsum(sizes)]),
         level=level,
@@ -36,7 +36,7 @@ def assemble(
         parent_group=_groups_from(num_clusters, num_groups, 1),
         box=np.concatenate([table.box for table in tables]),
         filter_px2=np.where(level == 0, config.asset_filter_px2, coarse_px2).astype(np.float32),
-        antialiased=np.where(level == 0, config.asset_antialiased, True).astype(np.uint8),
+        antialiased=antialiased,
     )
     groups = Groups(
         ball=np.concatenate([np.zeros((0, 4), np.float32), *(table.ball for table in tables[1:])]),

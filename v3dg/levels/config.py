@@ -2,9 +2,9 @@
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Literal, NoReturn, get_args, get_origin
 
-from v3dg._numbers import check
+from v3dg._numbers import check, refuse
 
 # A target is drawn without a chance to interrupt it: in about a second at most.
 _MOST_SIDE = 8192
@@ -15,10 +15,11 @@ _DEEP = 64  # a level whose targets have that many samples
 # bytes each.
 _MOST_PIXELS_KEPT = 1 << 26
 
-_KINDS: dict[Any, tuple[Any, str]] = {
-    int: (int, "a whole number"),
+# The classes of the values of a setting by its type, and what messages call them.
+_KINDS: dict[type, tuple[tuple[type, ...], str]] = {
+    int: ((int,), "a whole number"),
     float: ((int, float), "a number"),
-    bool: (bool, "True or False"),
+    bool: ((bool,), "True or False"),
 }
 _Weight = Annotated[float, (0, 1_000_000)]
 _StepSize = Annotated[float, (0, 1_000_000_000)]
@@ -126,21 +127,23 @@ class BuildConfig:
             value = getattr(self, field.name)
             arguments = get_args(field.type)
             if get_origin(field.type) is Literal:
-                self._require(field.name, value in arguments, " or ".join(map(repr, arguments)))
+                if value not in arguments:
+                    self._refuse(field.name, " or ".join(map(repr, arguments)))
                 continue
             kind, *ranges = arguments or (field.type,)
             classes, expected = _KINDS[kind]
             is_kind = isinstance(value, classes) and isinstance(value, bool) == (kind is bool)
-            self._require(field.name, is_kind, expected)
+            if not is_kind:
+                self._refuse(field.name, expected)
             for minimum, maximum in ranges:
-                self._require(
-                    field.name, minimum <= value <= maximum, f"{minimum:,} to {maximum:,}"
-                )
-        self._require("group_size", self.group_size.bit_count() == 1, "a power of two")
+                if not minimum <= value <= maximum:
+                    self._refuse(field.name, f"{minimum:,} to {maximum:,}")
+        if self.group_size.bit_count() != 1:
+            self._refuse("group_size", "a power of two")
         self.check_views(1)
 
-    def _require(self, name: str, is_good: bool, expected: str) -> None:
-        check(name, is_good, f"{expected}, got {getattr(self, name)!r}")
+    def _refuse(self, name: str, expected: str) -> NoReturn:
+        refuse(name, f"{expected}, got {getattr(self, name)!r}")
 
     def check_views(self, most_gaussians: int) -> None:
         """Refuse views of groups of at most `most_gaussians` that have too many pixels,

@@ -17,6 +17,7 @@ Points = npt.NDArray[np.uint32]
 """(N, 4): the bits of x, y and z, and the index."""
 
 Words = npt.NDArray[np.uint32]
+WordFile = RowFile[np.uint32]
 
 FITTING_BYTES = 48
 """Memory for each point of a node that is split in memory."""
@@ -29,7 +30,7 @@ def points_of(means: npt.NDArray[np.float32], index: npt.NDArray[np.integer]) ->
 
 
 def split(
-    files: tuple[RowFile, RowFile], count: int, depth: int, num_fitting: int, order: RowFile
+    files: tuple[WordFile, WordFile], count: int, depth: int, num_fitting: int, order: WordFile
 ) -> None:
     """Write the indices of points in the order of `_core.median_split`, with which it
     agrees in every bit.
@@ -60,7 +61,7 @@ def _split_in_memory(points: Points, depth: int) -> Words:
     return np.asarray(index[order])
 
 
-def _partition(source: RowFile, first: int, middle: int, last: int, target: RowFile) -> None:
+def _partition(source: WordFile, first: int, middle: int, last: int, target: WordFile) -> None:
     """Write the lower half of a node at `first` and the upper half at `middle`, both in
     the same order."""
     axis = _longest_axis(source, first, last)
@@ -77,7 +78,7 @@ def _partition(source: RowFile, first: int, middle: int, last: int, target: RowF
             ends[side] += len(half)
 
 
-def _longest_axis(source: RowFile, first: int, last: int) -> int:
+def _longest_axis(source: WordFile, first: int, last: int) -> int:
     low = np.full(3, np.inf, np.float32)
     high = np.full(3, -np.inf, np.float32)
     for points in source.blocks(first, last, _AT_ONCE):
@@ -87,7 +88,7 @@ def _longest_axis(source: RowFile, first: int, last: int) -> int:
     return int(np.argmax(high - low))  # the first of equal sides; in float32, as in the core
 
 
-def _median(source: RowFile, first: int, middle: int, last: int, axis: int) -> tuple[int, int]:
+def _median(source: WordFile, first: int, middle: int, last: int, axis: int) -> tuple[int, int]:
     """The greatest key of the lower half, as of `_ordered`, and how many points of the
     lower half have it."""
 

@@ -5,8 +5,9 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from v3dg import _files
 from v3dg._device import Device
@@ -70,59 +71,120 @@ def build_file(
         ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: As
             `read_asset` and `build_bundle`.
     """
-    paths = [asset_path] if isinstance(asset_path, str | os.PathLike) else list(asset_path)
-    bundle_path = Path(bundle_path)
-    levels = levels_path(bundle_path)
+    config = _checked_config(config)
+    _check_output(Path(bundle_path))
+    build = _FileBuild(
+        paths=_paths_of(asset_path),
+        bundle_path=Path(bundle_path),
+        config=config,
+        seed=seed,
+        progress=progress,
+        devices=devices_for(device, asset),
+        unusable=unusable,
+        num_bytes=in_bytes(memory),
+        executor=executor,
+        codec=codec,
+        up=up,
+    )
+    if not resume:
+        discard_levels(build.levels_path)
+    with _naming_asset(build.paths[0]):
+        if asset is None:
+            source = build.leaves_on_disk()
+        else:
+            source = nullcontext(MemoryLeaves(asset, config, unusable, build.devices[0]))
+        del asset
+        return build.run(source, resume=resume)
+
+
+def _checked_config(config: BuildConfig | None) -> BuildConfig:
     if config is None:
-        config = BuildConfig()
+        return BuildConfig()
     check_type("config", config, BuildConfig, "a BuildConfig")
+    return config
+
+
+def _check_output(bundle_path: Path) -> None:
+    """Refuse, before long work, a path to which no bundle can be written."""
     _files.check_bundle_name(bundle_path)
     _files.check_folder(bundle_path)
     _files.status_of_replaced(bundle_path)
-    devices = devices_for(device, asset)
-    num_bytes = in_bytes(memory)
-    if not resume:
-        discard_levels(levels)
-    with _naming_asset(paths[0]):
-        source: AbstractContextManager[Leaves]
-        if asset is not None:
-            source = nullcontext(MemoryLeaves(asset, config, unusable, devices[0]))
-        else:
-            source = leaves_on_disk(
-                paths,
-                levels.with_suffix(".scratch"),
-                memory=num_bytes,
-                config=config,
-                unusable=unusable,
-                reserved=unit_bytes,
-                device=devices[0],
-                progress=progress,
-                # Workers of an executor cannot read leaves in the memory of this
-                # process.
-                most_in_memory=MOST_GAUSSIANS if executor is None else 0,
-            )
-        del asset
+
+
+def _paths_of(asset_path: AssetPath | Sequence[AssetPath]) -> list[AssetPath]:
+    if isinstance(asset_path, str | os.PathLike):
+        return [asset_path]
+    return list(asset_path)
+
+
+@dataclass(frozen=True, eq=False)
+class _FileBuild:
+    """The arguments of `build_file`, checked."""
+
+    paths: Sequence[AssetPath]
+    bundle_path: Path
+    config: BuildConfig
+    seed: int
+    progress: Progress
+    devices: Sequence[Device]
+    unusable: Literal["drop", "refuse"]
+    num_bytes: int  # memory of the host
+    executor: Executor | None
+    codec: str
+    up: Axis | None
+
+    @property
+    def levels_path(self) -> Path:
+        return levels_path(self.bundle_path)
+
+    def leaves_on_disk(self) -> AbstractContextManager[Leaves]:
+        """The leaves in the files of the asset."""
+        most_in_memory = MOST_GAUSSIANS
+        if self.executor is not None:  # its workers cannot read the memory of this process
+            most_in_memory = 0
+        return leaves_on_disk(
+            self.paths,
+            self.levels_path.with_suffix(".scratch"),
+            memory=self.num_bytes,
+            config=self.config,
+            unusable=self.unusable,
+            reserved=unit_bytes,
+            device=self.devices[0],
+            progress=self.progress,
+            most_in_memory=most_in_memory,
+        )
+
+    def run(self, source: AbstractContextManager[Leaves], *, resume: bool) -> tuple[Bundle, bool]:
+        """Keep or build the bundle; returns it, and whether it was built."""
         with source as leaves:
-            if resume and _is_made_with(
-                bundle_path, made_with(leaves, config, seed, codec, up), codec
-            ):
+            if resume and self._is_finished(leaves):
                 with suppress(RuntimeError):  # another build has begun to write there
-                    discard_levels(levels)
-                return Bundle.open(bundle_path), False
+                    discard_levels(self.levels_path)
+                return Bundle.open(self.bundle_path), False
             bundle = build_into(
-                levels,
+                self.levels_path,
                 leaves,
-                config,
-                seed,
-                devices,
-                progress,
-                codec=codec,
-                bundle_path=bundle_path,
-                most_units=most_units(num_bytes, leaves),
-                executor=executor,
-                up=up,
+                self.config,
+                self.seed,
+                self.devices,
+                self.progress,
+                codec=self.codec,
+                bundle_path=self.bundle_path,
+                most_units=most_units(self.num_bytes, leaves),
+                executor=self.executor,
+                up=self.up,
             )
             return bundle, True
+
+    def _is_finished(self, leaves: Leaves) -> bool:
+        """Whether the bundle exists, was made of these leaves with these settings, and
+        was not converted to another codec since."""
+        config = made_with(leaves, self.config, self.seed, self.codec, self.up)
+        try:
+            bundle = Bundle.open(self.bundle_path)
+            return bundle.config == config and bundle.codec == self.codec
+        except (ValueError, OSError):  # missing, damaged, or of another version: build it
+            return False
 
 
 @contextmanager
@@ -135,16 +197,6 @@ def _naming_asset(path: AssetPath) -> Iterator[None]:
         if text.startswith("asset: "):
             text = f"{shown(path)}: {text}"
         raise ValueError(text) from None
-
-
-def _is_made_with(bundle_path: Path, config: dict[str, Any], codec: str) -> bool:
-    """Whether a bundle exists, has this config, and was not converted to another codec
-    since."""
-    try:
-        bundle = Bundle.open(bundle_path)
-        return bundle.config == config and bundle.codec == codec
-    except (ValueError, OSError):  # missing, damaged, or of another version: build it
-        return False
 
 
 def levels_path(bundle_path: str | os.PathLike[str]) -> Path:

@@ -54,7 +54,7 @@ def run_fit(
     result: list[_T] = []
     run = _device.with_this_stream(lambda: result.append(fit(state)), device)
     failure: list[BaseException] = []
-    done = threading.Event()
+    has_ended = threading.Event()
 
     def work(token: _Token) -> None:
         del token  # the frame of the thread still holds it
@@ -63,7 +63,7 @@ def run_fit(
         except BaseException as error:
             failure.append(error)
         finally:
-            done.set()
+            has_ended.set()
 
     # Not threading.Thread: if the thread ends before its first line because memory is
     # short, start() waits for ever; and after Ctrl-C during join(), Python 3.11 can
@@ -72,16 +72,16 @@ def run_fit(
     running_token = weakref.ref(tokens[0])
     try:
         _thread.start_new_thread(work, (tokens.pop(),))
-        while running_token() is not None and not done.wait(0.1):
+        while running_token() is not None and not has_ended.wait(0.1):
             show(state)
     except BaseException:
         state.cancel()
-        while running_token() is not None and not done.is_set():
+        while running_token() is not None and not has_ended.is_set():
             time.sleep(0.01)
         raise
     if failure:
         raise failure[0]
-    if not done.is_set():
+    if not has_ended.is_set():
         raise MemoryError("a thread that had started ended at once")
     show(state)
     return result[0]

@@ -6,13 +6,14 @@ import warnings
 from abc import ABC, abstractmethod
 from collections import Counter
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core, _device, cleaning
 from v3dg._device import Device
+from v3dg._json import JsonObject
 from v3dg._numbers import check, one_of, shown, whole_number
 from v3dg.bundle.codec import Codec
 from v3dg.cameras import Axis
@@ -68,7 +69,7 @@ class MemoryLeaves(Leaves):
         self._asset = _device.place(asset, _device.of(asset.means))  # without gradients
         self._config = config
         self._device = device
-        self._order: npt.NDArray[np.integer[Any]] | None = None
+        self._order: npt.NDArray[np.int32] | npt.NDArray[np.int64] | None = None
         self._lock = threading.Lock()
 
     def read(self, first: int, last: int) -> Gaussians:
@@ -87,11 +88,11 @@ class MemoryLeaves(Leaves):
 
 def made_with(
     leaves: Leaves, config: BuildConfig, seed: int, codec: str, up: Axis | None
-) -> dict[str, Any]:
+) -> JsonObject:
     """The config of a bundle: the asset and the settings that it was made with."""
     seed = whole_number(seed, "seed")
     check("seed", 0 <= seed < 2**58, f"0 to 2^58 - 1, got {shown(seed)}")
-    result: dict[str, Any] = {
+    result: JsonObject = {
         "build": asdict(config),
         "seed": seed,
         "asset_gaussians": leaves.asset_gaussians,

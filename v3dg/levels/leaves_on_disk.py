@@ -11,7 +11,7 @@ import os
 import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -111,11 +111,12 @@ def leaves_on_disk(
     folder = Path(folder)
     fits = count <= min(sizes.in_memory, most_in_memory)
     scratch: AbstractContextManager[None] = nullcontext()
-    if not fits or os.path.lexists(
-        folder
-    ):  # a folder that a killed build left is removed in any case
+    # A folder that a killed build left is removed in any case.
+    if not fits or os.path.lexists(folder):
         scratch = scratch_folder(folder, _NAMES)
-    with scratch, Bar(2 * count, "reading", False if fits else progress) as bar:
+    if fits:
+        progress = False
+    with scratch, Bar(2 * count, "reading", progress) as bar:
         if fits:
             buffer = Codec(degree).empty(count)
             for _ in _blocks(tiles, buffer, bar):
@@ -188,6 +189,11 @@ class _Sizes(NamedTuple):
             in_bucket=min(_MOST_IN_BUCKET, for_split // _bytes_in_bucket(degree)),
         )
 
+    def blocks(self, tiles: Sequence[_Tile], bar: Bar) -> "_Blocks":
+        """The asset in blocks of this size."""
+        degree = max(tile.sh_degree for tile in tiles)
+        return _blocks(tiles, Codec(degree).empty(self.in_block), bar)
+
 
 def _bytes_in_bucket(degree: int) -> int:
     """Memory for each gaussian of a bucket that is sorted: two copies of it, and the
@@ -245,31 +251,23 @@ def _sort_on_disk(
     degree = max(tile.sh_degree for tile in tiles)
     points, spare, order, rows = (folder / name for name in _NAMES)
     tally = Tally()
-    with ExitStack() as stack:
-
-        def new(path: Path, width: int, dtype: npt.DTypeLike = np.uint32) -> RowFile:
-            return stack.enter_context(RowFile(path, width, dtype, must_be_new=True))
-
-        files = (new(points, 4), new(spare, 4))
-        order_file = new(order, 1)
-        blocks = _blocks(tiles, Codec(degree).empty(sizes.in_block), bar)
-        digest = _write_points(blocks, files[0], tally)
-        del blocks  # and with it the buffer
-        tally.check(unusable)
-        count = tally.num_drawable
-        depth = _core.num_halvings(count, config.cluster_size)
-        bucket_depth = min(depth, _core.num_halvings(count, sizes.in_bucket))
-        external_split.split(files, count, bucket_depth, sizes.in_node, order_file)
+    with _new_words(order, 1) as order_file:
+        with _new_words(points, 4) as point_file, _new_words(spare, 4) as spare_file:
+            digest = _write_points(sizes.blocks(tiles, bar), point_file, tally)
+            tally.check(unusable)
+            count = tally.num_drawable
+            depth = _core.num_halvings(count, config.cluster_size)
+            bucket_depth = min(depth, _core.num_halvings(count, sizes.in_bucket))
+            files = (point_file, spare_file)
+            external_split.split(files, count, bucket_depth, sizes.in_node, order_file)
         points.unlink()
         spare.unlink()
         offset = halved(np.array([count]), bucket_depth)
-        row_file = new(rows, gaussian_bytes(degree) // 4, np.float32)
         ends = _ends_in_buckets(order_file, offset, sizes.in_block, tally.num_gaussians)
-        blocks = _blocks(tiles, Codec(degree).empty(sizes.in_block), bar)
-        second_digest = _write_rows(blocks, order_file, ends, row_file)
+        with RowFile(rows, gaussian_bytes(degree) // 4, np.float32, must_be_new=True) as row_file:
+            second_digest = _write_rows(sizes.blocks(tiles, bar), order_file, ends, row_file)
     order.unlink()
-    name = shown(tiles[0].path) if len(tiles) == 1 else f"one of {len(tiles)} files"
-    check(name, second_digest == digest, _CHANGED)
+    check(_name_of(tiles), second_digest == digest, _CHANGED)
     bar.close()
     return DiskLeaves(
         num_gaussians=count,
@@ -284,7 +282,19 @@ def _sort_on_disk(
     )
 
 
-def _write_points(blocks: _Blocks, points: RowFile, tally: Tally) -> str:
+def _new_words(path: Path, width: int) -> external_split.WordFile:
+    """A new file of rows of words."""
+    return RowFile(path, width, np.uint32, must_be_new=True)
+
+
+def _name_of(tiles: Sequence[_Tile]) -> str:
+    """What messages call the asset in these files."""
+    if len(tiles) == 1:
+        return shown(tiles[0].path)
+    return f"one of {len(tiles)} files"
+
+
+def _write_points(blocks: _Blocks, points: external_split.WordFile, tally: Tally) -> str:
     """The first pass: write the means of the drawable gaussians, with their rows in the
     asset; the digest."""
     hashes: list[bytes] = []
@@ -301,7 +311,12 @@ def _write_points(blocks: _Blocks, points: RowFile, tally: Tally) -> str:
     return digest_of_hashes(hashes)
 
 
-def _write_rows(blocks: _Blocks, order: RowFile, ends: npt.NDArray[np.int64], rows: RowFile) -> str:
+def _write_rows(
+    blocks: _Blocks,
+    order: external_split.WordFile,
+    ends: npt.NDArray[np.int64],
+    rows: RowFile[np.float32],
+) -> str:
     """The second pass: write every gaussian to its bucket, in the order of the asset;
     the digest."""
     hashes: list[bytes] = []
@@ -331,7 +346,10 @@ def _write_rows(blocks: _Blocks, order: RowFile, ends: npt.NDArray[np.int64], ro
 
 
 def _ends_in_buckets(
-    order: RowFile, offset: npt.NDArray[np.int64], block: int, asset_gaussians: int
+    order: external_split.WordFile,
+    offset: npt.NDArray[np.int64],
+    block: int,
+    asset_gaussians: int,
 ) -> npt.NDArray[np.int64]:
     """(B, blocks + 1) places in the order: the start of each bucket, then its end in
     each block."""

@@ -27,10 +27,11 @@ def in_bytes(memory: int | str | None) -> int:
     if memory is None:
         return free_bytes() // 2
     is_amount = isinstance(memory, str | int | float | np.number) and not isinstance(memory, bool)
-    is_long = (
-        isinstance(memory, int) and memory.bit_length() > 128
-    )  # which Python may refuse to print
-    text = str(memory) if is_amount and not is_long else ""
+    # Python may refuse to print a very long number.
+    is_long = isinstance(memory, int) and memory.bit_length() > 128
+    text = ""
+    if is_amount and not is_long:
+        text = str(memory)
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?\s*", text, re.IGNORECASE)
     if match is None or not float(match[1]) > 0:
         refuse("memory", f"bytes, or text like '8GiB', got {shown(memory)}")

@@ -38,10 +38,11 @@ class Bar(_progress.Bar):
             if self._is_stopped:
                 raise Stopped
             text = f"level {levels[-1]}/{self._last_level}"
-            done = state.groups_done
-            if done > 0:
-                text += f", groups {done}/{num_groups}, loss {state.loss_sum / done:.4f}"
-            self._update((part, levels[0]), num_gaussians * done / num_groups, text)
+            num_fitted = state.groups_done
+            if num_fitted > 0:
+                loss = state.loss_sum / num_fitted
+                text += f", groups {num_fitted}/{num_groups}, loss {loss:.4f}"
+            self._update((part, levels[0]), num_gaussians * num_fitted / num_groups, text)
 
         return show
 
@@ -53,4 +54,4 @@ class Bar(_progress.Bar):
     def _update(self, key: tuple[int, int], num_gaussians: float, text: str = "") -> None:
         with self._lock:
             self._fitted[key] = num_gaussians
-            self.update(self._initial + int(sum(self._fitted.values())) - self.done, text)
+            self.update(self._initial + int(sum(self._fitted.values())) - self.num_done, text)

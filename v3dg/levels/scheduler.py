@@ -76,23 +76,28 @@ def watch_over(executor: Executor) -> Watch | None:
     module = sys.modules.get("distributed.cfexecutor")
     if module is None or not isinstance(executor, module.ClientExecutor):
         return None
-    client = executor._client  # which has no public name
-    return None if client.scheduler is None else Watch(client)
+    client = executor._client  # dask gives the client no public name
+    if client.scheduler is None:
+        return None
+    return Watch(client)
 
 
 def completed(futures: Collection[Future[T]], watch: Watch | None) -> Iterator[Future[T]]:
     """Futures in the order in which they end; SchedulerError where the scheduler drops
     them or is silent."""
     waiting = set(futures)
+    timeout = None
+    if watch is not None:
+        timeout = _TICK_S
     while waiting:
-        done, waiting = wait(waiting, None if watch is None else _TICK_S, FIRST_COMPLETED)
+        ended, waiting = wait(waiting, timeout, FIRST_COMPLETED)
         if watch is not None:
-            if any(future.cancelled() for future in done):
+            if any(future.cancelled() for future in ended):
                 raise SchedulerError(
                     f"{watch.name}: connection lost, or units cancelled; {_ADVICE}"
                 )
-            if done:
+            if ended:
                 watch.hear()
             else:
                 watch.tick()
-        yield from done
+        yield from ended

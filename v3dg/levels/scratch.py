@@ -6,7 +6,7 @@ import os
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -15,17 +15,19 @@ from v3dg import _files
 
 _MARK = "v3dg-scratch"  # a file by which the folder is known
 
+_Scalar = TypeVar("_Scalar", np.float32, np.uint32)
 
-class RowFile(AbstractContextManager["RowFile"]):
+
+class RowFile(AbstractContextManager["RowFile[_Scalar]"], Generic[_Scalar]):
     """A file of rows of one width, float32 or uint32, in the byte order of the
     machine."""
 
     def __init__(
-        self, path: Path, width: int, dtype: npt.DTypeLike, *, must_be_new: bool = False
+        self, path: Path, width: int, dtype: type[_Scalar], *, must_be_new: bool = False
     ) -> None:
         self.path = path
         self._width = width
-        self._dtype = np.dtype(dtype)
+        self._dtype: np.dtype[_Scalar] = np.dtype(dtype)
         self._row_bytes = width * self._dtype.itemsize
         flags = os.O_RDONLY
         if must_be_new:
@@ -35,21 +37,23 @@ class RowFile(AbstractContextManager["RowFile"]):
     def __exit__(self, *_: object) -> None:
         os.close(self._descriptor)
 
-    def read(self, first: int, last: int) -> npt.NDArray[Any]:
+    def read(self, first: int, last: int) -> npt.NDArray[_Scalar]:
         """Rows `first` to `last`, (M, width); (M,) where the width is 1."""
-        shape = (last - first,) if self._width == 1 else (last - first, self._width)
+        shape: tuple[int, ...] = (last - first,)
+        if self._width != 1:
+            shape = (last - first, self._width)
         rows = np.empty(shape, self._dtype)
         with _files.naming_errors(self.path):
             if not _files.read_at(self._descriptor, rows, first * self._row_bytes):
                 raise OSError(f"{self.path}: expected rows {first} to {last} of scratch, got fewer")
         return rows
 
-    def blocks(self, first: int, last: int, size: int) -> Iterator[npt.NDArray[Any]]:
+    def blocks(self, first: int, last: int, size: int) -> Iterator[npt.NDArray[_Scalar]]:
         """Rows `first` to `last`, at most `size` at a time."""
         for start in range(first, last, size):
             yield self.read(start, min(start + size, last))
 
-    def write(self, first: int, rows: npt.NDArray[Any]) -> None:
+    def write(self, first: int, rows: npt.NDArray[_Scalar]) -> None:
         """Write rows from row `first` on."""
         data = np.ascontiguousarray(rows, self._dtype).reshape(-1).view(np.uint8).data
         with _files.naming_errors(self.path):
@@ -67,7 +71,10 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
     try:
         lock(descriptor, folder)
         present = os.listdir(folder)
-        foreign_names = sorted(set(present) - {_MARK, *names} if _MARK in present else present)
+        own_names: set[str] = set()
+        if _MARK in present:
+            own_names = {_MARK, *names}
+        foreign_names = sorted(set(present) - own_names)
         if foreign_names:
             raise ValueError(
                 f"{folder}: expected scratch of a build, got {foreign_names[0]!a}; move it "

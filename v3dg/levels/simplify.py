@@ -29,9 +29,8 @@ class LevelTables:
 
     box: npt.NDArray[np.float32]  # (C, 2, 3), bounds of the drawn clusters
     ball: npt.NDArray[np.float32]  # (G, 4), nested, for selection
-    fit_ball: npt.NDArray[
-        np.float32
-    ]  # (G, 4), as small as is known, framed by the views of the fit
+    # (G, 4), as small as is known, framed by the views of the fit
+    fit_ball: npt.NDArray[np.float32]
     error: npt.NDArray[np.float32]  # (G, 2), residual of the fits
 
 
@@ -111,16 +110,13 @@ class LevelBuilder:
         plans = [self.plan.levels[number] for number in numbers]
         gaussians = self._starts(lower_levels[numbers[0] - 1].gaussians, numbers)
         targets = range(config.target_of(numbers[0]), config.target_of(numbers[-1]) + 1)
-        target = _target(lower_levels, targets, config)
         target_sizes = [len(lower_levels[number].gaussians) for number in targets]
-        target_offsets: list[Offsets] = []
-        fit_balls: list[npt.NDArray[np.float32]] = []
-        for number in numbers:
-            offset, fit_ball = _view(
-                lower_levels[config.target_of(number)], self.plan, number, config
-            )
-            target_offsets.append(offset)
-            fit_balls.append(fit_ball)
+        views = [
+            _view(lower_levels[config.target_of(number)], self.plan, number, config)
+            for number in numbers
+        ]
+        target_offsets = [offset for offset, _ in views]
+        fit_balls = [ball for _, ball in views]
         first_row = np.cumsum([0, *(plan.num_gaussians for plan in plans)])
         first_group = np.cumsum([0, *(plan.num_groups for plan in plans)])
         device = _device.of(gaussians.means)
@@ -128,7 +124,7 @@ class LevelBuilder:
         error = run_fit(
             lambda progress: _core.fit_level(
                 fit_config(config, self.seed, numbers[0]),
-                target,
+                _target(lower_levels, targets, config),
                 _ranges(target_offsets, target_sizes),
                 gaussians.rows,  # the fit replaces them by its result
                 _ranges([plan.group_offset for plan in plans], np.diff(first_row)),
@@ -236,8 +232,8 @@ def _target(
     """
     rows = _joined([lower_levels[number].gaussians for number in numbers]).rows
     if numbers[0] == 0:
-        return _core.FitTarget(rows, 0.0, False)
-    return _core.FitTarget(rows, config.filter_px2, True)
+        return _core.FitTarget(rows, filter_px2=0.0, antialiased=False)
+    return _core.FitTarget(rows, filter_px2=config.filter_px2, antialiased=True)
 
 
 def _start(

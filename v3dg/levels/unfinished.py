@@ -34,9 +34,8 @@ from v3dg.levels.plan import LevelPlan
 from v3dg.levels.scratch import lock
 from v3dg.levels.simplify import Level, LevelTables
 
-_RECORD = struct.Struct(
-    "<II16s"
-)  # precedes a level: its part, its number, the hash of the following arrays
+# Precedes a level: its part, its number, the hash of the following arrays.
+_RECORD = struct.Struct("<II16s")
 _MAGIC = bytes(8) + b"unfinished v3dg 1\n"
 
 
@@ -291,8 +290,8 @@ def discard_levels(resume_path: str | os.PathLike[str]) -> None:
         with _open_locked(resume_path) as file:
             head = os.pread(file.fileno(), len(_MAGIC), 0)
             is_ours = _MAGIC.startswith(head) or _is_bundle(resume_path)
-            got = "something else; move it elsewhere"
-            check(resume_path, is_ours, f"levels of an interrupted build, got {got}")
+            expected = "levels of an interrupted build, got something else; move it elsewhere"
+            check(resume_path, is_ours, expected)
             os.unlink(resume_path)
 
 

@@ -4,11 +4,12 @@ import os
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -48,12 +49,12 @@ _Levels = dict[int, FinishedLevel]
 def devices_for(device: str | Device, asset: Gaussians | None = None) -> list[Device]:
     """Where to build: with "auto" and "cuda" also on all devices like the asset's or
     the current one."""
-    where = _device.resolve(device)
-    if not where.is_cuda or str(device) not in ("auto", "cuda"):
-        return [where]
+    first = _device.resolve(device)
+    if not first.is_cuda or str(device) not in ("auto", "cuda"):
+        return [first]
     if asset is not None and _device.of(asset.means).is_cuda:
-        where = _device.of(asset.means)
-    return _device.all_like(where)
+        first = _device.of(asset.means)
+    return _device.all_like(first)
 
 
 def build_into(
@@ -74,24 +75,24 @@ def build_into(
     as `build_bundle`."""
     plan = Plan.of(leaves.num_gaussians, config)
     config.check_views(
-        max((np.diff(made.group_offset).max() for made in plan.levels[1:]), default=1)
+        max((np.diff(level.group_offset).max() for level in plan.levels[1:]), default=1)
     )
     units = plan.units(UNIT_LEAVES)
-    kept = codec_of(codec, leaves.sh_degree)
-    file = BundlePlan(plan.layout, kept, made_with(leaves, config, seed, codec, up))
+    page_codec = codec_of(codec, leaves.sh_degree)
+    file = BundlePlan(plan.layout, page_codec, made_with(leaves, config, seed, codec, up))
     parts = _parts(plan, units, file)
-    with (
-        _device.memory_errors(),
-        Unfinished(Path(path), file, parts, devices[0], bundle_path)
-        if path is not None
-        else nullcontext(MemoryStore(file)) as store,
-    ):
+    opened: AbstractContextManager[Unfinished | MemoryStore]
+    if path is not None:
+        opened = Unfinished(Path(path), file, parts, devices[0], bundle_path)
+    else:
+        opened = nullcontext(MemoryStore(file))
+    with _device.memory_errors(), opened as store:
         if not store.is_whole:
-            config = measured_config(config, plan, leaves, seed, kept, devices[0])
-            done = sum(
+            config = measured_config(config, plan, leaves, seed, page_codec, devices[0])
+            num_finished = sum(
                 parts[part][number][0].num_gaussians for part, number in store.levels if number > 0
             )
-            with Bar(plan, done, progress) as bar:
+            with Bar(plan, num_finished, progress) as bar:
                 build = _Build(config, file.config["seed"], plan, units, parts, file, store, bar)
                 tables, hashes = build.all_levels(leaves, devices, most_units, executor)
                 if config.smooth == "yes" and len(tables) > 1:
@@ -105,8 +106,8 @@ def _parts(plan: Plan, units: Sequence[Plan], file: BundlePlan) -> list[Part]:
 
     def runs(number: int, count: int) -> list[PageRun]:
         first, last = plan.first_page[number : number + 2]
-        each = (last - first) // count
-        return [file.run(page, page + each) for page in range(first, last, each)]
+        num_pages = (last - first) // count
+        return [file.run(page, page + num_pages) for page in range(first, last, num_pages)]
 
     num_low = len(units[0].levels)
     pages = [runs(n, len(units)) for n in range(num_low)]
@@ -144,22 +145,25 @@ class _Build:
     ) -> tuple[list[LevelTables], npt.NDArray[np.uint8]]:
         """Build all levels; their tables, and the hashes of all pages."""
         if executor is None:
-            self._build_here(leaves, devices, most_units)
+            self._build_on_threads(leaves, devices, most_units)
         else:
-            self._build_elsewhere(leaves, devices[0], executor)
+            self._build_on_executor(leaves, devices[0], executor)
         finished = [self._joined(number) for number in range(self.num_low)]
-        top, levels, pages = len(self.units), self.store.levels, self.store.pages
+        top = len(self.units)
+        levels = self.store.levels
+        pages = self.store.pages
         runs = {number: run for number, (_, run) in self.parts[top].items()}
         saved = (levels[top, n].read(pages, run) for n, run in runs.items() if (top, n) in levels)
-        below: dict[int, Level] = {}
-        first = self.config.target_of(self.num_low) if runs else self.num_low - 1
+        first = self.num_low - 1
+        if runs:
+            first = self.config.target_of(self.num_low)
+        lower_levels: dict[int, Level] = {}
         for n in range(first, self.num_low):  # what the levels above begin with
-            below[n] = Level(
-                _device.place(self._level(n).gaussians, devices[0]), finished[n].tables
-            )
+            gaussians = _device.place(self._level(n).gaussians, devices[0])
+            lower_levels[n] = Level(gaussians, finished[n].tables)
         builder = LevelBuilder(self.plan, self.config, self.seed, self.file.codec)
-        above = builder.levels_above(below, saved, self.bar.show_of(top))
-        for number, level in enumerate(above, self.num_low):
+        upper_levels = builder.levels_above(lower_levels, saved, self.bar.show_of(top))
+        for number, level in enumerate(upper_levels, self.num_low):
             if (top, number) not in levels:
                 hashes = pages.write(runs[number], level.gaussians)
                 self.store.save(top, number, FinishedLevel(level.tables, hashes))
@@ -171,13 +175,20 @@ class _Build:
     def grown(self, tables: Sequence[LevelTables], device: Device) -> list[LevelTables]:
         """The tables with larger balls: of level 1 by what is measured, if the asset is
         one unit."""
-        ball, here, config = tables[1].ball, self.plan.levels[1], self.config
+        ball = tables[1].ball
+        level_1 = self.plan.levels[1]
         growth = np.full(len(ball), _UNMEASURED, np.float32)
         if len(self.units) == 1:
             leaves, level = (_device.place(self._level(n).gaussians, device).rows for n in (0, 1))
-            filters = config.asset_filter_px2, config.asset_antialiased, config.filter_px2
             growth = _core.first_selected(
-                leaves, level, here.leaf_offset, here.group_offset, ball, *filters
+                leaves,
+                level,
+                level_1.leaf_offset,
+                level_1.group_offset,
+                ball,
+                self.config.asset_filter_px2,
+                self.config.asset_antialiased,
+                self.config.filter_px2,
             )
         balls = _core.grown_balls([table.ball for table in tables], growth)
         return [replace(table, ball=ball) for table, ball in zip(tables, balls, strict=True)]
@@ -187,7 +198,7 @@ class _Build:
             self.store.pages, self.file.run(*self.plan.first_page[n : n + 2])
         )
 
-    def _build_here(
+    def _build_on_threads(
         self, leaves: Leaves, devices: Sequence[Device], most_units: int | None
     ) -> None:
         workers = [device for _ in range(_UNITS_ON_GPU) for device in devices if device.is_cuda]
@@ -215,14 +226,15 @@ class _Build:
             with ThreadPoolExecutor(len(workers)) as executor:
                 self._collect(lambda unit: executor.submit(work, unit))
 
-    def _build_elsewhere(self, leaves: Leaves, device: Device, executor: Executor) -> None:
-        like, nonce = (str(device).partition(":")[0], *described(device)), os.urandom(8)
+    def _build_on_executor(self, leaves: Leaves, device: Device, executor: Executor) -> None:
+        expected_device = WorkerDevice(str(device).partition(":")[0], *described(device))
+        nonce = os.urandom(8)
 
         def submit(unit: int) -> Future[_Levels]:
             task = self._task(unit, leaves)
             if isinstance(leaves, MemoryLeaves):  # those of the unit go along
                 task = replace(task, leaves=task.leaves().numpy)
-            return executor.submit(build_elsewhere, task, like, nonce)
+            return executor.submit(build_in_worker, task, expected_device, nonce)
 
         watch = watch_over(executor)
         try:
@@ -230,7 +242,9 @@ class _Build:
         except (OSError, ValueError, RuntimeError, MemoryError):
             raise
         except Exception as error:
-            name = "executor" if watch is None else watch.name
+            name = "executor"
+            if watch is not None:
+                name = watch.name
             reason = f"{type(error).__name__}: {error}".rstrip(": ")
             raise RuntimeError(f"{name}: expected all units to be built, got {reason}") from error
 
@@ -291,10 +305,13 @@ class UnitTask:
         """Build the levels that are not finished, one after another, and write their
         pages."""
         finished = (self.finished[n].read(self.pages, self.runs[n]) for n in sorted(self.finished))
-        leaves = next(finished).gaussians if self.finished else self.leaves()
-        own = _device.place(leaves, device)
-        levels = self.builder.levels(own, finished, show)
-        del leaves, own
+        if self.finished:
+            leaves = next(finished).gaussians
+        else:
+            leaves = self.leaves()
+        leaves = _device.place(leaves, device)
+        levels = self.builder.levels(leaves, finished, show)
+        del leaves
         for number, level in enumerate(levels):
             if number not in self.finished:
                 hashes = self.pages.write(self.runs[number], level.gaussians)
@@ -302,21 +319,33 @@ class UnitTask:
             del level  # while the next is made, its memory is free
 
 
-def build_elsewhere(task: UnitTask, like: tuple[str, str, str], _: bytes) -> _Levels:
-    """Build a unit in a worker of an executor, on a device of this kind, which must be
-    described like this.
+class WorkerDevice(NamedTuple):
+    """What the device of every worker must be, so that they all give the same bits."""
 
-    The last argument is another in each build: dask gives what it has for the same
-    arguments.
+    kind: str  # "cpu" or "cuda"
+    description: str
+    version: str  # of v3dg
+
+    def __str__(self) -> str:
+        return f"{self.description} with v3dg {self.version}"
+
+
+def build_in_worker(task: UnitTask, expected_device: WorkerDevice, _: bytes) -> _Levels:
+    """Build a unit in a worker of an executor, on a device like the expected one.
+
+    The last argument differs in each build, because dask returns a cached result for
+    the same arguments.
     """
-    device, here = _device.resolve(like[0]), f"worker on {socket.gethostname()}: expected"
-    if (own := described(device)) != like[1:]:
-        wanted, got = (" with v3dg ".join(pair) for pair in (like[1:], own))
+    device = _device.resolve(expected_device.kind)
+    worker = f"worker on {socket.gethostname()}"
+    worker_device = WorkerDevice(expected_device.kind, *described(device))
+    if worker_device != expected_device:
         raise RuntimeError(
-            f"{here} {wanted} as where the build began, got {got}; the last bits would differ"
+            f"{worker}: expected {expected_device} as where the build began, "
+            f"got {worker_device}; the last bits would differ"
         )
     assert isinstance(task.pages, PageFile)
     if not task.pages.path.exists():
-        raise RuntimeError(f"{here} {task.pages.path}, got none; share its folder")
+        raise RuntimeError(f"{worker}: expected {task.pages.path}, got none; share its folder")
     with _device.own_stream(device), _device.memory_errors():
         return dict(task.levels(device, lambda *_: None))

@@ -107,18 +107,19 @@ def write_scene(
         document["up"] = scene.up
     document["bundles"] = dict(zip(names, bundle_paths, strict=True))
     document["instances"] = _instances_as_json(scene, names)
-    document["cameras"] = [
-        {
-            "name": name,
-            "width": camera.width,
-            "height": camera.height,
-            "near": camera.near,
-            "viewmat": camera.viewmat.tolist(),
-            "K": camera.K.tolist(),
-        }
-        for name, camera in cameras.items()
-    ]
+    document["cameras"] = [_camera_as_json(name, camera) for name, camera in cameras.items()]
     write_json(path, document)
+
+
+def _camera_as_json(name: str, camera: Camera) -> dict[str, object]:
+    return {
+        "name": name,
+        "width": camera.width,
+        "height": camera.height,
+        "near": camera.near,
+        "viewmat": camera.viewmat.tolist(),
+        "K": camera.K.tolist(),
+    }
 
 
 def _paths_of_bundles(scene: Scene, folder: str) -> list[str]:

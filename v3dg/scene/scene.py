@@ -117,16 +117,7 @@ class Scene:
             TypeError: ``bundle`` is not a bundle.
             ValueError: A shape or a value is not as above.
         """
-        if isinstance(bundle, str | os.PathLike):
-            bundle = Bundle.open(bundle)
-        is_one_for_each = isinstance(bundle, list | tuple)
-        bundles: list[Bundle] = []
-        if isinstance(bundle, list | tuple):
-            bundles.extend(bundle)
-        else:
-            bundles.append(cast(Bundle, bundle))
-        for item in bundles:
-            check_type("bundle", item, Bundle, "a Bundle")
+        bundles = _bundles_of(bundle)
         points: Array = positions
         if not getattr(points, "is_cuda", False):
             points = floats(points, "positions")
@@ -135,22 +126,16 @@ class Scene:
         shape = tuple(points.shape)
         check("positions", shape[1:] == (3,), f"shape (I, 3), got {shape}")
         count = shape[0]
-        if is_one_for_each:
+        if isinstance(bundle, list | tuple):
             check("bundle", len(bundles) == count, f"one for all or {count}, got {len(bundles)}")
-        if quaternions is None:
-            quaternions = (1.0, 0.0, 0.0, 0.0)
-        if scales is None:
-            scales = 1.0
         position_rows = _rows(points, "positions", count)
         quaternion_rows = _rows(quaternions, "quaternions", count)
         scale_rows = _rows(scales, "scales", count)
         importance_rows = _rows(importance, "importance", count)
         with _lock:
             state = self._state
-            number_of = {
-                item: number
-                for number, item in enumerate(dict.fromkeys((*state.bundles, *bundles)))
-            }
+            distinct = dict.fromkeys((*state.bundles, *bundles))
+            number_of = {item: number for number, item in enumerate(distinct)}
             numbers = np.array([number_of[item] for item in bundles], np.int32)
             first = len(self)
             state = state._replace(
@@ -333,10 +318,25 @@ Subject: TypeAlias = Scene | Bundle | Gaussians
 """A value that can be drawn."""
 
 _ROW = {"positions": (3,), "quaternions": (4,), "scales": (), "importance": ()}
+_DEFAULTS: dict[str, Array] = {"quaternions": (1.0, 0.0, 0.0, 0.0), "scales": 1.0}
 _POSITIVE = {
     "scales": (5e-324, np.inf, "positive numbers"),
     "importance": (LEAST_FLOAT, MOST_FLOAT, "positive numbers that a float32 can hold"),
 }
+
+
+def _bundles_of(bundle: Bundle | str | os.PathLike[str] | Sequence[Bundle]) -> list[Bundle]:
+    """The bundles of a list or a tuple, or a single one, which may be a file."""
+    if isinstance(bundle, str | os.PathLike):
+        return [Bundle.open(bundle)]
+    bundles: list[Bundle] = []
+    if isinstance(bundle, list | tuple):
+        bundles.extend(bundle)
+    else:
+        bundles.append(cast(Bundle, bundle))
+    for item in bundles:
+        check_type("bundle", item, Bundle, "a Bundle")
+    return bundles
 
 
 def _read_only(state: _State) -> _State:
@@ -346,9 +346,11 @@ def _read_only(state: _State) -> _State:
     return state
 
 
-def _rows(values: Array, name: str, count: int) -> Array:
-    """A contiguous (count, ...) copy of a column; one row stands for all, except of
-    positions."""
+def _rows(values: Array | None, name: str, count: int) -> Array:
+    """A contiguous (count, ...) copy of a column, or of its default for None; one row
+    stands for all, except of positions."""
+    if values is None:
+        values = _DEFAULTS[name]
     row = _ROW[name]
     is_on_device = getattr(values, "is_cuda", False) and name != "importance"
     if is_on_device:

@@ -19,7 +19,7 @@ def may_draw(
     scene, camera, *, tolerance, min_level=0, footprint="solid_angle", cull=True, and_coarser=False
 ):
     """For each instance, whether its clusters may be drawn, cluster by cluster."""
-    rule = rule_of(tolerance, None, min_level, footprint, cull)
+    rule = rule_of(tolerance, None, min_level, footprint, cull=cull)
     tables = [residency.table(bundle) for bundle in scene.bundles]
     flags, first = _core.bounds_may_draw(
         tables, instances_of(scene), camera.core, rule, and_coarser

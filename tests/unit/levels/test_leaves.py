@@ -531,3 +531,22 @@ def test_scratch_of_a_killed_build_is_removed_by_the_next(tmp_path):
         assert leaves.num_gaussians == 10
         assert not (tmp_path / "s" / "rows").exists()
     assert not (tmp_path / "s").exists()
+
+
+def test_points_leave_the_disk_before_the_rows_are_written(tmp_path, small, monkeypatch):
+    v3dg.write_asset(tmp_path / "a.ply", some_asset(300))
+    small()
+    open_names = []
+    write_rows = on_disk._write_rows
+
+    def look_and_write(*arguments):
+        # A removed file takes space until it is closed.
+        descriptors = Path("/proc/self/fd").iterdir()
+        open_names.extend(os.readlink(link) for link in descriptors if link.is_symlink())
+        return write_rows(*arguments)
+
+    monkeypatch.setattr(on_disk, "_write_rows", look_and_write)
+    with leaves_on_disk([tmp_path / "a.ply"], tmp_path / "s", memory=0, config=CONFIG):
+        pass
+    scratch = [name for name in open_names if name.startswith(f"{tmp_path}/s/")]
+    assert sorted(scratch) == [str(tmp_path / "s" / name) for name in ("order", "rows")]
