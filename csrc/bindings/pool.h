@@ -4,9 +4,9 @@
 
 #include <algorithm>
 #include <memory>
-#include <mutex>
 #include <vector>
 
+#include "base/mutex.h"
 #include "bindings/resident.h"
 #include "residency/host_pages.h"
 
@@ -41,7 +41,7 @@ class BoundPool {
     NotedView frame_on_host(const SceneState& scene, SelectRule rule, PoolFrame kind,
                             const Cut& cut) {
         pool_->check_process();  // In a child of fork() the lock may be held for ever.
-        const std::lock_guard<std::mutex> lock(busy_);
+        const MutexLock lock(busy_);
         if (kind == PoolFrame::first_look) pool_->begin_settling();
         const bool is_aside = kind == PoolFrame::aside && has_begun_;
         const bool is_bounded = kind == PoolFrame::flight || kind == PoolFrame::aside;
@@ -81,7 +81,7 @@ class BoundPool {
 #if V3DG_WITH_CUDA
     void make_on_device(const Work& work);
 #endif
-    NotedView note_needs(float tolerance_px2, bool is_bounded);
+    NotedView note_needs(float tolerance_px2, bool is_bounded) V3DG_REQUIRES(busy_);
 
     const Device device_;
     const py::list tables_, sources_;
@@ -90,9 +90,9 @@ class BoundPool {
 #if V3DG_WITH_CUDA
     std::unique_ptr<cuda::DevicePages> on_device_;
 #endif
-    std::mutex busy_;
-    bool has_begun_ = false;                    // with a frame on the host
-    std::vector<std::vector<uint32_t>> needs_;  // of each bundle
+    Mutex busy_;
+    bool has_begun_ V3DG_GUARDED_BY(busy_) = false;                    // with a frame on the host
+    std::vector<std::vector<uint32_t>> needs_ V3DG_GUARDED_BY(busy_);  // of each bundle
 };
 
 }  // namespace v3dg

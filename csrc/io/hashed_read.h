@@ -1,51 +1,54 @@
 #pragma once
 
-#include <condition_variable>
-#include <future>
-#include <mutex>
+// A part of a file that is read and hashed at the same time.
 
+#include <future>
+
+#include "base/mutex.h"
 #include "base/span.h"
 #include "io/blake2b.h"
 #include "io/posix_file.h"
 
 namespace v3dg {
 
-// How bytes are hashed: one after another, or piece by piece, the hashes of which have the hash.
+// What the hash is of: all bytes in order, or the hashes of their pieces (HashOfPieces).
 enum class HashOf { bytes, pieces };
 
-// A part of a file, with its hash behind it, that is read and hashed at the same time, where it is
-// large on threads of its own: the caller may look at it while it is still hashed. Where it is
-// small, in the threads that wait.
+// A part of a file, followed by its hash, that is read and hashed at the same time. A large part
+// has two threads of its own, so the caller may use it while it is still hashed. A small one is
+// read and hashed by the threads that wait for it.
 class HashedRead {
   public:
     static constexpr size_t kLargeBytes = size_t(4) << 20;
 
-    // What lies at `offset` comes to `message` behind so many bytes, with which it is hashed: all
-    // but the hash at the end. They stay where they are as long as this lives.
-    HashedRead(PosixFile file, size_t offset, Span<uint8_t> message, size_t num_before, HashOf how);
+    // Reads from `offset` on to `message`, after its first `num_before` bytes, which are hashed,
+    // too. The message ends with the hash of all bytes before that. It outlives this.
+    HashedRead(PosixFile file, size_t offset, Span<uint8_t> message, size_t num_before,
+               HashOf hash_of);
     HashedRead(const HashedRead&) = delete;
 
-    // Waits until all is read. Throws std::system_error; false where the file ends before.
+    // Waits until all is read. Returns false if the file ended before. Throws std::system_error.
     bool wait() { return read_.get(); }
-    // Whether all that was read has the hash at its end.
+    // Waits until all is hashed. Returns whether the hash at the end of the message is right.
     bool is_sound();
 
   private:
-    bool read();
-    bool hash();
-    size_t wait_for_more(size_t than);
+    bool read() V3DG_EXCLUDES(busy_);
+    bool hash() V3DG_EXCLUDES(busy_);
+    void report(size_t num_read, bool is_over) V3DG_EXCLUDES(busy_);
+    size_t wait_for_more(size_t num_known) V3DG_EXCLUDES(busy_);
 
     const PosixFile file_;
     const size_t offset_;
-    const Span<uint8_t> bytes_;          // that are read
-    const Span<const uint8_t> message_;  // that is hashed
-    const HashOf how_;
+    const Span<uint8_t> bytes_;          // to be read
+    const Span<const uint8_t> message_;  // to be hashed
+    const HashOf hash_of_;
 
-    std::mutex busy_;
-    std::condition_variable has_more_;
-    size_t num_read_ = 0;
-    bool is_over_ = false;
-    // Last, for they wait for the threads, which use all of the above.
+    Mutex busy_;
+    Condition has_more_;
+    size_t num_read_ V3DG_GUARDED_BY(busy_) = 0;
+    bool is_over_ V3DG_GUARDED_BY(busy_) = false;
+    // Last: their destructors wait for the threads, which use all of the above.
     std::shared_future<bool> read_;
     std::shared_future<bool> is_sound_;
 };

@@ -101,7 +101,7 @@ class PagePolicy {
 
     // Any thread may ask for the state of a page, and change it from absent to loading and from
     // that on.
-    std::atomic<PageState>& state(size_t bundle, size_t page) {
+    std::atomic<PageState>& state(size_t bundle, size_t page) const {
         return states_[id_of(bundle, page)];
     }
     void forget_failures();

@@ -43,7 +43,10 @@ def ply_seeds():
 def compiled(folder):
     sources = [
         HERE / "fuzz_ply.cpp",
-        *(ROOT / "csrc/io" / f"ply_{part}.cpp" for part in ("header", "read")),
+        *(
+            ROOT / "csrc/io" / f"ply_{part}.cpp"
+            for part in ("fields", "header", "read", "rows", "text")
+        ),
     ]
     checks = ["-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=undefined"]
     program = folder / "fuzz_ply"

@@ -1,0 +1,81 @@
+#pragma once
+
+// A mutex, its locks and its condition variable, as the standard library has them, with the
+// annotations that clang needs to check their use (base/thread_annotations.h).
+
+#include <chrono>
+#include <condition_variable>
+#include <mutex>
+
+#include "base/thread_annotations.h"
+
+namespace v3dg {
+
+class V3DG_CAPABILITY("mutex") Mutex {
+  public:
+    Mutex() = default;
+    Mutex(const Mutex&) = delete;
+    Mutex& operator=(const Mutex&) = delete;
+
+    void lock() V3DG_ACQUIRE() { mutex_.lock(); }
+    bool try_lock() V3DG_TRY_ACQUIRE(true) { return mutex_.try_lock(); }
+    void unlock() V3DG_RELEASE() { mutex_.unlock(); }
+
+  private:
+    friend class Condition;
+    std::mutex mutex_;
+};
+
+// Holds a mutex for the rest of a scope.
+class V3DG_SCOPED_CAPABILITY MutexLock {
+  public:
+    explicit MutexLock(Mutex& mutex) V3DG_ACQUIRE(mutex) : mutex_(mutex) { mutex.lock(); }
+    // The caller holds the mutex already; it is released at the end of the scope.
+    MutexLock(Mutex& mutex, std::adopt_lock_t) V3DG_REQUIRES(mutex) : mutex_(mutex) {}
+    ~MutexLock() V3DG_RELEASE() { mutex_.unlock(); }
+    MutexLock(const MutexLock&) = delete;
+    MutexLock& operator=(const MutexLock&) = delete;
+
+  private:
+    Mutex& mutex_;
+};
+
+// Releases a mutex that the caller holds, and takes it again at the end of the scope, however that
+// is left.
+class V3DG_SCOPED_CAPABILITY MutexUnlock {
+  public:
+    explicit MutexUnlock(Mutex& mutex) V3DG_RELEASE(mutex) : mutex_(mutex) { mutex.unlock(); }
+    ~MutexUnlock() V3DG_RELEASE() { mutex_.lock(); }
+    MutexUnlock(const MutexUnlock&) = delete;
+    MutexUnlock& operator=(const MutexUnlock&) = delete;
+
+  private:
+    Mutex& mutex_;
+};
+
+// Waits may end without a notification: callers check in a loop what they wait for, which lets
+// clang check the condition, too.
+class Condition {
+  public:
+    using Time = std::chrono::steady_clock::time_point;
+
+    void notify_one() { condition_.notify_one(); }
+    void notify_all() { condition_.notify_all(); }
+    void wait(Mutex& mutex) V3DG_REQUIRES(mutex) {
+        std::unique_lock<std::mutex> lock(mutex.mutex_, std::adopt_lock);
+        condition_.wait(lock);
+        lock.release();
+    }
+    // Returns false if the time is up.
+    bool wait_until(Mutex& mutex, Time end) V3DG_REQUIRES(mutex) {
+        std::unique_lock<std::mutex> lock(mutex.mutex_, std::adopt_lock);
+        const std::cv_status status = condition_.wait_until(lock, end);
+        lock.release();
+        return status == std::cv_status::no_timeout;
+    }
+
+  private:
+    std::condition_variable condition_;
+};
+
+}  // namespace v3dg
