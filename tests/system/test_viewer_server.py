@@ -67,7 +67,7 @@ def test_the_viewer_in_python_takes_the_axis_of_the_commands(blob_bundle, option
     scene.up = "-y"
     site = v3dg.view(scene, port=0, device="cpu", **options)
     try:
-        assert site._greeting["up"] == list(up)
+        assert site._greeting.up == up
     finally:
         site.close()
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 import scenes_lod
 import v3dg
-from v3dg.viewer.frame import SceneView
+from v3dg.viewer.frame import SceneView, Settings
 from v3dg.viewer.server import Site, start_view
 from v3dg.viewer.view import look_at
 
@@ -79,7 +79,7 @@ def beside(site):
 
 
 def test_page_is_told_what_there_is(tab, site):
-    assert tab.hello["settings"] == {"tolerance": 3.0, "budget": None, "fade": v3dg.DEFAULT_FADE}
+    assert tab.hello["settings"] == tab.hello["defaults"] == asdict(Settings())
     assert tab.hello["up"] == [0, 0, 1]
     assert [camera["name"] for camera in tab.hello["cameras"]] == ["aside"]
     assert tab.hello["cameras"][0]["view"]["position"] == [9, 0, 0]
@@ -92,6 +92,18 @@ def test_page_is_told_what_there_is(tab, site):
         len({tuple(color) for color in tab.scene["level_colors"]})
         == site.scene.bundles[0].num_levels
     )
+
+
+def test_page_is_told_what_a_tab_begins_with(blob_bundle):
+    scene_view = SceneView(blob_bundle, device="cpu")
+    site = Site(scene_view, port=0, tolerance=0.0, budget=5000)
+    try:
+        with viewer_client.Tab(site.port) as tab:
+            expected = asdict(Settings(tolerance=0.0, budget=5000))
+            assert tab.hello["settings"] == expected
+            assert tab.hello["defaults"] == asdict(Settings())
+    finally:
+        site.close()
 
 
 def test_tab_gets_a_small_picture_and_then_the_full_one(site):

@@ -2,7 +2,8 @@
 extra `viewer`.
 
 `view` says from where a tab looks, `frame` draws what it shows, `pacing` decides how
-large and when, `path` flies the camera: these know no browser. `figures`, `controls`,
-`exports` and `path_controls` are the parts of a browser's `tab`, and `server` gives
-each browser that connects one.
+large and when, and `path` flies the camera: these know no browser. `messages` and
+`answers` are what a page and the viewer say to each other, a `tab` is the server's half
+of a page, `exports` does its long work, `gate` decides who may connect, and `server`
+serves the page in `page/` and gives each browser that connects a tab.
 """

@@ -1,21 +1,22 @@
-"""What a tab does that takes long, such as files that it saves, and the thread that it
-is done in."""
+"""The work of a tab that takes long, such as saving files, and the thread that does
+it."""
 
 import contextlib
 import os
 import tempfile
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
 from v3dg import _core
 from v3dg.scene import Scene
+from v3dg.viewer.answers import Answer, Done, File, Notice
 
 
 def bundle_names(scene: Scene) -> list[str]:
-    """Return where the scene's bundles, which must be files, are in the folder that all
-    of them lie below."""
+    """Return the paths of the scene's bundles, which must be files, from the folder
+    that contains all of them."""
     paths = [os.path.abspath(bundle.path or "") for bundle in scene.bundles]
     folder = os.path.commonpath([os.path.dirname(path) for path in paths] or ["/"])
     return [os.path.relpath(path, folder) for path in paths]
@@ -24,14 +25,14 @@ def bundle_names(scene: Scene) -> list[str]:
 class Tell(Protocol):
     """Sends a message to the page, with bytes that belong to it."""
 
-    def __call__(self, message: Mapping[str, object], data: bytes = b"") -> None: ...
+    def __call__(self, answer: Answer, data: bytes = b"") -> None: ...
 
 
 class Exporter:
-    """Does one thing at a time, in a thread, until it is done or stopped.
+    """Does one piece of work at a time, in a thread, until it is done or stopped.
 
     Args:
-        tell: Called in any thread.
+        tell: Sends an answer to the page; called in any thread.
         explain: Turns an error into a line for the page.
     """
 
@@ -44,8 +45,10 @@ class Exporter:
         self._stop = _core.Stop()
 
     def begin(self, work: Callable[[_core.Stop], None]) -> None:
-        """Start work that ends when it is asked to, and whose errors become notices,
-        unless there is some."""
+        """Start work, unless other work is under way: a notice says so.
+
+        The work ends soon after its argument is requested; its errors become notices.
+        """
         with self._lock:
             if self._is_closed:
                 return
@@ -56,27 +59,24 @@ class Exporter:
                 )
                 self._thread.start()
                 return
-        self._run(
-            lambda _: self._tell(
-                {"type": "notice", "text": "Still at work: stop it first, or wait."}
-            )
-        )
+        busy = Notice("Still at work: stop it first, or wait.")
+        self._run(lambda _: self._tell(busy))
 
     def _run(self, work: Callable[[_core.Stop], None]) -> None:
-        answer = {"type": "done"}
+        answer: Answer = Done()
         try:
             work(self._stop)
         except Exception as error:
-            answer = {"type": "notice", "text": f"Not done: {self._explain(error)}"}
+            answer = Notice(f"Not done: {self._explain(error)}")
         with contextlib.suppress(Exception):  # the page may be closed
             self._tell(answer)
 
     def save(self, name: str, write: Callable[[Path], object]) -> None:
-        """Have the browser save a file that is written now."""
+        """Write a file, and have the browser save it."""
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, name)
             write(path)
-            self._tell({"type": "file", "name": name}, path.read_bytes())
+            self._tell(File(name), path.read_bytes())
 
     def stop(self) -> None:
         """Ask the work under way to end."""

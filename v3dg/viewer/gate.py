@@ -1,5 +1,5 @@
-"""Who may talk to the viewer's server: what a request has to say of where it comes
-from.
+"""Who may talk to the viewer's server, judged by what a request says about where it
+comes from.
 
 Any web page can have its visitor's browser connect to this machine. The browser then
 says which name it looked up (Host), whose page asks (Origin, which the pictures,
@@ -31,18 +31,18 @@ _PAGE_PATHS = ("/", "/index.html")
 
 
 class Gate:
-    """Decides about requests to the server at one address of this machine.
+    """Decides which requests to the server at one address of this machine are answered.
 
     Args:
         host: Address to listen at; ``"0.0.0.0"`` for all that this machine has.
-        port: Where to listen; the next free one where it is taken.
+        port: Port to listen at; if it is taken, the next free one.
 
     Attributes:
-        socket: Which listens there.
-        port: The one that was free.
-        url: What a browser is to open. Where other machines can connect, a secret that
-            lets in who has it follows the port.
-        is_secret: Whether it does.
+        socket: The socket that listens.
+        port: The port that was free.
+        url: The address for a browser. If other machines can connect, it contains a
+            secret, without which requests are refused.
+        is_secret: Whether the address contains a secret.
 
     Raises:
         ValueError: ``host`` is not an address of this machine, or no port is free.
@@ -53,8 +53,8 @@ class Gate:
         self.port = int(self.socket.getsockname()[1])
         address = ipaddress.ip_address(self.socket.getsockname()[0].partition("%")[0])
         self._names = {"localhost", host.lower(), str(address)}
-        # Those of a machine that listens everywhere are not known: there the token
-        # alone decides.
+        # The names of a machine that listens at all addresses are not known: there only
+        # the token decides.
         self._has_any_name = address.is_unspecified
         self._token = ""
         if not address.is_loopback:
@@ -70,8 +70,8 @@ class Gate:
             self.url += f"/{self._token}/"
 
     def refusal(self, request: Request) -> str | None:
-        """Why a request gets no answer; the token is taken off the path of one that
-        does."""
+        """Return why a request is refused, or None; the token is removed from the path
+        of a request that is not."""
         headers = request.headers
         texts = (request.path, *(value for _, value in headers.raw_items()))
         if not all(text.isascii() for text in texts):
@@ -94,8 +94,10 @@ class Gate:
         return None
 
     def _knows(self, host: str) -> bool:
-        """Whether a Host is loopback or was asked for: other names can be led here by
-        those who own them."""
+        """Whether a Host is a loopback address or the host that was asked for.
+
+        The owner of any other name can make it point to this machine.
+        """
         match = _HOST.fullmatch(host)
         if match is None:
             return False
@@ -109,8 +111,8 @@ class Gate:
 
 
 def _opens_the_page(request: Request) -> bool:
-    """Whether a request is of a tab that a link leads to the page; frames have another
-    destination."""
+    """Whether a request comes from a tab in which a link to the page was opened; a
+    frame has another destination."""
     headers = request.headers
     is_navigation = headers.get_all("Sec-Fetch-Mode") == ["navigate"]
     is_tab = headers.get_all("Sec-Fetch-Dest") == ["document"]

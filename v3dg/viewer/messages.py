@@ -1,5 +1,8 @@
 """What a page may say to the viewer: JSON of these kinds, with numbers in bounds, and
-nothing else."""
+nothing else.
+
+`tests/support/page_protocol.py` makes the page's types of this module and `answers`.
+"""
 
 import math
 from typing import Annotated, Literal
@@ -7,16 +10,28 @@ from typing import Annotated, Literal
 import msgspec
 
 from v3dg.cameras import Axis
-from v3dg.select import DEFAULT_FADE
+from v3dg.viewer.answers import Limits
 from v3dg.viewer.frame import Settings, Shows
 from v3dg.viewer.pacing import Request, scaled
 from v3dg.viewer.path import CameraPath
 from v3dg.viewer.view import View
 
-# Of a picture's longer side, however large a window the page claims to have.
+# The longer side of a picture, however large a window the page claims to have.
 MOST_PIXELS = 4096
-# In which the page sends files that were dropped onto it.
+# The largest message; the page sends files that were dropped onto it in pieces.
 MOST_BYTES = 1 << 20
+# The length of a path: all its views are made before it is stopped or saved.
+MOST_PATH_SECONDS = 600.0
+MOST_TOLERANCE = 1e6
+MOST_GAUSSIANS = 1 << 40
+MOST_GAIN = 50.0
+LIMITS = Limits(
+    tolerance=(0.0, MOST_TOLERANCE),
+    budget=(1, MOST_GAUSSIANS),
+    gain=(1.0, MOST_GAIN),
+    picture_px=MOST_PIXELS,
+    path_seconds=MOST_PATH_SECONDS,
+)
 
 # Bounds keep out what is not a number, too.
 _Number = Annotated[float, msgspec.Meta(ge=-1e15, le=1e15)]
@@ -27,8 +42,7 @@ _Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 _Seconds = Annotated[float, msgspec.Meta(ge=0.01)]
 _Name = Annotated[str, msgspec.Meta(min_length=1, max_length=200, pattern=r"^[^/\\\x00]+$")]
 _MOST_STOPS = 10_000
-# Of a path: all its views are made before it is stopped or saved.
-_MOST_SECONDS = 600.0
+_DEFAULTS = Settings()
 
 
 class _View(msgspec.Struct, forbid_unknown_fields=True):
@@ -45,15 +59,15 @@ class _View(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _Settings(msgspec.Struct, forbid_unknown_fields=True):
-    """As in `Settings`."""
+    """What a picture shows, and how finely."""
 
-    shows: Shows = "appearance"
-    tolerance: Annotated[float, msgspec.Meta(ge=0, le=1e6)] = 3.0
-    budget: Annotated[int, msgspec.Meta(ge=1, le=1 << 40)] | None = None
-    min_level: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0
-    gain: Annotated[float, msgspec.Meta(ge=1, le=50)] = 5.0
-    fade: Annotated[float, msgspec.Meta(ge=1, le=4)] | None = DEFAULT_FADE
-    split: _Share = 0.0
+    shows: Shows = _DEFAULTS.shows
+    tolerance: Annotated[float, msgspec.Meta(ge=0, le=MOST_TOLERANCE)] = _DEFAULTS.tolerance
+    budget: Annotated[int, msgspec.Meta(ge=1, le=MOST_GAUSSIANS)] | None = _DEFAULTS.budget
+    min_level: Annotated[int, msgspec.Meta(ge=0, le=64)] = _DEFAULTS.min_level
+    fade: Annotated[float, msgspec.Meta(ge=1, le=4)] | None = _DEFAULTS.fade
+    gain: Annotated[float, msgspec.Meta(ge=1, le=MOST_GAIN)] = _DEFAULTS.gain
+    split: _Share = _DEFAULTS.split
     frozen: _View | None = None
 
     def settings(self) -> Settings:
@@ -73,7 +87,12 @@ class _Settings(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Look(msgspec.Struct, tag="look", forbid_unknown_fields=True):
-    """What the page shows from now on."""
+    """Asks for a picture, in place of what was asked for before.
+
+    Attributes:
+        size: Width and height of the picture, px.
+        number: By which the page knows the pictures that answer.
+    """
 
     view: _View
     size: tuple[_Pixels, _Pixels]
@@ -81,7 +100,7 @@ class Look(msgspec.Struct, tag="look", forbid_unknown_fields=True):
     number: Annotated[int, msgspec.Meta(ge=0, le=1 << 53)] = 0
 
     def request(self) -> Request:
-        """What is to be drawn; the size is what can be drawn."""
+        """Return what is to be drawn, in a size that can be drawn."""
         size = scaled(self.size, min(1.0, MOST_PIXELS / max(self.size)))
         return Request(self.view.view(), size, self.settings.settings(), self.number)
 
@@ -89,7 +108,9 @@ class Look(msgspec.Struct, tag="look", forbid_unknown_fields=True):
 class Pick(msgspec.Struct, tag="pick", forbid_unknown_fields=True):
     """Asks what is at a place of the picture, or where an instance is.
 
-    The place is in shares of width and height from the upper left.
+    Attributes:
+        at: The place, in shares of width and height from the upper left corner.
+        instance: The instance to tell about, whatever is at the place.
     """
 
     look: Look
@@ -110,8 +131,14 @@ class Move(msgspec.Struct, tag="move", forbid_unknown_fields=True):
 
 
 class Save(msgspec.Struct, tag="save", forbid_unknown_fields=True):
-    """Asks for a file; or, to play it, for the views of a path: stops with the seconds
-    to each."""
+    """Asks for a file; or, to play it, for the views of a path.
+
+    Attributes:
+        what: The file: a picture, a film of the path, its cameras, or the scene.
+        look: What is shown, and in which size.
+        up: The axis that is up, which a scene's file says; null for another direction.
+        path: Views, each with the seconds from the one before.
+    """
 
     output: Literal["picture", "film", "cameras", "scene", "play"] = msgspec.field(name="what")
     look: Look
@@ -119,19 +146,24 @@ class Save(msgspec.Struct, tag="save", forbid_unknown_fields=True):
     path: Annotated[list[tuple[_Seconds, _View]], msgspec.Meta(max_length=_MOST_STOPS)]
 
     def __post_init__(self) -> None:
-        if sum(seconds for seconds, _ in self.path) > _MOST_SECONDS:
-            raise ValueError(f"path: expected at most {_MOST_SECONDS} s")
+        total = sum(seconds for seconds, _ in self.path)
+        if total > MOST_PATH_SECONDS:
+            raise ValueError(f"path: expected at most {MOST_PATH_SECONDS} s, got {total:.1f} s")
 
     def camera_path(self) -> CameraPath:
         return CameraPath([(seconds, stop.view()) for seconds, stop in self.path])
 
 
 class Stop(msgspec.Struct, tag="stop", forbid_unknown_fields=True):
-    """Ends what `Save` began."""
+    """Ends the work that `Save` began."""
 
 
 class Open(msgspec.Struct, tag="open", forbid_unknown_fields=True):
-    """Says that so many bytes of a file follow, which is then shown."""
+    """Says that a file follows as bytes, which is then shown.
+
+    Attributes:
+        size: Number of bytes.
+    """
 
     name: _Name
     size: Annotated[int, msgspec.Meta(ge=1, le=1 << 38)]
@@ -142,5 +174,6 @@ read_message = msgspec.json.Decoder(Message).decode
 
 
 def _check_rotation(wxyz: tuple[float, ...]) -> None:
-    if abs(math.hypot(*wxyz) - 1) > 1e-3:
-        raise ValueError("expected a rotation")
+    length = math.hypot(*wxyz)
+    if abs(length - 1) > 1e-3:
+        raise ValueError(f"quaternion: expected length 1, got {length:.4g}")

@@ -1,5 +1,5 @@
-"""How large to draw, and when: small while things move, larger step by step once they
-rest."""
+"""Decides how large to draw, and when: small while the camera moves, larger step by
+step once it rests."""
 
 import contextlib
 import math
@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from v3dg import _core
 from v3dg.select import DEFAULT_TOLERANCE
@@ -16,26 +16,31 @@ from v3dg.viewer.view import View
 
 Size = tuple[int, int]
 
-# Of one picture while the camera moves; a drag then has an answer in less than twice
-# that.
+# Time for one picture while the camera moves; a drag then has an answer in less than
+# twice that.
 TARGET_MS = 60.0
-# Without a change for so long, a larger picture is begun.
+# A larger picture is begun when nothing has changed for so long.
 REST_SECONDS = 0.15
-# What a picture at rest waits for pages; another one follows as long as some are
+# A picture at rest waits so long for pages; another one follows while some are
 # missing.
 PAGES_SECONDS = 0.1
-# A draft that has taken so long is given up for what is asked for now.
+# A draft that has taken so long is given up when something else is asked for.
 PATIENCE_SECONDS = 4e-3 * TARGET_MS
-# Smaller ones show nothing; from there on the cut gets coarser, which shows less.
+# The smallest draft, as a share of the full width; below that the cut gets coarser, by
+# at most this factor of the tolerance.
 _SMALLEST = 1 / 4
 _COARSEST = 64.0
-# Sizes are this far apart, so that they do not change from picture to picture.
+# Sizes come in steps, so that they do not change from picture to picture.
 _STEPS_AN_OCTAVE = 4
 
 
 class Draft(NamedTuple):
-    """How to draw what passes by: its size in px, and what the tolerance is multiplied
-    by."""
+    """How to draw while the camera moves.
+
+    Attributes:
+        size: Width and height, px.
+        coarser: Factor of the tolerance.
+    """
 
     size: Size
     coarser: float = 1.0
@@ -44,9 +49,9 @@ class Draft(NamedTuple):
 class Pacer:
     """Chooses how to draw a picture in time, from how long earlier ones took.
 
-    Time is taken to be proportional to work, pixels over the factor of the tolerance,
-    measured with the picture that was drawn last: where it is not, the choice still
-    settles at the one that takes the target.
+    Time is assumed to be proportional to work, which is pixels divided by the factor of
+    the tolerance, and is measured with each picture. Where that does not hold, the
+    choice still converges to the one that takes the target.
     """
 
     def __init__(self, target_ms: float = TARGET_MS) -> None:
@@ -54,11 +59,14 @@ class Pacer:
         self._work_per_ms = 0.0
 
     def draft(self, full: Size) -> Draft:
-        """Return a size with about the shape of ``full``, not larger, at first a
-        quarter of its width."""
+        """Return how to draw a draft of a picture of size ``full``.
+
+        Its size has about the same aspect and is not larger; the first one is a quarter
+        as wide.
+        """
         whole = math.prod(full)
         share = (self._target_ms * self._work_per_ms or whole / 16) / whole
-        # A little more, so that rounding refuses no step that fits.
+        # The small term keeps rounding from refusing a step that fits.
         scale = 2 ** (math.floor(_STEPS_AN_OCTAVE * math.log2(share) / 2 + 1e-6) / _STEPS_AN_OCTAVE)
         coarser = min(max((_SMALLEST / scale) ** 2, 1.0), _COARSEST)
         return Draft(scaled(full, min(max(scale, _SMALLEST), 1.0)), coarser)
@@ -66,29 +74,30 @@ class Pacer:
     def drew(self, draft: Draft, milliseconds: float) -> None:
         """Take note of how long a picture took."""
         speed = math.prod(draft.size) / draft.coarser / max(milliseconds, 0.1)
-        # Slower counts at once, faster only where it lasts.
+        # A lower speed counts at once, a higher one only if it lasts.
         share = 1.0
         if speed > self._work_per_ms > 0:
             share = 0.3
         self._work_per_ms += share * (speed - self._work_per_ms)
 
     def rested(self) -> None:
-        """Take half the work for the next: a browser on these cores has a large picture
-        to move then."""
+        """Halve the work of the next draft: on the same CPU the browser is still
+        decoding the large picture."""
         self._work_per_ms /= 2
 
 
 def scaled(full: Size, scale: float) -> Size:
+    """Return a size in px, multiplied by a factor; at least 1 x 1."""
     return max(1, round(scale * full[0])), max(1, round(scale * full[1]))
 
 
 def finer_sizes(drawn: Size, full: Size) -> list[Size]:
-    """Return the sizes to go on with, each twice the one before, to ``full``; empty
-    where that is drawn."""
+    """Return the sizes to draw after ``drawn``, each twice the one before, up to
+    ``full``; empty if that is drawn already."""
     sizes = []
     width = drawn[0]
     while width < full[0]:
-        # The last step is not worth a picture of its own where it is small.
+        # A last step of less than a factor of 1.5 is not worth a picture of its own.
         if 3 * width >= full[0]:
             sizes.append(full)
             break
@@ -98,8 +107,12 @@ def finer_sizes(drawn: Size, full: Size) -> list[Size]:
 
 
 class Request(NamedTuple):
-    """What a tab wants to see: a view, full size in px, settings; and the number by
-    which it knows that."""
+    """What a tab wants to see.
+
+    Attributes:
+        size: Width and height of the full picture, px.
+        number: By which the tab knows the pictures that answer.
+    """
 
     view: View
     size: Size
@@ -107,25 +120,32 @@ class Request(NamedTuple):
     number: int = 0
 
 
+class SendFrame(Protocol):
+    """Sends a picture to the page; ``is_final`` says that no other follows for the
+    request of that number."""
+
+    def __call__(self, frame: Frame, number: int, *, is_final: bool) -> None: ...
+
+
 class RenderLoop:
     """Draws what one tab asked for last, in a thread of its own, as often and as large
     as time allows.
 
     A request is answered by a small picture; after a rest larger ones follow, up to the
-    full size. A new request ends a larger picture at once, and a small one that has
-    taken too long, after which the next is smaller; the smallest is always finished, so
-    that something is seen.
+    full size. A new request ends a larger picture at once. It ends a small one that has
+    taken too long, after which the next one is smaller; the smallest is always
+    finished, so that something is seen.
 
     Args:
-        send: Called with each picture, whether it is the final one, and the request's
-            number; in the loop's thread.
-        fail: Called with what could not be drawn or sent; in the loop's thread.
+        send: Called with each picture in the loop's thread.
+        fail: Called with the error of what could not be drawn or sent, in the loop's
+            thread.
     """
 
     def __init__(
         self,
         scene_view: SceneView,
-        send: Callable[[Frame, bool, int], None],
+        send: SendFrame,
         fail: Callable[[Exception], None],
         pacer: Pacer | None = None,
     ) -> None:
@@ -143,7 +163,7 @@ class RenderLoop:
         self._thread.start()
 
     def ask(self, request: Request) -> None:
-        """Ask for a picture, in place of what was asked for before."""
+        """Ask for a picture; it replaces the request before."""
         with self._changed:
             self._request = request
             if time.monotonic() >= self._patience_ends:
@@ -151,8 +171,8 @@ class RenderLoop:
             self._changed.notify()
 
     def close(self, seconds: float) -> bool:
-        """Draw nothing more; returns whether the thread has ended, waiting so long for
-        it."""
+        """Draw nothing more; waits for the thread at most so long, and returns whether
+        it has ended."""
         with self._changed:
             self._is_closed = True
             self._stop.request()
@@ -173,7 +193,7 @@ class RenderLoop:
             except Stopped:
                 pass
             except Exception as error:
-                # a tab that shows the reason is better than one that stands still
+                # The loop goes on, and the tab shows the reason.
                 with contextlib.suppress(Exception):
                     self._fail(error)
 
@@ -185,7 +205,7 @@ class RenderLoop:
         if settings != request.settings and not sizes:
             sizes = [draft.size]
         has_pool = self._scene_view.pool is not None
-        self._send(frame, not sizes and not has_pool, request.number)
+        self._send(frame, request.number, is_final=not sizes and not has_pool)
         with self._changed:
             if self._changed.wait_for(self._has_news, REST_SECONDS):
                 return
@@ -200,7 +220,8 @@ class RenderLoop:
             )
             if self._has_news():
                 return
-            self._send(frame, size == sizes[-1] and not has_pool, request.number)
+            is_last = size == sizes[-1]
+            self._send(frame, request.number, is_final=is_last and not has_pool)
         if has_pool:
             self._draw_until_complete(request)
         elif request.settings.budget is not None and not is_larger:
@@ -214,11 +235,12 @@ class RenderLoop:
         start = time.perf_counter()
         try:
             return self._scene_view.frame(view, draft.size, settings, stop, self._steps)
-        finally:  # a picture that was stopped would have taken at least as long
+        finally:
+            # A picture that was stopped would have taken at least as long.
             self._pacer.drew(draft, 1e3 * (time.perf_counter() - start))
 
     def _draw_until_complete(self, request: Request) -> None:
-        """Draw pictures from a pool until one misses no page."""
+        """Draw pictures from a pool until none of its pages is missing."""
         is_complete = False
         while not is_complete:
             stop = self._begin(0.0)
@@ -228,23 +250,24 @@ class RenderLoop:
             if self._has_news():
                 return
             is_complete = not frame.figures.missing
-            self._send(frame, is_complete, request.number)
+            self._send(frame, request.number, is_final=is_complete)
 
     def _draw_until_settled(self, request: Request, tolerance: float) -> None:
-        """Draw pictures until the tolerance of a budget, which changes in steps, stays
-        the same."""
+        """Draw pictures until the tolerance, which approaches that of the budget in
+        steps, stays the same."""
         is_settled = False
         while not is_settled:
             stop = self._begin(0.0)
             frame = self._scene_view.frame(
                 request.view, request.size, request.settings, stop, self._steps
             )
-            self._send(frame, True, request.number)
+            self._send(frame, request.number, is_final=True)
             is_settled = frame.figures.tolerance == tolerance
             tolerance = frame.figures.tolerance
 
     def _while_moving(self, settings: Settings, draft: Draft) -> Settings:
-        """What of the settings there is time for."""
+        """Return the settings without what there is no time for while the camera
+        moves."""
         draws_all = self._scene_view.draws_all_while_moving
         if not draws_all and (settings.split > 0 or settings.shows == "difference"):
             settings = replace(settings, shows="appearance", split=0.0)
@@ -257,8 +280,11 @@ class RenderLoop:
         return self._is_closed or self._request is not None
 
     def _begin(self, patience: float) -> _core.Stop:
-        """Return what ends the next picture once something new is asked for, after so
-        many seconds."""
+        """Return what stops the next picture.
+
+        A new request stops it at once if it comes ``patience`` seconds from now or
+        later.
+        """
         with self._changed:
             self._stop = _core.Stop()
             self._patience_ends = time.monotonic() + patience

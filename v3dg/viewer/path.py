@@ -1,4 +1,4 @@
-"""Camera paths: views at times, and the smooth way through them."""
+"""Camera paths: views at times, and the smooth curve through them."""
 
 import itertools
 from collections.abc import Sequence
@@ -14,8 +14,12 @@ from v3dg.viewer.view import View
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Views, each with the seconds that it comes after the one before; those of the
-    first do not count."""
+    """A path through views.
+
+    Attributes:
+        stops: Each view with the seconds since the one before; the seconds of the first
+            are ignored.
+    """
 
     stops: Sequence[tuple[float, View]] = ()
 
@@ -24,16 +28,15 @@ class CameraPath:
 
     @property
     def times(self) -> Floats:
-        """When the views are, seconds from the first."""
+        """(K,) seconds of each view from the first."""
         return np.cumsum([0.0, *(seconds for seconds, _ in self.stops[1:])])
 
     def views_at(self, seconds: Floats) -> list[View]:
-        """Return the views so long after the first, on a smooth curve through all of
-        them.
+        """Return views on a smooth curve through all stops, at times since the first.
 
         Positions, rotations and fields of view follow cubic Hermite curves whose slopes
-        are those of Catmull-Rom for uneven times; rotations are normalised. Before the
-        first and after the last time it stays.
+        are those of Catmull-Rom for uneven times; rotations are normalised. Earlier
+        times give the first view, later ones the last.
 
         Raises:
             ValueError: The path is empty.
@@ -61,22 +64,27 @@ class CameraPath:
         return [View(tuple(row[:4]), tuple(row[4:7]), row[7], row[8]) for row in curve.tolist()]
 
     def film(self, fps: int) -> list[View]:
-        """Return the views of a film: the first, the last, and those between at ``fps``
-        a second."""
+        """Return the views of a film: the first, the last, and between them ``fps`` a
+        second."""
         seconds = self.times[-1]
         return self.views_at(np.linspace(0.0, seconds, max(round(seconds * fps), 1) + 1))
 
     def cameras(self, fps: int, width: int, height: int, near: float) -> dict[str, Camera]:
-        """Return the film's cameras by name."""
+        """Return the cameras of the film's views; their names are numbers of equal
+        length."""
         views = self.film(fps)
         digits = len(str(len(views) - 1))
         return {f"{i:0{digits}}": view.camera(width, height, near) for i, view in enumerate(views)}
 
 
 def _rows(views: list[View]) -> Floats:
-    """(K, 9): quaternion of the sign that is next to the one before, position, field of
-    view, aspect."""
-    rows = np.array([(*v.wxyz, *v.position, v.fov_y, v.aspect) for v in views], np.float64)
+    """(K, 9): quaternion, position, field of view, aspect.
+
+    Each quaternion has the sign with which it is nearest to the one before.
+    """
+    rows = np.array(
+        [(*view.wxyz, *view.position, view.fov_y, view.aspect) for view in views], np.float64
+    )
     rows[:, :4] = normalised(rows[:, :4])
     for previous, row in itertools.pairwise(rows):
         if previous[:4] @ row[:4] < 0:

@@ -1,5 +1,5 @@
-"""The viewer's web server: it hands out the page, and gives every browser tab a
-connection of its own."""
+"""The viewer's web server: serves the page, and gives every browser tab a connection of
+its own."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ import asyncio
 import contextlib
 import http
 import io
-import json
 import logging
 import math
 import threading
 import time
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,35 +22,36 @@ from PIL import Image
 from v3dg import _extras
 from v3dg._version import __version__
 from v3dg.cameras import Camera, VectorLike, check_cameras
-from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE
-from v3dg.viewer.frame import SceneView
+from v3dg.select import DEFAULT_TOLERANCE
+from v3dg.viewer.frame import SceneView, Settings
 from v3dg.viewer.view import View, look_at
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
+    from v3dg.viewer.answers import Hello
     from v3dg.viewer.tab import Tab
 
 _FOV_Y = math.radians(45)
-# What is still at work after so long is left behind.
+# Threads that are still at work after so long are not waited for.
 _CLOSE_SECONDS = 1.0
-# Of the longer side of photographs, at most, by the folder that the page asks for them
-# in.
+# The longer side of photographs at most, by the folder in which the page asks for them.
 _PHOTOGRAPH_PIXELS = {"photograph": 1600, "thumbnail": 240}
-# What goes wrong in a connection is its client's fault: for those who set up logging,
-# not for the terminal.
+# Errors of a connection are its client's fault: they are logged, and not printed in the
+# terminal.
 _LOG = logging.getLogger(__name__)
 _LOG.addHandler(logging.NullHandler())
-_KINDS = {
+# Media types of the files that are served; other files of the page's folder are not.
+_MEDIA_TYPES = {
     ".html": "text/html",
     ".css": "text/css",
     ".js": "text/javascript",
     ".svg": "image/svg+xml",
 }
-# Of every answer, refusals and errors too. The page is shown in no other page, runs
-# nothing but its own files, and talks to no other server; other pages show nothing of
-# it, and have no handle on its window.
+# Headers of every answer, of refusals and errors too. No other page can frame this one;
+# it runs only its own files and talks to no other server. Other pages cannot show what
+# is served, nor get hold of the window.
 _HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -68,21 +67,24 @@ _HEADERS = {
 
 
 class Site:
-    """The viewer as a web server, from when it is made until `close`.
+    """The viewer as a web server, from its construction until `close`.
 
     Args:
-        name: Title of the tabs, and of the files that they save.
+        name: Title of the tabs, and name of the files that they save.
         cameras: Named cameras to jump to.
         photographs: Files of the pictures that cameras took, by the cameras' names.
-        host, port: As of its `Gate`, whose port and URL it has, and whose errors it
-            raises.
-        tolerance, budget: What a tab begins with.
-        up: (3,) direction in the world.
-        asks_up: Whether that is but assumed, so that the page asks.
+        host, port: As for `Gate`.
+        tolerance, budget: Settings that a tab begins with.
+        up: (3,) direction in the world that is up.
+        asks_up: Whether ``up`` is only assumed, so that the page asks.
+
+    Attributes:
+        port, url, is_secret: As of `Gate`.
 
     Raises:
         ImportError: The extra is not installed.
-        TypeError: Cameras are none, or without names.
+        TypeError: ``cameras`` is not a mapping of names to cameras.
+        ValueError: As of `Gate`.
     """
 
     def __init__(
@@ -110,15 +112,14 @@ class Site:
         cameras = cameras or {}
         check_cameras(cameras)
         self._photographs = [dict(photographs or {}).get(camera) for camera in cameras]
-        self._greeting = {
-            "type": "hello",
-            "version": __version__,
-            "up": np.asarray(up, np.float64).tolist(),
-            "asks_up": asks_up,
-            "home": asdict(start_view(scene_view, up)),
-            "settings": {"tolerance": tolerance, "budget": budget, "fade": DEFAULT_FADE},
-            "cameras": self._describe_cameras(cameras),
-        }
+        self._greeting = _greeting(
+            scene_view,
+            cameras,
+            self._photographs,
+            settings=Settings(tolerance=tolerance, budget=budget),
+            up=up,
+            asks_up=asks_up,
+        )
         self._page = _read_page()
         self._tabs: set[Tab] = set()
         self._gate = Gate(host, port)
@@ -127,15 +128,8 @@ class Site:
         self.is_secret = self._gate.is_secret
         self._start()
 
-    def _describe_cameras(self, cameras: Mapping[str, Camera]) -> list[dict[str, object]]:
-        result: list[dict[str, object]] = []
-        for (name, camera), photograph in zip(cameras.items(), self._photographs, strict=True):
-            view = asdict(View.of_camera(camera))
-            result.append({"name": name, "photograph": photograph is not None, "view": view})
-        return result
-
     def _start(self) -> None:
-        """Start the thread of the server, and wait until that accepts connections."""
+        """Start the server's thread, and wait until it accepts connections."""
         self._closing = asyncio.Event()
         is_serving = threading.Event()
         serving = self._serve(is_serving)
@@ -148,7 +142,7 @@ class Site:
     def close(self) -> bool:
         """End all tabs and the server in about two seconds; returns whether all their
         threads have ended."""
-        with contextlib.suppress(RuntimeError):  # it is closed already
+        with contextlib.suppress(RuntimeError):  # the loop is closed already
             self._loop.call_soon_threadsafe(self._closing.set)
         self._thread.join(3 * _CLOSE_SECONDS)
         return not self._thread.is_alive() and not self._tabs
@@ -167,9 +161,9 @@ class Site:
             sock=self._gate.socket,
             logger=_LOG,
             max_size=MOST_BYTES,
-            compression=None,  # pictures are compressed
-            close_timeout=0.5,  # a client that does not answer does not hold up the end
-            server_header=None,  # it would tell clients which versions answer
+            compression=None,  # pictures are compressed already
+            close_timeout=0.5,  # the end does not wait for a client that does not answer
+            server_header=None,  # clients are not told versions
             process_request=self._answer,
             process_response=_add_headers,
         )
@@ -179,12 +173,13 @@ class Site:
         await asyncio.to_thread(self._end_tabs)
 
     def _end_tabs(self) -> None:
-        """Have the threads of all tabs end, of those that are gone, too."""
+        """End the threads of all tabs, also of those whose connection is closed."""
         end = time.monotonic() + _CLOSE_SECONDS
         self._tabs = {tab for tab in self._tabs if not tab.close(max(end - time.monotonic(), 0.0))}
 
     async def _talk(self, connection: ServerConnection) -> None:
-        """Serve one tab for as long as it is open."""
+        """Serve one tab while it is open."""
+        from v3dg.viewer.answers import encode
 
         def send(data: str | bytes) -> None:
             coroutine = connection.send(data)
@@ -193,7 +188,8 @@ class Site:
             except RuntimeError:  # the server has ended
                 coroutine.close()
                 raise
-            if threading.current_thread() is not self._thread:  # which would wait for itself
+            # The server's own thread would wait for itself.
+            if threading.current_thread() is not self._thread:
                 sending.result()
 
         def moved(scene_view: SceneView) -> None:
@@ -204,17 +200,18 @@ class Site:
         tab = self._make_tab(self._scene_view, self._name, send, moved)
         self._tabs.add(tab)
         try:
-            await connection.send(json.dumps(self._greeting))
-            await connection.send(json.dumps(tab.describe_scene()))
+            await connection.send(encode(self._greeting))
+            await connection.send(encode(tab.describe_scene()))
             async for data in connection:
-                with contextlib.suppress(Exception):  # whatever is wrong with what it says
+                # A wrong message is ignored, whatever is wrong with it.
+                with contextlib.suppress(Exception):
                     tab.take(data)
         finally:
             if tab.close(0.0):
                 self._tabs.discard(tab)
 
     async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Answer a request for a part of the page; None where a connection begins."""
+        """Answer a request for a file of the page; None if it opens a connection."""
         refusal = self._gate.refusal(request)
         if refusal is not None:
             return connection.respond(http.HTTPStatus.FORBIDDEN, refusal)
@@ -222,23 +219,24 @@ class Site:
         if "Upgrade" in request.headers and name == "connection":
             return None
         body = self._page.get(name)
-        kind = _KINDS.get(Path(name).suffix, "text/plain")
+        media_type = _MEDIA_TYPES.get(Path(name).suffix, "text/plain")
         folder, _, place = name.partition("/")
         if folder in _PHOTOGRAPH_PIXELS:
             side = _PHOTOGRAPH_PIXELS[folder]
             body = await asyncio.to_thread(self._photograph, place, side)
-            kind = "image/jpeg"
+            media_type = "image/jpeg"
         if body is None:
             return connection.respond(http.HTTPStatus.NOT_FOUND, "There is no such page.\n")
         response = connection.respond(http.HTTPStatus.OK, "")
         for header in ("Content-Type", "Content-Length"):
             del response.headers[header]
-        response.headers.update({"Content-Type": kind, "Content-Length": str(len(body))})
+        response.headers.update({"Content-Type": media_type, "Content-Length": str(len(body))})
         response.body = body
         return response
 
     def _photograph(self, place: str, side: int) -> bytes | None:
-        """JPEG of what the camera at that place took, if that can be read."""
+        """Return the photograph of the camera of that number as JPEG; None if there is
+        none that can be read."""
         try:
             if not place.isdecimal():
                 return None
@@ -250,18 +248,51 @@ class Site:
                 file = io.BytesIO()
                 picture.convert("RGB").save(file, "jpeg", quality=85)
                 return file.getvalue()
-        except Exception:  # of whatever kind Pillow raises for a damaged file
+        except Exception:  # Pillow raises errors of many kinds for damaged files
             return None
 
 
+def _greeting(
+    scene_view: SceneView,
+    cameras: Mapping[str, Camera],
+    photographs: Sequence[Path | None],
+    *,
+    settings: Settings,
+    up: VectorLike,
+    asks_up: bool,
+) -> Hello:
+    from v3dg.viewer.answers import FileCamera, Hello
+    from v3dg.viewer.messages import LIMITS
+
+    descriptions: list[FileCamera] = []
+    for (name, camera), photograph in zip(cameras.items(), photographs, strict=True):
+        view = View.of_camera(camera)
+        descriptions.append(FileCamera(name, photograph is not None, view))
+    x, y, z = np.asarray(up, np.float64).tolist()
+    return Hello(
+        version=__version__,
+        up=(x, y, z),
+        asks_up=asks_up,
+        home=start_view(scene_view, up),
+        settings=settings,
+        defaults=Settings(),
+        limits=LIMITS,
+        cameras=descriptions,
+    )
+
+
 def _read_page() -> dict[str, bytes]:
-    """The files of the page by name."""
+    """Return the files of the page by name."""
     folder = files("v3dg.viewer").joinpath("page")
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
+    return {
+        path.name: path.read_bytes()
+        for path in folder.iterdir()
+        if Path(path.name).suffix in _MEDIA_TYPES
+    }
 
 
 def _add_headers(_connection: ServerConnection, _request: Request, response: Response) -> None:
-    """Give an answer of any kind the headers that all have."""
+    """Give an answer the headers that all answers have."""
     response.headers.update(_HEADERS)
 
 
@@ -269,7 +300,7 @@ def start_view(scene_view: SceneView, up: VectorLike, aspect: float = 16 / 9) ->
     """Return the view that a tab begins with: all of the scene, from a little above."""
     axis = np.asarray(up, np.float64)
     axis = axis / np.linalg.norm(axis)
-    # Of the world's axes the one that comes after the upright one, so that no two are
+    # The world's axis after the one that is nearest to `up`, so that the two are not
     # parallel.
     aside = np.roll(np.eye(3)[int(np.abs(axis).argmax())], 1)
     aside = aside - (aside @ axis) * axis

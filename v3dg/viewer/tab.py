@@ -1,5 +1,4 @@
-"""A browser tab: what its page asks for, the loop that draws it, and what the page is
-told."""
+"""A browser tab: does what its page asks for, and tells the page what came of it."""
 
 import contextlib
 import copy
@@ -11,13 +10,13 @@ import resource
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import IO
 
-import msgspec
 import numpy as np
+import numpy.typing as npt
 from PIL import Image
 
 from v3dg import _core
@@ -30,34 +29,34 @@ from v3dg.io import read_asset
 from v3dg.pictures import to_8bit
 from v3dg.scene.file import write_scene
 from v3dg.video import write_video
-from v3dg.viewer import messages
+from v3dg.viewer import answers, messages
 from v3dg.viewer.exports import Exporter, bundle_names
 from v3dg.viewer.frame import MOST_COUNTED, Frame, Pixels, SceneView
 from v3dg.viewer.pacing import RenderLoop
 
-# Quality of JPEG, of drafts and of final pictures.
+# Qualities of JPEG.
 _DRAFT_QUALITY = 75
 _FINAL_QUALITY = 94
 # Pillow's numbers for JPEG whose colours have half the resolution, and the whole one.
 _HALF_COLORS = 2
 _WHOLE_COLORS = 0
 _FPS = 30
-# Of a pixel, for a click to mean the gaussian: what is fainter is hardly seen.
+# Share of a pixel's colour from which a click means a gaussian: less is hardly seen.
 _LEAST_WEIGHT = 0.05
-
+_SECONDS_BETWEEN_PROGRESS = 0.2
 
 _Send = Callable[[str | bytes], None]
 
 
 class Tab:
-    """What a page that is connected to a `Site` sees and does, until `close`.
+    """The server's half of a page that is connected to a `Site`, until `close`.
 
     Args:
-        scene_view: What it shows, until a file is dropped onto it.
-        name: Of the files that it saves.
+        scene_view: The scene that is shown until a file is dropped onto the page.
+        name: Name of the files that the page saves.
         send: Sends text or bytes to the page; waits until they are away, but not in the
             server's thread.
-        moved: Called with a scene view of which an instance has another pose.
+        moved: Called with a scene view after one of its instances was moved.
     """
 
     def __init__(
@@ -76,80 +75,67 @@ class Tab:
         self._missing_bytes = 0
 
     def close(self, seconds: float) -> bool:
-        """Stop drawing and saving; returns whether the threads have ended, waiting so
-        long for each."""
+        """Stop drawing and saving; waits for each thread at most so long, and returns
+        whether all have ended."""
         has_ended = all([self._loop.close(seconds), self._exporter.close(seconds)])
         if has_ended and self._folder is not None:
             self._folder.cleanup()
         return has_ended
 
     def ask_again(self) -> None:
-        """Draw once more what is shown, which has changed."""
+        """Draw again, because what is shown has changed."""
         if self._look is not None:
             self._loop.ask(self._look.request())
 
     def take(self, data: str | bytes) -> None:
-        """Do what a message says; ValueError and its like where it is none of
-        `messages`."""
+        """Do what a message of the page says.
+
+        Raises:
+            ValueError: It is none of `messages`.
+        """
         if isinstance(data, bytes):
             self._take_bytes(data)
             return
         message = messages.read_message(data)
-        if isinstance(message, messages.Look):
-            self._look = message
-            self.ask_again()
-        elif isinstance(message, messages.Pick):
-            if self._picking.acquire(blocking=False):  # one at a time
-                threading.Thread(
-                    target=self._pick, args=(message,), name="v3dg pick", daemon=True
-                ).start()
-        elif isinstance(message, messages.Move):
-            self.scene_view.scene.move(
-                [message.instance],
-                positions=[message.position],
-                quaternions=message.quaternion,
-                scales=message.scale,
-            )
-            self._moved(self.scene_view)
-        elif isinstance(message, messages.Save):
-            self._exporter.begin(
-                functools.partial(getattr(self, f"_save_{message.output}"), message)
-            )
-        elif isinstance(message, messages.Stop):
-            self._exporter.stop()
-        else:
-            self._begin_file(message)
+        match message:
+            case messages.Look():
+                self._look = message
+                self.ask_again()
+            case messages.Pick():
+                self._begin_picking(message)
+            case messages.Move():
+                self._move(message)
+            case messages.Save():
+                self._exporter.begin(functools.partial(self._save, message))
+            case messages.Stop():
+                self._exporter.stop()
+            case messages.Open():
+                self._begin_file(message)
 
-    def describe_scene(self) -> dict[str, object]:
+    def describe_scene(self) -> answers.Scene:
         """Return what the page has to know of what it shows."""
         scene_view = self.scene_view
         bundles = scene_view.scene.bundles
-        return {
-            "type": "scene",
-            "name": self._name,
-            "center": scene_view.center.tolist(),
-            "radius": scene_view.radius,
-            "near": scene_view.near,
-            "instances": len(scene_view.scene),
-            "has_files": self._folder is None and all(bundle.path for bundle in bundles),
-            "level_colors": to_8bit(_core.level_colors(scene_view.num_levels)).tolist(),
-            "ramp": to_8bit(_core.ramp(np.linspace(0, 1, 7))).tolist(),
-            "most_counted": MOST_COUNTED,
-            "modes": scene_view.modes,
-            "shows_cuts": scene_view.shows_cuts,
-            "missing_colors": to_8bit(_core.missing_colors(4.0 ** np.arange(4))).tolist(),
-        }
+        num_missing = np.arange(4)
+        return answers.Scene(
+            name=self._name,
+            center=_vector(scene_view.center),
+            radius=scene_view.radius,
+            near=scene_view.near,
+            instances=len(scene_view.scene),
+            has_files=self._folder is None and all(bundle.path for bundle in bundles),
+            level_colors=_colors(_core.level_colors(scene_view.num_levels)),
+            ramp=_colors(_core.ramp(np.linspace(0, 1, 7))),
+            most_counted=MOST_COUNTED,
+            modes=scene_view.modes,
+            shows_cuts=scene_view.shows_cuts,
+            missing_colors=_colors(_core.missing_colors(4.0**num_missing)),
+        )
 
-    def _tell(self, message: Mapping[str, object], data: bytes = b"") -> None:
-        """Send a message; with bytes, as the length of the message, the message, and
-        the bytes."""
-        text = msgspec.json.encode(message)
-        if data:
-            self._send(len(text).to_bytes(4, "little") + text + data)
-        else:
-            self._send(text.decode())
+    def _tell(self, answer: answers.Answer, data: bytes = b"") -> None:
+        self._send(answers.encode(answer, data))
 
-    def _show(self, frame: Frame, is_final: bool, number: int) -> None:
+    def _show(self, frame: Frame, number: int, *, is_final: bool) -> None:
         quality = _DRAFT_QUALITY
         subsampling = _HALF_COLORS
         if is_final:
@@ -159,60 +145,107 @@ class Tab:
         Image.fromarray(frame.pixels).save(
             picture, "jpeg", quality=quality, subsampling=subsampling
         )
-        message = {
-            "type": "picture",
-            "final": is_final,
-            "number": number,
-            "size": frame.size,
-            "view": asdict(frame.view),
-            "shows": frame.shows,
-            "range": frame.value_range,
-            "distance": frame.distance,
-            "figures": {**frame.figures._asdict(), "memory_bytes": _resident_bytes()},
-        }
-        self._tell(message, picture.getvalue())
+        stats = frame.figures
+        figures = answers.Figures(
+            gaussians_selected=stats.gaussians_selected,
+            gaussians_in_frustum=stats.gaussians_in_frustum,
+            tolerance=stats.tolerance,
+            select_ms=stats.select_ms,
+            draw_ms=stats.draw_ms,
+            levels=stats.levels,
+            missing=stats.missing,
+            memory_bytes=_resident_bytes(),
+        )
+        answer = answers.Picture(
+            final=is_final,
+            number=number,
+            size=frame.size,
+            view=frame.view,
+            shows=frame.shows,
+            range=frame.value_range,
+            distance=frame.distance,
+            figures=figures,
+        )
+        self._tell(answer, picture.getvalue())
 
     def _fail(self, error: Exception) -> None:
-        self._tell({"type": "failed", "text": self.scene_view.explain(error)})
+        self._tell(answers.Failed(self.scene_view.explain(error)))
+
+    def _move(self, message: messages.Move) -> None:
+        self.scene_view.scene.move(
+            [message.instance],
+            positions=[message.position],
+            quaternions=message.quaternion,
+            scales=message.scale,
+        )
+        self._moved(self.scene_view)
+
+    def _begin_picking(self, message: messages.Pick) -> None:
+        """Answer in a thread of its own, unless an earlier question is not answered
+        yet."""
+        if self._picking.acquire(blocking=False):
+            threading.Thread(
+                target=self._pick, args=(message,), name="v3dg pick", daemon=True
+            ).start()
 
     def _pick(self, message: messages.Pick) -> None:
-        """Tell what is at a place of the picture."""
         try:
-            request = message.look.request()
-            answer: dict[str, object] = {"type": "picked"}
-            if message.instance is not None:
-                answer.update(self._describe_instance(message.instance))
-            elif self.scene_view.shows_cuts:
-                width, height = request.size
-                x = min(int(message.place[0] * width), width - 1)
-                y = min(int(message.place[1] * height), height - 1)
-                picked = self.scene_view.pick(request.view, request.size, x, y, request.settings)
-                if picked is not None and picked.weight >= _LEAST_WEIGHT:
-                    answer.update(self._describe_instance(picked.instance))
-                    answer["point"] = picked.position.tolist()
-            self._tell(answer)
+            self._tell(self._find(message))
         except Exception as error:
             with contextlib.suppress(Exception):  # the page may be closed
-                self._tell({"type": "notice", "text": self.scene_view.explain(error)})
+                self._tell(answers.Notice(self.scene_view.explain(error)))
         finally:
             self._picking.release()
 
-    def _describe_instance(self, number: int) -> dict[str, object]:
+    def _find(self, message: messages.Pick) -> answers.Picked:
+        """Return the instance that a page asks about, or that is at a place of its
+        picture."""
+        if message.instance is not None:
+            return self._describe_instance(message.instance)
+        if not self.scene_view.shows_cuts:
+            return answers.Picked()
+        request = message.look.request()
+        width, height = request.size
+        x = min(int(message.place[0] * width), width - 1)
+        y = min(int(message.place[1] * height), height - 1)
+        picked = self.scene_view.pick(request.view, request.size, x, y, request.settings)
+        if picked is None or picked.weight < _LEAST_WEIGHT:
+            return answers.Picked()
+        answer = self._describe_instance(picked.instance)
+        answer.point = _vector(picked.position)
+        return answer
+
+    def _describe_instance(self, number: int) -> answers.Picked:
         scene = self.scene_view.scene
         if number >= len(scene):
             raise ValueError(f"instance: expected 0 to {len(scene) - 1}, got {number}")
         bundle = scene.bundles[scene.instance_bundle[number]]
         boxes = bundle.clusters.box[: bundle.level_range(0).stop]
-        return {
-            "instance": number,
-            "pose": {
-                "position": scene.positions[number].tolist(),
-                "quaternion": scene.quaternions[number].tolist(),
-                "scale": float(scene.scales[number]),
-            },
-            "box": [boxes[:, 0].min(axis=0).tolist(), boxes[:, 1].max(axis=0).tolist()],
-            "bundle": beside(bundle.path or "").name,
-        }
+        w, x, y, z = scene.quaternions[number].tolist()
+        pose = answers.Pose(
+            position=_vector(scene.positions[number]),
+            quaternion=(w, x, y, z),
+            scale=float(scene.scales[number]),
+        )
+        return answers.Picked(
+            instance=number,
+            pose=pose,
+            box=(_vector(boxes[:, 0].min(axis=0)), _vector(boxes[:, 1].max(axis=0))),
+            bundle=beside(bundle.path or "").name,
+        )
+
+    def _save(self, message: messages.Save, stop: _core.Stop) -> None:
+        match message.output:
+            case "picture":
+                self._save_picture(message, stop)
+            case "film":
+                self._save_film(message, stop)
+            case "cameras":
+                self._save_cameras(message)
+            case "scene":
+                self._save_scene(message)
+            case "play":
+                self._tell(answers.Play(_FPS, message.camera_path().film(_FPS)))
 
     def _save_picture(self, message: messages.Save, stop: _core.Stop) -> None:
         request = message.look.request()
@@ -220,10 +253,6 @@ class Tab:
             request.view, request.size, request.settings, stop, patience=math.inf
         )
         self._exporter.save(f"{self._name}.png", Image.fromarray(frame.pixels).save)
-
-    def _save_play(self, message: messages.Save, _: _core.Stop) -> None:
-        views = [asdict(view) for view in message.camera_path().film(_FPS)]
-        self._tell({"type": "play", "fps": _FPS, "views": views})
 
     def _save_film(self, message: messages.Save, stop: _core.Stop) -> None:
         request = message.look.request()
@@ -236,8 +265,8 @@ class Tab:
         def pictures() -> Iterator[Pixels]:
             last_progress = 0.0
             for number, view in enumerate(views):
-                if time.monotonic() - last_progress > 0.2:
-                    self._tell({"type": "progress", "share": number / len(views)})
+                if time.monotonic() - last_progress > _SECONDS_BETWEEN_PROGRESS:
+                    self._tell(answers.Progress(number / len(views)))
                     last_progress = time.monotonic()
                 view = replace(view, aspect=width / height)
                 frame = self.scene_view.frame(
@@ -249,14 +278,14 @@ class Tab:
             f"{self._name}.mp4", lambda file: write_video(file, pictures(), fps=_FPS)
         )
 
-    def _save_cameras(self, message: messages.Save, _: _core.Stop) -> None:
+    def _save_cameras(self, message: messages.Save) -> None:
         size = message.look.request().size
         cameras = message.camera_path().cameras(_FPS, *size, self.scene_view.near)
         self._exporter.save("transforms.json", lambda file: write_cameras(file, cameras))
 
-    def _save_scene(self, message: messages.Save, _: _core.Stop) -> None:
-        """Save the instances as they are now, the axis that is up, and the cameras of a
-        path, if any."""
+    def _save_scene(self, message: messages.Save) -> None:
+        """Save the instances as they are now, the axis that is up, and the cameras of
+        the path."""
         width, height = message.look.request().size
         path = message.camera_path()
         cameras: dict[str, Camera] = {}
@@ -270,19 +299,19 @@ class Tab:
         )
 
     def _begin_file(self, message: messages.Open) -> None:
-        """Keep the bytes that come now, until they are all there, in a folder that goes
-        with the tab."""
+        """Create the file that the next bytes are written to, in a folder that is
+        removed with the tab."""
         self._folder = self._folder or tempfile.TemporaryDirectory(prefix="v3dg_")
         if self._dropped is not None:
             self._dropped.close()
         folder = tempfile.mkdtemp(dir=self._folder.name)
-        self._dropped = open(Path(folder, message.name), "wb")  # noqa: SIM115  # until all of it is there
+        self._dropped = open(Path(folder, message.name), "wb")  # noqa: SIM115  # it is closed after its last bytes
         self._missing_bytes = message.size
 
     def _take_bytes(self, data: bytes) -> None:
         file = self._dropped
         if file is None:
-            raise ValueError("expected a file's name before its bytes")
+            raise ValueError("file: bytes came before the name; send `open` first")
         file.write(data[: self._missing_bytes])
         self._missing_bytes -= min(len(data), self._missing_bytes)
         if self._missing_bytes == 0:
@@ -297,7 +326,7 @@ class Tab:
                 subject = Bundle.open(path)
             else:
                 subject = read_asset(path)
-        except (OSError, ValueError) as error:  # the page gets to see no folder of this machine
+        except (OSError, ValueError) as error:  # no page is told the folders of this machine
             raise ValueError(str(error).replace(f"{path.parent}{os.sep}", "")) from None
         scene_view = SceneView(subject, device=self.scene_view.device)
         old_loop = self._loop
@@ -308,8 +337,18 @@ class Tab:
         self._tell(self.describe_scene())
 
 
+def _vector(array: npt.NDArray[np.floating]) -> answers.Vector:
+    x, y, z = array.tolist()
+    return x, y, z
+
+
+def _colors(colors: npt.NDArray[np.float32]) -> list[answers.Color]:
+    return [(red, green, blue) for red, green, blue in to_8bit(colors).tolist()]
+
+
 def _resident_bytes(statm_path: str = "/proc/self/statm") -> int:
-    """Memory that this process holds; without /proc, the most that it has held."""
+    """Return the memory that this process holds; without /proc, the most that it has
+    held."""
     try:
         with open(statm_path, encoding="ascii") as file:
             return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")

@@ -1,5 +1,5 @@
-"""From where a tab looks: what a browser knows of its camera, and the pinhole camera
-that it makes."""
+"""Views: cameras as a browser knows them, and the pinhole cameras that follow from
+them."""
 
 import math
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ class View:
     Attributes:
         wxyz: Rotation from camera (x right, y down, z forward) to world, a quaternion
             of any length but zero.
-        position: The eye, world units.
+        position: Position of the eye, world units.
         fov_y: Vertical field of view in radians.
         aspect: Width over height.
     """
@@ -29,16 +29,16 @@ class View:
 
     @classmethod
     def of_camera(cls, camera: Camera) -> "View":
-        """Take over pose and field of view; a principal point off the middle is
-        lost."""
+        """Return the view with a camera's pose and field of view; a principal point off
+        the middle is lost."""
         half_x = camera.width / 2 / camera.fx
         half_y = camera.height / 2 / camera.fy
         wxyz = quaternion_from_rotation(camera.viewmat[:3, :3].T)
         return cls(wxyz, tuple(camera.position.tolist()), 2 * math.atan(half_y), half_x / half_y)
 
     def camera(self, width: int, height: int, near: float) -> Camera:
-        """Return the camera whose picture of that size fills the view; its pixels need
-        not be square."""
+        """Return the camera whose picture of ``width`` x ``height`` px fills the view;
+        its pixels need not be square."""
         quaternion = in_range(np.asarray(self.wxyz, np.float64))
         rotation = rotation_from_quaternion(quaternion / np.linalg.norm(quaternion)).T
         viewmat = rigid(rotation, np.asarray(self.position, np.float64))

@@ -426,20 +426,20 @@ class NoPacer:
 @pytest.fixture
 def rendering(request):
     """A render loop, what it draws of, and what it sent: (view, size, is it final)."""
-    scene_view, sent, errors, is_final = FakeSceneView(), [], [], threading.Event()
+    scene_view, sent, errors, is_done = FakeSceneView(), [], [], threading.Event()
 
-    def send(frame, final, _):
-        sent.append((frame.pixels[0, 0, 0], frame.size, final))
-        if final:
-            is_final.set()
+    def send(frame, number, *, is_final):
+        sent.append((frame.pixels[0, 0, 0], frame.size, is_final))
+        if is_final:
+            is_done.set()
 
     def fail(error):
         errors.append(error)
-        is_final.set()
+        is_done.set()
 
     loop = RenderLoop(scene_view, send, fail, getattr(request, "param", None))
     yield SimpleNamespace(
-        loop=loop, scene_view=scene_view, sent=sent, errors=errors, is_final=is_final
+        loop=loop, scene_view=scene_view, sent=sent, errors=errors, is_final=is_done
     )
     assert loop.close(SECONDS)
 

@@ -206,24 +206,24 @@ def test_a_still_is_cut_once_and_a_settled_one_twice(scene, monkeypatch):
 @pytest.fixture
 def loop(scene):
     """A render loop over a pool, and what it sent: (frame, is it final, number)."""
-    pooled, sent, is_final, errors = (
+    pooled, sent, is_done, errors = (
         SceneView(scene, device="cpu", memory="64MB"),
         [],
         threading.Event(),
         [],
     )
 
-    def send(*frame):
-        sent.append(frame)
-        if frame[1]:
-            is_final.set()
+    def send(frame, number, *, is_final):
+        sent.append((frame, is_final, number))
+        if is_final:
+            is_done.set()
 
     def fail(error):
         errors.append(error)
-        is_final.set()
+        is_done.set()
 
     loop = RenderLoop(pooled, send, fail)
-    loop.sent, loop.is_final, loop.errors = sent, is_final, errors
+    loop.sent, loop.is_final, loop.errors = sent, is_done, errors
     yield loop
     assert loop.close(SECONDS)
 
@@ -275,7 +275,9 @@ def test_damage_is_told_and_the_draft_stays(tmp_path):
     pooled, sent, told = SceneView(bundle, device="cpu", memory="64MB"), [], threading.Event()
     errors = []
     loop = RenderLoop(
-        pooled, lambda *frame: sent.append(frame), lambda error: (errors.append(error), told.set())
+        pooled,
+        lambda frame, _, *, is_final: sent.append((frame, is_final)),
+        lambda error: (errors.append(error), told.set()),
     )
     try:
         loop.ask(Request(VIEW, SIZE, Settings(tolerance=0.0)))
@@ -285,4 +287,4 @@ def test_damage_is_told_and_the_draft_stays(tmp_path):
     assert "page 0: the hash does not match" in pooled.explain(errors[0])
     assert "/" not in pooled.explain(errors[0])
     assert sent
-    assert not any(final for _, final, _ in sent)
+    assert not any(is_final for _, is_final in sent)
