@@ -1,6 +1,6 @@
 #pragma once
 
-// Things that are made ahead of who uses them, on threads of their own.
+// Makes things on threads of their own before they are needed.
 
 #include <omp.h>
 
@@ -16,9 +16,9 @@
 
 namespace v3dg {
 
-// Makes things number 0 to count - 1, which are used one after the other. Number i is made by
-// thread i % num_threads, with one thread of OpenMP, and is the only one in place i % num_places
-// until it was used.
+// Makes things number 0 to count - 1, which are used in that order. Thread i % num_threads makes
+// number i, and OpenMP gives it one thread. Number i alone occupies place i % num_places until it
+// was used.
 class Ahead {
   public:
     Ahead(uint64_t count, unsigned num_threads, unsigned num_places,
@@ -39,14 +39,14 @@ class Ahead {
     Ahead(const Ahead&) = delete;
     Ahead& operator=(const Ahead&) = delete;
 
-    // Waits for the next thing and returns its place. Throws what making it threw.
+    // Waits for the next thing and returns its place. Rethrows what was thrown while it was made.
     size_t wait_for_next() {
         std::unique_lock<std::mutex> lock(busy_);
         changed_.wait(lock, [&] { return is_made_[used_ % num_places_] || error_; });
         if (error_) std::rethrow_exception(error_);
         return used_ % num_places_;
     }
-    // Its place may be made anew.
+    // Releases the place of the next thing for another one.
     void next_is_used() {
         const std::lock_guard<std::mutex> lock(busy_);
         is_made_[used_++ % num_places_] = false;

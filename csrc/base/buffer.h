@@ -1,7 +1,7 @@
 #pragma once
 
-// Memory on the host that grows by forgetting what it held. On a device that is DeviceBuffer
-// (device.h).
+// Memory on the host that loses its contents when it grows. The counterpart on a device is
+// DeviceBuffer (device.h).
 
 #include <sys/mman.h>
 
@@ -13,8 +13,8 @@
 
 namespace v3dg {
 
-// Memory that begins at a cache line, or null; much of it in huge pages where the system has them,
-// because what is read here and there would wait for the table of pages.
+// Returns memory that begins at a cache line, or null. Large blocks are in huge pages where the
+// system has them, because scattered reads would otherwise wait for the page table.
 inline void* allocate_pages(size_t bytes) {
     constexpr size_t kHugePage = size_t(2) << 20;
     const size_t alignment = bytes < 2 * kHugePage ? 64 : kHugePage;
@@ -26,7 +26,7 @@ inline void* allocate_pages(size_t bytes) {
     return memory;
 }
 
-// Owned elements of a plain type, not initialised. Grows by forgetting what it held.
+// Owns elements of a plain type, not initialised. Growing loses the contents.
 template <class T>
 class Buffer {
   public:
@@ -42,7 +42,7 @@ class Buffer {
     }
     ~Buffer() { std::free(data_); }
 
-    // Room for `size` elements; throws std::bad_alloc when there is none.
+    // Makes room for `size` elements; throws std::bad_alloc when there is none.
     T* reserve(size_t size) {
         if (size > capacity_) {
             std::free(data_);

@@ -1,13 +1,14 @@
 #pragma once
 
-// Copies from device to shared memory that pass through no register.
+// Asynchronous copies from device to shared memory, which use no registers.
 
 #include <cuda_runtime.h>
 
 namespace v3dg {
 namespace cuda {
 
-// Copies 16 or 8 bytes from device to shared memory; they are there once the thread has waited.
+// Copies 16 or 8 bytes from device to shared memory. They have arrived once the thread has called
+// wait_for_copies().
 __device__ inline void copy_async(float4* shared, const float4* from) {
 #ifdef __CUDA_ARCH__
     asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(

@@ -1,3 +1,5 @@
+// Devices, and the pool that their stream-ordered memory comes from.
+
 #include "base/device.h"
 
 #include <map>
@@ -61,8 +63,8 @@ void allow_shared_memory(const void* kernel, size_t bytes, const char* name) {
 }
 
 bool can_start_early(const void* kernel) {
-    constexpr int kFirst =
-        90;  // of the architectures whose kernels can wait for the one before them
+    // The first architecture whose kernels can wait for the one before them.
+    constexpr int kFirst = 90;
     static std::mutex mutex;
     static std::map<std::pair<int, const void*>, bool> known;
     const int device = current_device();
@@ -77,7 +79,7 @@ bool can_start_early(const void* kernel) {
     return found->second;
 }
 
-// A pool of our own, so that how long we keep memory is nobody else's affair.
+// The package has a pool of its own, so that no other library decides how long memory is kept.
 static cudaMemPool_t pool_of_current_device() {
     static std::mutex mutex;
     static std::vector<cudaMemPool_t> pools;
@@ -91,8 +93,8 @@ static cudaMemPool_t pool_of_current_device() {
         properties.location.id = device;
         cudaMemPool_t pool;
         check(cudaMemPoolCreate(&pool, &properties), "cudaMemPoolCreate");
-        // What is given back stays ours until somebody runs out; mapping it anew costs
-        // milliseconds.
+        // Memory that was given back is kept until some allocation fails, because mapping it anew
+        // costs milliseconds.
         uint64_t keep = uint64_t(1) << 30;
         check(cudaMemPoolSetAttribute(pool, cudaMemPoolAttrReleaseThreshold, &keep),
               "cudaMemPoolSetAttribute");
@@ -109,7 +111,8 @@ void* allocate(size_t bytes, cudaStream_t stream) {
     void* pointer = nullptr;
     cudaError_t error = cudaMallocFromPoolAsync(&pointer, bytes, pool, stream);
     if (error == cudaErrorMemoryAllocation) {
-        // What the pool kept may be in pieces, and other streams may still be about to give back.
+        // The pool's free memory may be fragmented, and other streams may be about to give memory
+        // back.
         cudaGetLastError();
         check(cudaDeviceSynchronize(), "cudaDeviceSynchronize");
         check(cudaMemPoolTrimTo(pool, 0), "cudaMemPoolTrimTo");
@@ -131,7 +134,7 @@ void release(void* pointer, int device, cudaStream_t stream) noexcept {
     int current = device;
     const bool is_elsewhere = cudaGetDevice(&current) == cudaSuccess && current != device &&
                               cudaSetDevice(device) == cudaSuccess;
-    // At exit the driver may be gone before us, and then so is the memory.
+    // At exit the driver may be gone already, and then so is the memory.
     if (cudaFreeAsync(pointer, stream) != cudaSuccess) cudaGetLastError();
     if (is_elsewhere && cudaSetDevice(current) != cudaSuccess) cudaGetLastError();
 }
@@ -165,12 +168,12 @@ StreamMutex::StreamMutex() {
 
 StreamMutex::~StreamMutex() {
     if (cudaEventDestroy(done_) != cudaSuccess)
-        cudaGetLastError();  // at exit the driver may be gone
+        cudaGetLastError();  // the driver may be gone at exit
 }
 
 void StreamMutex::wait() const noexcept {
     if (cudaEventSynchronize(done_) != cudaSuccess)
-        cudaGetLastError();  // at exit the driver may be gone
+        cudaGetLastError();  // the driver may be gone at exit
 }
 
 StreamLock::StreamLock(StreamMutex& mutex, cudaStream_t stream)

@@ -1,8 +1,8 @@
 #pragma once
 
-// Memory and errors of the CUDA half. A DeviceBuffer frees itself into a pool of its device,
-// trim_pool() gives what the pool keeps to the driver. v3dg/residency.py says when what stays on a
-// device is freed. Sources that include it are built only with CUDA.
+// Memory and errors of the CUDA half. A DeviceBuffer frees itself into a pool of its device;
+// trim_pool() returns the pool's free memory to the driver. v3dg/residency.py says when memory that
+// stays on a device is freed. Sources that include this header are built only with CUDA.
 
 #include <cuda_runtime.h>
 
@@ -17,8 +17,8 @@
 namespace v3dg {
 namespace cuda {
 
-// The device has no room; what() names what was asked for and what was free. Python gets a
-// MemoryError, as of every std::bad_alloc.
+// The device has no room; what() names how much was requested and how much was free. Python turns
+// it into a MemoryError, as it does every std::bad_alloc.
 class OutOfMemory : public std::bad_alloc {
   public:
     explicit OutOfMemory(std::string text) : text_(std::move(text)) {}
@@ -28,52 +28,56 @@ class OutOfMemory : public std::bad_alloc {
     std::string text_;
 };
 
-// Throws std::runtime_error with CUDA's own words unless the call succeeded; `what` names it.
+// Throws std::runtime_error with CUDA's error text unless the call succeeded; `what` names the
+// call.
 void check(cudaError_t error, const char* what);
 
-// How many devices there are; 0 without a driver.
+// Returns the number of devices; 0 without a driver.
 int num_devices();
 int current_device();
-// How many multiprocessors the current device has.
+// Returns the number of multiprocessors of the current device.
 unsigned num_multiprocessors();
 
-// Bytes of shared memory that one of them has.
+// Returns the bytes of shared memory of one multiprocessor.
 size_t shared_memory_of_multiprocessor();
 
-// Lets the kernel have `bytes` of dynamic shared memory on the current device, which has to be
-// asked for where it is more than 48 KiB with what the kernel declares. The driver's limit is one
-// for all threads, so it is only ever raised: a lower one could come between another thread's
-// asking and its launch. `name` goes into errors.
+// Allows the kernel `bytes` of dynamic shared memory on the current device, which is necessary
+// where that and what the kernel declares exceed 48 KiB. The driver has one limit for all threads,
+// so it is only ever raised: a lower one could be set between another thread's request and its
+// launch. `name` goes into errors.
 void allow_shared_memory(const void* kernel, size_t bytes, const char* name);
 
-// Whether what the current device runs of the kernel is code that waits for the kernel before it.
+// Returns whether the code that the current device runs for the kernel waits for the kernel before
+// it.
 bool can_start_early(const void* kernel);
 
-// Stream-ordered memory of the current device, from a pool that keeps what is given back for the
-// next caller. Throws OutOfMemory.
+// Returns stream-ordered memory of the current device, from a pool that keeps released memory for
+// the next caller. Throws OutOfMemory.
 void* allocate(size_t bytes, cudaStream_t stream);
-// Of memory and a stream of `device`, whichever is current.
+// Releases memory of `device` on a stream of it, whichever device is current.
 void release(void* pointer, int device, cudaStream_t stream) noexcept;
-// Waits for the stream, and returns to the driver what the pool keeps.
+// Waits for the stream, and returns the pool's free memory to the driver.
 void trim_pool(cudaStream_t stream);
 
-// What the pool of the current device has of the driver, and how much of that is in use.
+// The memory that the pool of the current device has reserved from the driver, and the part of it
+// that is in use.
 struct PoolBytes {
     size_t reserved, used;
 };
 PoolBytes pool_bytes();
 
 bool is_capturing(cudaStream_t stream);
-// Throws std::runtime_error while it is: memory from a graph is gone with the graph.
+// Throws std::runtime_error while the stream is being captured: memory from a graph is gone with
+// the graph.
 void refuse_capture(cudaStream_t stream);
 
-// Guards memory that several threads and streams use, one after the other.
+// Guards memory that several threads and streams use in turn.
 class StreamMutex {
   public:
     StreamMutex();
     ~StreamMutex();
-    // Waits until the device is done with what was enqueued under the last lock, and so with all
-    // before it.
+    // Waits until the device is done with the work that was enqueued under the last lock, and so
+    // with all work before it.
     void wait() const noexcept;
     StreamMutex(const StreamMutex&) = delete;
     StreamMutex& operator=(const StreamMutex&) = delete;
@@ -85,9 +89,9 @@ class StreamMutex {
     cudaStream_t last_ = nullptr;
 };
 
-// While it lives, the memory belongs to one thread, and what that enqueues on the stream runs after
-// what was enqueued under the lock before. It does not order what a graph captures: whoever replays
-// the graph does that.
+// Holds a StreamMutex. The memory belongs to one thread meanwhile, and work that this thread
+// enqueues on the stream runs after the work that was enqueued under the lock before. The lock does
+// not order what a graph captures; that is left to the code that replays the graph.
 class StreamLock {
   public:
     StreamLock(StreamMutex& mutex, cudaStream_t stream);
@@ -102,8 +106,8 @@ class StreamLock {
     bool is_captured_;
 };
 
-// Owned elements of a plain type, not initialised, on the device that is current when it grows.
-// Grows by forgetting what it held. Whoever uses it on several streams orders them.
+// Owns elements of a plain type, not initialised, on the device that is current when the buffer
+// grows. Growing loses the contents. Code that uses a buffer on several streams orders them itself.
 template <class T>
 class DeviceBuffer {
   public:
@@ -117,7 +121,7 @@ class DeviceBuffer {
     }
     ~DeviceBuffer() { release(data_, device_, stream_); }
 
-    // Room for `size` elements, allocated and given back in the order of `stream`.
+    // Makes room for `size` elements; memory is allocated and released in the order of `stream`.
     T* reserve(size_t size, cudaStream_t stream) {
         if (size > capacity_) {
             refuse_capture(stream);
@@ -131,7 +135,7 @@ class DeviceBuffer {
         stream_ = stream;
         return data_;
     }
-    // The host's memory may be reused on return.
+    // Copies elements of the host, whose memory may be reused on return.
     T* copy_from(Span<const T> host, cudaStream_t stream) {
         reserve(host.size, stream);
         if (host.size > 0)

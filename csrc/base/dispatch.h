@@ -1,6 +1,7 @@
 #pragma once
 
-// Where an operation runs, and the one place that chooses between its two halves.
+// The device that an operation runs on, and the one place that chooses between the two halves of an
+// operation.
 
 #include "base/stream.h"
 
@@ -21,7 +22,8 @@ struct Device {
 
 }  // namespace v3dg
 
-// Runs an operation where `work` is: cpu::operation(...), or cuda::operation(..., work.stream()).
+// Runs an operation on the device of `work`: cpu::operation(...), or cuda::operation(...,
+// work.stream()).
 #define V3DG_DISPATCH(work, operation, ...)                                                       \
     [&] {                                                                                         \
         if constexpr (V3DG_WITH_CUDA != 0)                                                        \

@@ -1,5 +1,7 @@
 #pragma once
 
+// Exceptions of parallel loops.
+
 #include <cstddef>
 #include <exception>
 #include <mutex>

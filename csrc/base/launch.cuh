@@ -1,6 +1,6 @@
 #pragma once
 
-// Starting kernels, and what kernels need of a block and a warp.
+// Starts kernels, and has the few helpers of blocks and warps that most kernels use.
 
 #include "base/device.h"
 
@@ -9,8 +9,8 @@ namespace cuda {
 
 constexpr unsigned kAllLanes = 0xffffffffu;
 
-// Starts `kernel` and checks that it started; `name` goes into the error. A grid of no blocks does
-// nothing.
+// Starts `kernel` and checks that it started; `name` goes into the error. Does nothing for a grid
+// without blocks.
 template <class... P, class... A>
 void launch(const char* name, void (*kernel)(P...), dim3 grid, dim3 block, size_t shared_bytes,
             cudaStream_t stream, A&&... arguments) {
@@ -21,9 +21,9 @@ void launch(const char* name, void (*kernel)(P...), dim3 grid, dim3 block, size_
     check(cudaGetLastError(), name);
 }
 
-// As launch(), for a kernel that begins with await_kernel_before() in every block: where the device
-// can do that, it is launched before the memory of the kernel before it can be seen, and waits for
-// that itself.
+// As launch(), for a kernel that calls await_kernel_before() first in every block. Where the device
+// can do that, the kernel starts before the writes of the kernel before it are visible, and waits
+// for them itself.
 template <class... P, class... A>
 void launch_early(const char* name, void (*kernel)(P...), dim3 grid, dim3 block,
                   size_t shared_bytes, cudaStream_t stream, A&&... arguments) {
@@ -43,31 +43,33 @@ void launch_early(const char* name, void (*kernel)(P...), dim3 grid, dim3 block,
     check(cudaLaunchKernelEx(&config, kernel, static_cast<P>(arguments)...), name);
 }
 
-// Waits for all that the kernel before this one has written, and so for all before that.
+// Waits for all writes of the kernel before this one, and so for those of all kernels before that.
 __device__ inline void await_kernel_before() {
 #if __CUDA_ARCH__ >= 900
     cudaGridDependencySynchronize();
 #endif
 }
 
-// Blocks of `size` threads that cover `count` elements.
+// Returns the number of blocks of `size` threads that cover `count` elements.
 V3DG_HD inline unsigned blocks_for(size_t count, unsigned size) {
     return static_cast<unsigned>((count + size - 1) / size);
 }
 
-// The block's dynamic shared memory.
+// Returns the block's dynamic shared memory.
 __device__ inline unsigned char* shared_memory() {
     extern __shared__ __align__(16) unsigned char bytes[];
     return bytes;
 }
 
-// What a warp is to do next, in lane 0: the first `dealt` things have been dealt out, and `taken`
-// counts the others, from 0. Ask early, for it takes a while to come.
+// Returns, in lane 0, the number of the work item that a warp takes next. The first `dealt` items
+// have been assigned, and `taken` counts the others, from 0. Call it early, because the atomic
+// operation has a long latency.
 __device__ inline unsigned take_next(unsigned* taken, unsigned dealt) {
     return threadIdx.x % 32 == 0 ? dealt + atomicAdd(taken, 1u) : 0;
 }
 
-// Over the lanes of a whole warp, in every lane. The order of the additions is fixed.
+// Reduce over the lanes of a whole warp; every lane gets the result. The order of the additions is
+// fixed.
 template <class T>
 __device__ inline T warp_sum(T x) {
 #pragma unroll

@@ -1,14 +1,17 @@
 #pragma once
 
+// Random numbers that are the same on every device.
+
 #include <cstdint>
 
 #include "base/host_device.h"
 
 namespace v3dg {
 
-// Random numbers by counter: the same (seed, stream, counter) gives the same number everywhere.
+// Returns random bits by counter: the same (seed, stream, counter) gives the same number
+// everywhere.
 V3DG_HD inline uint64_t random_bits(uint64_t seed, uint64_t stream, uint64_t counter) {
-    // Three rounds of the splitmix64 finaliser, one for each argument.
+    // There are three rounds of the splitmix64 finaliser, one for each argument.
     uint64_t x = seed;
     const uint64_t more[3] = {stream, counter, 0};
     for (const uint64_t m : more) {
@@ -20,7 +23,7 @@ V3DG_HD inline uint64_t random_bits(uint64_t seed, uint64_t stream, uint64_t cou
     return x;
 }
 
-// Uniform in [0, 1).
+// Returns a number that is uniform in [0, 1).
 V3DG_HD inline double random_uniform(uint64_t seed, uint64_t stream, uint64_t counter) {
     return static_cast<double>(random_bits(seed, stream, counter) >> 11) * 0x1p-53;
 }

@@ -1,5 +1,7 @@
 #pragma once
 
+// Spans of elements, on the host or a device.
+
 #include <cassert>
 #include <cstddef>
 
@@ -7,7 +9,7 @@
 
 namespace v3dg {
 
-// Borrowed contiguous elements.
+// Borrows contiguous elements.
 template <class T>
 struct Span {
     T* data = nullptr;

@@ -1,10 +1,12 @@
 #pragma once
 
+// Requests to stop long work.
+
 #include <atomic>
 
 namespace v3dg {
 
-// Whether work is no longer wanted; null: it always is.
+// Returns whether work is no longer wanted; with a null `stop` it always is wanted.
 inline bool is_stopped(const std::atomic<bool>* stop) {
     return stop != nullptr && stop->load(std::memory_order_relaxed);
 }

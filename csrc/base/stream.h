@@ -1,11 +1,13 @@
 #pragma once
 
+// CUDA's stream, for headers that sources without CUDA include.
+
 struct CUstream_st;
 
 namespace v3dg {
 namespace cuda {
 
-// cudaStream_t, for headers that sources without CUDA include.
+// This is cudaStream_t.
 using Stream = CUstream_st*;
 
 }  // namespace cuda

@@ -1,3 +1,5 @@
+// The number of threads that OpenMP may start without harm.
+
 #include "base/threads.h"
 
 #include <omp.h>
@@ -11,13 +13,13 @@ namespace v3dg {
 namespace {
 
 constexpr int kMostThreads = 1024;
-// What a thread may have as its stack: with 64 KiB the median split overflows it, and more than the
-// most is address space that a machine with many processors does not have.
+// Limits of a thread's stack. The median split overflows 64 KiB, and machines with many processors
+// lack the address space for more than the upper limit.
 constexpr double kLeastStackBytes = double(256 << 10);
 constexpr double kMostStackBytes = double(1 << 30);
 
-// Bytes in a text such as "512", "64 k" or "2M" of OpenMP, without a letter KiB; 0 where it is none
-// of those, which OpenMP ignores.
+// Returns the bytes in a text of OpenMP such as "512", "64 k" or "2M", where a number without a
+// letter means KiB. Returns 0 for other texts, which OpenMP ignores.
 double stack_bytes_of(const char* text) {
     char* end = nullptr;
     const double value = std::strtod(text, &end);

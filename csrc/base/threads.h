@@ -1,10 +1,12 @@
 #pragma once
 
+// The number of threads of parallel loops.
+
 namespace v3dg {
 
-// Threads that a parallel region here asks OpenMP for, at least 1. It is what OpenMP was told, but
-// no number that no machine has processors for, and 1 where threads would get stacks that do not
-// fit: OpenMP would end the process.
+// Returns the number of threads that a parallel region requests from OpenMP, at least 1. It is
+// OpenMP's own number, but at most the number of processors that a machine may have, and 1 where
+// the threads' stacks would be too small or too large: OpenMP would end the process.
 int most_threads();
 
 }  // namespace v3dg

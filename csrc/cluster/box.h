@@ -1,5 +1,7 @@
 #pragma once
 
+// Boxes around what clusters draw.
+
 #include <cstdint>
 
 #include "base/span.h"
@@ -13,14 +15,12 @@ struct BoxInput {
     Span<const int64_t> offset;           // [C + 1] gaussians of each cluster
 };
 
-// Boxes of what clusters draw: the reach of an opaque gaussian around every mean, rounded outwards,
-// without that of the filter. A cluster of no gaussians gets a box of none: +inf to -inf. Both
-// halves give the same bits.
-//
-// box: [C].
+// Bounds what clusters draw: each box contains the reach of an opaque gaussian around every mean,
+// rounded outwards, but not that of the filter. The box of a cluster without gaussians is empty:
+// +inf to -inf. Both halves give the same bits.
 namespace cpu { void bound_by_boxes(const BoxInput& in, Span<Box> box); }
 
-// Rows and boxes on the device, offsets on the host. Work is queued on the stream. Throws
+// Rows and boxes are on the device, offsets on the host. Work is queued on the stream. Throws
 // std::runtime_error when CUDA reports an error.
 namespace cuda { void bound_by_boxes(const BoxInput& in, Span<Box> box, Stream stream); }
 

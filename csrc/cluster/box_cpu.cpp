@@ -1,4 +1,4 @@
-// One thread a cluster.
+// Each thread bounds one cluster at a time.
 
 #include "cluster/box.h"
 

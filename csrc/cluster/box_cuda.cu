@@ -1,4 +1,4 @@
-// One warp a cluster.
+// Each warp bounds one cluster.
 
 #include "base/launch.cuh"
 #include "cluster/box.h"

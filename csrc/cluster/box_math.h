@@ -1,6 +1,7 @@
 #pragma once
 
-// Compiled without contraction on both halves, so that they give the same bits.
+// The box of one gaussian. Both halves compile it without contraction, so that they get the same
+// bits.
 
 #include <cmath>
 
@@ -9,7 +10,8 @@
 
 namespace v3dg {
 
-// What one gaussian draws. In double precision: scales of 1e-6 and 1e6 in one gaussian are legal.
+// Returns the box of what one gaussian draws. It is computed in double precision, because scales of
+// 1e-6 and 1e6 in one gaussian are legal.
 V3DG_HD inline Box box_of_gaussian(const float* mean, const float* quat, const float* scale) {
     const double q[4] = {quat[0], quat[1], quat[2], quat[3]};
     double r[9];
@@ -21,7 +23,7 @@ V3DG_HD inline Box box_of_gaussian(const float* mean, const float* quat, const f
             const double side = r[3 * a + k] * scale[k];
             variance += side * side;
         }
-        // A little more than the reach, for the rounding of the corners.
+        // The reach has a margin for the rounding of the corners.
         const double reach = kReachSigmas * 1.0001 * sqrt(variance) + 1e-6 * fabs(double(mean[a]));
         box.lo[a] = static_cast<float>(mean[a] - reach);
         box.hi[a] = static_cast<float>(mean[a] + reach);

@@ -1,3 +1,5 @@
+// Checks tables one property after another, each for all rows; the first wrong row is reported.
+
 #include "cluster/check_tables.h"
 
 #include <algorithm>
@@ -13,8 +15,8 @@ namespace v3dg {
 
 namespace {
 
-constexpr double kRounding =
-    1e-9;  // two ways to compute the same double need not agree to the last bit
+// Two computations of the same double may differ in the last bits.
+constexpr double kRounding = 1e-9;
 
 template <class Expected>
 std::string text_of(const Expected& expected, size_t row) {
@@ -24,14 +26,15 @@ std::string text_of(const Expected& expected, size_t row) {
         return expected;
 }
 
-// Goes over rows; `expected` is a text, or makes one from the row.
+// Throws for the first row for which `holds` is false. `expected` is a text, or a function that
+// makes one from the row.
 template <class Holds, class Expected>
 void check_rows(const char* table, size_t count, const Holds& holds, const Expected& expected) {
     for (size_t row = 0; row < count; ++row)
         if (!holds(row)) throw TableFault{table, static_cast<int64_t>(row), text_of(expected, row)};
 }
 
-// As above, for rows that are at least all before them.
+// Checks that no value is less than one before it.
 template <class Value>
 void check_ascends(const char* table, size_t count, const Value& value, const char* expected) {
     check_rows(
@@ -164,7 +167,8 @@ class Checker {
     }
 
   private:
-    // Each row links to a group of its own level plus `above`; those of level `without` to none.
+    // Checks that each row links to a group of its own level plus `above`, and that rows of level
+    // `without` link to none.
     void check_links(const char* table, Span<const int32_t> links, Span<const int32_t> level,
                      int32_t without, int above) const {
         const auto wanted = [&](size_t row) { return int64_t{level[row]} + above; };

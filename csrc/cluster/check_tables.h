@@ -1,5 +1,6 @@
-// Whether the tables of a bundle fit each other, and guarantee that every cut of them is exact.
 #pragma once
+
+// Checks that the tables of a bundle fit each other, and that they guarantee an exact cut.
 
 #include <cstdint>
 #include <string>
@@ -26,15 +27,15 @@ struct GivenTables {
     Span<const float> error;           // [G * 2]
 };
 
-// What is thrown for the first row that is wrong; row -1 is the last.
+// Thrown for the first wrong row; row -1 is the last.
 struct TableFault {
-    std::string table;  // as files have it; "groups" for a group that clusters lack
+    std::string table;  // its name in files; "groups" for a group that clusters lack
     int64_t row;
     std::string expected;
 };
 
-// Nothing in the tables is believed. A group's ball and weight have to contain those below, so that
-// the metric never decreases towards the root.
+// Throws TableFault unless the tables are valid; it trusts nothing in them. A group's ball and
+// weight have to contain those below, so that the metric never decreases towards the root.
 void check_tables(const GivenTables& tables, int64_t num_gaussians);
 
 }  // namespace v3dg

@@ -1,5 +1,7 @@
 #pragma once
 
+// Formulas of bounding balls, for both halves.
+
 #include <cmath>
 #include <cstddef>
 
@@ -11,32 +13,32 @@ struct Point {
     float axis[3];
 };
 
-// A ball contains another with this relative margin, so that rounding in the float32 footprint
-// (about 1e-6) cannot turn their order round.
+// The relative margin by which a ball contains another, so that rounding in the float32 footprint
+// (about 1e-6) cannot reverse their order.
 constexpr double kNestingMargin = 4e-6;
 
-// Squares of radii stay normal numbers, so that they keep their relative precision.
+// Squares of larger radii are normal numbers, so that they keep their relative precision.
 constexpr float kMinRadius = 1e-15f;
 
 struct Center {
     double x, y, z;
 };
 
-// Distance from `center` to the farthest point of the sphere.
+// Returns the distance from `center` to the farthest point of the sphere.
 V3DG_HD inline double reach(const Center& center, const Ball& sphere) {
     const double dx = sphere.x - center.x, dy = sphere.y - center.y, dz = sphere.z - center.z;
     return sqrt(dx * dx + dy * dy + dz * dz) + sphere.radius;
 }
 
-// The centre of the smallest ball around many spheres comes from a core set of a few: those that
-// were the farthest from the centre of the ones before (Badoiu and Clarkson, Smaller core-sets for
+// The centre of the smallest ball around many spheres is that of a small core set: each sphere in
+// it was the farthest from the centre of those before (Badoiu and Clarkson, Smaller core-sets for
 // balls, SODA 2003).
 constexpr int kCoreSize = 24;
 constexpr int kFirstCoreStep = 2, kLastCoreStep = 255;
 constexpr double kCoreTolerance = 1e-4;
 
 // Moves the centre of a core set towards the sphere that reaches farthest from it, to `radius`.
-// False when the two are concentric, so that there is nothing to move towards.
+// Returns false when the two are concentric, so that there is no direction to move in.
 V3DG_HD inline bool move_center(const Ball& farthest, double radius, int step, Center& center) {
     const double distance = radius - farthest.radius;
     if (distance <= 0.0) return false;
@@ -47,12 +49,12 @@ V3DG_HD inline bool move_center(const Ball& farthest, double radius, int step, C
     return true;
 }
 
-// Whether all spheres lie within the core set's ball, or nearly.
+// Returns whether all spheres lie within the core set's ball, or nearly.
 V3DG_HD inline bool core_suffices(double radius, double core_radius, int core_size) {
     return radius <= core_radius * (1.0 + kCoreTolerance) || core_size == kCoreSize;
 }
 
-// The centre as a ball in float32 has it; the radius is still to come.
+// Returns a ball in float32 at the centre, whose radius is not yet set.
 V3DG_HD inline Ball ball_at(const Center& center) {
     return {static_cast<float>(center.x), static_cast<float>(center.y),
             static_cast<float>(center.z), 0.0f};

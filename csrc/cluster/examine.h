@@ -1,5 +1,7 @@
 #pragma once
 
+// Checks which gaussians of an asset can be drawn.
+
 #include <cstdint>
 
 #include "base/span.h"
@@ -7,8 +9,8 @@
 
 namespace v3dg {
 
-// Why a gaussian cannot be drawn: bits, of which it may have several. All but the last are wrong
-// values.
+// Reasons why a gaussian cannot be drawn: bits, of which it may have several. All but the last are
+// invalid values.
 enum Finding : uint16_t {
     kMeanNotFinite = 1 << 0,
     kQuatNotFinite = 1 << 1,
@@ -21,10 +23,10 @@ enum Finding : uint16_t {
     kTransparent = 1 << 8,  // no pixel shows it
 };
 
-// Of a coordinate or a scale, in world units: squares of more are no float32 numbers.
+// The largest coordinate or scale, in world units: squares of larger ones exceed float32.
 constexpr float kMostLength = 1e18f;
 
-// findings: [N], 0 where a gaussian can be drawn.
+// Sets findings, [N], to 0 where a gaussian can be drawn.
 void examine(const GaussianRows<const float>& in, Span<uint16_t> findings);
 
 }  // namespace v3dg

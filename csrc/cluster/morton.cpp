@@ -9,8 +9,8 @@
 
 namespace v3dg {
 
-constexpr size_t kChunk = 4096;  // points that go to a thread together
-constexpr int kBits = 21;        // of a coordinate: three fit in a word
+constexpr size_t kChunk = 4096;  // points that a thread takes together
+constexpr int kBits = 21;        // bits of a coordinate: three fit in a word
 
 void morton_order(Span<const Point> points, Span<int64_t> order) {
     Point low = points.empty() ? Point{} : points[0], high = low;

@@ -1,5 +1,7 @@
 #pragma once
 
+// The order of points along a Morton curve.
+
 #include <cstdint>
 
 #include "base/span.h"
@@ -7,8 +9,8 @@
 
 namespace v3dg {
 
-// Indices that put points along a curve that keeps neighbours together; the same on every run.
-// Points are finite.
+// Computes indices that put points along a curve that keeps neighbours together; they are the same
+// on every run. Points are finite.
 void morton_order(Span<const Point> points, Span<int64_t> order);
 
 }  // namespace v3dg

@@ -1,23 +1,24 @@
 #pragma once
 
-// Gaussians in the order of their depth in each view, ties by place.
+// Orders gaussians by their depth in each view, ties by place.
 
 #include "fit_group/team.cuh"
 
 namespace v3dg {
 namespace cuda {
 
-constexpr uint32_t kHiddenKey = 0xfffffffeu;  // of what is not drawn; comes after all depths
+// Key of gaussians that are not drawn; it is above all depths.
+constexpr uint32_t kHiddenKey = 0xfffffffeu;
 
-// Puts gaussian `i` of the view whose keys these are into its position.
+// Puts gaussian `i` of the view with these keys into its position.
 template <class Fit>
 __device__ void rank_by_depth(const Fit& fit, const uint32_t* view_keys, uint32_t begin,
                               uint32_t i) {
     const uint4* all = reinterpret_cast<const uint4*>(view_keys);
     const uint32_t key = view_keys[i], warp_first = i - threadIdx.x % 32;
     uint32_t rank = 0;
-    // Of equal keys, the one whose place comes first comes first. So keys in runs of 32 before this
-    // warp's run precede this one if they are equal, and keys in runs behind it do not.
+    // Equal keys are ordered by place. So keys in runs of 32 before this warp's run precede this
+    // one if they are equal, and keys in later runs do not.
     const auto count = [&](uint32_t from, uint32_t to, const auto& before) {
         for (uint32_t run = from; run < to; run += 32) {
             uint4 other[8];
@@ -46,8 +47,8 @@ __device__ void rank_by_counting(const Fit& fit, int num_views) {
                           j / fit.n_padded * fit.n_padded, j % fit.n_padded);
         return;
     }
-    // All threads read all keys, so these are copied to shared memory where they fit: fragments
-    // come later.
+    // All threads read all keys, so these are copied to shared memory where they fit. Fragments are
+    // written there later.
     auto* copy = reinterpret_cast<uint32_t*>(shared_memory() + fit.layout.fragments);
     const bool fits = fit.n_padded * sizeof(uint32_t) <= Fit::kWarps * fragments_bytes(Fit::kChunk);
     for (int b = 0; b < num_views; ++b) {

@@ -1,5 +1,7 @@
 #pragma once
 
+// D-SSIM of a picture, with its gradient, for the loss of a fit.
+
 #include <vector>
 
 namespace v3dg {
@@ -11,14 +13,15 @@ struct LossWeights {
     float alpha;  // |difference| of alpha
 };
 
-// Maps that dssim needs in between.
+// Temporary maps of dssim().
 struct SsimScratch {
     std::vector<float> maps;
 };
 
-// Mean of 1 - SSIM over one channel of width x height, row major, and `weight` times its gradient
-// by `picture`, added to `d_picture`. Gaussian window of 11 x 11, sigma 1.5, zeros beyond the
-// border, constants 0.01² and 0.03² (Wang et al. 2004, as 3D Gaussian Splatting uses it).
+// Returns the mean of 1 - SSIM over one channel of width x height, row major, and adds `weight`
+// times its gradient by `picture` to `d_picture`. The Gaussian window is 11 x 11 with sigma 1.5,
+// there are zeros beyond the border, and the constants are 0.01² and 0.03² (Wang et al. 2004, as 3D
+// Gaussian Splatting uses it).
 float dssim(const float* picture, const float* target, int width, int height, float weight,
             float* d_picture, SsimScratch& scratch);
 

@@ -1,7 +1,7 @@
 #pragma once
 
-// Where the arrays of a fit on the device lie: in the shared memory of blocks, or in their scratch.
-// The host decides that, and knows nothing of CUDA here.
+// The places of the arrays of a fit on the device: in the shared memory of blocks, or in their
+// scratch. The host decides that, and this header knows nothing of CUDA.
 
 #include <cstddef>
 #include <cstdint>
@@ -13,54 +13,54 @@ namespace v3dg {
 namespace cuda {
 
 constexpr int kViewsAtOnce = 2;
-// A half-warp blends a cell. Masks have a bit for each cell of a region; a larger picture takes
+// Each half-warp blends a cell. Masks have a bit for each cell of a region; a larger picture has
 // several regions.
 constexpr int kCell = 4, kCellPixels = kCell * kCell;
 constexpr int kRegion = 32, kRegionCells = kRegion / kCell;
 static_assert(kRegionCells * kRegionCells == 64 && kCellPixels == 16,
               "a mask is a word, a cell half a warp");
 using CellMask = unsigned long long;
-constexpr int kAtOnce = 4;  // gaussians that a half-warp looks at together
+constexpr int kAtOnce = 4;  // gaussians that a half-warp blends together
 constexpr int kSums = 9;    // FalloffSums and colour
 constexpr int kSumStride = 12;
 
-// How a kernel was compiled: for small groups, which keep what is read again and again in shared
-// memory, or for large ones; and how many gaussians of a list a warp takes from pixels to sums at
-// once.
+// The shape that a kernel is compiled for: small groups, which keep what is read repeatedly in
+// shared memory, or large ones; and the number of gaussians of a list that a warp takes from pixels
+// to sums at once.
 template <int kThreadsOfBlock, bool kIsSmall, int kChunkSize>
 struct FitShape {
     static constexpr int kThreads = kThreadsOfBlock, kWarps = kThreads / 32, kChunk = kChunkSize;
     static constexpr bool kSmall = kIsSmall;
-    using Index =
-        std::conditional_t<kSmall, uint16_t, uint32_t>;  // of a gaussian in the views at once
+    // Index of a gaussian in the current views.
+    using Index = std::conditional_t<kSmall, uint16_t, uint32_t>;
 };
 
-// Where an array lies: in the block's shared memory, or in the team's part of the scratch.
+// The place of an array: in the block's shared memory, or in the team's part of the scratch.
 struct Place {
     size_t offset;
     bool is_shared;
 };
 
 struct FitLayout {
-    // Shared for small groups, in the scratch for large ones.
+    // These are in shared memory for small groups, and in the scratch for large ones.
     size_t records, sorted, keys, mask, slot_first, order, lists, errors;
-    size_t list_size;          // bytes, of a half-warp
+    size_t list_size;          // bytes of a half-warp's list
     size_t fragments, staged;  // shared
-    // Wherever there is room.
+    // These are wherever there is room.
     Place value, m, v, by_view, sum, sort_keys, sums, near_slots;
     size_t far_slots, maps, exchange;  // scratch
     uint32_t num_near_slots, num_far_slots;
-    size_t shared_bytes;   // of a block
-    size_t scratch_bytes;  // of a team
+    size_t shared_bytes;   // bytes of a block
+    size_t scratch_bytes;  // bytes of a team
 };
 
-// Of a warp: a value of two floats a gaussian and pixel, in rows of 33, and one of four floats a
-// pixel.
+// Returns the bytes of a warp's fragments: two floats a gaussian and pixel, in rows of 33, and four
+// floats a pixel.
 V3DG_HD constexpr size_t fragments_bytes(int chunk) {
     return (chunk * 33 * 2 + 32 * 4) * sizeof(float);
 }
 
-// Deals out memory. Only small groups have arrays in shared memory that large ones have in the
+// Allocates memory. Only small groups have arrays in shared memory that large ones have in the
 // scratch.
 struct Arena {
     bool is_small;
@@ -75,25 +75,25 @@ struct Arena {
         scratch += rounded(bytes);
         return scratch - rounded(bytes);
     }
-    // For what a small group has to have in shared memory.
+    // Allocates an array that a small group must have in shared memory.
     size_t hot(size_t bytes) { return is_small ? in_shared(bytes) : in_scratch(bytes); }
-    // For what a small group has there while there is room.
+    // Allocates an array that a small group has in shared memory while there is room.
     Place anywhere(size_t bytes) {
         const bool fits = is_small && shared + rounded(bytes) <= shared_limit;
         return {fits ? in_shared(bytes) : in_scratch(bytes), fits};
     }
 };
 
-// What there is to lay out.
+// The sizes that a layout follows from.
 struct FitSizes {
-    size_t most_gaussians, floats_per_gaussian;  // of a group
+    size_t most_gaussians, floats_per_gaussian;  // largest of a group
     int largest_picture;                         // px a side
     bool has_dssim;
-    size_t num_blocks;    // that fit a group together
-    size_t shared_limit;  // bytes of a block
+    size_t num_blocks;    // blocks that fit a group together
+    size_t shared_limit;  // most bytes of a block
 };
 
-// What only large groups, or only small ones, have is left at 0 for the others.
+// Returns the layout. Fields that only large groups have, or only small ones, are 0 for the others.
 template <class Shape>
 FitLayout layout_of(const FitSizes& sizes) {
     constexpr bool kSmall = Shape::kSmall;
@@ -112,7 +112,7 @@ FitLayout layout_of(const FitSizes& sizes) {
     if (!kSmall) l.sorted = arena.hot((places + 1) * sizeof(Record<float>));
     l.mask = arena.hot(regions * places * sizeof(CellMask));
     l.slot_first = arena.hot(regions * places * sizeof(uint32_t));
-    // A small group's keys are done with when it is in order, before it gets slots.
+    // A small group's keys are no longer needed when it is in order, before it gets slots.
     l.keys = kSmall ? l.slot_first : arena.hot(places * sizeof(uint32_t));
     l.order = arena.hot(places * kIndex);
     l.list_size = Arena::rounded((padded + kAtOnce) * kIndex);
@@ -121,8 +121,8 @@ FitLayout layout_of(const FitSizes& sizes) {
     const size_t errors_bytes = kViewsAtOnce * (cells + largest) * 2 * kFloat;
     l.errors = kSmall && errors_bytes <= kFragments ? l.fragments : arena.hot(errors_bytes);
     if (!kSmall) l.staged = arena.in_shared(kWarps * 2 * Shape::kChunk * sizeof(Record<float>));
-    // Fragments, and the lists of small groups in front of them, are done with when gradients come,
-    // and not begun when keys are sorted.
+    // Fragments, and the lists of small groups before them, are no longer needed when gradients are
+    // written, and not yet needed when keys are sorted.
     const size_t over = kSmall ? l.lists : l.fragments;
     const auto over_fragments = [&](size_t bytes) {
         return num_blocks == 1 && bytes <= l.fragments + kFragments - over ? Place{over, true}
@@ -144,13 +144,13 @@ FitLayout layout_of(const FitSizes& sizes) {
     l.m = arena.anywhere(values * kFloat);
     l.v = arena.anywhere(values * kFloat);
     l.sum = {arena.in_scratch(values * kFloat), false};
-    // At least what one region can take.
+    // There is room for at least the slots of one region.
     l.num_far_slots = static_cast<uint32_t>(places * kRegionCells * kRegionCells);
     l.far_slots = arena.in_scratch(l.num_far_slots * kSums * kFloat);
     if (sizes.has_dssim)
         l.maps = arena.in_scratch(10 * 3 * kViewsAtOnce * largest * largest * kFloat);
     if (kSmall && arena.shared < sizes.shared_limit) {
-        // The rest of the shared memory takes slots.
+        // The rest of the shared memory holds slots.
         l.num_near_slots =
             static_cast<uint32_t>((sizes.shared_limit - arena.shared) / (kSums * kFloat));
         l.near_slots = {arena.in_shared(l.num_near_slots * kSums * kFloat), true};

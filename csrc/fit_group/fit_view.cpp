@@ -1,3 +1,5 @@
+// Views of a group for callers that do not include the formulas.
+
 #include <stdexcept>
 #include <string>
 

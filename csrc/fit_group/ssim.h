@@ -1,12 +1,15 @@
 #pragma once
 
+// SSIM of whole pictures.
+
 #include <cstddef>
 
 #include "math/ssim.h"
 
 namespace v3dg {
 
-// Two pictures of several channels, interleaved. T is float or double; all is computed in double.
+// Two pictures of several channels, interleaved. T is float or double; everything is computed in
+// double.
 template <class T>
 struct SsimInput {
     const T *picture, *target;  // [height * width * channels]
@@ -14,9 +17,9 @@ struct SsimInput {
     size_t channels;
 };
 
-// Mean of SSIM over all pixels and channels. Gaussian window of 11 x 11, sigma 1.5, population
-// variances, the border mirrored without repeating the edge, constants 0.01² and 0.03²; the same on
-// every run.
+// Returns the mean of SSIM over all pixels and channels. The Gaussian window is 11 x 11 with sigma
+// 1.5, variances are those of the population, the border is mirrored without repeating the edge,
+// and the constants are 0.01² and 0.03². The result is the same on every run.
 //
 // Source: Wang et al., Image quality assessment: from error visibility to structural similarity,
 // 2004.

@@ -1,6 +1,6 @@
 #pragma once
 
-// An entry of a tile's list on the CPU, in one word. (CUDA's are in tile_list.h.)
+// An entry of a tile's list on the CPU, in one word. (CUDA's entries are in tile_list.h.)
 
 #include <cstdint>
 #include <cstring>
@@ -12,8 +12,8 @@ namespace v3dg {
 constexpr int kBlockSize = 4;  // px
 constexpr int kTileBlocks = kTileSize / kBlockSize;
 
-// The blocks of a tile that a box in it meets, of 6 bits each: its first column and, higher, its
-// last, and the same of rows. A block has a bit, row by row.
+// The blocks of a tile that a box in it meets. Columns have 6 bits, the first and, higher, the
+// last; rows have 6 more. A block has a bit, row by row.
 struct BlocksOfBox {
     uint64_t columns[64] = {}, rows[64] = {};
     constexpr BlocksOfBox() {
@@ -29,22 +29,23 @@ struct BlocksOfBox {
 };
 inline constexpr BlocksOfBox kBlocksOfBox;
 
-// The bits of a depth, which is positive, order as depths do.
+// Returns the bits of a depth. Depths are positive, so their bits have the same order.
 V3DG_INLINE uint32_t depth_bits_of(float depth) {
     uint32_t bits;
     std::memcpy(&bits, &depth, sizeof bits);
     return bits;
 }
 
-// What an entry holds, from its highest bits on: how far the bits of the record's depth are above
-// the least, its place among the records, and where in the tile its box is. Where depths and places
-// are too many for a word, the lowest bits of depths are dropped.
+// The format of an entry. From the highest bits on it has the difference of the depth's bits to the
+// least depth, the index of the record, and the box in the tile. Where depths and records are too
+// many for a word, the lowest bits of depths are dropped.
 struct EntryFormat {
     static constexpr int kBoxBits = 12;
     int depth_shift = kBoxBits, dropped_bits = 0;
     uint32_t least_depth = 0;
 
-    // For places below num_records and for depths with bits from `least` to `most`.
+    // Returns the format for records below num_records and for depths with bits from `least` to
+    // `most`.
     static constexpr EntryFormat of(uint64_t num_records, uint32_t least, uint32_t most) {
         EntryFormat f;
         f.least_depth = least;
@@ -60,7 +61,7 @@ struct EntryFormat {
     V3DG_INLINE uint64_t record_of(uint64_t entry) const {
         return (entry & ((uint64_t(1) << depth_shift) - 1)) >> kBoxBits;
     }
-    // Blocks of the tile that the record's box meets.
+    // Returns the blocks of the tile that the record's box meets.
     V3DG_INLINE static uint64_t blocks_of(uint64_t entry) {
         return kBlocksOfBox.columns[entry & 63] & kBlocksOfBox.rows[entry >> 6 & 63];
     }

@@ -1,7 +1,7 @@
 #pragma once
 
-// Where the gradients of a CUDA frame's records are summed: one place for each tile that a record
-// lies in.
+// Slots in which the gradients of a CUDA frame's records are summed: one for each tile that a
+// record lies in.
 
 #include "frame/tile_list.h"
 
@@ -9,12 +9,12 @@ namespace v3dg {
 namespace cuda {
 
 // A record's gradient is the sum of its slots, one for each tile of its pixel box, row by row. A
-// tile writes the slots of the records that it blended and marks them as touched; the others mean
-// nothing.
+// tile writes the slots of the records that it blended and marks them as touched; the contents of
+// others are undefined.
 struct GradientSlots {
-    const uint32_t* first;  // of each record
+    const uint32_t* first;  // first slot of each record
     RecordGradient<float>* slot;
-    CenterSize<float>* size;  // of each slot; null where nobody asks for it
+    CenterSize<float>* size;  // sizes of each slot; null if not requested
     uint8_t* is_touched;      // zeros at the start
 };
 

@@ -18,18 +18,19 @@ struct Window {
     V3DG_INLINE bool contains(int x, int y) const { return x0 <= x && x < x1 && y0 <= y && y < y1; }
 };
 
-// A pixel stops where hardly any light gets through, and what is behind is left out. As gsplat's
-// do: before a gaussian that would leave kMinTransmittance or less, which is left out too.
+// A pixel stops where its transmittance is low, and everything behind is left out. As gsplat's
+// pixels do, it stops before a gaussian that would leave kMinTransmittance or less, which is left
+// out, too.
 struct StopsBefore {};
-// Behind the gaussian that leaves this much or less. That light goes to what was blended, in
-// proportion: so no channel is off by more than this much of the difference between what was
-// blended and what is behind it.
+// A pixel stops after the gaussian that leaves this transmittance or less. The rest of the light is
+// distributed over what was blended, in proportion. So no channel is off by more than this fraction
+// of the difference between what was blended and what is behind it.
 template <class T>
 struct StopsBehind {
     T transmittance;
 };
 
-// What pictures hold: StopsBehind, or StopsBefore where that is negative.
+// The value of pictures for StopsBefore, which is negative; other values mean StopsBehind.
 constexpr float kStopsBefore = -1.0f;
 template <class T, class Draw>
 V3DG_INLINE void with_stop(float min_transmittance, const Draw& draw) {
@@ -44,14 +45,15 @@ template <class T>
 struct Picture {
     Window window;
     T background[3];
-    T* color;  // premultiplied, the background composed last
+    T* color;  // premultiplied, composed over the background
     T* alpha;
-    T* depth;  // expected depth, sum of weight * depth over alpha, 0 where alpha is 0; may be null
-    T* count = nullptr;  // gaussians that were blended, in place of depth; may be null
+    // The expected depth: sum of weight * depth over alpha, 0 where alpha is 0; may be null.
+    T* depth;
+    T* count = nullptr;  // number of blended gaussians, instead of depth; may be null
     float min_transmittance = kStopsBefore;
 };
 
-// Gradients of the picture, laid out as it is; `depth` may be null.
+// Gradients of the picture, in its layout; `depth` may be null.
 template <class T>
 struct PictureGradient {
     const T* color;
@@ -61,9 +63,9 @@ struct PictureGradient {
 
 namespace cuda {
 
-// A block blends one tile, a warp a part of four rows of it.
+// A block blends one tile, and each of its warps a part of four rows.
 constexpr int kFrameTileWidth = 32, kFrameTileHeight = 16;
-// Where a picture is, as Picture<float> has it. It may be asked for after the first stages of a
+// The memory of a picture, as in Picture<float>. It may be requested after the first stages of a
 // frame are enqueued.
 struct PicturePlanes {
     float *color, *alpha, *depth;  // all may be null, or depth alone
@@ -74,17 +76,16 @@ struct FrameImage {
     Pinhole<float> camera;
     int width, height;
     int tile_columns, tile_rows;
-    uint32_t first_tile;  // in the batch, its tiles row by row
+    uint32_t first_tile;  // number in the batch; tiles are numbered row by row
     float background[3];
     PicturePlanes planes;
 };
 
-// The pictures of a scene's frame: one for each eye. Tiles of the second follow on those of the
-// first.
+// The pictures of a scene's frame, one for each eye. Tiles of the second follow those of the first.
 struct EyeImages {
     FrameImage image[2];
     uint32_t count;
-    float min_transmittance;  // of both
+    float min_transmittance;  // shared by both pictures
 };
 
 }  // namespace cuda

@@ -8,14 +8,14 @@
 
 namespace v3dg {
 
-// Ellipse says what L is.
+// A gaussian on the image; see Ellipse for L.
 template <class T>
 struct Record {
     T u, v, l11, l12, l22, log2_opacity;
     T color[3];
     T depth;
-    // First and last pixel whose centre the gaussian can reach, cut to the image or the window that
-    // is drawn.
+    // The first and last pixel whose centre the gaussian can reach, clipped to the image or the
+    // window that is drawn.
     uint16_t x0, x1, y0, y1;
 };
 
@@ -41,8 +41,8 @@ V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, const PixelBox<int>& b
     r.y1 = static_cast<uint16_t>(box.y1);
 }
 
-// Sum over pixels of the size of the gradient by a record's centre, along both axes: how much
-// pixels pull at it, also where they pull apart.
+// The sum over pixels of the absolute gradient by a record's centre, along both axes: how strongly
+// pixels pull at it, even in opposite directions.
 template <class V>
 struct CenterSize {
     V u, v;
@@ -54,7 +54,7 @@ struct CenterSize {
     }
 };
 
-// What is told of gradients by centres, (N, 2) each, in 1 / px; either may be null.
+// Gradients by centres that are reported, (N, 2) each, in 1 / px; either may be null.
 template <class T>
 struct CenterGradients {
     T* sum;

@@ -1,5 +1,7 @@
 #pragma once
 
+// The gaussians of clusters of instances, transformed into the world.
+
 #include <cstdint>
 
 #include "base/span.h"
@@ -8,7 +10,7 @@
 
 namespace v3dg {
 
-// Clusters of instances. An instance takes p to scale * rotation p + position.
+// Clusters of instances. An instance transforms p to scale * rotation p + position.
 struct GatherInput {
     Span<const GaussianRows<const float>> bundles;
     // [I] instances
@@ -18,14 +20,14 @@ struct GatherInput {
     Span<const double> scale;
     // [S] clusters
     Span<const int32_t> instance;
-    Span<const int64_t> first_row;  // in the bundle
-    Span<const int64_t> offset;     // [S + 1] in the result, ascending from 0
-    Span<const float> weight;       // [S] that opacities are multiplied by; none where all are 1
+    Span<const int64_t> first_row;  // row in the bundle
+    Span<const int64_t> offset;     // [S + 1] rows of the result, ascending from 0
+    Span<const float> weight;       // [S] factors of opacities; empty where all are 1
 };
 
 // Writes the gaussians of all clusters in the world, in order. Spherical harmonics are rotated into
-// the world's frame, which is exact; the coefficients that a bundle lacks are 0. Computed in double
-// precision; both halves give the same bits.
+// the world's frame, which is exact; the coefficients that a bundle lacks are 0. Results are
+// computed in double precision; both halves give the same bits.
 namespace cpu { void gather(const GatherInput& in, const GaussianRows<float>& out); }
 // Rows of bundles and `out` are on the device, all else on the host. Work is queued on the stream.
 // Throws std::runtime_error when CUDA reports an error.

@@ -1,4 +1,4 @@
-// One cluster after another, on all threads.
+// Each thread gathers one cluster at a time.
 
 #include "base/parallel_for.h"
 #include "gather/gather_math.h"

@@ -1,5 +1,5 @@
-// A thread writes the shape of a gaussian, or one of its SH bases. Blocks take neighbours, so they
-// look up few clusters.
+// Each thread writes the shape of a gaussian, or one of its SH bases. Blocks take neighbours, so
+// they look up few clusters.
 
 #include "base/launch.cuh"
 #include "gather/gather.h"
@@ -12,7 +12,8 @@ namespace {
 
 constexpr unsigned kBlockSize = 256;
 
-// The last cluster that begins at or before `row`, from low to high; so an empty one never.
+// Returns the last cluster that begins at or before `row`, from low to high. An empty cluster is
+// never returned.
 __device__ size_t cluster_at(const Span<const int64_t>& offset, size_t low, size_t high,
                              int64_t row) {
     while (low < high) {
@@ -25,7 +26,7 @@ __device__ size_t cluster_at(const Span<const int64_t>& offset, size_t low, size
     return low;
 }
 
-// One thread a row of the result, or one a row and basis: num_items a row.
+// There is one thread a row of the result, or one a row and basis: num_items a row.
 __global__ void __launch_bounds__(kBlockSize)
     gather_kernel(GatherInput in, Rotations rotations, GaussianRows<float> out, int num_items) {
     const int64_t num = in.offset[in.instance.size] * num_items;
@@ -45,7 +46,7 @@ __global__ void __launch_bounds__(kBlockSize)
     if (basis == 0) gather_shape(in, rotations, s, row - in.offset[s], out);
 }
 
-// A host array on the device, for as long as this lives.
+// Copies a host array to the device for as long as the object lives.
 template <class T>
 class Copy {
   public:

@@ -1,5 +1,7 @@
 #pragma once
 
+// Formulas of gather(), for both halves; all are in double precision.
+
 #include <vector>
 
 #include "base/host_device.h"
@@ -9,20 +11,20 @@
 
 namespace v3dg {
 
-// How instances are turned.
+// Rotations of instances, and of their SH bands.
 struct Rotations {
     const double* rotation;  // [I * 9] rows
-    const double* bands;     // [I * kBandsSize]; none where the result has SH degree 0
+    const double* bands;     // [I * kBandsSize]; empty where the result has SH degree 0
 };
 
-// The memory of these, on the host.
+// Owns such rotations on the host.
 struct RotationTables {
     std::vector<double> rotation, bands;
 
     RotationTables(const GatherInput& in, int sh_degree);
 };
 
-// Writes all but the SH coefficients of the gaussian `within` cluster s.
+// Writes the gaussian `within` cluster s except its SH coefficients.
 V3DG_HD inline void gather_shape(const GatherInput& in, const Rotations& rotations, size_t s,
                                  int64_t within, const GaussianRows<float>& out) {
     const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;

@@ -1,5 +1,5 @@
 // A band is closed under rotation, so its matrix follows from the bases at enough directions: the
-// colour towards d in the new frame is the old one's towards the direction rotated back.
+// colour towards d in the new frame is the colour of the old frame towards d rotated back.
 
 #include "gather/sh_rotation.h"
 
@@ -13,14 +13,14 @@ namespace v3dg {
 namespace {
 
 constexpr int kMaxBand = 7;
-// Many more than the 7 that the largest band needs, for a well-posed solution.
+// There are many more directions than the 7 that the largest band needs, for a well-posed solution.
 constexpr int kNumDirections = 32;
 
 struct Direction {
     double x, y, z;
 };
 
-// Points on a spiral from pole to pole.
+// Returns points on a spiral from pole to pole.
 Direction direction_of(int i) {
     const double z = 1 - (2 * i + 1) / static_cast<double>(kNumDirections);
     const double turn = i * 3.14159265358979323846 * (3 - std::sqrt(5.0)),
@@ -28,7 +28,7 @@ Direction direction_of(int i) {
     return {radius * std::cos(turn), radius * std::sin(turn), z};
 }
 
-// Least squares: row r of the solution for right-hand side b is the sum over directions of
+// Solves least squares: row r of the solution for right-hand side b is the sum over directions of
 // weight[r] times b.
 class Band {
   public:

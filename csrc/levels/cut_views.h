@@ -1,5 +1,7 @@
 #pragma once
 
+// Pictures of random cuts of a bundle, which refinement compares with those of the asset.
+
 #include <cstdint>
 #include <vector>
 
@@ -11,14 +13,15 @@ namespace v3dg {
 
 double median(std::vector<double> values);
 
-// The ball around the median of means that holds this share of them; the rest may float far away.
+// The ball around the median of means that contains a share of them; the rest may float far away.
 struct Surroundings {
     double center[3], radius;
 };
 Surroundings surroundings_of(Span<const float> means, double share);
 
-// Looks at the centre of the ball from so many radii away, outwards; what is right in its picture
-// is a unit vector, too. Its pixels are left to the caller.
+// Returns a camera that looks at the centre of the ball from `distance` radii away, in the
+// direction `outwards`. `right` is to the right in its picture; both are unit vectors. The caller
+// sets its pixels.
 Camera camera_at(const Surroundings& ball, double distance, const double outwards[3],
                  const double right[3]);
 
@@ -30,26 +33,27 @@ struct CutView {
     int samples;
 };
 
-// Pictures of cuts of one bundle: of random budgets, at random sizes, from random sides of what
-// lies around a centre, or from cameras that are given.
+// Pictures of cuts of one bundle: of random budgets, at random sizes, from random directions around
+// a centre, or from given cameras.
 struct CutPictures {
     const ClusterTable& table;
-    Span<const float> means;  // [N * 3] of the asset
+    Span<const float> means;  // [N * 3] means of the asset
     Span<const Camera> cameras;
     uint64_t seed;
-    double most, least;  // gaussians of a cut
+    double most, least;  // limits of the gaussians of a cut
     std::vector<double>
-        weight;         // [N] how often each of the asset is looked at, as the sum up to it
-    Surroundings ball;  // that is looked at
+        weight;         // [N] prefix sums of how often each gaussian of the asset is looked at
+    Surroundings ball;  // the ball that views look at
 };
 
-// Those of a bundle and its asset, which has gaussians: of cuts of 0.7 of these down to the
-// coarsest one. Borrows all but the seed.
+// Returns the pictures of a bundle and its asset, which must have gaussians: of cuts from 0.7 of
+// these down to the coarsest one. Borrows all arguments but the seed.
 CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const float>& asset,
                              Span<const Camera> cameras, uint64_t seed);
 
-// Picture number `number`. The same arguments give the same view. A cut from a given camera has the
-// share of the gaussians in its frustum, and is as large, that a cut from around has of all.
+// Returns the view of picture `number`. The same arguments give the same view. A cut from a given
+// camera has the share of the gaussians in its frustum, and the size, that a cut from around has of
+// all gaussians.
 CutView cut_view(const CutPictures& pictures, uint64_t number);
 
 }  // namespace v3dg

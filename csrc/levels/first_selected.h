@@ -1,6 +1,6 @@
 #pragma once
 
-// At which size each group of level 1 of a smooth asset is no worse than its leaves.
+// Finds the size at which each group of level 1 of a smooth asset is no worse than its leaves.
 
 #include <cstdint>
 #include <vector>
@@ -12,25 +12,26 @@
 
 namespace v3dg {
 
-// Pictures of the whole asset are compared, because alone groups show edges that others hide. Who
-// has them drawn adds their losses, and asks for the result.
+// Compares pictures of the whole asset, because groups alone show edges that other groups hide. The
+// caller draws the pictures, adds their losses, and asks for the result.
 class FirstSelected {
   public:
     static constexpr size_t kSides = 8, kSizes = 4;
-    static constexpr int kSamples = 2;  // a side of a pixel of the truth
+    static constexpr int kSamples = 2;  // samples a side of a pixel of the truth
 
-    // Of the leaves' means, (N, 3), and the groups' balls; level 1 has the gaussians of
-    // `group_offset`.
+    // Takes the leaves' means, (N, 3), and the groups' balls; `group_offset` has the gaussians of
+    // level 1.
     FirstSelected(Span<const float> means, Span<const Ball> balls,
                   Span<const int64_t> group_offset);
 
     static constexpr size_t num_pictures() { return kSides * kSizes; }
     Camera camera(size_t picture) const;
 
-    // Adds what the leaves share of a picture's losses, rows of three of which the third is none.
+    // Adds the losses that a picture assigns to the leaves: rows of three, of which the third is
+    // unused.
     void add(size_t picture, Span<const float> shares, Span<const int64_t> leaf_offset);
 
-    // How many times larger each ball is to be.
+    // Returns the factor by which each ball is to grow.
     std::vector<float> growth() const;
 
   private:
@@ -43,10 +44,10 @@ class FirstSelected {
 // A picture's colours, (height, width, 3), over white.
 struct PictureColors {
     Span<const float> of_leaves, of_level;
-    Span<const float> truth;  // of FirstSelected::kSamples times the width and height
+    Span<const float> truth;  // kSamples times as wide and high
 };
 
-// How far off each pixel is, (height, width, 3): of the leaves, of the level, and 0.
+// Computes the error of each pixel, (height, width, 3): of the leaves, of the level, and 0.
 void losses_of_pixels(const PictureColors& colors, size_t width, size_t height, Span<float> losses);
 
 }  // namespace v3dg

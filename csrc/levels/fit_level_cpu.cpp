@@ -1,5 +1,4 @@
-// Hands the groups of a level to threads. What is done for one group is in
-// fit_group/fit_group_cpu.cpp.
+// Distributes the groups of a level over threads. fit_group/fit_group_cpu.cpp fits one group.
 
 #include "base/threads.h"
 #include "levels/fit_level.h"
@@ -15,16 +14,16 @@
 
 namespace v3dg {
 
-// Bytes of target pictures that may wait at once.
+// The largest size of target pictures that wait at once, in bytes.
 constexpr size_t kTargetBytes = size_t(256) << 20;
 
 void fit_level(const FitConfig& config, Span<const FitGroup> groups, const FitTarget& target,
                const GaussianRows<float>& rows, float* error, FitProgress& progress) {
-    const size_t num_pictures =
-        config.num_views > 0 ? config.num_views + kHeldOutViews : 0;  // kept of a group
+    // Pictures that a group keeps.
+    const size_t num_pictures = config.num_views > 0 ? config.num_views + kHeldOutViews : 0;
     std::vector<FitImage> images;
-    // Pictures first, one a (group, view), so that the last levels, with a group or two, keep all
-    // threads busy.
+    // Pictures are drawn first, one a (group, view), so that the last levels, with a group or two,
+    // keep all threads busy.
     for (size_t first = 0; first < groups.size && !progress.cancel;) {
         size_t last = groups.size;
         if (num_pictures > 0) {

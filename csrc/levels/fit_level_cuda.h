@@ -1,5 +1,7 @@
 #pragma once
 
+// Fits all groups of a level on CUDA.
+
 #include "base/stream.h"
 #include "fit_group/fit_group.h"
 #include "math/gaussian.h"
@@ -16,10 +18,10 @@ struct DeviceFitTarget {
 
 // As v3dg::fit_level, with rows on the device and `error` on the host. Returns when all is done.
 //
-// Every run gives the same bytes. How many groups there are, and the device, decide how a group is
-// spread over blocks, which changes no order of additions; still, kernels for one and the other may
-// round differently, as the CPU does. Groups' pictures are drawn before they are fitted, as many
-// groups at once as there is memory for.
+// Every run gives the same bytes. The number of groups and the device decide how a group is spread
+// over blocks, which changes no order of additions; still, the kernels may round differently, as
+// the CPU does. Groups' pictures are drawn before they are fitted, for as many groups at once as
+// there is memory.
 void fit_level(const FitConfig& config, Span<const FitGroup> groups, const DeviceFitTarget& target,
                const GaussianRows<float>& rows, float* error, FitProgress& progress, Stream stream);
 

@@ -1,5 +1,7 @@
 #pragma once
 
+// Refines all levels of a bundle together on CUDA.
+
 #include "levels/fit_level_cuda.h"
 #include "levels/refine_cuts.h"
 
@@ -11,7 +13,7 @@ namespace cuda {
 void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const CutRows& levels,
                  const CutPictures& pictures, FitProgress& progress, Stream stream);
 
-// As v3dg::weigh_cuts, likewise.
+// As v3dg::weigh_cuts, with rows on the device and all else on the host. Returns when all is done.
 void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows,
                 const CutPictures& pictures, const SeenOfGaussians& seen, FitProgress& progress,
                 Stream stream);

@@ -1,6 +1,6 @@
 #pragma once
 
-// Balls and boxes, and how they grow.
+// Balls and boxes.
 
 #include <cmath>
 
@@ -8,20 +8,22 @@
 
 namespace v3dg {
 
-// Centre and radius.
+// A ball by its centre and radius.
 struct Ball {
     float x, y, z, radius;
 };
 
-// Lower and upper corner.
+// A box by its lower and upper corner.
 struct Box {
     float lo[3], hi[3];
 };
 
+// Returns a box that contains nothing.
 V3DG_HD inline Box no_box() {
     return {{INFINITY, INFINITY, INFINITY}, {-INFINITY, -INFINITY, -INFINITY}};
 }
 
+// Makes `box` contain `other`, too.
 V3DG_HD inline void grow(Box& box, const Box& other) {
     for (int a = 0; a < 3; ++a) {
         box.lo[a] = other.lo[a] < box.lo[a] ? other.lo[a] : box.lo[a];
@@ -29,7 +31,7 @@ V3DG_HD inline void grow(Box& box, const Box& other) {
     }
 }
 
-// The smallest float32 that is not below `value`.
+// Returns the smallest float32 that is not below `value`.
 V3DG_HD inline float round_up(double value) {
     const float nearest = static_cast<float>(value);
     return nearest < value ? nextafterf(nearest, INFINITY) : nearest;

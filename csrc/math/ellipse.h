@@ -1,7 +1,7 @@
 #pragma once
 
-// The ellipse that a gaussian covers on the image, and the rows of pixels that it meets. Its
-// falloff over a pixel is computed in rasterize/rasterize_math.h.
+// The ellipse that a gaussian covers on the image, and the rows of pixels that it meets.
+// rasterize/rasterize_math.h has its falloff over a pixel.
 
 #include "math/gaussian.h"
 
@@ -16,8 +16,8 @@ struct Ellipse {
     V depth;
 };
 
-// The first and the last pixel in x and in y that something covers; none where a first lies after
-// its last.
+// The first and the last pixel in x and in y that something covers. A box is empty where a first
+// pixel lies after its last.
 template <class I>
 struct PixelBox {
     I x0, x1, y0, y1;
@@ -25,18 +25,19 @@ struct PixelBox {
     V3DG_HD V3DG_INLINE auto holds_pixels() const { return (x0 <= x1) & (y0 <= y1); }
 };
 
-// An ellipse |L d|² = reach as a row of pixels meets it.
+// The ellipse |L d|² = reach, prepared for its extent in a row of pixels.
 template <class V>
 struct EllipseRows {
     V reach;
     V inverse;  // 1 / l11
-    V slope;    // of the line through the middles of the rows' extents
+    V slope;    // dx / dy of the line through the middles of the rows' extents
     V l22;
-    V rightmost;  // height above the centre at which it reaches farthest right; farthest left is
-                  // opposite
+    // The height above the centre at which the ellipse reaches farthest right. It reaches farthest
+    // left at the opposite height.
+    V rightmost;
 };
 
-// Of where alpha is 1/255 or more.
+// Returns the ellipse on which alpha is 1/255.
 template <class V>
 V3DG_HD V3DG_INLINE EllipseRows<V> ellipse_rows(V l11, V l12, V l22, V log2_opacity) {
     EllipseRows<V> e;
@@ -48,12 +49,12 @@ V3DG_HD V3DG_INLINE EllipseRows<V> ellipse_rows(V l11, V l12, V l22, V log2_opac
     return e;
 }
 
-// Where the ellipse may lie between the heights y0 <= y1: from x0 to x1, all from its centre, with
-// a margin, so that the blend step alone decides. Means nothing where the ellipse's box does not
-// meet the heights.
+// Sets x0 to x1, the extent that the ellipse may have between the heights y0 <= y1; all are
+// relative to its centre. There is a margin, so that the blend step alone decides. The result is
+// meaningless where the ellipse's box does not meet the heights.
 //
-// From this, four places find the cells of a grid that a gaussian may reach. They round differently
-// on purpose: each says why.
+// Four places find the cells of a grid that a gaussian may reach from this extent. They round
+// differently on purpose, and each says why.
 template <class V>
 V3DG_HD V3DG_INLINE void row_extent(const EllipseRows<V>& e, V y0, V y1, V& x0, V& x1) {
     const V a = min_of(max_of(e.rightmost, y0), y1), b = min_of(max_of(-e.rightmost, y0), y1);

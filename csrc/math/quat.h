@@ -1,15 +1,15 @@
 #pragma once
 
-// Rotations from quaternions (w, x, y, z) of any length, which is not part of what they say. A zero
-// quaternion is no rotation; one that is not finite gives a matrix that is not a number.
+// Rotations from quaternions (w, x, y, z) of any length, which does not change the rotation. A zero
+// quaternion is no rotation; one that is not finite gives a matrix of NaN.
 
 #include "math/lanes.h"
 
 namespace v3dg {
 
-// Squared lengths from `least2` to `most2` are computed without a product that vanishes or
-// overflows. A quaternion of any other length, down to the least denormal number, comes between
-// them when it is multiplied by `up` or `down`, powers of two that round nothing.
+// Squared lengths from `least2` to `most2` are computed without underflow or overflow. A quaternion
+// of any other length, down to the least denormal number, gets into this range when it is
+// multiplied by `up` or `down`, powers of two that round nothing.
 template <class T>
 struct QuatRange {
     static constexpr T least2 = T(0x1p-80), most2 = T(0x1p100), up = T(0x1p100), down = T(0x1p-100);
@@ -24,15 +24,15 @@ V3DG_HD V3DG_INLINE V length2_of_quat(const V q[4]) {
     return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
 }
 
-// Whether a squared length is outside of its range; one that is not a number is not.
+// Returns whether a squared length is outside of its range; NaN is not.
 template <class V>
 V3DG_HD V3DG_INLINE auto is_out_of_range(V length2) {
     using Range = QuatRange<Lane<V>>;
     return (length2 < all_lanes<V>(Range::least2)) | (length2 > all_lanes<V>(Range::most2));
 }
 
-// Multiplies a quaternion, where its squared length is outside of its range, by the power of two
-// that brings it inside, and returns that, elsewhere 1.
+// Multiplies a quaternion whose squared length is outside of its range by the power of two that
+// brings it inside. Returns that factor, or 1 for other quaternions.
 template <class V>
 V3DG_HD V3DG_INLINE V bring_into_range(V q[4]) {
     using Range = QuatRange<Lane<V>>;
@@ -52,8 +52,8 @@ V3DG_HD V3DG_INLINE void normalise_quat(T q[4]) {
     for (int k = 0; k < 4; ++k) q[k] = length2 == 0 ? static_cast<T>(k == 0) : q[k] / length;
 }
 
-// Rounds a quaternion to float32. One that float32 would not hold, or without squares, becomes of
-// length one.
+// Rounds a quaternion to float32. A quaternion that float32 cannot hold, or whose squared length it
+// cannot hold, is normalised first.
 V3DG_HD V3DG_INLINE void round_quat(double q[4], float out[4]) {
     const double length2 = length2_of_quat(q);
     const bool is_held = length2 >= QuatRange<float>::least2 && length2 <= QuatRange<float>::most2;
@@ -61,7 +61,7 @@ V3DG_HD V3DG_INLINE void round_quat(double q[4], float out[4]) {
     for (int k = 0; k < 4; ++k) out[k] = static_cast<float>(q[k]);
 }
 
-// Rotation matrix, row major, of a quaternion of which 2 over its squared length is `s`.
+// Computes the rotation matrix, row major, of a quaternion; `s` is 2 over its squared length.
 template <class V>
 V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V s, V r[9]) {
     const V w = q[0], x = q[1], y = q[2], z = q[3];
@@ -76,9 +76,10 @@ V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V s, V r[9]) {
     r[8] = 1 - s * (x * x + y * y);
 }
 
-// That of the normalised quaternion. Lengths out of range are rare, and what belongs to them is
-// computed again. The other lanes keep their first result: so its rounding depends neither on their
-// neighbours nor on how the compiler contracts it when it is moved behind the branch.
+// Computes the rotation matrix of the normalised quaternion. Lengths out of range are rare, and
+// their lanes are computed again. The other lanes keep their first result, so that its rounding
+// depends neither on their neighbours nor on how the compiler contracts the formula behind the
+// branch.
 template <class V>
 V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V r[9]) {
     const V n2 = length2_of_quat(q);
@@ -96,8 +97,8 @@ V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V r[9]) {
     }
 }
 
-// Gradient of a quaternion whose squared length is in range, through its normalisation, from that
-// of the rotation matrix.
+// Computes the gradient of a quaternion through its normalisation, from that of the rotation
+// matrix. Precondition: its squared length is in range.
 template <class V>
 V3DG_HD V3DG_INLINE void rotation_of_quat_in_range_vjp(const V q[4], V n2, const V g[9], V g_q[4]) {
     const V s = n2 > V{} ? 2 / n2 : V{};
@@ -118,7 +119,8 @@ V3DG_HD V3DG_INLINE void rotation_of_quat_in_range_vjp(const V q[4], V n2, const
     g_q[3] = d_z - along * z;
 }
 
-// The same for any length. It grows as one over the length, up to the largest number.
+// As rotation_of_quat_in_range_vjp(), for any length. The gradient grows as one over the length, up
+// to the largest number.
 template <class V>
 V3DG_HD V3DG_INLINE void rotation_of_quat_vjp(const V q[4], const V g[9], V g_q[4]) {
     const V n2 = length2_of_quat(q);

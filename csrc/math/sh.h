@@ -8,16 +8,15 @@
 namespace v3dg {
 
 constexpr int kMaxShDegree = 3, kMaxShBases = 16;
-constexpr double kShBase0 = 0.28209479177387814;  // the same in every direction
-// The degree of colours that are meant as they are, negative ones too: three numbers in place of
-// coefficients.
+constexpr double kShBase0 = 0.28209479177387814;  // equal in every direction
+// The degree of plain colours: three numbers, possibly negative, in place of coefficients.
 constexpr int kPlainColor = -1;
 
 V3DG_HD constexpr int num_sh_bases(int degree) {
     return degree == kPlainColor ? 1 : (degree + 1) * (degree + 1);
 }
 
-// Values of the bases in the unit direction (x, y, z).
+// Computes the bases in the unit direction (x, y, z).
 template <class V>
 V3DG_HD V3DG_INLINE void sh_bases(int degree, V x, V y, V z, V basis[kMaxShBases]) {
     using T = Lane<V>;
@@ -44,7 +43,7 @@ V3DG_HD V3DG_INLINE void sh_bases(int degree, V x, V y, V z, V basis[kMaxShBases
     basis[15] = T(-0.5900435899266435) * x * (xx - 3 * yy);
 }
 
-// Gradient of the unit direction from that of the bases.
+// Computes the gradient of the unit direction from that of the bases.
 template <class V>
 V3DG_HD V3DG_INLINE void sh_bases_vjp(int degree, V x, V y, V z, const V g[kMaxShBases],
                                       V g_dir[3]) {
@@ -80,10 +79,10 @@ V3DG_HD V3DG_INLINE void sh_bases_vjp(int degree, V x, V y, V z, const V g[kMaxS
     g_dir[2] = gz;
 }
 
-// Colour in a direction of any length, from the eye to the gaussian in model space; what is not
-// finite is 0, so that it stays off pixels on which the gaussian has no weight. `sh(k)` is the k-th
-// coefficient of one gaussian (or of one a lane), base by base, three channels each; it is asked
-// for each once, in this order.
+// Computes the colour in a direction of any length, from the eye to the gaussian in model space. A
+// channel that is not finite becomes 0, so that it does not spread to pixels on which the gaussian
+// has no weight. `sh(k)` returns the k-th coefficient of one gaussian (or of one a lane), base by
+// base, three channels each; each is requested once, in this order.
 template <class V, class Coefficient>
 V3DG_HD V3DG_INLINE void color_of_coefficients(int degree, const V direction[3],
                                                const Coefficient& sh, V color[3]) {
@@ -114,7 +113,7 @@ V3DG_HD V3DG_INLINE void color_of_coefficients(int degree, const V direction[3],
     }
 }
 
-// The same of coefficients in memory.
+// As color_of_coefficients(), for coefficients in memory.
 template <class V>
 V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V direction[3], const V* sh, V color[3]) {
     color_of_coefficients(degree, direction, [&](int k) { return sh[k]; }, color);

@@ -1,8 +1,8 @@
 #pragma once
 
-// Poses of instances, and a camera in the world as one instance sees it: composed in double
-// precision, then rounded. Decisions depend on it, so whoever calls it is compiled without
-// contraction.
+// Poses of instances, and a camera in the frame of an instance: composed in double precision, then
+// rounded. Decisions depend on the results, so sources that call these functions are compiled
+// without contraction.
 
 #include <cfloat>
 
@@ -18,8 +18,8 @@ struct Pose {
     double scale;
 };
 
-// Whether a pose is one: what is not finite, of no size, or turned by a quaternion of zeros, is not
-// drawn.
+// Returns whether a pose is valid. Instances whose pose is not finite, has no size or has a zero
+// quaternion are not drawn.
 V3DG_HD inline bool is_placed(const Pose& pose) {
     double sum = pose.scale;
     for (int k = 0; k < 3; ++k) sum += fabs(pose.position[k]);
@@ -56,13 +56,13 @@ V3DG_HD inline InstanceAxes axes_of_instance(const Camera& camera, const Pose& p
             out.axes[3 * row + k] = axis;
         }
         out.origin[row] = origin * inverse_scale;
-        // Any eye gives an exact cut as long as squares of distances stay finite.
+        // The cut is exact for any eye as long as squares of distances stay finite.
         out.eye[row] = min_of(max_of(eye * inverse_scale, -1e18), 1e18);
     }
     return out;
 }
 
-// What projection needs of it.
+// Returns the transform that projection needs.
 V3DG_HD inline ModelView<float> model_view_from_instance(const InstanceAxes& in, const Pose& pose) {
     double linear[9], translation[3];
     for (int k = 0; k < 9; ++k) linear[k] = pose.scale * in.axes[k];

@@ -1,6 +1,6 @@
 #pragma once
 
-// What both halves need of the loss, and SSIM of whole pictures: a pixel at a time.
+// SSIM of a pixel and the L1 loss, for both halves and for whole pictures.
 
 #include "math/lanes.h"
 
@@ -8,7 +8,7 @@ namespace v3dg {
 
 constexpr int kSsimRadius = 5;
 
-// Weight of the pixel `offset` away in the normalised Gaussian window of 11, sigma 1.5.
+// Returns the weight of the pixel `offset` away in the normalised Gaussian window of 11, sigma 1.5.
 template <class T>
 V3DG_HD V3DG_INLINE T ssim_weight(int offset) {
     const T weight[kSsimRadius + 1] = {T(0.2660117248617943),   T(0.21300553771125366),
@@ -17,14 +17,14 @@ V3DG_HD V3DG_INLINE T ssim_weight(int offset) {
     return weight[offset < 0 ? -offset : offset];
 }
 
-// The window's sums around a pixel over a picture x and its target y.
+// The window's sums around a pixel, over a picture x and its target y.
 template <class T>
 struct SsimSums {
     T x, y, xx, yy, xy;
 };
 
-// Structural similarity (Wang et al. 2004, constants 0.01² and 0.03²), and its derivatives by the
-// sums of x, x² and xy.
+// Structural similarity (Wang et al. 2004, constants 0.01² and 0.03²), and its derivatives with
+// respect to the sums of x, x² and xy.
 template <class T>
 struct Ssim {
     T value, d_x, d_xx, d_xy;
@@ -44,7 +44,7 @@ V3DG_HD inline Ssim<T> ssim_of(const SsimSums<T>& s) {
     return out;
 }
 
-// Gradient of weight * |difference|.
+// Returns the gradient of weight * |difference|.
 template <class V>
 V3DG_HD V3DG_INLINE V l1_vjp(V difference, Lane<V> weight) {
     return difference > V{} ? all_lanes<V>(weight)

@@ -11,11 +11,12 @@
 
 namespace v3dg {
 
+// The falloff of a gaussian at a pixel.
 template <class V>
 struct Falloff {
-    V dx, dy;    // px from the centre
+    V dx, dy;    // px, relative to the centre
     V t1, t2;    // L d
-    V exponent;  // log2 of alpha before the cut
+    V exponent;  // log2 of alpha before it is limited
 };
 
 template <class V>
@@ -25,18 +26,18 @@ V3DG_HD V3DG_INLINE Falloff<V> falloff_at(V x, V y, V u, V v, V l11, V l12, V l2
     f.dy = y - v;
     f.t1 = l11 * f.dx + l12 * f.dy;
     f.t2 = l22 * f.dy;
-    f.exponent =
-        log2_opacity - f.t2 * f.t2 - f.t1 * f.t1;  // pixels of a row share all but the last term
+    // Pixels of a row share all but the last term.
+    f.exponent = log2_opacity - f.t2 * f.t2 - f.t1 * f.t1;
     return f;
 }
 
-// Whether the gaussian counts at all there.
+// Returns whether the gaussian contributes to the pixel at all.
 template <class V>
 V3DG_HD V3DG_INLINE auto contributes(const Falloff<V>& f) {
     return f.exponent >= all_lanes<V>(Lane<V>(kLog2MinAlpha));
 }
 
-// Of a gaussian that contributes.
+// Returns alpha. Precondition: contributes(f).
 template <class V>
 V3DG_HD V3DG_INLINE V capped_alpha_of(const Falloff<V>& f) {
     return min_of(exp2_in_range(f.exponent), all_lanes<V>(Lane<V>(kMaxAlpha)));
@@ -52,13 +53,13 @@ template <class V>
 V3DG_HD V3DG_INLINE V transmittance_behind(V alpha, V t) {
 #ifdef __CUDA_ARCH__
     return fma(-alpha, t,
-               t);  // one operation, which is not left to the compiler: t - (alpha t) cancels
+               t);  // an explicit fma, because t - (alpha t) cancels
 #else
     return t * (1 - alpha);
 #endif
 }
 
-// Blends over a pixel with transmittance `t`, updates it and returns the gaussian's weight.
+// Blend over a pixel with transmittance `t`, update it, and return the gaussian's weight.
 template <class V>
 V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t, StopsBehind<Lane<V>> stop) {
     const V next = transmittance_behind(alpha, t);
@@ -77,8 +78,8 @@ V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t, StopsBefore = {}) {
     return weight;
 }
 
-// Of a pixel that was blended to the end: how much light reaches the background, and what its
-// colour is multiplied by.
+// The result of a pixel that was blended to the end: the transmittance to the background, and the
+// factor of its colour.
 template <class T>
 struct Finished {
     T transmittance, gain;
@@ -90,8 +91,8 @@ V3DG_HD V3DG_INLINE Finished<T> finished(T t, float min_transmittance) {
     return {has_stopped ? -t : t, T(1)};
 }
 
-// blend_weight() for several gaussians, one behind the other; `before` is the transmittance at
-// each. Most pixels do not stop among them, and then the product of all tells that.
+// As blend_weight(), for several gaussians, front to back; `before` is the transmittance before
+// each. Most pixels do not stop among them, which the product of all tells.
 template <int kCount, class T>
 V3DG_HD V3DG_INLINE void blend_weights(const T (&alpha)[kCount], T& t, T (&before)[kCount],
                                        T (&weight)[kCount]) {
@@ -111,26 +112,26 @@ V3DG_HD V3DG_INLINE void blend_weights(const T (&alpha)[kCount], T& t, T (&befor
     }
 }
 
-// Gradient by the exponent of a gaussian that was blended with `alpha` and `weight` where the
-// transmittance was `before`. `by_weight` is the gradient by its weight, `behind` what all
-// gaussians behind it give: the sum of their weights times the gradients by them.
+// Returns the gradient by the exponent of a gaussian that was blended with `alpha` and `weight`
+// where the transmittance was `before`. `by_weight` is the gradient by its weight; `behind` is the
+// sum over all gaussians behind it of their weights times the gradients by them.
 template <class V>
 V3DG_HD V3DG_INLINE V exponent_vjp(V alpha, V before, V weight, V by_weight, V behind) {
-    // alpha takes its weight and dims all that is behind.
+    // alpha adds to the gaussian's weight and attenuates everything behind it.
     const V d_alpha = before * by_weight - quotient_of(behind, 1 - alpha);
     const auto moves = (weight > V{}) & (alpha < all_lanes<V>(Lane<V>(kMaxAlpha)));
     return moves ? Lane<V>(kLn2) * alpha * d_alpha : V{};
 }
 
-// Sums over pixels of the gradients by what the exponent is made of.
+// Sums over pixels of the gradients by the terms of the exponent.
 template <class T>
 struct FalloffSums {
     T exponent, t1, t2;
     T t1_dx, t1_dy, t2_dy;  // gradient by t1 times dx, ...
 };
 
-// The same over the pixels of one row, which have dy and t2 in common: of the gradient by the
-// exponent, and of it times t1 and t1 dx.
+// Sums over the pixels of one row, which share dy and t2: of the gradient by the exponent, and of
+// its products with t1 and t1 dx.
 template <class T>
 struct RowSums {
     T exponent, t1, t1_dx;
@@ -142,8 +143,8 @@ struct RowSums {
         t1_dx += d_t1 * f.dx;
     }
 
-    // `f` is that of any pixel of the row. The exponent contains -(t1² + t2²), hence the factors
-    // -2.
+    // Returns the row's sums for falloff_vjp(); `f` is the falloff at any pixel of the row. The
+    // exponent contains -(t1² + t2²), hence the factors -2.
     V3DG_HD V3DG_INLINE FalloffSums<T> of_falloff(const Falloff<T>& f) const {
         FalloffSums<T> sums;
         sums.exponent = exponent;
@@ -156,8 +157,8 @@ struct RowSums {
     }
 };
 
-// What a pixel adds to the size of the gradient of the centre: both parts of falloff_vjp(), without
-// sign.
+// Returns the contribution of a pixel to the size of the gradient by the centre: the absolute
+// values of both components of falloff_vjp().
 template <class V>
 V3DG_HD V3DG_INLINE CenterSize<V> size_of_center_vjp(V l11, V l12, V l22, const Falloff<V>& f,
                                                      V d_exponent) {
@@ -165,7 +166,8 @@ V3DG_HD V3DG_INLINE CenterSize<V> size_of_center_vjp(V l11, V l12, V l22, const 
     return {max_of(d_u, -d_u), max_of(d_v, -d_v)};
 }
 
-// Gradient of the ellipse: t1 = l11 dx + l12 dy and t2 = l22 dy, with dx = x - u and dy = y - v.
+// Returns the gradient of the ellipse, where t1 = l11 dx + l12 dy and t2 = l22 dy, with dx = x - u
+// and dy = y - v.
 template <class T>
 V3DG_HD V3DG_INLINE Ellipse<T> falloff_vjp(T l11, T l12, T l22, const FalloffSums<T>& d) {
     Ellipse<T> out;
@@ -179,9 +181,9 @@ V3DG_HD V3DG_INLINE Ellipse<T> falloff_vjp(T l11, T l12, T l22, const FalloffSum
     return out;
 }
 
-// blend_weight() for a single pixel that has not stopped: calls add(weight) if there is one.
-// Returns whether the pixel goes on; `t` stays positive. As predicates these conditions cost next
-// to nothing on a GPU, where selecting between numbers is an operation each.
+// As blend_weight(), for a single pixel that has not stopped: they call add(weight) if there is a
+// weight, and return whether the pixel goes on; `t` stays positive. As predicates these conditions
+// are nearly free on a GPU, where selecting between numbers is an instruction each.
 template <class Add>
 V3DG_HD V3DG_INLINE bool blend_live(const Falloff<float>& f, float& t, StopsBehind<float> stop,
                                     const Add& add) {
@@ -205,26 +207,26 @@ V3DG_HD V3DG_INLINE bool blend_live(const Falloff<float>& f, float& t, StopsBefo
     return !is_last;
 }
 
-// A window of 8 x 4 cells, each of kPixels side by side: the cells in which a gaussian may reach a
-// pixel, a bit each, row by row. (u, v) is its centre from that of the first pixel. Both axes have
-// a margin, so that the blend step alone decides.
+// Returns a bit for each cell of a window of 8 x 4, each of kPixels side by side, in which a
+// gaussian may reach a pixel, row by row. (u, v) is its centre relative to that of the first pixel.
+// Both axes have a margin, so that the blend step alone decides.
 template <int kPixels>
 V3DG_HD inline uint32_t reached_cells(float u, float v, float l11, float l12, float l22,
                                       float log2_opacity) {
-    // In x, 1 is the width of the window, so that saturation cuts off what lies outside.
+    // In x, 1 is the width of the window, so that saturation clips to it.
     constexpr float kScale = 0.125f / kPixels, kMargin = 1e-2f, kReachMargin = 1e-5f;
     const float reach = log2_opacity - static_cast<float>(kLog2MinAlpha) + kReachMargin;
     const float inverse = kScale * rough_reciprocal(l11), slope = -l12 * inverse,
                 wider = inverse * (1 + 2e-3f);
-    // The first cell is the first of which the last pixel is not before the ellipse, and the end is
-    // behind the last of which the first pixel is not behind it. Half a cell is added, as both are
+    // The first cell is the first one whose last pixel is not before the ellipse; the end is after
+    // the last one whose first pixel is not behind it. Half a cell is added, because both are
     // rounded to integers.
     const float first_u = kScale * u + kScale * (1 - 0.5f * kPixels - kMargin),
                 end_u = kScale * u + kScale * (0.5f * kPixels + kMargin);
     uint32_t cells = 0;
     for (int row = 0; row < 4; ++row) {
         const float y = static_cast<float>(row) - v, t = l22 * y;
-        // Where the row is missed it is not a number, which saturates to 0.
+        // In rows that the ellipse misses it is NaN, which saturates to 0.
         const float half = rough_sqrt(reach - t * t) * wider;
         const float first = saturated_fma(slope, y, first_u - half);
         const float end = fmaxf(saturated_fma(slope, y, end_u + half), first);

@@ -1,7 +1,7 @@
 #pragma once
 
-// Blending one tile, front to back: a batch of records is sorted into the blocks that they may
-// change, then each block takes its own, with its pixels in registers.
+// Blends one tile, front to back: a batch of records is sorted into the blocks that they may
+// change, then each block blends its own, with its pixels in registers.
 
 #include <cstddef>
 #include <cstring>
@@ -11,13 +11,15 @@
 namespace v3dg {
 namespace V3DG_ISA {
 
-// So many that a block finds several of its own, so few that all stay in the first-level cache.
+// A batch is so large that a block finds several records of its own, and so small that all stay in
+// the first-level cache.
 constexpr int kBatchSize = 256;
-// And so few blocks of theirs in all, that where records are large, not many are taken that turn
-// out to be hidden.
+// The records of a batch reach few blocks in all, so that where records are large, few are taken
+// that turn out to be hidden.
 constexpr int kBatchBlocks = 1024;
 
-// What blending reads of a record, as it begins; its centre is in px from the tile's corner.
+// The part of a record that blending reads, which is its first part; its centre is in px from the
+// tile's corner.
 template <class T>
 struct BatchRecord {
     T u, v, l11, l12, l22, log2_opacity;
@@ -34,8 +36,8 @@ struct BatchRecord {
     }
 };
 
-// Into the second-level cache, which waits for more lines at once than the first. A record may lie
-// on two.
+// Prefetches a record into the second-level cache, which supports more outstanding lines than the
+// first. A record may lie on two lines.
 template <class T>
 V3DG_INLINE void prefetch_record(const Record<T>* record) {
     constexpr int kRead = 0, kSecondLevel = 2;
@@ -43,12 +45,12 @@ V3DG_INLINE void prefetch_record(const Record<T>* record) {
     __builtin_prefetch(reinterpret_cast<const char*>(record + 1) - 1, kRead, kSecondLevel);
 }
 
-// Records of a tile, front to back, and places among them by block.
+// Records of a tile, front to back, and their places by block.
 template <class T>
 struct Batch {
     int size;
-    const Record<T>* source[1 + kBatchSize];  // from 1 on
-    uint64_t blocks[kBatchSize];              // that a record may change
+    const Record<T>* source[1 + kBatchSize];  // valid from 1 on
+    uint64_t blocks[kBatchSize];              // blocks that each record may change
     BatchRecord<T> record[kBatchSize];
     uint16_t count[kTileBlocks * kTileBlocks];
     uint8_t place[kTileBlocks * kTileBlocks][kBatchSize];
@@ -61,14 +63,14 @@ struct Listed {
     uint64_t blocks;
 };
 
-// Takes records from the i-th on until the batch is full: those whose boxes meet live blocks, and
-// only those are fetched from memory. Whether one does is as good as random, so there is no branch
-// on it.
+// Takes records from the i-th on until the batch is full. It takes those whose boxes meet live
+// blocks, and only those are fetched from memory. It is branch-free, because the outcome is
+// unpredictable.
 template <class T, class ListedAt>
 V3DG_INLINE size_t take_live(size_t i, size_t count, uint64_t alive, const ListedAt& listed_at,
                              Batch<T>& batch) {
     int size = 0, num_blocks = 0;
-    batch.source[0] = listed_at(i).record;  // to be fetched while there is none
+    batch.source[0] = listed_at(i).record;  // prefetched while the batch is empty
     for (; i < count && size < kBatchSize && num_blocks < kBatchBlocks; ++i) {
         const Listed<T> g = listed_at(i);
         const uint64_t blocks = g.blocks & alive;
@@ -82,7 +84,8 @@ V3DG_INLINE size_t take_live(size_t i, size_t count, uint64_t alive, const Liste
     return i;
 }
 
-// Leaves of each record's blocks what its ellipse reaches, and sorts the records into the blocks.
+// Restricts each record's blocks to those that its ellipse reaches, and sorts the records into the
+// blocks.
 template <class T>
 V3DG_INLINE void sort_into_blocks(int left, int top, Batch<T>& batch) {
     uint8_t many[kBatchSize];
@@ -128,7 +131,7 @@ V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels
             const Falloff<V> f = falloff_at(
                 x, y, all_lanes<V>(g.u) - block_u, all_lanes<V>(g.v) - block_v, all_lanes<V>(g.l11),
                 all_lanes<V>(g.l12), all_lanes<V>(g.l22), all_lanes<V>(g.log2_opacity));
-            // Where a vector is a block, few are not reached.
+            // Where a vector spans a block, few vectors are missed, so the test does not pay.
             if (kLanes<T> < kBlockPixels && bits_of(contributes(f)) == 0) continue;
             const V weight = blend_weight(alpha_of(f), t, stop);
             red += weight * all_lanes<V>(g.color[0]);
@@ -148,8 +151,8 @@ V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels
     return goes_on;
 }
 
-// Blends `count` records front to back over a tile, which starts empty. listed_at(i) is one of
-// them.
+// Blends `count` records front to back over a tile, which is cleared first. listed_at(i) returns
+// record i.
 template <class T, Extra kExtra, class Stop, class ListedAt>
 V3DG_INLINE void blend_tile(size_t count, int left, int top, const Window& window, Stop stop,
                             TilePlanes<T>& tile, const ListedAt& listed_at) {

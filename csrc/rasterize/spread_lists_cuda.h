@@ -1,15 +1,17 @@
 #pragma once
 
+// Plans of tiles, and long lists in the order of buckets.
+
 #include "frame/tile_list.h"
 
 namespace v3dg {
 namespace cuda {
 
 // Plans the blending of each tile, by `num_places` blocks at a time, and spreads each list that is
-// longer than a piece over buckets of depth, as its plan tells.
+// longer than a piece over buckets of depth, as its plan says.
 void spread_lists(const FrameLists& lists, uint32_t num_places, cudaStream_t stream);
 
-// Plans that so many places lead to at most where tiles may be blended in parts.
+// Returns the largest number of plans with this many places, where tiles may be blended in parts.
 uint32_t most_plans(uint32_t num_tiles, uint32_t num_places);
 
 }  // namespace cuda

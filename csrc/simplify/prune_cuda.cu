@@ -1,5 +1,5 @@
-// Pruning: a block ranks the gaussians of one cell, of which the median split has eight a group;
-// the rows that are kept are then gathered in ascending order.
+// Each block ranks the gaussians of one cell, of which the median split makes eight a group; the
+// rows that are kept are then compacted in ascending order.
 
 #include <cub/device/device_select.cuh>
 
@@ -37,7 +37,7 @@ __global__ void keep_kernel(const Cell* cells, const int64_t* order, const doubl
     for (int64_t i = cell.first + threadIdx.x; i < cell.last; i += kBlockSize) {
         const double score = score_at[i];
         int64_t rank = 0;
-        // Rows ascend within a cell, so of equals the one that comes first has the lower index.
+        // Rows ascend within a cell, so of equal scores the first has the lower index.
         for (int64_t k = cell.first; k < cell.last; ++k) {
             const double other = score_at[k];
             rank += other > score || (other == score && k < i);

@@ -1,3 +1,5 @@
+// Each thread prunes or merges one group at a time.
+
 #include "simplify/simplify.h"
 
 #include <algorithm>
@@ -36,10 +38,10 @@ void cpu::prune(const GaussianRows<const float>& in, Span<const int64_t> in_offs
 
 namespace {
 
-// Merges rows first .. first + count to `wanted` of them, which are written from row `to` on.
+// Merges rows first .. first + count to `wanted` rows, which are written from row `to` on.
 void merge_segment(const GaussianRows<const float>& in, int64_t first, int count, int64_t wanted,
                    const GaussianRows<float>& out, int64_t to) {
-    // A node is known by the first row it holds; its other rows follow in a list.
+    // A node is identified by its first row; its other rows follow in a linked list.
     std::vector<MergeNode> nodes(count);
     std::vector<double> row_weight(count);
     std::vector<int> alive(count), next(count, -1), last(count);
@@ -56,7 +58,7 @@ void merge_segment(const GaussianRows<const float>& in, int64_t first, int count
     }
     const double inverse_spacing2 = inverse_spacing2_of(low, high, wanted);
 
-    // Rounds: each node finds its cheapest partner, and the cheapest disjoint pairs join.
+    // In each round every node finds its cheapest partner, and the cheapest disjoint pairs join.
     std::vector<MergeFeature> features(count);
     std::vector<MergePair> pairs;
     std::vector<char> is_used;

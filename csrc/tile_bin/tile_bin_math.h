@@ -1,20 +1,20 @@
 #pragma once
 
-// Which tiles in a row of tiles a record may touch.
+// The tiles in a row of tiles that a record may touch.
 
 #include "frame/tile_list.h"
 
 namespace v3dg {
 namespace cuda {
 
-// The tiles in one row of tiles that a record's ellipse may reach: columns [first, first + count).
+// The columns [first, first + count) of one row of tiles that a record's ellipse may reach.
 struct TileRun {
     int row, first, count;
 };
 
-// `row` counts from the record's first row of tiles. Rounds to pixels without care for their
-// centres, and so that NaN keeps the box: the same comparisons count and scatter, and a tile too
-// many costs an entry only.
+// Returns the tiles of one row, which counts from the record's first row of tiles. Rounding ignores
+// pixel centres, and NaN keeps the whole box: the same comparisons count and scatter, and a
+// superfluous tile only costs an entry.
 V3DG_HD inline TileRun tile_run(const Record<float>& r, int row) {
     row += r.y0 / kFrameTileHeight;
     const int top = max_of(static_cast<int>(r.y0), row * kFrameTileHeight);
@@ -24,7 +24,7 @@ V3DG_HD inline TileRun tile_run(const Record<float>& r, int row) {
     float low, high;
     row_extent(ellipse, static_cast<float>(top) + 0.5f - r.v,
                static_cast<float>(bottom) + 0.5f - r.v, low, high);
-    // Pixels whose centres lie in between, cut to the box.
+    // These are the pixels whose centres lie in between, clipped to the box.
     const float x0 = r.u + low - 0.5f, x1 = r.u + high - 0.5f;
     const int first = x0 > static_cast<float>(r.x0) ? static_cast<int>(min_of(x0, 65536.0f)) : r.x0;
     const int last = x1 < static_cast<float>(r.x1) ? static_cast<int>(max_of(x1, -1.0f)) : r.x1;

@@ -1,4 +1,5 @@
-// Coverage-guided fuzzer of the .ply reader, for libFuzzer (tests/fuzz/run builds and starts it).
+// Coverage-guided fuzzer of the .ply reader, for libFuzzer (tests/fuzz/run.py builds and starts
+// it).
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
@@ -23,7 +24,7 @@ bool is_printable(const std::string& text) {
     return !text.empty();
 }
 
-// Means, quaternions and so on of gaussians first .. last.
+// Reads gaussians first .. last: means, quaternions and so on.
 std::vector<float> read(const v3dg::PlyFile& ply, size_t first, size_t last,
                         v3dg::PlyPlace& place) {
     const size_t n = last - first;
@@ -44,11 +45,11 @@ void read(const char* path, size_t file_bytes) {
     const v3dg::PlyFile ply = v3dg::open_ply(path);
     const size_t n = ply.num_gaussians();
     const size_t floats = n * (11 + 3 * ply.num_sh);
-    // A number takes at least one byte in the file, and four in memory.
+    // A number occupies at least one byte in the file, and four in memory.
     require(n == 0 || (floats / n == 11 + 3 * ply.num_sh && floats <= file_bytes));
     v3dg::PlyPlace end = ply.begin(), start = ply.begin(), middle = ply.begin();
     read(ply, 0, n, end);
-    // The second half is the same whether the first was read before it or skipped.
+    // The second half must be the same whether the first was read before it or skipped.
     read(ply, 0, n / 2, middle);
     const std::vector<float> after = read(ply, n / 2, n, middle),
                              skipped = read(ply, n / 2, n, start);
@@ -61,7 +62,7 @@ void read(const char* path, size_t file_bytes) {
 }  // namespace
 
 extern "C" int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
-    // A file in memory, emptied and filled again each time.
+    // The file is in memory, and is emptied and filled again each time.
     static const int file = memfd_create("fuzz_ply", 0);
     static const std::string path = "/proc/self/fd/" + std::to_string(file);
     require(file >= 0 && ftruncate(file, 0) == 0);
