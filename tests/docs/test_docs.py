@@ -211,6 +211,14 @@ def test_links_lead_somewhere(page):
             assert (ROOT / page).parent.joinpath(target).exists(), f"{page}: {target}"
 
 
+def test_every_experiment_is_in_the_index():
+    """They are not in the navigation, where one that nothing links would be missed."""
+    folder = ROOT / "docs" / "notes" / "experiments"
+    index = (folder / "index.md").read_text(encoding="utf-8")
+    pages = {path.name for path in folder.glob("*.md")} - {"index.md"}
+    assert pages == set(re.findall(r"\]\((\d{4}-[^)#]+\.md)\)", index))
+
+
 def test_notebook_runs_and_keeps_no_output(tmp_path, monkeypatch):
     notebook = json.loads((ROOT / "examples" / "first_steps.ipynb").read_text(encoding="utf-8"))
     monkeypatch.chdir(tmp_path)
