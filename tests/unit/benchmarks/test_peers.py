@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 import v3dg
-from benchmarks.studies import peers, peers_draw, peers_report, peers_scenes
+from benchmarks.studies.peers import draw as peers_draw
+from benchmarks.studies.peers import measure as peers
+from benchmarks.studies.peers import report as peers_report
+from benchmarks.studies.peers import scenes as peers_scenes
 from benchmarks.worlds.procedural import make_person
 from reference import project
 
