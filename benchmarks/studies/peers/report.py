@@ -158,7 +158,9 @@ def failure_text(row: Row) -> str:
     place = [
         str(row[name]) for name in ("renderer", "scene", "view", "width", "part") if name in row
     ]
-    return f"{row['job']}{': ' if place else ''}{', '.join(place)}: {row['error'].splitlines()[0][:200]}"
+    colon = ": " if place else ""
+    reason = row["error"].splitlines()[0][:200]
+    return f"{row['job']}{colon}{', '.join(place)}: {reason}"
 
 
 def main(report: Report) -> None:

@@ -20,11 +20,12 @@ torch = pytest.importorskip("torch")
 GSPLAT = """
 import torch, v3dg
 
-def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, *, near_plane, eps2d,
-                  sh_degree, packed):
+def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, *,
+                  near_plane, eps2d, sh_degree, packed):
     sh = colors if sh_degree is not None else (colors[:, None] - 0.5) / v3dg._core.sh_base0
     camera = v3dg.Camera(viewmats[0].numpy(), Ks[0].numpy(), width, height, near_plane)
-    image = v3dg.rasterize(v3dg.Gaussians(means, quats, scales, opacities, sh), camera, filter_px2=eps2d)
+    gaussians = v3dg.Gaussians(means, quats, scales, opacities, sh)
+    image = v3dg.rasterize(gaussians, camera, filter_px2=eps2d)
     return image.color[None], image.alpha[None, ..., None], {}
 """
 # Draws a picture that is wrong by a tenth everywhere.
