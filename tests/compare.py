@@ -51,8 +51,11 @@ class GradientBound:
 PROJECTION_DOUBLE = Bound(
     relative=1e-7,
     absolute=1e-8,
-    reason="float64 on both sides. gsplat takes the determinant as a difference, which for aspect 30 (more "
-    "after foreshortening) loses five of its sixteen digits; gradients square that loss.",
+    reason=(
+        "float64 on both sides. gsplat takes the determinant as a difference, which for aspect "
+        "30 (more after foreshortening) loses five of its sixteen digits; gradients square that"
+        " loss."
+    ),
 )
 PICTURE_DOUBLE = PictureBound(
     absolute=1e-9,
@@ -60,7 +63,10 @@ PICTURE_DOUBLE = PictureBound(
     relative_depth=1e-9,
     band=1e-8,
     share=0.0,
-    reason="float64 on both sides, the order of operations differs; needles of aspect 1e3 lose six digits.",
+    reason=(
+        "float64 on both sides, the order of operations differs; needles of aspect 1e3 lose six"
+        " digits."
+    ),
 )
 PICTURE_FLOAT = PictureBound(
     absolute=1e-4,
@@ -68,9 +74,12 @@ PICTURE_FLOAT = PictureBound(
     relative_depth=1e-4,
     band=1e-4,
     share=0.01,
-    reason="float32 against float64: a mean is off by 1e-6 px to 1e-5 px, which moves the falloff of the "
-    "narrowest gaussians (0.1 px) by 3 sigma * 1e-5 / 0.1. Depth is divided by an alpha of 1/255, "
-    "itself 1 minus a number that is rounded to 6e-8. Measured: 2e-5, 3e-7, 3e-5.",
+    reason=(
+        "float32 against float64: a mean is off by 1e-6 px to 1e-5 px, which moves the falloff "
+        "of the narrowest gaussians (0.1 px) by 3 sigma * 1e-5 / 0.1. Depth is divided by an "
+        "alpha of 1/255, itself 1 minus a number that is rounded to 6e-8. Measured: 2e-5, 3e-7,"
+        " 3e-5."
+    ),
 )
 NEEDLES_FLOAT = PictureBound(
     absolute=1e-3,
@@ -78,8 +87,10 @@ NEEDLES_FLOAT = PictureBound(
     relative_depth=1e-3,
     band=1e-3,
     share=0.01,
-    reason="As PICTURE_FLOAT, with gaussians of aspect 1e3 that are 0.005 px wide without a filter. "
-    "Measured: 3e-4, 7e-7, 4e-4.",
+    reason=(
+        "As PICTURE_FLOAT, with gaussians of aspect 1e3 that are 0.005 px wide without a "
+        "filter. Measured: 3e-4, 7e-7, 4e-4."
+    ),
 )
 FAR_ASIDE_FLOAT = PictureBound(
     absolute=2e-3,
@@ -87,8 +98,11 @@ FAR_ASIDE_FLOAT = PictureBound(
     relative_depth=2e-3,
     band=1e-3,
     share=0.01,
-    reason="A mean at 4e3 px from the principal point is off by an ulp or two of that, 5e-4 px, which moves "
-    "the falloff of gaussians of 0.5 px (the filter's) by as much. Measured: 1e-3, 4e-6, 9e-4.",
+    reason=(
+        "A mean at 4e3 px from the principal point is off by an ulp or two of that, 5e-4 px, "
+        "which moves the falloff of gaussians of 0.5 px (the filter's) by as much. Measured: "
+        "1e-3, 4e-6, 9e-4."
+    ),
 )
 CUTOFF_FLOAT = PictureBound(
     absolute=1e-4,
@@ -101,12 +115,17 @@ CUTOFF_FLOAT = PictureBound(
 GRADIENT_DOUBLE = Bound(
     relative=1e-7,
     absolute=1e-9,
-    reason="The same derivatives in float64 by another route; absolute where terms of order 1 cancel.",
+    reason=(
+        "The same derivatives in float64 by another route; absolute where terms of order 1 cancel."
+    ),
 )
 FINITE_DIFFERENCE = Bound(
     relative=2e-6,
     absolute=1e-8,
-    reason="Central differences of step 1e-6 in float64: rounding leaves 1e-16 / 1e-6 of the picture's sum.",
+    reason=(
+        "Central differences of step 1e-6 in float64: rounding leaves 1e-16 / 1e-6 of the "
+        "picture's sum."
+    ),
 )
 GRADIENT_FLOAT = GradientBound(
     relative_l2=2e-3,
@@ -116,7 +135,9 @@ GRADIENT_FLOAT = GradientBound(
 GRADIENT_NEEDLES = GradientBound(
     relative_l2=1e-2,
     cosine=0.9999,
-    reason="As GRADIENT_FLOAT; needles thinner than the rounding of their place cross other pixels.",
+    reason=(
+        "As GRADIENT_FLOAT; needles thinner than the rounding of their place cross other pixels."
+    ),
 )
 
 GRADIENT_GSPLAT = GradientBound(
@@ -135,19 +156,26 @@ BACKGROUND_GRADIENT = Bound(
 MERGE_FLOAT = Bound(
     relative=2e-5,
     absolute=3e-6,
-    reason="Computed in float64 from and to float32; squares of scales and rotations lose a few ulps. "
-    "Absolute for what is compared in units of the largest.",
+    reason=(
+        "Computed in float64 from and to float32; squares of scales and rotations lose a few "
+        "ulps. Absolute for what is compared in units of the largest."
+    ),
 )
 FIT_FLOAT = Bound(
     relative=2e-3,
     absolute=1e-5,
-    reason="Tens of steps of float32 gradients against float64; Adam divides by their own size, so their "
-    "relative errors stay.",
+    reason=(
+        "Tens of steps of float32 gradients against float64; Adam divides by their own size, so"
+        " their relative errors stay."
+    ),
 )
 DSSIM_FLOAT = Bound(
     relative=2e-3,
     absolute=2e-5,
-    reason="Variances are differences of float32 blurs of squares, 6e-8 against the constant 0.03^2 = 9e-4.",
+    reason=(
+        "Variances are differences of float32 blurs of squares, 6e-8 against the constant "
+        "0.03^2 = 9e-4."
+    ),
 )
 
 

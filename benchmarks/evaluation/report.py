@@ -169,7 +169,8 @@ def machine(results: Sequence[dict[str, Any]]) -> str:
     commits = list(dict.fromkeys(result["commit"] for result in results))
     versions = [f"Python {first['python']}"]
     versions += [f"{name} {first[name]}" for name in ("torch", "gsplat") if name in first]
-    return f"{where}, {'commit' if len(commits) == 1 else 'commits'} {', '.join([*commits, *versions])}"
+    noun = "commit" if len(commits) == 1 else "commits"
+    return f"{where}, {noun} {', '.join([*commits, *versions])}"
 
 
 def heading(result: dict[str, Any]) -> str:

@@ -33,7 +33,8 @@ _NOTE = """() => {
         await show(message, bytes);
         requestAnimationFrame(() => log.push([performance.now(), message.number, message.size[0]]));
     };
-    addEventListener("pointermove", () => (window.first ??= [performance.now(), viewer.number]), true);
+    addEventListener(
+        "pointermove", () => (window.first ??= [performance.now(), viewer.number]), true);
 }"""
 _MOVES = 45
 

@@ -29,7 +29,7 @@ import v3dg
 from benchmarks.evaluation import record
 from benchmarks.evaluation.assets import read_layout
 from benchmarks.evaluation.measure import times_ms
-from benchmarks.studies import peers_scenes as scenes
+from benchmarks.studies.peers import scenes
 from benchmarks.studies.two_versions import digest
 from benchmarks.worlds.procedural import make_asset
 from v3dg.cameras import Camera

@@ -21,7 +21,7 @@ from benchmarks.evaluation.measure import Row
 from benchmarks.evaluation.record import write
 from benchmarks.evaluation.steadiness import Cut, Options, compare, paths_from
 from benchmarks.evaluation.steadiness import Path as CameraPath
-from benchmarks.studies.fades import Stays, field_of, first_camera
+from benchmarks.studies.fades.measure import Stays, field_of, first_camera
 from v3dg import (
     DEFAULT_FADE,
     DEFAULT_TOLERANCE,

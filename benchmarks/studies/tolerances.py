@@ -25,7 +25,7 @@ import tyro
 import v3dg
 from benchmarks.evaluation import record
 from benchmarks.evaluation.markdown import Column, markdown
-from benchmarks.studies.pairs_subject import Subject, scaled
+from benchmarks.studies.pairs.subject import Subject, scaled
 from v3dg import _device
 from v3dg._judges import Judges
 from v3dg.metrics import draw_truth, errors_of

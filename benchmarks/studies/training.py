@@ -23,7 +23,7 @@ from torch.nn.functional import conv2d
 import v3dg
 from benchmarks.evaluation.measure import time_ms
 from benchmarks.evaluation.record import write
-from benchmarks.studies.peers_scenes import random as random_scene
+from benchmarks.studies.peers.scenes import random as random_scene
 from v3dg.compat.gsplat import rasterization
 
 _DRAWN_BY: dict[str, Callable[..., Any]] = {"v3dg": rasterization, "gsplat": gsplat.rasterization}

@@ -31,7 +31,7 @@ import tyro
 import v3dg
 from benchmarks.evaluation import record
 from benchmarks.evaluation.markdown import Column, markdown
-from benchmarks.studies.pairs_subject import Subject, scaled
+from benchmarks.studies.pairs.subject import Subject, scaled
 from v3dg.metrics import draw_truth, errors_of
 from v3dg.pictures import to_8bit
 

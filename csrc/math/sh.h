@@ -91,7 +91,7 @@ V3DG_HD V3DG_INLINE void color_of_coefficients(int degree, const V direction[3],
     if (degree == kPlainColor) {
         for (int c = 0; c < 3; ++c) {
             const V x = sh(c);
-            color[c] = (x < most) & (x > -most) ? x : V{};
+            color[c] = ((x < most) & (x > -most)) ? x : V{};
         }
         return;
     }

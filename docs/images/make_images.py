@@ -43,7 +43,8 @@ def main(config: Config) -> None:
     for tolerance in (0.0, *config.tolerances):
         image = v3dg.render(scene, camera, tolerance=tolerance, device="cpu")
         color = np.clip(image.color, 0, 1)
-        count = f"{image.stats.gaussians_in_frustum / 1e6:.2f} M gaussians, FLIP {flip(truth, color):.3f}"
+        millions = image.stats.gaussians_in_frustum / 1e6
+        count = f"{millions:.2f} M gaussians, FLIP {flip(truth, color):.3f}"
         panels.append(
             (f"{'all' if tolerance == 0 else f'tolerance {tolerance:g}'}: {count}", color)
         )

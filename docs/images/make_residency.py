@@ -23,7 +23,7 @@ from v3dg.viewer.server import Site
 from v3dg.viewer.view import View
 
 sys.path.append(str(Path(__file__).resolve().parents[2]))  # for benchmarks/ of this checkout
-from benchmarks.studies.residency import Config, Field, write_copies
+from benchmarks.studies.residency.measure import Config, Field, write_copies
 
 WIDTH, HEIGHT, PANEL = 1120, 640, 300
 

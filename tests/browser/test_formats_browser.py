@@ -42,7 +42,10 @@ EYE = (0.18, -0.38, 0.30)  # of the donut, whose z is up
 # Each page looks from EYE at the origin, with z up, and counts the pictures since its
 # asset was there.
 HEAD = """<!doctype html>
-<style>body { margin: 0; overflow: hidden } canvas { width: 100vw; height: 100vh; display: block }</style>
+<style>
+body { margin: 0; overflow: hidden }
+canvas { width: 100vw; height: 100vh; display: block }
+</style>
 <canvas id="canvas"></canvas>
 <script>const file = "FILE", eye = EYE, canvas = document.getElementById("canvas");
 window.frames_shown = 0;</script>
@@ -52,7 +55,8 @@ PAGES = {
 import * as pc from "./modules/playcanvas/build/playcanvas.min.mjs";
 const options = new pc.AppOptions();
 options.graphicsDevice = await pc.createGraphicsDevice(canvas, { deviceTypes: ["webgl2"] });
-options.componentSystems = [pc.CameraComponentSystem, pc.GSplatComponentSystem, pc.RenderComponentSystem];
+options.componentSystems = [
+  pc.CameraComponentSystem, pc.GSplatComponentSystem, pc.RenderComponentSystem];
 options.resourceHandlers = [pc.TextureHandler, pc.GSplatHandler, pc.ContainerHandler];
 const app = new pc.AppBase(canvas);
 app.init(options);
@@ -111,7 +115,8 @@ camera.setTarget(BABYLON.Vector3.Zero());
 camera.fov = FOV * Math.PI / 180;
 camera.minZ = 0.01;
 const local = (path) => new URL("modules/" + path, location).href;
-const splat = { deflateURL: local("fflate/umd/index.js"), spzLibraryUrl: local("@adobe/spz/dist/spz.js") };
+const splat = {
+  deflateURL: local("fflate/umd/index.js"), spzLibraryUrl: local("@adobe/spz/dist/spz.js") };
 if (file.endsWith(".json")) {
   const folder = new URL(file, location), index = await (await fetch(folder)).json();
   const root = new URL(".", folder).href;

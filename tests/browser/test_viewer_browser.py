@@ -235,7 +235,8 @@ def test_larger_pictures_of_where_the_camera_was_are_left_out(tab):
         """async () => {
             window.before = viewer.picture;
             viewer.number += 1;  // the camera moves
-            await viewer.show({ ...viewer.picture }, null);  // without bytes: it is not even looked at
+            // Without bytes: it is not even looked at.
+            await viewer.show({ ...viewer.picture }, null);
         }"""
     )
     assert tab.page.evaluate("viewer.picture === window.before")
@@ -508,7 +509,8 @@ def test_dropped_file_is_shown(tab, tmp_path):
             const bytes = Uint8Array.from(atob(content), (c) => c.charCodeAt(0));
             const transfer = new DataTransfer();
             transfer.items.add(new File([bytes], "few.ply"));
-            window.dispatchEvent(new DragEvent("drop", { dataTransfer: transfer, cancelable: true }));
+            const options = { dataTransfer: transfer, cancelable: true };
+            window.dispatchEvent(new DragEvent("drop", options));
         }""",
         content,
     )

@@ -39,7 +39,8 @@ PROBES = """async (viewer) => {
     Object.assign(node, fields);
     document.body.append(node);
   });
-  const asked = (path, options) => fetch(viewer + path, options).then((a) => `${a.type}`, () => "nothing");
+  const asked = (path, options) =>
+    fetch(viewer + path, options).then((a) => `${a.type}`, () => "nothing");
   const connected = (path) => new Promise((resolve) => {
     const socket = new WebSocket(viewer.replace("http", "ws") + path);
     socket.onopen = () => resolve("open");
@@ -63,8 +64,10 @@ PROBES = """async (viewer) => {
   };
   const learned = {};
   for (const [name, probe] of Object.entries(probes)) learned[name] = await probe;
-  const entries = performance.getEntriesByType("resource").filter((entry) => entry.name.startsWith(viewer));
-  learned.sizes = entries.reduce((sum, entry) => sum + entry.decodedBodySize + entry.transferSize, 0);
+  const entries = performance.getEntriesByType("resource")
+    .filter((entry) => entry.name.startsWith(viewer));
+  learned.sizes = entries.reduce(
+    (sum, entry) => sum + entry.decodedBodySize + entry.transferSize, 0);
   return learned;
 }"""
 NAMES = (

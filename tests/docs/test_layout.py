@@ -326,3 +326,13 @@ def test_extras_are_told_by_the_names_that_pip_has():
     extras = settings.partition("[project.optional-dependencies]")[2].partition("\ntest = [")[0]
     names = [requirement.partition(">=")[0] for requirement, _ in EXTRAS.values()]
     assert [name for name in names if f'"{name}>=' not in extras] == []
+
+
+def test_every_result_is_named():
+    """By a page, or by the program that reads it; what nothing names is not read."""
+    pages = [ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")]
+    programs = [*(ROOT / "benchmarks").rglob("*.py"), *(ROOT / "benchmarks").rglob("*.md")]
+    text = "\n".join(path.read_text(encoding="utf-8") for path in (*pages, *programs))
+    results = (ROOT / "benchmarks" / "results").glob("*.json")
+    unnamed = [path.stem for path in results if not re.search(rf"\b{path.stem}\b", text)]
+    assert sorted(unnamed) == []

@@ -35,22 +35,23 @@ MOST_POSITIONAL = 6
 # a thing are left out where that is what they mean here: `left` and `right` (sides),
 # `now` (a time), `first`, `last`, `start` and `end` (positions).
 _PREPOSITIONS_AND_ADVERBS = """
-    of by at in to from for with without over under above below about around after before behind beside
-    between beyond inside outside into onto per since until till through toward towards upon via within
-    along among against here there where elsewhere then once yet already still meanwhile apart away
-    together ahead
+    of by at in to from for with without over under above below about around after before behind
+    beside between beyond inside outside into onto per since until till through toward towards
+    upon via within along among against here there where elsewhere then once yet already still
+    meanwhile apart away together ahead
 """
 _CONJUNCTIONS_AND_QUESTIONS = """
-    and or not if so as that than because unless while whether how why when who whom whose what which
-    like unlike alike else also too only just even both either neither
+    and or not if so as that than because unless while whether how why when who whom whose what
+    which like unlike alike else also too only just even both either neither
 """
 _PRONOUNS_AND_DETERMINERS = """
-    it its is this these those they them their he she we us our you your one ones other others another
-    each every all any some none same such own more most less few fewer many much several rest
+    it its is this these those they them their he she we us our you your one ones other others
+    another each every all any some none same such own more most less few fewer many much
+    several rest
 """
 _PARTICIPLES_AND_VERBS = """
-    found told given kept known taken made done seen asked wanted meant held shown chosen gone got had
-    said was are be been has have does do did can may must will would
+    found told given kept known taken made done seen asked wanted meant held shown chosen gone
+    got had said was are be been has have does do did can may must will would
 """
 FUNCTION_WORDS = frozenset(
     (

@@ -1034,7 +1034,8 @@ def test_config_that_no_reader_would_accept_is_refused(saved):
     large = Bundle(
         bundle.clusters, bundle.groups, bundle.gaussians, {"note": "x" * ((1 << 20) - 100)}
     )
-    message = r"config: expected at most 1048576 bytes of JSON in the header that contains it, got (\d+); "
+    expected = "at most 1048576 bytes of JSON in the header that contains it"
+    message = rf"config: expected {expected}, got (\d+); "
     with pytest.raises(ValueError, match=message) as error:
         large.write(path)
     assert int(re.search(message, str(error.value))[1]) > 1048576

@@ -7,7 +7,13 @@ import stat
 import pytest
 
 import v3dg
-from test_malformed import ASSET, WRITERS, assert_refused, without_privileges
+from test_malformed import (
+    ASSET,
+    WRITERS,
+    assert_refused,
+    let_others_look,
+    without_privileges,
+)
 from v3dg._files import replacing
 
 EVERY_WRITER = WRITERS | {"sog": ("a.sog", lambda path: v3dg.write_asset(path, ASSET))}
@@ -54,8 +60,7 @@ def test_a_file_that_may_not_be_written_is_refused(tmp_path, writer):
     path = tmp_path / name
     path.write_bytes(b"before")
     path.chmod(0o444)
-    for folder in (tmp_path, *tmp_path.parents[:2]):
-        folder.chmod(0o755)  # in pytest's own, only the owner may look
+    let_others_look(tmp_path)
     tmp_path.chmod(0o777)
     with without_privileges():
         assert_refused(write, path)

@@ -226,6 +226,16 @@ def without_privileges():
             os.seteuid(0)
 
 
+def let_others_look(folder):
+    """Open a temporary folder to every user, with those above it that pytest made for
+    its own user alone: there is one more in a process of pytest-xdist."""
+    folders = [folder, *folder.parents]
+    names = [path.name.startswith("pytest-of-") for path in folders]
+    top = names.index(True) if any(names) else 2
+    for path in folders[: top + 1]:
+        path.chmod(0o755)
+
+
 @pytest.mark.parametrize("reader", READERS)
 def test_unreadable_files_are_named(tmp_path, reader):
     name, good, read = READERS[reader]
@@ -455,8 +465,7 @@ def test_writing_below_nothing_or_a_file_is_refused(tmp_path, writer):
 def test_writing_to_a_read_only_folder_is_refused(tmp_path, writer):
     name, write = WRITERS[writer]
     (tmp_path / name).write_bytes(b"before")
-    for folder in (tmp_path, *tmp_path.parents[:2]):
-        folder.chmod(0o755)  # in pytest's own, only the owner may look
+    let_others_look(tmp_path)
     tmp_path.chmod(0o555)
     try:
         with without_privileges():

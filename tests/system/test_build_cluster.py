@@ -463,7 +463,10 @@ def test_a_server_of_another_kind_is_no_scheduler(tmp_path, answer):
     pytest.importorskip("distributed")
     v3dg.write_asset(tmp_path / "a.ply", make_asset(num_gaussians=1000, seed=0))
     with serving(answer) as address:
-        expected = f"{address}: expected a dask scheduler, got a server that speaks another protocol; give the"
+        expected = (
+            f"{address}: expected a dask scheduler, got a server that speaks another protocol; "
+            "give the"
+        )
         fails(1, expected, "build", "a.ply", "--scheduler", address, cwd=tmp_path)
 
 

@@ -148,7 +148,8 @@ def test_bash_completes_what_the_script_says():
 @pytest.mark.skipif(shutil.which("fish") is None, reason="there is no fish")
 def test_fish_completes_what_the_script_says(tmp_path):
     (tmp_path / "rendered.ply").touch()
-    typed = f"{shlex.join(COMMAND)} completion fish | source; complete -C 'v3dg ren'; complete -C 'v3dg build r'"
+    completed = "complete -C 'v3dg ren'; complete -C 'v3dg build r'"
+    typed = f"{shlex.join(COMMAND)} completion fish | source; {completed}"
     done = subprocess.run(
         ["fish", "-c", typed], capture_output=True, text=True, cwd=tmp_path, env=ENVIRONMENT
     )
@@ -477,7 +478,10 @@ def test_wrong_usage(folder):
 def test_options_of_a_turntable_are_refused_beside_cameras(folder, option, command):
     """Whatever their values: those that are the defaults say nothing of what was
     given."""
-    message = f"{option[0]}: expected a turntable to set with it, got the cameras of scene.json; leave it out"
+    message = (
+        f"{option[0]}: expected a turntable to set with it, got the cameras of scene.json; "
+        "leave it out"
+    )
     fails(2, message, *command.split(), *option, cwd=folder)
 
 

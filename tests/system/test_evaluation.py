@@ -18,8 +18,8 @@ from benchmarks.evaluation import measure, report, steadiness
 from benchmarks.evaluation.assets import hair_lines, like_trained, many_copies, sky_dome
 from benchmarks.evaluation.hierarchy import HierarchyScene, build_hierarchy
 from benchmarks.evaluation.parts import motion
-from benchmarks.studies import fades_scenes
-from benchmarks.studies.fades import Stays
+from benchmarks.studies.fades import scenes as fades_scenes
+from benchmarks.studies.fades.measure import Stays
 from benchmarks.worlds.procedural import make_asset
 from reference.project import project
 from v3dg.cameras import Camera

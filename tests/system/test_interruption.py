@@ -100,7 +100,10 @@ print("done")
 
 
 def test_an_import_is_finished_before_an_interrupt_is_raised(tmp_path):
-    code = "try:\n import slow\n time.sleep(5)\nexcept KeyboardInterrupt:\n print(sys.modules['slow'].done)"
+    code = (
+        "try:\n import slow\n time.sleep(5)\n"
+        "except KeyboardInterrupt:\n print(sys.modules['slow'].done)"
+    )
     assert run_as_command(code, tmp_path).stdout == "499999500000\n"
 
 

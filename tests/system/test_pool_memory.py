@@ -26,7 +26,8 @@ bundles = v3dg.Bundle.open_all(sys.argv[2:])
 scene.add(bundles, [(4.0 * k, 0, 0) for k in range(len(bundles))])
 def camera(x):
     return v3dg.Camera.look_at((x, -7, 2), (x, 0, 0), (0, 0, 1), width=96, height=64)
-v3dg.render(scene, camera(-1000.0), memory="1MB", device="cpu")  # what threads and libraries take, once
+# What threads and libraries take, once.
+v3dg.render(scene, camera(-1000.0), memory="1MB", device="cpu")
 before, most = anonymous(), 0
 renderer = v3dg.Renderer(scene, memory=memory, device="cpu")
 for x in [*range(0, 4 * len(bundles), 2), *range(4 * len(bundles), 0, -3)]:

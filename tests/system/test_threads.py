@@ -425,7 +425,8 @@ from test_threads import asset, bundle_of, crowd, frame, gradient, picture
 def size():
     with open("/proc/self/statm") as file:
         return int(file.read().split()[0]) * resource.getpagesize()
-for work, subject in ((picture, asset()), (gradient, asset()), (frame, crowd()), (bundle_of, asset(num=300))):
+subjects = (asset(), asset(), crowd(), asset(num=300))
+for work, subject in zip((picture, gradient, frame, bundle_of), subjects):
     expected, seen = work(subject), Counter()
     for room in [*range(0, 2 << 20, 128 << 10), *range(2 << 20, 24 << 20, 1 << 20)]:
         resource.setrlimit(resource.RLIMIT_AS, (size() + room, resource.RLIM_INFINITY))

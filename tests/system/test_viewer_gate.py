@@ -378,8 +378,9 @@ def test_bundles_go_by_their_names(blob_bundle, tmp_path):
 # Hostile messages.
 
 NASTY = [
-    None, True, False, 0, -1, 1, 3.14, 1e-300, 1e300, -1e308, float("nan"), float("inf"), -float("inf"),
-    2**63, -(2**63), 2**64 - 1, "", "nan", "1e400", "\x1b[31m", "x" * 5000, "\x00", [], [0], [[[]]], {},
+    None, True, False, 0, -1, 1, 3.14, 1e-300, 1e300, -1e308,
+    float("nan"), float("inf"), -float("inf"), 2**63, -(2**63), 2**64 - 1,
+    "", "nan", "1e400", "\x1b[31m", "x" * 5000, "\x00", [], [0], [[[]]], {},
     {"value": 1}, [0, 0, 0], [0, 0, 0, 0], [1e15] * 3, [float("nan")] * 4,
 ]  # fmt: skip
 

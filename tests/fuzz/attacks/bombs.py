@@ -321,7 +321,10 @@ def picture_that_claims(rng):
 def picture_of_another_program(rng):
     """What Pillow hands on to other programs, or reads with plugins that nobody asked
     for."""
-    eps = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n0 0 8 8 rectfill showpage\n%%EOF\n"
+    eps = (
+        b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n"
+        b"0 0 8 8 rectfill showpage\n%%EOF\n"
+    )
     frames, stream = [Image.new("RGB", (8, 8), c) for c in ("red", "blue")], io.BytesIO()
     frames[0].save(
         stream, rng.choice(("PNG", "GIF", "TIFF")), save_all=True, append_images=frames[1:]

@@ -103,7 +103,8 @@ class Attack:
             fault = fault_of(ended, codes=(0,))
             expected = self._of_nothing(what, "other.ply" if swaps else "asset.ply", work)[1]
             if fault is None and (work / name).read_bytes() != expected:
-                fault = f"not the bytes of one that nothing stopped{', but of the asset before' if swaps else ''}"
+                swapped = ", but of the asset before" if swaps else ""
+                fault = f"not the bytes of one that nothing stopped{swapped}"
             if fault is None and _left(work, name):
                 fault = f"{_left(work, name)} is left beside a whole bundle"
             result = outcome(ended, fault)

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 import v3dg
-from benchmarks.studies import pairs, pairs_report, pairs_subject, tolerances
+from benchmarks.studies import tolerances
+from benchmarks.studies.pairs import measure as pairs
+from benchmarks.studies.pairs import report as pairs_report
+from benchmarks.studies.pairs import subject as pairs_subject
 from benchmarks.worlds.procedural import make_person
 from v3dg._judges import Judges
 from v3dg.metrics import has_flip

@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 import v3dg
-from benchmarks.studies import peers, peers_draw, peers_report, peers_scenes
+from benchmarks.studies.peers import draw as peers_draw
+from benchmarks.studies.peers import measure as peers
+from benchmarks.studies.peers import report as peers_report
+from benchmarks.studies.peers import scenes as peers_scenes
 from benchmarks.worlds.procedural import make_person
 from reference import project
 
@@ -17,11 +20,12 @@ torch = pytest.importorskip("torch")
 GSPLAT = """
 import torch, v3dg
 
-def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, *, near_plane, eps2d,
-                  sh_degree, packed):
+def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, *,
+                  near_plane, eps2d, sh_degree, packed):
     sh = colors if sh_degree is not None else (colors[:, None] - 0.5) / v3dg._core.sh_base0
     camera = v3dg.Camera(viewmats[0].numpy(), Ks[0].numpy(), width, height, near_plane)
-    image = v3dg.rasterize(v3dg.Gaussians(means, quats, scales, opacities, sh), camera, filter_px2=eps2d)
+    gaussians = v3dg.Gaussians(means, quats, scales, opacities, sh)
+    image = v3dg.rasterize(gaussians, camera, filter_px2=eps2d)
     return image.color[None], image.alpha[None, ..., None], {}
 """
 # Draws a picture that is wrong by a tenth everywhere.

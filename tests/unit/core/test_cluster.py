@@ -220,7 +220,8 @@ import hashlib, numpy as np
 from v3dg import _core
 rng = np.random.default_rng(5)
 means = np.round(rng.normal(size=(200_000, 3)), 2).astype(np.float32)
-order, leaf_offset = _core.median_split(means, np.array([0, len(means)]), _core.num_halvings(len(means), 100))
+offset = np.array([0, len(means)])
+order, leaf_offset = _core.median_split(means, offset, _core.num_halvings(len(means), 100))
 radii = rng.exponential(0.01, size=(len(means), 1)).astype(np.float32)
 ball = _core.bound_spheres(np.concatenate([means[order], radii], axis=1), leaf_offset)
 print(hashlib.sha256(order.tobytes() + leaf_offset.tobytes() + ball.tobytes()).hexdigest())

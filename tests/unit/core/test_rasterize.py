@@ -834,7 +834,8 @@ camera = scenes.camera(131, 97, fx=90.0, cx=60.0, cy=55.0, pose=scenes.pose(8))
 gaussians = scenes.trained_like(20, camera, 1500)
 out = []
 for _ in range(2):
-    raster = v3dg.rasterize(gaussians, camera, filter_px2=0.1, antialiased=True, background=(0.1, 0.2, 0.3))
+    raster = v3dg.rasterize(
+        gaussians, camera, filter_px2=0.1, antialiased=True, background=(0.1, 0.2, 0.3))
     out.append([raster.color, raster.alpha, raster.depth])
 if sys.argv[2] == "gradients":
     from test_rasterize import draw_leaves, leaves, weighted_sum

@@ -510,7 +510,8 @@ rng = np.random.default_rng(5)
 scene = random_scene(rng, lod_bundle(rng, blob(rng, 500), 8), 300)
 selection = select(scene, random_camera(rng), tolerance=0.5, device="cpu")
 assert len(selection) > 1000
-print(hashlib.sha256(selection.instance_ids.tobytes() + selection.cluster_ids.tobytes()).hexdigest())
+chosen = selection.instance_ids.tobytes() + selection.cluster_ids.tobytes()
+print(hashlib.sha256(chosen).hexdigest())
 """
 
 

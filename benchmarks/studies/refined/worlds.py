@@ -1,8 +1,8 @@
 """The composed worlds with levels as they are built, and refined together: what fewer
 gaussians are enough.
 
-    python -m benchmarks.studies.refined_worlds --steps 10000 --persons 3 --device cuda
-    -o refined_worlds python -m benchmarks.studies.refined_worlds --report
+    python -m benchmarks.studies.refined.worlds --steps 10000 --persons 3 --device cuda
+    -o refined_worlds python -m benchmarks.studies.refined.worlds --report
     refined_worlds.json
 
 Cuts of several tolerances, from cameras near to far, are compared with all gaussians at
@@ -31,7 +31,7 @@ import tyro
 import v3dg
 from benchmarks import worlds
 from benchmarks.evaluation import record
-from benchmarks.studies.pairs import errors
+from benchmarks.studies.pairs.measure import errors
 from v3dg._judges import Judges
 from v3dg.metrics import draw_truth
 from v3dg.pictures import Picture, to_8bit

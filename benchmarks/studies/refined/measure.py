@@ -31,7 +31,7 @@ import v3dg
 from benchmarks.evaluation import record
 from benchmarks.evaluation.assets import read_layout
 from benchmarks.studies import unseen
-from benchmarks.studies.pairs import errors
+from benchmarks.studies.pairs.measure import errors
 from benchmarks.studies.unseen import others_of
 from v3dg import _device
 from v3dg._judges import Judges
@@ -125,7 +125,3 @@ def main(config: Config) -> None:
         result["rows"] = [row | found for (row, _, _), found in judges.measured(shown, errors)]
     print(result)
     record.write(config.output, result, "cuda" if _device.resolve(config.device).is_cuda else "cpu")
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Config))

@@ -155,7 +155,7 @@ def open_and_draw(config: Config, paths: list[Path]) -> dict[str, Any]:
 def main(config: Config) -> None:
     config.folder.mkdir(exist_ok=True)
     sets = {"set": write_set(config), "joined": [write_joined(config)]}
-    here = Path(__file__).parents[2]
+    here = Path(__file__).parents[3]
     checkouts = {"this": here} | ({} if config.against is None else {"other": config.against})
     rows = []
     for _ in range(config.rounds):

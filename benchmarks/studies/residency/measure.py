@@ -25,7 +25,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-import tyro
 
 import v3dg
 from benchmarks.evaluation import record
@@ -287,7 +286,3 @@ def main(config: Config) -> None:
             result["teleports"].append(row)
             print({k: v for k, v in row.items() if k != "curve"}, flush=True)
         record.write(config.output, {"device": config.device, **result}, config.device)
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Config))

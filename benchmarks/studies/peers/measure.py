@@ -42,9 +42,9 @@ import tyro
 
 from benchmarks.evaluation import gpu, record
 from benchmarks.evaluation.measure import times_ms
-from benchmarks.studies import peers_scenes as scenes
-from benchmarks.studies.peers_draw import INPUTS, ROWS, Draw, Job, Peer, Raw, jobs
-from benchmarks.studies.peers_scenes import TRAINED_PX2, Subject
+from benchmarks.studies.peers import scenes
+from benchmarks.studies.peers.draw import INPUTS, ROWS, Draw, Job, Peer, Raw, jobs
+from benchmarks.studies.peers.scenes import TRAINED_PX2, Subject
 from v3dg.cameras import Camera
 
 Row = dict[str, Any]
@@ -382,7 +382,3 @@ def print_table(rows: list[Row]) -> None:
             print(
                 f"    {name:24} {row['ms']:9.3f} ms, p95 {row['p95_ms']:9.3f}  {psnr:>9}  {memory}"
             )
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Config))

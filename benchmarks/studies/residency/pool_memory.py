@@ -1,7 +1,7 @@
 """What a process holds on the host while it flies over a field of copies, with pools
 and without.
 
-The copies are those of `residency.py`. Each flight has a process of its own, in turn:
+The copies are those of `measure.py`. Each flight has a process of its own, in turn:
 how long frames take, the largest part of memory that the process had (RSS), and hashes
 of some settled pictures, which have to be the same for all. `--degree` gives the copies
 coefficients of spherical harmonics that the bundle lacks.
@@ -26,7 +26,7 @@ import tyro
 
 import v3dg
 from benchmarks.evaluation import record
-from benchmarks.studies import residency
+from benchmarks.studies.residency import measure as residency
 
 POOL = "V3DG_POOL_MEMORY"  # names the variable that a child finds its pool in
 MIB = 1 << 20
@@ -127,7 +127,7 @@ def main(config: Config) -> None:
     for number in range(config.rounds):
         for pool in config.pools:
             done = subprocess.run(
-                [sys.executable, "-m", "benchmarks.studies.pool_memory", *sys.argv[1:]],
+                [sys.executable, "-m", "benchmarks.studies.residency.pool_memory", *sys.argv[1:]],
                 env=os.environ | {POOL: pool},
                 check=True,
                 stdout=subprocess.PIPE,

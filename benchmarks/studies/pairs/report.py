@@ -170,9 +170,18 @@ def table(pairs: Sequence[Row]) -> str:
     )
 
 
+def rows_of(recorded: Row) -> list[Row]:
+    """The rows of a result, which has them as written, or as lists beside the names of
+    their columns."""
+    columns = recorded.get("columns")
+    if columns is None:
+        return list(recorded["rows"])
+    return [dict(zip(columns, row, strict=True)) for row in recorded["rows"]]
+
+
 def report(options: Report) -> None:
     recorded = json.loads(options.results.read_text(encoding="utf-8"))
-    rows = recorded["rows"]
+    rows = rows_of(recorded)
     parts = {"As they are built": "ours"}
     if any(row["method"] == "refined" for row in rows):
         parts[f"Refined in {recorded['changes']['refine']:,} steps"] = "refined"

@@ -10,7 +10,7 @@ reads; `up` for an object, which is drawn from four sides, or for a scene `camer
 transforms.json, `views`, names of some of them, and `refined_from`, cameras of another
 file by which it is refined; and `published`, by their names the `file` and number of
 `gaussians` of the levels that its makers gave it. Levels of other tools are
-ASSETS/peers/NAME/TOOL_PERCENT.npz, which `pairs_subject.pack_level` makes of what
+ASSETS/peers/NAME/TOOL_PERCENT.npz, which `subject.pack_level` makes of what
 
     splat-transform -g cpu -w NAME.ply -d 50% d_50.ply
     splat-transform -g cpu -w NAME.ply --decimate-adaptive 50% adaptive_50.ply
@@ -49,8 +49,9 @@ import tyro
 
 import v3dg
 from benchmarks.evaluation import record
-from benchmarks.studies import pairs_report, pairs_subject
-from benchmarks.studies.pairs_subject import Subject
+from benchmarks.studies.pairs import report as pairs_report
+from benchmarks.studies.pairs import subject as pairs_subject
+from benchmarks.studies.pairs.subject import Subject
 from v3dg import _device
 from v3dg._judges import Judges
 from v3dg.metrics import draw_truth, errors_of
@@ -382,14 +383,18 @@ def known_results(
         if {"refine": expected["refine"], **recorded["changes"]} != expected:
             raise SystemExit(f"{path}: expected levels of {changes}, got {recorded['changes']}")
         changes = {name: value for name, value in expected.items() if value is not None}
-        rows |= by_key(recorded["rows"])
+        rows |= by_key(pairs_report.rows_of(recorded))
         for name, seconds in recorded["builds"].items():
             builds.setdefault(name, {}).update(seconds)
     return rows, builds, changes
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Read the command line of both parts, and run one."""
     commands: dict[str, Callable[..., Measure | pairs_report.Report]]
     commands = {"measure": Measure, "report": pairs_report.Report}
     options = tyro.extras.subcommand_cli_from_dict(commands)
-    measure(options) if isinstance(options, Measure) else pairs_report.report(options)
+    if isinstance(options, Measure):
+        measure(options)
+    else:
+        pairs_report.report(options)

@@ -29,7 +29,7 @@ from benchmarks.evaluation.evaluation import resized
 from benchmarks.evaluation.measure import Row
 from benchmarks.evaluation.record import write
 from benchmarks.evaluation.steadiness import SUPERSAMPLING, paths_from
-from benchmarks.studies.fades import axes, filtered, line, measure, verdict
+from benchmarks.studies.fades.measure import axes, filtered, line, measure, verdict
 from v3dg import (
     DEFAULT_FADE,
     DEFAULT_TOLERANCE,

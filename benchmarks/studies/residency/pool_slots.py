@@ -4,8 +4,8 @@ of a flight by turns.
 A pool keeps rows where a bundle of the scene is float32. So one of the two scenes has a
 tiny one more, behind the camera.
 
-    python -m benchmarks.studies.pool_slots --bundle quantized.v3dg --side 13 --size
-    1920 1080 --device cuda
+    python -m benchmarks.studies.residency.pool_slots --bundle quantized.v3dg --side 13
+    --size 1920 1080 --device cuda
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import tyro
 
 import v3dg
 from benchmarks.evaluation import record
-from benchmarks.studies.residency import Config, Field, pixels, summary, timed, write_copies
+from benchmarks.studies.residency.measure import Config, Field, pixels, summary, timed, write_copies
 from v3dg.donut import make_donut
 
 ROUNDS = 3

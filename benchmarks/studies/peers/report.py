@@ -1,7 +1,7 @@
 """The page of `peers`: tables of everyone's times, errors and memory, from one or more
 recorded results.
 
-    python -m benchmarks.studies.peers_report peers.json -o docs/notes/peers.md
+    python -m benchmarks.studies.peers.report peers.json -o docs/notes/peers.md
 
 Ours is the quicker of `v3dg.Renderer` and `v3dg.rasterize` in the same row, where both
 were measured.
@@ -23,7 +23,7 @@ Row = dict[str, Any]
 _OURS, _LIKE_GSPLAT = "v3dg", "v3dg, 1e-4"
 _ABOUT = """# Note: other rasterizers
 
-Written by `python -m benchmarks.studies.peers_report` from recorded JSON, never by hand.
+Written by `python -m benchmarks.studies.peers.report` from recorded JSON, never by hand.
 
 All draw the same gaussians, whole, in processes that follow each other on one {gpu}. A time is the median of
 single calls, from an idle device to an idle device, Python included. PSNR is to float64, in eight windows of
@@ -158,7 +158,9 @@ def failure_text(row: Row) -> str:
     place = [
         str(row[name]) for name in ("renderer", "scene", "view", "width", "part") if name in row
     ]
-    return f"{row['job']}{': ' if place else ''}{', '.join(place)}: {row['error'].splitlines()[0][:200]}"
+    colon = ": " if place else ""
+    reason = row["error"].splitlines()[0][:200]
+    return f"{row['job']}{colon}{', '.join(place)}: {reason}"
 
 
 def main(report: Report) -> None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -246,7 +245,3 @@ def line(row: Row) -> str:
         f"{row['pop_worst']:.3f}  {warped}changed {row['changed_items']:.0f}  PSNR "
         f"{row['psnr']:.2f}"
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

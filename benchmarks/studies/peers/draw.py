@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 import v3dg
 from benchmarks.evaluation import gpu
-from benchmarks.studies.peers_scenes import Subject
+from benchmarks.studies.peers.scenes import Subject
 from v3dg import _core
 from v3dg.cameras import Camera
 

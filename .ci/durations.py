@@ -1,0 +1,62 @@
+"""How long tests took: the heaviest ones, the folders, and what answers first.
+
+    python .ci/durations.py build/ci/tests.xml
+
+reads what `pytest --junit-xml` wrote and prints Markdown.
+"""
+
+from __future__ import annotations
+
+import sys
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from pathlib import Path
+
+HEAVIEST = 25
+SOON_SECONDS = 300
+
+
+def durations_of(path: Path) -> dict[str, float]:
+    """Seconds by the name of a test: its file's module, and what pytest calls it."""
+    durations: dict[str, float] = {}
+    for case in ElementTree.parse(path).iter("testcase"):
+        name = f"{case.get('classname')}::{case.get('name')}"
+        durations[name] = durations.get(name, 0.0) + float(case.get("time", "0"))
+    return durations
+
+
+def folder_of(name: str) -> str:
+    """`tests/unit/core` of `tests.unit.core.test_select::test_x`."""
+    module = name.partition("::")[0].split(".")
+    return "/".join(part for part in module if not part.startswith(("test_", "Test")))
+
+
+def table(title: str, seconds: dict[str, float]) -> list[str]:
+    rows = sorted(seconds.items(), key=lambda item: -item[1])
+    return [
+        "",
+        f"| {title} | seconds |",
+        "| --- | ---: |",
+        *(f"| {n} | {s:.1f} |" for n, s in rows),
+    ]
+
+
+def main(path: Path) -> int:
+    durations = durations_of(path)
+    folders: Counter[str] = Counter()
+    for name, seconds in durations.items():
+        folders[folder_of(name)] += seconds
+    soon, total = 0, 0.0
+    for seconds in sorted(durations.values()):
+        total += seconds
+        soon += total <= SOON_SECONDS
+    share = soon / max(len(durations), 1)
+    heaviest = dict(sorted(durations.items(), key=lambda item: -item[1])[:HEAVIEST])
+    print(f"{len(durations)} tests took {sum(durations.values()):.0f} s.")
+    print(f"The quickest {share:.0%} of them take {SOON_SECONDS} s together.")
+    print("\n".join([*table("folder", dict(folders)), *table("test", heaviest)]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))
