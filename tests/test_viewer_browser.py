@@ -597,6 +597,20 @@ def test_panel_is_folded_away(tab):
     assert tab.page.locator("#stage").bounding_box()["width"] > wide + 200
 
 
+def test_heading_of_the_panel_covers_what_is_scrolled_below_it(tab):
+    def heading():
+        box = tab.page.locator("#panel h1").bounding_box()
+        clip = box | {"width": 200}
+        return np.asarray(Image.open(io.BytesIO(tab.page.screenshot(clip=clip)))).astype(int)
+
+    tab.settled()
+    before = heading()
+    for distance in (60, 100, 140):
+        tab.page.locator("#panel").evaluate("(panel, y) => panel.scrollTo(0, y)", distance)
+        tab.page.wait_for_timeout(200)
+        assert differ(before, heading()) == 0
+
+
 def test_page_says_when_the_viewer_is_gone_and_comes_back_with_it(browser, site):
     first = Site(site.scene_view, port=0)
     with Tab(browser, first.url) as tab:
