@@ -28,13 +28,14 @@ import chromium
 # What the page does, by its own clock.
 _NOTE = """() => {
     window.log = [];
-    const show = viewer.show.bind(viewer);
-    viewer.show = async (message, bytes) => {
+    const show = viewer.picture.show.bind(viewer.picture);
+    viewer.picture.show = async (message, bytes) => {
         await show(message, bytes);
         requestAnimationFrame(() => log.push([performance.now(), message.number, message.size[0]]));
     };
     addEventListener(
-        "pointermove", () => (window.first ??= [performance.now(), viewer.number]), true);
+        "pointermove",
+        () => (window.first ??= [performance.now(), viewer.requests.number]), true);
 }"""
 _MOVES = 45
 
@@ -94,7 +95,7 @@ def main(config: Config) -> None:
 def drags_from(page: Any, camera: int, drags: int) -> dict[str, Any]:
     """Answers to drags from a camera of the file, gaps between later pictures, widths
     of the first ones."""
-    page.evaluate(f"viewer.lookThrough({camera})")
+    page.evaluate(f"viewer.fileCameras.lookThrough({camera})")
     page.wait_for_timeout(2500)
     answers, gaps, widths = [], [], []
     for drag in range(drags):

@@ -63,11 +63,11 @@ def main(bundle: str, folder: str) -> None:
         page.goto(site.url)
         page.wait_for_function("() => viewer.scene")
         page.get_by_label("Show", exact=True).select_option("Residency")
-        page.evaluate("viewer.lookThrough(0)")
+        page.evaluate("viewer.fileCameras.lookThrough(0)")
         settle(page)
         view.eye = near.position
-        page.evaluate("viewer.lookThrough(1)")
-        page.wait_for_function("() => viewer.picture.figures.missing", timeout=120_000)
+        page.evaluate("viewer.fileCameras.lookThrough(1)")
+        page.wait_for_function("() => viewer.picture.message?.figures.missing", timeout=120_000)
         page.wait_for_timeout(1000)
         save("residency", shot(page))
         view.eye, view.is_held = None, False

@@ -39,7 +39,7 @@ def main(scene_path: str, camera: str) -> None:
         look_through(page, camera)
         save("tab", shot(page))
         page.mouse.click(330, 400)
-        page.wait_for_function("() => viewer.selected")
+        page.wait_for_function("() => viewer.instances.selected")
         settle(page)
         save("instance", shot(page))
         page.keyboard.press("Escape")
@@ -88,8 +88,8 @@ def main(scene_path: str, camera: str) -> None:
 
 def look_through(page: Page, camera: str) -> None:
     settle(page)
-    place = f"viewer.cameras.findIndex(({{ name }}) => name === {camera!r})"
-    page.evaluate(f"viewer.lookThrough({place})")
+    place = f"viewer.fileCameras.indexOf({camera!r})"
+    page.evaluate(f"viewer.fileCameras.lookThrough({place})")
     settle(page)
 
 

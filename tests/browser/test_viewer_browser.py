@@ -97,7 +97,7 @@ class Tab:
     def view(self):
         """What the address says of the camera and the settings."""
         self.page.wait_for_timeout(300)  # until what was done before has begun
-        self.page.wait_for_function("() => !viewer.isMoving && !viewer.needsFrame")
+        self.page.wait_for_function("() => !viewer.requests.isMoving && !viewer.frames.isDue")
         hash = self.page.evaluate("location.hash").removeprefix("#")
         return dict(part.split("=", 1) for part in hash.split("&"))
 
@@ -198,7 +198,9 @@ def test_drag_is_answered_while_the_mouse_is_still_down(tab):
     tab.page.mouse.move(200, 400)
     tab.page.mouse.down()
     tab.page.mouse.move(400, 380, steps=8)
-    is_whole = "viewer.picture.final && viewer.picture.number === viewer.number"
+    is_whole = (
+        "viewer.picture.message.final && viewer.picture.message.number === viewer.requests.number"
+    )
     told = tab.page.evaluate(f"[document.body.dataset.state, {is_whole}]")
     assert told in (["moving", False], ["refining", False], ["ready", True])
     assert differ(first, tab.seen()) > 0.02
@@ -214,14 +216,14 @@ def test_moved_picture_is_nearly_the_one_that_follows(browser, site):
         tab.settled()
         tab.page.get_by_role("radio", name="Fly").click()
         first = tab.settled()
-        tab.page.evaluate("viewer.link.send = () => {}")  # so that no picture follows
+        tab.page.evaluate("viewer.connection.send = () => {}")  # so that no picture follows
         tab.drag((200, 300), (260, 300))
         tab.page.wait_for_timeout(
             300
         )  # where frames take the browser long, it follows so often only
         moved = tab.seen()
         assert differ(first, moved) > 0.02
-        tab.page.evaluate("delete viewer.link.send; viewer.asked = null; viewer.redraw()")
+        tab.page.evaluate("delete viewer.connection.send; viewer.requests.reset(); viewer.redraw()")
         after = tab.settled()
     middle = np.s_[:, 100:400]
     assert (
@@ -233,13 +235,13 @@ def test_larger_pictures_of_where_the_camera_was_are_left_out(tab):
     tab.settled()
     tab.page.evaluate(
         """async () => {
-            window.before = viewer.picture;
-            viewer.number += 1;  // the camera moves
+            window.before = viewer.picture.message;
+            viewer.requests.number += 1;  // the camera moves
             // Without bytes: it is not even looked at.
-            await viewer.show({ ...viewer.picture }, null);
+            await viewer.picture.show({ ...viewer.picture.message }, null);
         }"""
     )
-    assert tab.page.evaluate("viewer.picture === window.before")
+    assert tab.page.evaluate("viewer.picture.message === window.before")
 
 
 def test_every_mode_looks_different(tab):
@@ -393,6 +395,7 @@ def test_link_leads_to_the_same_picture(browser, site, tab):
         "#at=1,2&turn=x&show=nothing&mode=fall&fov=NaN&up=q",
         "#%E0%A4%A",
         "#at=1e999,0,0&turn=0,0,0,0",
+        "#up=constructor",
     ],
 )
 def test_wrong_links_show_the_scene(browser, site, hash):
@@ -439,7 +442,7 @@ def test_go_to_a_point_an_instance_and_a_camera(tab):
     scene = tab.page.evaluate("viewer.scene.instances")
     assert scene == 200
     go("#7")
-    assert tab.page.evaluate("viewer.selected.instance") == 7
+    assert tab.page.evaluate("viewer.instances.selected.instance") == 7
     go("from the side")
     np.testing.assert_allclose(tab.position(), (6, 0, 0))
     go("nowhere")
@@ -459,17 +462,23 @@ def test_clicked_instance_is_selected_moved_undone_and_saved(browser, site):
             assert (
                 layer.evaluate("e => e.style.opacity") == "0"
             )  # nothing to blend over the picture
-            at = tab.page.evaluate("viewer.overlay.place([4, 0, 0])")
+            at = tab.page.evaluate("viewer.overlay.projection.place([4, 0, 0])")
             tab.page.mouse.click(*at)
-            tab.page.wait_for_function("() => viewer.selected?.instance === 1")
-            tip = tab.page.evaluate("viewer.overlay.place(viewer.overlay.tip(2))")
+            tab.page.wait_for_function("() => viewer.instances.selected?.instance === 1")
+            tip = tab.page.evaluate(
+                "viewer.overlay.projection.place(viewer.overlay.handles.tip(2))"
+            )
             assert layer.evaluate("e => e.style.opacity") == "1"
             tab.drag(tip, (tip[0], tip[1] - 60))
             tab.page.get_by_role("radio", name="Turn").click()
-            ring = tab.page.evaluate("viewer.overlay.place(viewer.overlay.ring(1)[6])")
+            ring = tab.page.evaluate(
+                "viewer.overlay.projection.place(viewer.overlay.handles.ring(1)[6])"
+            )
             tab.drag(ring, (ring[0] - 60, ring[1]))
             tab.page.get_by_role("radio", name="Scale").click()
-            middle = tab.page.evaluate("viewer.overlay.place(viewer.selected.pose.position)")
+            middle = tab.page.evaluate(
+                "viewer.overlay.projection.place(viewer.instances.selected.pose.position)"
+            )
             tab.drag((middle[0] + 59, middle[1]), (middle[0] + 118, middle[1]))
             assert differ(before, tab.settled()) > 0.01
             np.testing.assert_allclose(scene.positions[0], 0)
@@ -533,7 +542,7 @@ def test_photographs_lie_over_the_picture_of_their_camera(browser, site, tmp_pat
         with Tab(browser, captured.url) as tab:
             tab.settled()
             at = tab.page.evaluate(
-                "viewer.overlay.place([0, 3 - viewer.frustumSize * viewer.scene.radius, 0])"
+                "viewer.overlay.projection.place([0, 3 - viewer.fileCameras.frustumSize * viewer.scene.radius, 0])"
             )
             tab.page.mouse.click(*at)
             tab.page.wait_for_selector("#photograph:visible")
@@ -557,7 +566,7 @@ def test_phone_has_the_picture_to_itself(browser, site):
         assert tab.page.locator("#stage").bounding_box()["width"] == 390
         assert not tab.page.locator("#panel").is_visible()
         assert (picture.max(axis=2) > 30).mean() > 0.03
-        half_width = "Math.atan(Math.tan(viewer.camera.fov_y / 2) * viewer.aspect)"
+        half_width = "Math.atan(Math.tan(viewer.camera.fov_y / 2) * viewer.look.aspect)"
         fits = f"Math.asin(0.9 * viewer.scene.radius / viewer.camera.distance) < {half_width}"
         assert tab.page.evaluate(fits)
         tab.page.touchscreen.tap(195, 300)
@@ -588,6 +597,20 @@ def test_panel_is_folded_away(tab):
     tab.page.keyboard.press("p")
     tab.settled()
     assert tab.page.locator("#stage").bounding_box()["width"] > wide + 200
+
+
+def test_heading_of_the_panel_covers_what_is_scrolled_below_it(tab):
+    def heading():
+        box = tab.page.locator("#panel h1").bounding_box()
+        clip = box | {"width": 200}
+        return np.asarray(Image.open(io.BytesIO(tab.page.screenshot(clip=clip)))).astype(int)
+
+    tab.settled()
+    before = heading()
+    for distance in (60, 100, 140):
+        tab.page.locator("#panel").evaluate("(panel, y) => panel.scrollTo(0, y)", distance)
+        tab.page.wait_for_timeout(200)
+        assert differ(before, heading()) == 0
 
 
 def test_page_says_when_the_viewer_is_gone_and_comes_back_with_it(browser, site):

@@ -1,146 +1,286 @@
-// Where the page looks from, and how that moves. Lengths are in the scene's units.
+// The camera that the page looks from, and how it moves. Lengths are in the scene's units.
 
 import * as M from "./math.js";
 
+/** @typedef {import("./page.js").Axis} Axis */
+/** @typedef {import("./page.js").Mode} Mode */
+/** @typedef {import("./page.js").Pinhole} Pinhole */
+/** @typedef {import("./page.js").Quaternion} Quaternion */
+/** @typedef {import("./page.js").Vector} Vector */
+/** @typedef {Pinhole & { focus: Vector }} FlightEnd */
+
+/** @type {Record<Axis, Vector>} */
 export const AXES = {
-  x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1], "-x": [-1, 0, 0], "-y": [0, -1, 0], "-z": [0, 0, -1],
+  x: [1, 0, 0],
+  y: [0, 1, 0],
+  z: [0, 0, 1],
+  "-x": [-1, 0, 0],
+  "-y": [0, -1, 0],
+  "-z": [0, 0, -1],
 };
-const SECONDS_OF_A_FLIGHT = 0.6;
-const STEEPEST = 0.998; // sine of the angle to the horizon
+/** @type {Mode[]} */
+export const MODES = ["orbit", "fly", "walk"];
+export const SPEED_BOUNDS = [0.01, 100];
+const FLIGHT_SECONDS = 0.6;
+/** Largest sine of the angle between what the camera looks at and the horizon. */
+const STEEPEST = 0.998;
+/** Time in which the velocity follows a push, by a factor of e. */
+const EASE_SECONDS = 0.07;
+
+/**
+ * @param {string} text
+ * @returns {text is Mode}
+ */
+export function isMode(text) {
+  return MODES.some((mode) => mode === text);
+}
 
 export class Camera {
-  constructor() {
-    this.position = [0, -3, 1];
-    this.wxyz = M.looking([0, 3, -1], [0, 0, 1]);
-    this.fov_y = Math.PI / 4;
-    this.focus = [0, 0, 0]; // which orbits go around
-    this.up = [0, 0, 1];
-    this.mode = "orbit";
-    this.speed = 1; // of the slider
-    this.radius = 1; // of the scene
-    this.ahead = null; // distance to what is in the middle of the picture
-    this.velocity = [0, 0, 0];
-    this.held = 0; // seconds for which one has pushed against what is near
-    this.flight = null;
+  /** @type {Vector} */
+  position = [0, -3, 1];
+  /** Rotation from camera (x right, y down, z forward) to world. */
+  wxyz = M.looking([0, 3, -1], [0, 0, 1]);
+  /** Vertical field of view, radians. */
+  fov_y = Math.PI / 4;
+  /**
+   * The point that orbits go around.
+   *
+   * @type {Vector}
+   */
+  focus = [0, 0, 0];
+  /** @type {Vector} */
+  up = [0, 0, 1];
+  /** @type {Mode} */
+  mode = MODES[0];
+  /** Factor of the pace that suits the scene. */
+  speed = 1;
+  /** Radius of the scene. */
+  radius = 1;
+  /**
+   * Distance to what is in the middle of the picture; null if not known.
+   *
+   * @type {number}
+   */
+  ahead = null;
+  /** @type {Vector} */
+  velocity = [0, 0, 0];
+  /** Seconds for which the camera has been pushed against what is near. */
+  pushedSeconds = 0;
+  /**
+   * A flight to another view, and for how long it has gone on; null without one.
+   *
+   * @type {{ from: FlightEnd, to: FlightEnd, seconds: number }}
+   */
+  flight = null;
+
+  get right() {
+    return M.rotate(this.wxyz, [1, 0, 0]);
   }
 
-  get right() { return M.rotate(this.wxyz, [1, 0, 0]); }
-  get down() { return M.rotate(this.wxyz, [0, 1, 0]); }
-  get forward() { return M.rotate(this.wxyz, [0, 0, 1]); }
-  get distance() { return Math.max(M.length(M.sub(this.focus, this.position)), 1e-4 * this.radius); }
+  get down() {
+    return M.rotate(this.wxyz, [0, 1, 0]);
+  }
 
-  // Units a second at the slider's 1: the scene's size tells how quick, what is near how careful.
+  get forward() {
+    return M.rotate(this.wxyz, [0, 0, 1]);
+  }
+
+  /** Distance to the focus. */
+  get distance() {
+    return Math.max(M.length(M.sub(this.focus, this.position)), 1e-4 * this.radius);
+  }
+
+  /** Units a second: the scene's size says how fast, what is near how careful. */
   get pace() {
     const near = this.ahead ?? this.radius;
-    return this.speed * M.clamp(0.6 * near, this.least, 0.6 * this.radius);
+    return this.speed * M.clamp(0.6 * near, this.leastPace, 0.6 * this.radius);
   }
 
-  // However near things are: careful at first, but who goes on pushing comes through.
-  get least() {
-    return 0.02 * this.radius * M.clamp(2 ** (2 * (this.held - 0.5)), 1, 10);
+  /** However near things are: careful at first, but who goes on pushing comes through. */
+  get leastPace() {
+    return 0.02 * this.radius * M.clamp(2 ** (2 * (this.pushedSeconds - 0.5)), 1, 10);
   }
 
+  /** @param {number} aspect */
   view(aspect) {
     return { wxyz: this.wxyz, position: this.position, fov_y: this.fov_y, aspect };
   }
 
-  // Turn about the upright axis and about the horizon, in radians; around the focus where one orbits.
+  /**
+   * Whether a view is the camera's own, but for rounding.
+   *
+   * @param {Pinhole} view
+   */
+  isAt(view) {
+    const size = this.radius + M.length(this.position);
+    const isTurned = M.isNear(view.wxyz, this.wxyz, 1e-9);
+    const isThere = M.isNear(view.position, this.position, 1e-9 * size);
+    return isTurned && isThere && Math.abs(view.fov_y - this.fov_y) < 1e-9;
+  }
+
+  /** @param {number} speed */
+  setSpeed(speed) {
+    const [slowest, fastest] = SPEED_BOUNDS;
+    this.speed = M.clamp(speed, slowest, fastest);
+  }
+
+  /**
+   * Turns about the upright axis and about the horizon; around the focus in orbit mode.
+   *
+   * @param {number} yaw Radians.
+   * @param {number} pitch Radians.
+   */
   turn(yaw, pitch) {
     this.flight = null;
-    const pivot = this.mode === "orbit" ? this.focus : this.position;
-    const turned = (q) => {
-      this.wxyz = M.unit(M.product(q, this.wxyz));
-      this.position = M.add(pivot, M.rotate(q, M.sub(this.position, pivot)));
-    };
-    turned(M.about(this.up, yaw));
+    this.rotate(M.about(this.up, yaw));
     const before = M.dot(this.forward, this.up);
-    const after = M.dot(M.rotate(M.about(this.right, pitch), this.forward), this.up);
-    if (Math.abs(after) < STEEPEST || Math.abs(after) < Math.abs(before)) turned(M.about(this.right, pitch));
+    const rotation = M.about(this.right, pitch);
+    const after = M.dot(M.rotate(rotation, this.forward), this.up);
+    const isSteep = Math.abs(after) >= STEEPEST && Math.abs(after) >= Math.abs(before);
+    if (!isSteep) this.rotate(rotation);
     if (this.mode !== "orbit") this.carryFocus();
   }
 
-  // The focus stays in front, as far as it was.
+  /** @param {Quaternion} rotation */
+  rotate(rotation) {
+    const pivot = this.mode === "orbit" ? this.focus : this.position;
+    this.wxyz = M.unit(M.product(rotation, this.wxyz));
+    this.position = M.add(pivot, M.rotate(rotation, M.sub(this.position, pivot)));
+  }
+
+  /** Keeps the focus ahead, at its distance. */
   carryFocus() {
     this.focus = M.add(this.position, M.mul(this.forward, this.distance));
   }
 
-  // Move by steps to the right, down and forward.
+  /**
+   * Moves by steps along the camera's axes.
+   *
+   * @param {number} right
+   * @param {number} down
+   * @param {number} forward
+   */
   shift(right, down, forward) {
     this.flight = null;
-    const step = M.add(M.add(M.mul(this.right, right), M.mul(this.down, down)), M.mul(this.forward, forward));
+    const sideways = M.add(M.mul(this.right, right), M.mul(this.down, down));
+    this.moveBy(M.add(sideways, M.mul(this.forward, forward)));
+  }
+
+  /** @param {Vector} step In the world. */
+  moveBy(step) {
     this.position = M.add(this.position, step);
     this.focus = M.add(this.focus, step);
   }
 
-  // Go nearer to the focus by a factor; past it, the focus goes ahead.
+  /**
+   * Goes nearer to the focus by a factor; when that is reached, the focus goes ahead.
+   *
+   * @param {number} factor Of the distance.
+   */
   approach(factor) {
     this.flight = null;
     const least = 0.02 * this.radius;
+    if (factor < 1 && this.distance * factor < least) {
+      this.shift(0, 0, this.distance * (1 - factor));
+      return;
+    }
     const away = M.sub(this.position, this.focus);
-    if (factor < 1 && this.distance * factor < least) this.shift(0, 0, this.distance * (1 - factor));
-    else this.position = M.add(this.focus, M.mul(away, factor));
+    this.position = M.add(this.focus, M.mul(away, factor));
   }
 
-  // Move for so many seconds; `push` is right, up and forward, each -1 to 1.
+  /** The directions of a push to the right, up and forward. */
+  get pushDirections() {
+    if (this.mode === "walk") return [this.right, this.up, M.unit(M.cross(this.up, this.right))];
+    if (this.mode === "fly") return [this.right, M.mul(this.down, -1), this.forward];
+    return [this.right, this.up, this.forward];
+  }
+
+  /**
+   * Moves for some time.
+   *
+   * @param {Vector} push To the right, up and forward, each -1 to 1.
+   * @param {number} seconds
+   */
   move(push, seconds) {
-    const ways = this.mode === "walk"
-      ? [this.right, this.up, M.unit(M.cross(this.up, this.right))]
-      : [this.right, this.mode === "fly" ? M.mul(this.down, -1) : this.up, this.forward];
-    const isNear = push.some(Boolean) && 0.6 * (this.ahead ?? this.radius) < 0.05 * this.radius;
-    this.held = isNear ? this.held + seconds : 0;
-    const wanted = push.reduce((sum, part, i) => M.add(sum, M.mul(ways[i], part * this.pace)), [0, 0, 0]);
-    this.velocity = M.mix(this.velocity, wanted, 1 - Math.exp(-seconds / 0.07));
+    const isNear = 0.6 * (this.ahead ?? this.radius) < 0.05 * this.radius;
+    const isPushed = push.some(Boolean);
+    this.pushedSeconds = isPushed && isNear ? this.pushedSeconds + seconds : 0;
+    /** @type {Vector} */
+    let wanted = [0, 0, 0];
+    this.pushDirections.forEach((direction, i) => {
+      wanted = M.add(wanted, M.mul(direction, push[i] * this.pace));
+    });
+    this.velocity = M.mix(this.velocity, wanted, 1 - Math.exp(-seconds / EASE_SECONDS));
     if (M.length(this.velocity) < 1e-3 * this.pace) {
       this.velocity = [0, 0, 0];
       return;
     }
     this.flight = null;
-    const step = M.mul(this.velocity, seconds);
-    this.position = M.add(this.position, step);
-    this.focus = M.add(this.focus, step);
+    this.moveBy(M.mul(this.velocity, seconds));
   }
 
-  // Stand upright again, looking where one looks.
+  /** Stands upright again, looking in the same direction. */
   level() {
     this.wxyz = M.looking(this.forward, this.up);
   }
 
+  /**
+   * Is at a view from now on; the focus is ahead, at its distance.
+   *
+   * @param {Pinhole} view
+   */
   put(view) {
-    const distance = this.distance;
-    [this.wxyz, this.position, this.fov_y] = [M.unit(view.wxyz), view.position, view.fov_y];
+    const { distance } = this;
+    this.wxyz = M.unit(view.wxyz);
+    this.position = view.position;
+    this.fov_y = view.fov_y;
     this.focus = M.add(this.position, M.mul(this.forward, distance));
     this.velocity = [0, 0, 0];
     this.flight = null;
   }
 
-  // Fly to a view, to turn about a point, or about what is ahead of it.
+  /**
+   * Begins to fly to a view.
+   *
+   * @param {Pinhole} view
+   * @param {Vector | null} focus Of its orbits; what is ahead of the view if null.
+   */
   flyTo(view, focus) {
     const forward = M.rotate(view.wxyz, [0, 0, 1]);
-    const from = { wxyz: this.wxyz, position: this.position, fov_y: this.fov_y, focus: this.focus };
-    const to = { ...view, focus: focus ?? M.add(view.position, M.mul(forward, this.distance)) };
-    this.flight = { from, to, seconds: 0 };
+    const ahead = M.add(view.position, M.mul(forward, this.distance));
+    const from = { ...this.view(1), focus: this.focus };
+    this.flight = { from, to: { ...view, focus: focus ?? ahead }, seconds: 0 };
   }
 
-  // Look at a point from so far, from the side that one is on.
+  /**
+   * Begins to fly to where a point is seen from its present side.
+   *
+   * @param {Vector} point
+   * @param {number} distance
+   */
   lookAt(point, distance) {
-    const from = M.unit(M.sub(this.position, point));
-    const position = M.add(point, M.mul(from, distance));
-    this.flyTo({ wxyz: M.looking(M.mul(from, -1), this.up), position, fov_y: this.fov_y }, point);
+    const back = M.unit(M.sub(this.position, point));
+    const position = M.add(point, M.mul(back, distance));
+    const wxyz = M.looking(M.mul(back, -1), this.up);
+    this.flyTo({ wxyz, position, fov_y: this.fov_y }, point);
   }
 
-  // Go on with a flight.
+  /** @param {number} seconds For which a flight goes on. */
   advance(seconds) {
     if (!this.flight) return;
     const { from, to } = this.flight;
     this.flight.seconds += seconds;
-    const share = Math.min(this.flight.seconds / SECONDS_OF_A_FLIGHT, 1);
+    const share = Math.min(this.flight.seconds / FLIGHT_SECONDS, 1);
     const t = share * share * (3 - 2 * share);
     this.wxyz = M.slerp(from.wxyz, to.wxyz, t);
     this.position = M.mix(from.position, to.position, t);
     this.focus = M.mix(from.focus, to.focus, t);
     this.fov_y = from.fov_y + t * (to.fov_y - from.fov_y);
     if (share === 1) {
-      [this.wxyz, this.position, this.fov_y, this.focus] = [M.unit(to.wxyz), to.position, to.fov_y, to.focus];
+      this.wxyz = M.unit(to.wxyz);
+      this.position = to.position;
+      this.fov_y = to.fov_y;
+      this.focus = to.focus;
       this.flight = null;
     }
   }

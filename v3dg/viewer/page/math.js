@@ -1,15 +1,148 @@
-// Vectors as arrays of 3; rotations as quaternions [w, x, y, z].
+// Vectors as arrays, rotations as quaternions [w, x, y, z].
 
-export const add = (a, b) => a.map((x, i) => x + b[i]);
-export const sub = (a, b) => a.map((x, i) => x - b[i]);
-export const mul = (a, s) => a.map((x) => x * s);
-export const dot = (a, b) => a.reduce((sum, x, i) => sum + x * b[i], 0);
-export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-export const length = (a) => Math.hypot(...a);
-export const unit = (a) => mul(a, 1 / (length(a) || 1));
-export const mix = (a, b, t) => a.map((x, i) => x + t * (b[i] - x));
-export const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
+/** @typedef {import("./page.js").Pinhole} Pinhole */
+/** @typedef {import("./page.js").Quaternion} Quaternion */
+/** @typedef {import("./page.js").Vector} Vector */
+/** @typedef {[Vector, Vector, Vector]} Matrix Three rows. */
 
+/** @type {Matrix} */
+const IDENTITY = [
+  [1, 0, 0],
+  [0, 1, 0],
+  [0, 0, 1],
+];
+/** Most that the plane of a picture is moved, in its distances. */
+const MOST_SHIFT = 0.7;
+
+/**
+ * @template {number[]} V
+ * @param {V} a
+ * @param {V} b
+ */
+export function add(a, b) {
+  return /** @type {V} */ (a.map((x, i) => x + b[i]));
+}
+
+/**
+ * @template {number[]} V
+ * @param {V} a
+ * @param {V} b
+ */
+export function sub(a, b) {
+  return /** @type {V} */ (a.map((x, i) => x - b[i]));
+}
+
+/**
+ * @template {number[]} V
+ * @param {V} a
+ * @param {number} factor
+ */
+export function mul(a, factor) {
+  return /** @type {V} */ (a.map((x) => x * factor));
+}
+
+/**
+ * @param {number[]} a
+ * @param {number[]} b
+ */
+export function dot(a, b) {
+  return a.reduce((sum, x, i) => sum + x * b[i], 0);
+}
+
+/**
+ * @param {Vector} a
+ * @param {Vector} b
+ * @returns {Vector}
+ */
+export function cross(a, b) {
+  return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+}
+
+/** @param {number[]} a */
+export function length(a) {
+  return Math.hypot(...a);
+}
+
+/**
+ * A vector of the same direction and of length one; zero for zero.
+ *
+ * @template {number[]} V
+ * @param {V} a
+ */
+export function unit(a) {
+  return mul(a, 1 / (length(a) || 1));
+}
+
+/**
+ * From `a` (t = 0) to `b` (t = 1) along a line.
+ *
+ * @template {number[]} V
+ * @param {V} a
+ * @param {V} b
+ * @param {number} t
+ */
+export function mix(a, b, t) {
+  return /** @type {V} */ (a.map((x, i) => x + t * (b[i] - x)));
+}
+
+/**
+ * @param {number} x
+ * @param {number} low
+ * @param {number} high
+ */
+export function clamp(x, low, high) {
+  return Math.min(Math.max(x, low), high);
+}
+
+/**
+ * @param {number[]} a
+ * @param {number[]} b
+ * @param {number} difference
+ */
+export function isNear(a, b, difference) {
+  return a.every((x, i) => Math.abs(x - b[i]) <= difference);
+}
+
+/** @param {number} angle Radians. */
+export function degrees(angle) {
+  return (angle * 180) / Math.PI;
+}
+
+/** @param {number} angle Degrees. */
+export function radians(angle) {
+  return (angle * Math.PI) / 180;
+}
+
+/**
+ * The numbers of a text, separated by spaces or commas; NaN for what is none.
+ *
+ * @param {string} text
+ */
+export function numbersOf(text) {
+  return text
+    .split(/[\s,]+/)
+    .filter(Boolean)
+    .map(Number);
+}
+
+/**
+ * A world axis that is not parallel to a direction of length one.
+ *
+ * @param {Vector} direction
+ * @returns {Vector}
+ */
+export function axisAcross(direction) {
+  if (Math.abs(direction[0]) < 0.9) return [1, 0, 0];
+  return [0, 1, 0];
+}
+
+/**
+ * The rotation by `b`, then by `a`.
+ *
+ * @param {Quaternion} a
+ * @param {Quaternion} b
+ * @returns {Quaternion}
+ */
 export function product(a, b) {
   return [
     a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
@@ -18,21 +151,62 @@ export function product(a, b) {
     a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
   ];
 }
-export const about = (axis, angle) => [Math.cos(angle / 2), ...mul(unit(axis), Math.sin(angle / 2))];
-export const inverse = (q) => [q[0], -q[1], -q[2], -q[3]];
-export const rotate = (q, v) => product(product(q, [0, ...v]), inverse(q)).slice(1);
 
-export function slerp(a, b, t) {
-  let cosine = dot(a, b);
-  if (cosine < 0) [b, cosine] = [mul(b, -1), -cosine];
-  if (cosine > 0.9995) return unit(mix(a, b, t));
-  const angle = Math.acos(cosine);
-  return add(mul(a, Math.sin((1 - t) * angle) / Math.sin(angle)), mul(b, Math.sin(t * angle) / Math.sin(angle)));
+/**
+ * @param {Vector} axis
+ * @param {number} angle Radians.
+ * @returns {Quaternion}
+ */
+export function about(axis, angle) {
+  return [Math.cos(angle / 2), ...mul(unit(axis), Math.sin(angle / 2))];
 }
 
-// The rotation whose columns are these three, right-handed and of length one.
+/**
+ * @param {Quaternion} q
+ * @returns {Quaternion}
+ */
+export function inverse(q) {
+  return [q[0], -q[1], -q[2], -q[3]];
+}
+
+/**
+ * @param {Quaternion} q
+ * @param {Vector} v
+ * @returns {Vector}
+ */
+export function rotate(q, v) {
+  const [, x, y, z] = product(product(q, [0, ...v]), inverse(q));
+  return [x, y, z];
+}
+
+/**
+ * From `a` (t = 0) to `b` (t = 1) along the shorter arc.
+ *
+ * @param {Quaternion} a
+ * @param {Quaternion} b
+ * @param {number} t
+ */
+export function slerp(a, b, t) {
+  let end = b;
+  if (dot(a, b) < 0) end = mul(b, -1);
+  const cosine = dot(a, end);
+  if (cosine > 0.9995) return unit(mix(a, end, t));
+  const angle = Math.acos(cosine);
+  const shareOfStart = Math.sin((1 - t) * angle) / Math.sin(angle);
+  const shareOfEnd = Math.sin(t * angle) / Math.sin(angle);
+  return add(mul(a, shareOfStart), mul(end, shareOfEnd));
+}
+
+/**
+ * The rotation whose columns are three right-handed axes of length one.
+ *
+ * @param {Vector} x
+ * @param {Vector} y
+ * @param {Vector} z
+ */
 export function fromAxes(x, y, z) {
   const trace = x[0] + y[1] + z[2];
+  /** @type {Quaternion} */
   let q;
   if (trace > 0) {
     q = [1 + trace, y[2] - z[1], z[0] - x[2], x[1] - y[0]];
@@ -46,32 +220,74 @@ export function fromAxes(x, y, z) {
   return unit(q);
 }
 
-// From camera (x right, y down, z forward) to world, for one that looks along `forward`.
+/**
+ * The rotation from camera (x right, y down, z forward) to world of a camera that looks along
+ * `forward`.
+ *
+ * @param {Vector} forward
+ * @param {Vector} up
+ */
 export function looking(forward, up) {
   const z = unit(forward);
   let x = cross(z, up);
-  if (length(x) < 1e-6) x = cross(z, Math.abs(z[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]);
+  if (length(x) < 1e-6) x = cross(z, axisAcross(z));
   x = unit(x);
   return fromAxes(x, cross(z, x), z);
 }
 
-// The homography that shows an old picture from a new view, for what lies on a plane at a distance from the
-// old one; as a CSS transform of an element of that size in px with its origin in the upper left corner.
+/**
+ * The homography that shows a picture of one view from another view, for what lies on a plane
+ * at a distance from the first.
+ *
+ * @param {Pinhole} before
+ * @param {Pinhole} now
+ * @param {number} distance
+ * @param {number} width Of the element, px.
+ * @param {number} height
+ * @returns {string | null} The CSS transform of an element whose origin is its upper left
+ *   corner; null if the middle of the picture is behind the other view.
+ */
 export function warp(before, now, distance, width, height) {
-  const axis = (q, v) => rotate(q, v);
-  const oldAxes = [[1, 0, 0], [0, 1, 0], [0, 0, 1]].map((v) => axis(before.wxyz, v));
-  const newAxes = [[1, 0, 0], [0, 1, 0], [0, 0, 1]].map((v) => axis(now.wxyz, v));
-  const turn = newAxes.map((n) => oldAxes.map((o) => dot(n, o))); // rows
-  let shift = newAxes.map((n) => dot(n, sub(before.position, now.position)) / distance);
-  if (length(shift) > 0.7) shift = mul(shift, 0.7 / length(shift)); // a plane says little of what is near
+  const oldAxes = IDENTITY.map((axis) => rotate(before.wxyz, axis));
+  const newAxes = IDENTITY.map((axis) => rotate(now.wxyz, axis));
+  const step = sub(before.position, now.position);
+  let shift = newAxes.map((axis) => dot(axis, step) / distance);
+  // A plane says little about what is near.
+  if (length(shift) > MOST_SHIFT) shift = mul(shift, MOST_SHIFT / length(shift));
+  const turn = /** @type {Matrix} */ (
+    newAxes.map((axis) => oldAxes.map((oldAxis) => dot(axis, oldAxis)))
+  );
   turn.forEach((row, i) => (row[2] += shift[i]));
   const oldFocal = height / 2 / Math.tan(before.fov_y / 2);
   const newFocal = height / 2 / Math.tan(now.fov_y / 2);
-  const back = [[1 / oldFocal, 0, -width / 2 / oldFocal], [0, 1 / oldFocal, -height / 2 / oldFocal], [0, 0, 1]];
-  const there = [[newFocal, 0, width / 2], [0, newFocal, height / 2], [0, 0, 1]];
-  const times = (a, b) => a.map((row) => [0, 1, 2].map((j) => row[0] * b[0][j] + row[1] * b[1][j] + row[2] * b[2][j]));
-  const h = times(there, times(turn, back));
-  if (h[2][2] <= 0.05) return null; // the middle of the old picture is behind the new view
-  const m = [h[0][0], h[1][0], 0, h[2][0], h[0][1], h[1][1], 0, h[2][1], 0, 0, 1, 0, h[0][2], h[1][2], 0, h[2][2]];
-  return `matrix3d(${m.map((x) => (x / h[2][2]).toFixed(12)).join(",")})`;
+  /** @type {Matrix} */
+  const toRays = [
+    [1 / oldFocal, 0, -width / 2 / oldFocal],
+    [0, 1 / oldFocal, -height / 2 / oldFocal],
+    [0, 0, 1],
+  ];
+  /** @type {Matrix} */
+  const toPixels = [
+    [newFocal, 0, width / 2],
+    [0, newFocal, height / 2],
+    [0, 0, 1],
+  ];
+  return cssTransform(times(toPixels, times(turn, toRays)));
+}
+
+/**
+ * @param {Matrix} a
+ * @param {Matrix} b
+ */
+function times(a, b) {
+  return /** @type {Matrix} */ (
+    a.map((row) => [0, 1, 2].map((j) => row[0] * b[0][j] + row[1] * b[1][j] + row[2] * b[2][j]))
+  );
+}
+
+/** @param {Matrix} homography */
+function cssTransform([x, y, w]) {
+  if (w[2] <= 0.05) return null;
+  const columns = [x[0], y[0], 0, w[0], x[1], y[1], 0, w[1], 0, 0, 1, 0, x[2], y[2], 0, w[2]];
+  return `matrix3d(${columns.map((value) => (value / w[2]).toFixed(12)).join(",")})`;
 }

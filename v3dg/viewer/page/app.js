@@ -1,0 +1,202 @@
+// The page: its parts, what the server says to them, and what keys and buttons do.
+
+import { Bookmarks } from "./bookmarks.js";
+import { Camera } from "./camera.js";
+import { Connection } from "./connection.js";
+import { acceptDrops } from "./drop.js";
+import { element, saveFile } from "./elements.js";
+import { FileCameras } from "./file_cameras.js";
+import { Frames } from "./frames.js";
+import { Instances } from "./instances.js";
+import { LinkState } from "./link_state.js";
+import { Look } from "./look.js";
+import { Movement } from "./movement.js";
+import { Overlay } from "./overlay.js";
+import { Panel } from "./panel.js";
+import { CameraPath } from "./path.js";
+import { Picture } from "./picture.js";
+import { Places } from "./places.js";
+import { Pointers } from "./pointers.js";
+import { Requests } from "./requests.js";
+import { Status } from "./status.js";
+import { Toolbar } from "./toolbar.js";
+
+/** @typedef {import("./page.js").Mode} Mode */
+/** @typedef {import("./protocol.js").FromViewer} FromViewer */
+/** @typedef {import("./protocol.js").Hello} Hello */
+/** @typedef {import("./protocol.js").Scene} Scene */
+/** @typedef {import("./protocol.js").Settings} Settings */
+
+export class App {
+  /**
+   * What the server said first; null until then.
+   *
+   * @type {Hello}
+   */
+  greeting = null;
+  /**
+   * What is shown; null until the server has said it.
+   *
+   * @type {Scene}
+   */
+  scene = null;
+
+  camera = new Camera();
+  look = new Look(element("stage"), this.camera);
+  frames = new Frames(this);
+  requests = new Requests(this);
+  picture = new Picture(this);
+  status = new Status();
+  places = new Places(this);
+  fileCameras = new FileCameras(this);
+  instances = new Instances(this);
+  path = new CameraPath(this);
+  bookmarks = new Bookmarks(this);
+  linkState = new LinkState(this);
+  overlay = new Overlay(this);
+  movement = new Movement(this);
+  pointers = new Pointers(this);
+  panel = new Panel(this);
+  toolbar = new Toolbar(this);
+  connection = new Connection(
+    (message, bytes) => this.take(message, bytes),
+    (isOpen) => this.changeConnection(isOpen),
+  );
+
+  constructor() {
+    acceptDrops(this);
+    new ResizeObserver(() => this.resize()).observe(this.look.stage);
+    this.resize();
+  }
+
+  get limits() {
+    return this.greeting.limits;
+  }
+
+  // What the server says.
+
+  /** @param {boolean} isOpen */
+  changeConnection(isOpen) {
+    if (isOpen) this.requests.reset();
+    else this.status.say("connecting", "no connection to the viewer");
+  }
+
+  /**
+   * @param {FromViewer} message
+   * @param {ArrayBuffer | null} bytes
+   */
+  take(message, bytes) {
+    switch (message.type) {
+      case "hello":
+        this.greet(message);
+        break;
+      case "scene":
+        this.open(message);
+        break;
+      case "picture":
+        this.picture.show(message, bytes);
+        break;
+      case "failed":
+        this.status.say("failed", `not drawn: ${message.text}`);
+        break;
+      case "notice":
+        this.status.warn(message.text);
+        break;
+      case "progress":
+        this.panel.showProgress(message.share);
+        break;
+      case "done":
+        this.panel.hideProgress();
+        break;
+      case "file":
+        saveFile(message.name, bytes);
+        break;
+      case "picked":
+        this.instances.take(message);
+        break;
+      case "play":
+        this.path.play(message);
+        break;
+    }
+  }
+
+  /** @param {Hello} greeting */
+  greet(greeting) {
+    const isFirst = this.greeting === null;
+    if (!isFirst && this.greeting.version !== greeting.version) location.reload();
+    this.greeting = greeting;
+    if (!isFirst) return;
+    this.look.begin(greeting);
+    this.fileCameras.begin(greeting.cameras);
+    this.camera.up = greeting.up;
+  }
+
+  /** @param {Scene} scene */
+  open(scene) {
+    const before = this.scene;
+    this.scene = scene;
+    this.camera.radius = scene.radius;
+    if (before?.name === scene.name) {
+      this.redraw();
+      return;
+    }
+    document.title = scene.name;
+    this.instances.reset();
+    this.path.reset();
+    this.requests.reset();
+    this.bookmarks.load();
+    if (before) this.openAnother();
+    else this.openFirst();
+    this.sync();
+  }
+
+  openFirst() {
+    this.camera.put(this.places.home);
+    this.camera.focus = this.scene.center;
+    this.panel.build();
+    const { hash } = location;
+    this.toolbar.showQuestion(this.greeting.asks_up && !/[#&]up=/.test(hash));
+    if (hash.length > 1) this.linkState.open(hash);
+  }
+
+  openAnother() {
+    this.fileCameras.reset();
+    this.look.settings.frozen = null;
+    this.places.showAll();
+    this.panel.build();
+    this.toolbar.showQuestion(false);
+  }
+
+  // What is shown.
+
+  resize() {
+    const { clientWidth, clientHeight } = this.look.stage;
+    if (!clientWidth || !clientHeight) return;
+    this.overlay.resize(clientWidth, clientHeight);
+    this.redraw();
+  }
+
+  redraw() {
+    this.frames.redraw();
+  }
+
+  /** Has all that is seen follow what was set. */
+  sync() {
+    this.toolbar.sync();
+    this.panel.sync();
+    this.redraw();
+  }
+
+  /** @param {Partial<Settings>} settings */
+  change(settings) {
+    Object.assign(this.look.settings, settings);
+    this.sync();
+  }
+
+  /** @param {Mode} mode */
+  setMode(mode) {
+    this.camera.mode = mode;
+    document.body.dataset.mode = mode;
+    this.sync();
+  }
+}

@@ -1,0 +1,73 @@
+// The world's axes in a corner of the picture.
+
+import * as M from "./math.js";
+import { AXES } from "./camera.js";
+import { element } from "./elements.js";
+
+/** @typedef {import("./camera.js").Camera} Camera */
+
+/** Colours of x, y and z. */
+export const AXIS_COLORS = ["#ff6b5e", "#7ad97a", "#5aa9ff"];
+/** To be seen on bright pictures, too. */
+const EDGE_COLOR = "#000c";
+/** Px of the page: the side of the canvas, length of an axis, distance of its name. */
+const SIDE = 80;
+const MIDDLE = SIDE / 2;
+const ARM = 20;
+const NAME = 28;
+
+export class Compass {
+  canvas = /** @type {HTMLCanvasElement} */ (element("compass"));
+  context = this.canvas.getContext("2d");
+
+  /** @param {Camera} camera */
+  constructor(camera) {
+    this.camera = camera;
+  }
+
+  /** @param {number} ratio Px of the screen for one of the page. */
+  resize(ratio) {
+    this.canvas.width = Math.round(SIDE * ratio);
+    this.canvas.height = Math.round(SIDE * ratio);
+    this.context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  }
+
+  draw() {
+    const { context } = this;
+    context.clearRect(0, 0, SIDE, SIDE);
+    context.font = "bold 12px system-ui";
+    context.lineJoin = "round";
+    context.textAlign = "center";
+    context.textBaseline = "middle";
+    const toCamera = M.inverse(this.camera.wxyz);
+    const names = /** @type {const} */ (["x", "y", "z"]);
+    const axes = names.map((name, i) => ({
+      name,
+      direction: M.rotate(toCamera, AXES[name]),
+      color: AXIS_COLORS[i],
+    }));
+    axes.sort((a, b) => b.direction[2] - a.direction[2]); // the farthest first
+    for (const { name, direction, color } of axes) this.drawAxis(name, direction, color);
+  }
+
+  /**
+   * @param {string} name
+   * @param {import("./page.js").Vector} direction In the camera's coordinates.
+   * @param {string} color
+   */
+  drawAxis(name, [x, y], color) {
+    const { context } = this;
+    context.beginPath();
+    context.moveTo(MIDDLE, MIDDLE);
+    context.lineTo(MIDDLE + ARM * x, MIDDLE + ARM * y);
+    context.strokeStyle = EDGE_COLOR;
+    context.lineWidth = 5;
+    context.stroke();
+    context.strokeText(name, MIDDLE + NAME * x, MIDDLE + NAME * y);
+    context.strokeStyle = color;
+    context.lineWidth = 2;
+    context.stroke();
+    context.fillStyle = color;
+    context.fillText(name, MIDDLE + NAME * x, MIDDLE + NAME * y);
+  }
+}

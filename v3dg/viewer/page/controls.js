@@ -1,0 +1,149 @@
+// The panel's controls: each is made within an element, calls a function when it is used, and can
+// be set to a value that was chosen elsewhere.
+
+import { make } from "./elements.js";
+
+/**
+ * @template Value
+ * @typedef {object} Control
+ * @property {HTMLElement} element
+ * @property {(value: Value) => void} set
+ */
+
+/**
+ * @typedef {object} Range
+ * @property {number} low
+ * @property {number} high
+ * @property {number} [step] Of an even slider.
+ * @property {boolean} [isLogarithmic] Whether a step is a factor, so that small values have room.
+ * @property {number} value
+ * @property {(value: number) => string} [text] How a value is written.
+ * @property {string} [title]
+ */
+
+/** Step of a logarithmic slider. */
+const LOGARITHMIC_STEP = 0.01;
+
+/**
+ * Puts a label before a control.
+ *
+ * @param {HTMLElement} parent
+ * @param {string} label
+ * @param {HTMLElement} control
+ * @param {string} title
+ * @param {Node | string} output Between them.
+ */
+export function addLabelled(parent, label, control, title = "", output = "") {
+  control.setAttribute("aria-label", label);
+  const element = make("label", { title }, make("span", {}, label), output, control);
+  parent.append(element);
+  return element;
+}
+
+/**
+ * @param {HTMLElement} parent
+ * @param {string} label
+ * @param {Range} range
+ * @param {(value: number) => void} act
+ * @returns {Control<number>}
+ */
+export function addSlider(parent, label, range, act) {
+  const { low, high, value, title, text = shortText } = range;
+  const { toSlider, fromSlider, step } = scaleOf(range);
+  const output = make("output");
+  const control = make("input", {
+    type: "range",
+    min: toSlider(low),
+    max: toSlider(high),
+    step,
+  });
+  const set = (/** @type {number} */ shown) => {
+    control.value = String(toSlider(shown));
+    output.textContent = text(shown);
+  };
+  set(value);
+  control.addEventListener("input", () => {
+    const chosen = fromSlider(Number(control.value));
+    output.textContent = text(chosen);
+    act(chosen);
+  });
+  return { element: addLabelled(parent, label, control, title, output), set };
+}
+
+/** @param {Range} range */
+function scaleOf({ isLogarithmic, step }) {
+  if (isLogarithmic) return { toSlider: Math.log, fromSlider: Math.exp, step: LOGARITHMIC_STEP };
+  return { toSlider: Number, fromSlider: Number, step };
+}
+
+/**
+ * @param {HTMLElement} parent
+ * @param {string} label
+ * @param {{ value: boolean, title: string }} state
+ * @param {(value: boolean) => void} act
+ * @returns {Control<boolean>}
+ */
+export function addCheckbox(parent, label, { value, title }, act) {
+  const control = make("input", { type: "checkbox", checked: value });
+  control.addEventListener("change", () => act(control.checked));
+  const set = (/** @type {boolean} */ isChecked) => {
+    control.checked = isChecked;
+  };
+  return { element: addLabelled(parent, label, control, title), set };
+}
+
+/**
+ * @param {HTMLElement} parent
+ * @param {string} label
+ * @param {{ options: string[][], value: string, title?: string }} state Options: keys with texts.
+ * @param {(value: string) => void} act
+ * @returns {Control<string>}
+ */
+export function addSelect(parent, label, { options, value, title }, act) {
+  const items = options.map(([key, text]) => make("option", { value: key }, text));
+  const control = make("select", {}, ...items);
+  control.value = value;
+  control.addEventListener("change", () => act(control.value));
+  const set = (/** @type {string} */ key) => {
+    control.value = key;
+  };
+  return { element: addLabelled(parent, label, control, title), set };
+}
+
+/**
+ * @param {HTMLElement} parent
+ * @param {string} label
+ * @param {() => void} act
+ * @param {string} title
+ */
+export function addButton(parent, label, act, title = "") {
+  const element = make("button", { type: "button", title }, label);
+  element.addEventListener("click", act);
+  parent.append(element);
+  return element;
+}
+
+/** @param {HTMLElement} parent */
+export function addRow(parent) {
+  const element = make("div", { className: "row" });
+  parent.append(element);
+  return element;
+}
+
+/** @param {HTMLElement} parent */
+export function addFaintText(parent) {
+  const element = make("p", { className: "faint" });
+  parent.append(element);
+  return element;
+}
+
+/** @param {(Node | string)[][]} rows Their cells. */
+export function tableOf(rows) {
+  const lines = rows.map((cells) => make("tr", {}, ...cells.map((cell) => make("td", {}, cell))));
+  return make("table", {}, ...lines);
+}
+
+/** @param {number} value */
+export function shortText(value) {
+  return String(Number(value.toPrecision(3)));
+}

@@ -1,0 +1,34 @@
+// Files that are dropped onto the page, which the viewer then shows.
+
+import { element } from "./elements.js";
+
+/** @typedef {import("./app.js").App} App */
+
+/** @param {App} app */
+export function acceptDrops(app) {
+  const sign = element("drop");
+  window.addEventListener("dragover", (event) => {
+    event.preventDefault();
+    sign.hidden = false;
+  });
+  window.addEventListener("dragleave", (event) => {
+    if (event.relatedTarget === null) sign.hidden = true;
+  });
+  window.addEventListener("drop", async (event) => {
+    event.preventDefault();
+    sign.hidden = true;
+    const [file] = event.dataTransfer.files;
+    if (file) await send(app, file);
+  });
+}
+
+/**
+ * @param {App} app
+ * @param {File} file
+ */
+async function send(app, file) {
+  app.status.say("refining", `sending ${file.name}`);
+  await app.connection.sendFile(file, (share) => {
+    app.status.say("refining", `sending ${file.name}, ${Math.round(100 * share)} %`);
+  });
+}

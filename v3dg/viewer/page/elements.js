@@ -1,0 +1,37 @@
+// The page's elements: those of index.html by their ids, and new ones.
+
+/** @param {string} id */
+export function element(id) {
+  return document.getElementById(id);
+}
+
+/**
+ * Makes an element; attributes that are properties of it are set as such.
+ *
+ * @template {keyof HTMLElementTagNameMap} Tag
+ * @param {Tag} tag
+ * @param {Record<string, unknown>} attributes
+ * @param {...(Node | string)} children
+ * @returns {HTMLElementTagNameMap[Tag]}
+ */
+export function make(tag, attributes = {}, ...children) {
+  const result = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name in result) Object.assign(result, { [name]: value });
+    else result.setAttribute(name, String(value));
+  }
+  result.append(...children);
+  return result;
+}
+
+/**
+ * Has the browser save bytes as a file.
+ *
+ * @param {string} name
+ * @param {ArrayBuffer} bytes
+ */
+export function saveFile(name, bytes) {
+  const link = make("a", { href: URL.createObjectURL(new Blob([bytes])), download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+}

@@ -1,0 +1,105 @@
+// The panel's figures: what the last picture cost, and what its colours mean.
+
+import { shortText, tableOf } from "./controls.js";
+import { make } from "./elements.js";
+
+/** @typedef {import("./protocol.js").Picture} Picture */
+/** @typedef {import("./protocol.js").Scene} Scene */
+
+/**
+ * @param {Picture} picture
+ * @param {Scene} scene
+ * @returns {HTMLElement[]}
+ */
+export function figuresOf(picture, scene) {
+  const { levels } = picture.figures;
+  return [tableOf(rowsOf(picture)), ...legendOf(picture, scene), ...histogramOf(levels, scene)];
+}
+
+/** @param {Picture} picture */
+function rowsOf({ figures, size }) {
+  const mebibytes = Math.round(figures.memory_bytes / 2 ** 20);
+  const rows = [
+    ["selected", grouped(figures.gaussians_selected)],
+    ["in the frustum", grouped(figures.gaussians_in_frustum)],
+    ["tolerance", `${shortText(figures.tolerance)} px²`],
+    ["select", `${figures.select_ms.toFixed(1)} ms`],
+    ["draw", `${figures.draw_ms.toFixed(1)} ms`],
+    ["picture", `${size[0]} x ${size[1]}`],
+  ];
+  if (figures.missing) rows.push(["pages missing", grouped(figures.missing)]);
+  rows.push(["memory", `${grouped(mebibytes)} MiB`]);
+  return rows;
+}
+
+/**
+ * @param {Picture} picture
+ * @param {Scene} scene
+ * @returns {HTMLElement[]}
+ */
+function legendOf({ shows, range }, scene) {
+  if (shows === "residency") {
+    const [none, ...missing] = scene.missing_colors.map(cssColor);
+    const colors = [`${none} 25%`, `${missing[0]} 25%`, ...missing.slice(1)];
+    return barOf(colors, ["as wanted", "finer pages missing"]);
+  }
+  if (!range) return [];
+  const [low, high] = range.map(shortText);
+  const colors = scene.ramp.map(cssColor);
+  switch (shows) {
+    case "alpha":
+      return barOf(["#000", "#fff"], [low, high]);
+    case "count":
+      return barOf(colors, ["1", "4", "16", "64", `${scene.most_counted}+`]);
+    case "error":
+      return barOf(colors, ["finest", `tolerance, ${high} px²`]);
+    case "depth":
+      return barOf(colors, [`far ${low}`, `near ${high}`]);
+    default:
+      return barOf(colors, [low, high]);
+  }
+}
+
+/**
+ * @param {string[]} colors Of a gradient, from left to right.
+ * @param {string[]} marks Below it.
+ */
+function barOf(colors, marks) {
+  const ramp = make("div", { className: "ramp" });
+  ramp.style.background = `linear-gradient(90deg, ${colors.join(",")})`;
+  return [ramp, marksOf(marks)];
+}
+
+/**
+ * How many gaussians of each level are selected.
+ *
+ * @param {number[]} levels
+ * @param {Scene} scene
+ */
+function histogramOf(levels, scene) {
+  if (levels.length < 2) return [];
+  const most = Math.max(...levels, 1);
+  const bars = levels.map((count, level) => {
+    const bar = make("div", { title: `level ${level}: ${grouped(count)}` });
+    bar.style.height = `${Math.max((100 * count) / most, 1)}%`;
+    bar.style.background = cssColor(scene.level_colors[level]);
+    return bar;
+  });
+  const marks = marksOf(["level 0", "selected by level", String(levels.length - 1)]);
+  return [make("div", { className: "levels" }, ...bars), marks];
+}
+
+/** @param {string[]} marks */
+function marksOf(marks) {
+  return make("div", { className: "marks" }, ...marks.map((mark) => make("span", {}, mark)));
+}
+
+/** @param {number[]} color */
+function cssColor(color) {
+  return `rgb(${color})`;
+}
+
+/** @param {number} count */
+export function grouped(count) {
+  return count.toLocaleString("en");
+}

@@ -1,0 +1,122 @@
+// What dragging a handle does to the pose of an instance.
+
+import * as M from "./math.js";
+import { AXES } from "./camera.js";
+
+/** @typedef {import("./page.js").Place} Place */
+/** @typedef {import("./projection.js").Projection} Projection */
+/** @typedef {import("./protocol.js").Pose} Pose */
+
+/**
+ * A handle that is dragged: along an axis, in the picture's plane, around an axis, or away from
+ * the middle.
+ *
+ * @typedef {object} Grip
+ * @property {"move" | "slide" | "turn" | "size"} kind
+ * @property {number} axis Index of the axis; -1 for none.
+ * @property {Place} start Where it was gripped.
+ * @property {Pose} pose That the instance had then.
+ * @property {Place} middle Where the instance was in the picture.
+ */
+
+export const WORLD_AXES = [AXES.x, AXES.y, AXES.z];
+const MIN_SCALE = 1e-6;
+const MAX_SCALE = 1e6;
+/** An axis that points to the eye is short in the picture; a drag along it is not endless. */
+const LEAST_AXIS_PX = 5;
+/** A drag that begins in the middle scales no faster than one that begins so far from it. */
+const LEAST_RADIUS_PX = 5;
+
+/**
+ * The pose of an instance when its handle is dragged to a place of the picture.
+ *
+ * @param {Grip} grip
+ * @param {Place} place
+ * @param {Projection} projection
+ * @param {number} reach Length of a handle along an axis, world units.
+ * @returns {Pose}
+ */
+export function draggedPose(grip, place, projection, reach) {
+  const pose = structuredClone(grip.pose);
+  switch (grip.kind) {
+    case "move":
+      pose.position = alongAxis(grip, place, projection, reach);
+      break;
+    case "slide":
+      pose.position = inPlane(grip, place, projection);
+      break;
+    case "turn":
+      pose.quaternion = aroundAxis(grip, place, projection);
+      break;
+    case "size":
+      pose.scale = scaleAt(grip, place);
+      break;
+  }
+  return pose;
+}
+
+/**
+ * @param {Grip} grip
+ * @param {Place} place
+ * @param {Projection} projection
+ * @param {number} reach
+ */
+function alongAxis({ axis, pose, middle, start }, place, projection, reach) {
+  const direction = WORLD_AXES[axis];
+  const tip = projection.place(M.add(pose.position, M.mul(direction, reach)));
+  const along = M.sub(tip ?? middle, middle);
+  const squaredLength = Math.max(M.dot(along, along), LEAST_AXIS_PX ** 2);
+  const share = M.dot(M.sub(place, start), along) / squaredLength;
+  return M.add(pose.position, M.mul(direction, share * reach));
+}
+
+/**
+ * @param {Grip} grip
+ * @param {Place} place
+ * @param {Projection} projection
+ */
+function inPlane({ pose, start }, place, projection) {
+  const { camera, focal } = projection;
+  const [, , depth] = projection.inCamera(pose.position);
+  const [right, down] = M.mul(M.sub(place, start), depth / focal);
+  const step = M.add(M.mul(camera.right, right), M.mul(camera.down, down));
+  return M.add(pose.position, step);
+}
+
+/**
+ * @param {Grip} grip
+ * @param {Place} place
+ * @param {Projection} projection
+ */
+function aroundAxis({ axis, pose, middle, start }, place, projection) {
+  const direction = WORLD_AXES[axis];
+  const sign = M.dot(direction, projection.camera.forward) < 0 ? -1 : 1;
+  const angle = angleAround(middle, place) - angleAround(middle, start);
+  return M.unit(M.product(M.about(direction, sign * angle), pose.quaternion));
+}
+
+/**
+ * @param {Grip} grip
+ * @param {Place} place
+ */
+function scaleAt({ pose, middle, start }, place) {
+  const factor = distanceFrom(middle, place) / distanceFrom(middle, start);
+  return M.clamp(pose.scale * factor, MIN_SCALE, MAX_SCALE);
+}
+
+/**
+ * @param {Place} middle
+ * @param {Place} place
+ */
+function angleAround(middle, place) {
+  const [x, y] = M.sub(place, middle);
+  return Math.atan2(y, x);
+}
+
+/**
+ * @param {Place} middle
+ * @param {Place} place
+ */
+function distanceFrom(middle, place) {
+  return Math.max(M.length(M.sub(place, middle)), LEAST_RADIUS_PX);
+}

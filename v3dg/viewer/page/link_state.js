@@ -1,0 +1,210 @@
+// What the page's address says after `#`: where the camera is, and the settings.
+
+import * as M from "./math.js";
+import { AXES, MODES, SPEED_BOUNDS, isMode } from "./camera.js";
+
+/** @typedef {import("./app.js").App} App */
+/** @typedef {import("./page.js").Quaternion} Quaternion */
+/** @typedef {import("./page.js").Vector} Vector */
+/** @typedef {import("./protocol.js").Settings} Settings */
+/** @typedef {import("./protocol.js").Shows} Shows */
+/** @typedef {Record<string, string | number>} Parts */
+
+/** Field of view in degrees. */
+const FOV_BOUNDS = [1, 170];
+const RESOLUTION_BOUNDS = [0.1, 1];
+/** What a link that does not say it means, beside the settings' defaults. */
+const USUAL = { mode: MODES[0], speed: 1, resolution: 1 };
+
+export class LinkState {
+  /** @param {App} app */
+  constructor(app) {
+    this.app = app;
+    window.addEventListener("hashchange", () => {
+      if (location.hash !== this.hash) this.open(location.hash);
+    });
+  }
+
+  /** A link to what is looked at now, from `#` on; what it means anyway is left out. */
+  get hash() {
+    const { camera, look, places, greeting } = this.app;
+    /** @type {Parts} */
+    const parts = {
+      at: textOf(camera.position),
+      turn: textOf(camera.wxyz),
+      focus: textOf(camera.focus),
+      fov: Number(M.degrees(camera.fov_y).toPrecision(5)),
+      up: places.upAxis ?? textOf(camera.up),
+      mode: camera.mode,
+      speed: Number(camera.speed.toPrecision(3)),
+      ...partsOf(look.settings),
+      resolution: look.resolution,
+    };
+    /** @type {Parts} */
+    const usual = { ...USUAL, ...partsOf(greeting.defaults) };
+    delete usual.tolerance; // a link says it always
+    const said = Object.entries(parts).filter(([name, value]) => usual[name] !== value);
+    return `#${said.map(([name, value]) => `${name}=${value}`).join("&")}`;
+  }
+
+  /** Has the address lead to what is looked at now. */
+  write() {
+    history.replaceState(null, "", this.hash);
+  }
+
+  async copy() {
+    const url = location.href.split("#")[0] + this.hash;
+    this.write();
+    try {
+      await navigator.clipboard.writeText(url);
+      this.app.status.confirm("The link is in the clipboard.");
+    } catch {
+      // Without encryption a page may not use the clipboard.
+      this.app.status.confirm("The link is in the address bar.");
+    }
+  }
+
+  /**
+   * Goes where a link leads; a place that it does not say, or says wrongly, stays.
+   *
+   * @param {string} hash
+   * @param {"jump" | "fly"} manner
+   */
+  open(hash, manner = "jump") {
+    const values = new LinkValues(hash);
+    const { app } = this;
+    app.camera.up = values.up() ?? app.camera.up;
+    this.openView(values, manner);
+    const mode = values.text("mode") ?? USUAL.mode;
+    if (isMode(mode)) app.setMode(mode);
+    this.openSettings(values);
+    app.look.resolution = values.number("resolution", RESOLUTION_BOUNDS) ?? USUAL.resolution;
+    app.camera.speed = values.number("speed", SPEED_BOUNDS) ?? USUAL.speed;
+    app.sync();
+  }
+
+  /**
+   * @param {LinkValues} values
+   * @param {"jump" | "fly"} manner
+   */
+  openView(values, manner) {
+    const { camera } = this.app;
+    const position = /** @type {Vector} */ (values.numbers("at", 3));
+    const turn = /** @type {Quaternion} */ (values.numbers("turn", 4));
+    if (!position || !turn || M.length(turn) <= 0.5) return;
+    const focus = /** @type {Vector} */ (values.numbers("focus", 3));
+    const fov = values.number("fov", FOV_BOUNDS);
+    const fov_y = fov === null ? camera.fov_y : M.radians(fov);
+    const view = { position, wxyz: M.unit(turn), fov_y };
+    if (manner === "fly") {
+      camera.flyTo(view, focus);
+      return;
+    }
+    camera.put(view);
+    camera.focus = focus ?? camera.focus;
+  }
+
+  /** @param {LinkValues} values */
+  openSettings(values) {
+    const { settings } = this.app.look;
+    const { defaults, limits } = this.app.greeting;
+    const { level_colors, shows_cuts } = this.app.scene;
+    const lastLevel = Math.max(level_colors.length - 1, 0);
+    const budget = values.number("budget", limits.budget);
+    const level = values.number("level", [0, lastLevel]) ?? defaults.min_level;
+    settings.shows = this.modeOf(values) ?? settings.shows;
+    settings.tolerance = values.number("tolerance", limits.tolerance) ?? settings.tolerance;
+    settings.budget = budget === null ? null : Math.round(budget);
+    settings.min_level = Math.round(level);
+    settings.gain = values.number("gain", limits.gain) ?? defaults.gain;
+    settings.fade = values.text("fade") === "0" ? null : defaults.fade;
+    settings.split = values.number("split", [0, 1]) ?? defaults.split;
+    if (settings.split && !shows_cuts) {
+      settings.split = 0;
+      this.app.status.warn("The link's split is not there: a pool on a GPU has none.");
+    }
+  }
+
+  /**
+   * What a link asks to show; null if the scene cannot show it.
+   *
+   * @param {LinkValues} values
+   * @returns {Shows | null}
+   */
+  modeOf(values) {
+    const { modes } = this.app.scene;
+    const shows = values.text("show") ?? this.app.greeting.defaults.shows;
+    const mode = modes.find((name) => name === shows);
+    if (!mode) {
+      this.app.status.warn(`The link's mode ${shows} is not there; ${modes.join(", ")} are.`);
+    }
+    return mode ?? null;
+  }
+}
+
+/** The values of a link by their names; null where one is missing or wrong. */
+class LinkValues {
+  /** @param {string} hash */
+  constructor(hash) {
+    this.values = new URLSearchParams(hash.replace(/^#/, ""));
+  }
+
+  /** @param {string} name */
+  text(name) {
+    return this.values.get(name);
+  }
+
+  /**
+   * A number, brought within bounds.
+   *
+   * @param {string} name
+   * @param {number[]} bounds
+   */
+  number(name, [low, high]) {
+    const text = this.text(name);
+    if (!text) return null;
+    const value = Number(text);
+    return Number.isFinite(value) ? M.clamp(value, low, high) : null;
+  }
+
+  /**
+   * So many numbers, separated by commas.
+   *
+   * @param {string} name
+   * @param {number} count
+   */
+  numbers(name, count) {
+    const values = M.numbersOf(this.text(name) ?? "");
+    return values.length === count && values.every(Number.isFinite) ? values : null;
+  }
+
+  /** The direction that is up: an axis, or three numbers. */
+  up() {
+    const name = this.text("up");
+    if (Object.hasOwn(AXES, name)) return AXES[/** @type {keyof AXES} */ (name)];
+    return /** @type {Vector} */ (this.numbers("up", 3));
+  }
+}
+
+/**
+ * Settings as a link says them.
+ *
+ * @param {Settings} settings
+ * @returns {Parts}
+ */
+function partsOf(settings) {
+  return {
+    show: settings.shows,
+    tolerance: settings.tolerance,
+    budget: settings.budget ?? "",
+    level: settings.min_level,
+    gain: settings.gain,
+    fade: settings.fade === null ? 0 : 1,
+    split: settings.split,
+  };
+}
+
+/** @param {number[]} values */
+function textOf(values) {
+  return values.map((value) => Number(value.toPrecision(7))).join(",");
+}

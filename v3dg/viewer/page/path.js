@@ -1,0 +1,154 @@
+// A path of the camera: views that are added or recorded, played, and saved.
+
+import * as M from "./math.js";
+
+/** @typedef {import("./app.js").App} App */
+/** @typedef {import("./protocol.js").Play} Play */
+/** @typedef {import("./protocol.js").Save} Save */
+/** @typedef {import("./protocol.js").View} View */
+
+const RECORDED_A_SECOND = 30;
+/** The viewer takes no two views at the same time. */
+const LEAST_SECONDS = 0.01;
+/** Name of the film's size that is the window's; all others are like "1280 x 720". */
+export const AS_THE_WINDOW = "as the window";
+
+export class CameraPath {
+  /**
+   * Views, each with the seconds from the one before.
+   *
+   * @type {[number, View][]}
+   */
+  stops = [];
+  /** Seconds from the view before to the one that is added next. */
+  secondsOfNextStop = 2;
+  /** Width and height of films, px, or `AS_THE_WINDOW`. */
+  filmSize = "1280 x 720";
+  isRecording = false;
+  /**
+   * When a view was last recorded, ms; null for the first.
+   *
+   * @type {number}
+   */
+  recordedAt = null;
+  /**
+   * The views that are played, and since when, ms; null while none are.
+   *
+   * @type {Play & { start: number }}
+   */
+  film = null;
+
+  /** @param {App} app */
+  constructor(app) {
+    this.app = app;
+  }
+
+  /** Forgets the path of another scene. */
+  reset() {
+    this.stops = [];
+  }
+
+  get isPlaying() {
+    return this.film !== null;
+  }
+
+  /** Seconds from the first view to the last. */
+  get duration() {
+    return sumOfSeconds(this.stops.slice(1));
+  }
+
+  addStop() {
+    if (this.isRecording) return;
+    this.stops.push([this.secondsOfNextStop, this.app.look.view]);
+    this.app.sync();
+  }
+
+  clear() {
+    this.stops = [];
+    this.isRecording = false;
+    this.app.panel.showRecording(false);
+    this.app.sync();
+  }
+
+  /** Records every view from now on, in place of the path before. */
+  startRecording() {
+    this.stops = [];
+    this.recordedAt = null;
+    this.isRecording = true;
+    this.app.sync();
+  }
+
+  stopRecording() {
+    this.record(performance.now()); // so that the path ends where the camera rests
+    this.isRecording = false;
+    this.app.sync();
+  }
+
+  /** @param {number} now Time of a frame, ms. */
+  recordFrame(now) {
+    if (!this.isRecording) return;
+    const isFirst = this.recordedAt === null;
+    if (isFirst || now - this.recordedAt >= 1000 / RECORDED_A_SECOND) this.record(now);
+  }
+
+  /** @param {number} now */
+  record(now) {
+    const { app } = this;
+    const last = this.stops.at(-1);
+    if (last && app.camera.isAt(last[1])) return;
+    let seconds = LEAST_SECONDS;
+    if (this.recordedAt !== null) {
+      const passed = (now - this.recordedAt) / 1000;
+      seconds = M.clamp(passed, LEAST_SECONDS, app.limits.path_seconds);
+    }
+    this.stops.push([seconds, app.look.view]);
+    this.recordedAt = now;
+  }
+
+  /** @param {Play} message */
+  play(message) {
+    this.film = { ...message, start: performance.now() };
+    this.app.redraw();
+  }
+
+  /** @param {number} now Time of a frame, ms. */
+  playFrame(now) {
+    if (!this.film) return;
+    const { views, fps, start } = this.film;
+    const end = views.length - 1;
+    const place = Math.min(((now - start) / 1000) * fps, end);
+    this.app.camera.put(views[Math.floor(place)]);
+    if (place >= end) this.film = null;
+  }
+
+  /** Ends playing and saving. */
+  stop() {
+    this.film = null;
+    this.app.connection.send({ type: "stop" });
+  }
+
+  /**
+   * Asks for a file of the picture, the scene, or the path, or for the path's views to play.
+   *
+   * @param {Save["what"]} what
+   */
+  save(what) {
+    const { app } = this;
+    const most = app.limits.path_seconds;
+    if (sumOfSeconds(this.stops) > most) {
+      app.status.warn(`Path: expected at most ${most / 60} minutes, got more; clear it`);
+      return;
+    }
+    const look = structuredClone(app.look.message);
+    if (what === "film" && this.filmSize !== AS_THE_WINDOW) {
+      const [width, height] = this.filmSize.split(" x ").map(Number);
+      look.size = [width, height];
+    }
+    app.connection.send({ type: "save", what, look, up: app.places.upAxis, path: this.stops });
+  }
+}
+
+/** @param {[number, View][]} stops */
+function sumOfSeconds(stops) {
+  return stops.reduce((sum, [seconds]) => sum + seconds, 0);
+}
