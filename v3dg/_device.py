@@ -85,7 +85,7 @@ def missing_for_cuda() -> str | None:
     if not _core.has_cuda:
         return "v3dg was built without CUDA; install it again where nvcc is found"
     if _core.num_cuda_devices() == 0:
-        return "expected a CUDA device and its driver, found none"
+        return "expected a CUDA device and its driver, got none"
     try:
         import torch
     except ImportError:

@@ -118,7 +118,7 @@ def naming_errors(path: str | os.PathLike[str], other_name: str | None = None) -
 
 
 @contextlib.contextmanager
-def telling(path: str | os.PathLike[str], expected: str) -> Iterator[None]:
+def value_errors(path: str | os.PathLike[str], expected: str) -> Iterator[None]:
     """Turn every exception of a library into one ValueError: none documents what
     damaged content raises."""
     try:
@@ -163,7 +163,7 @@ def check_folder(path: Path) -> None:
 def check_bundle_name(path: str | os.PathLike[str]) -> None:
     """Refuse a name that `v3dg.open` would not recognise as a bundle's, with
     ValueError."""
-    check(path, Path(path).suffix == ".v3dg", "a file name ending in .v3dg; v3dg.open goes by it")
+    check(path, Path(path).suffix == ".v3dg", "a file name ending in .v3dg; v3dg.open needs it")
 
 
 def open_regular(path: str | os.PathLike[str]) -> int:

@@ -102,7 +102,7 @@ def _answer(pipe: Connection) -> object:
     try:
         result, error = pipe.recv()
     except (EOFError, ConnectionError):
-        raise RuntimeError("a process that measures pictures was ended from outside") from None
+        raise RuntimeError("a worker that measures pictures was killed") from None
     if error is not None:
         raise error
     return result

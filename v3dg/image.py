@@ -11,7 +11,7 @@ from v3dg.pictures import encode_png
 
 @dataclass(frozen=True, eq=False)
 class Planes:
-    """The arrays of an `Image`; depth is None where it was not asked for."""
+    """The arrays of an `Image`; depth is None unless it was requested."""
 
     color: Array
     alpha: Array
@@ -26,7 +26,7 @@ class Image:
         color: (H, W, 3) premultiplied colour, the background composed last.
         alpha: (H, W) coverage.
         depth: (H, W) expected depth along the camera's axis, 0 where nothing was drawn;
-            an AttributeError unless it was asked for.
+            an AttributeError unless it was requested.
     """
 
     def __init__(self, color: Array, alpha: Array, depth: Array | None) -> None:
@@ -59,24 +59,26 @@ class Image:
 
 
 class Stats(NamedTuple):
-    """What a picture cost.
+    """Costs of drawing a picture.
 
     Attributes:
         gaussians_selected: Gaussians of the selected clusters.
-        gaussians_in_frustum: Of them, those in front of the near plane whose extent
-            meets the image, before any finer cull.
-        tolerance: px² that one gaussian of a coarser cluster stands for at most; with a
-            budget, those with which it is met; 0 for an asset.
-        select_ms: Time to choose the clusters.
-        draw_ms: Time to draw them.
-        levels: Gaussians selected, by level; empty on CUDA, of an asset and of a cut
-            that was given.
-        missing: Pages that the picture misses, in place of which coarser ones are
-            drawn; 0 where all is resident, or the renderer has settled. This and the
-            next as far as is known.
+        gaussians_in_frustum: Selected gaussians in front of the near plane whose extent
+            meets the image, before any finer culling.
+        tolerance: Largest screen area, px², that one gaussian of a coarser cluster
+            stands for; with a budget, the area at which the budget is met; 0 for an
+            asset.
+        select_ms: Time of the selection.
+        draw_ms: Time of drawing.
+        levels: Selected gaussians by level; empty on CUDA, for an asset, and for a cut
+            that the caller passed.
+        missing: Pages that the picture needs and that are not resident, so that coarser
+            ones are drawn instead; 0 where everything is resident, or the renderer has
+            settled. `missing` and `failed` count what is known when the picture is
+            drawn.
         failed: Pages that cannot be read.
         bytes_in: Bytes of pages that came in with this picture.
-        memory: Bytes of the pool that it was drawn from; None where all is resident.
+        memory: Size of the pool in bytes; None where everything is resident.
     """
 
     gaussians_selected: int
@@ -92,13 +94,13 @@ class Stats(NamedTuple):
 
 
 class RenderedImage(Image):
-    """An `Image` that says what it cost.
+    """An `Image` with the costs of drawing it.
 
-    One that CUDA draws may still be under way; to look at one of its attributes waits
-    until it is there, and raises what went wrong.
+    CUDA may still be drawing it; reading an attribute waits for the end, and raises the
+    error of the drawing.
 
     Attributes:
-        stats: What it cost.
+        stats: The costs of drawing it.
     """
 
     def __init__(

@@ -205,14 +205,14 @@ def write_asset(
         check(
             "version",
             write is spz.write,
-            f"none for {os.fspath(path)}, which is no .spz, got {version}",
+            f"None for {os.fspath(path)}, which is not a .spz, got {version}",
         )
         write = partial(spz.write, version=version)
     if write is ply.write:
         one_of(encoding, "encoding", get_args(PlyEncoding))
         write = partial(ply.write, encoding=encoding)
     else:
-        expected = f"none for {os.fspath(path)}, which is no .ply, got {encoding!r}"
+        expected = f"the default for {os.fspath(path)}, which is not a .ply, got {encoding!r}"
         check("encoding", encoding == "binary_little_endian", expected)
     write(path, gaussians)
 

@@ -119,11 +119,11 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
         warnings.simplefilter("ignore")  # about what else the file holds, such as more pictures
         is_known = file.read(8).startswith((b"\x89PNG\r\n\x1a\n", b"\xff\xd8"))
         check(name, is_known, "a PNG or a JPEG, got another file")
-        with _files.telling(name, "a PNG or a JPEG that is not damaged"):
+        with _files.value_errors(name, "a PNG or a JPEG that is not damaged"):
             image = Image.open(file, formats=("PNG", "JPEG"))  # of others, Pillow starts programs
         check_size(name, *image.size, MOST_PIXELS_COMPARED)
         check(name, not image.mode.startswith("I"), "8 bits a channel, got 16; convert it first")
-        with _files.telling(name, "a PNG or a JPEG that is not damaged"):
+        with _files.value_errors(name, "a PNG or a JPEG that is not damaged"):
             return np.asarray(image.convert("RGB"))
 
 

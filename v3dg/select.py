@@ -182,10 +182,10 @@ class Selection:
     def _first(self) -> npt.NDArray[np.int64]:
         """(S + 1,) first gaussian of each selected cluster, and the number of all."""
         return np.concatenate(
-            [[0], np.cumsum(self._per_pair(lambda clusters: np.diff(clusters.offset)))]
+            [[0], np.cumsum(self.per_pair(lambda clusters: np.diff(clusters.offset)))]
         )
 
-    def _per_pair(self, column: Callable[[Clusters], npt.NDArray[_Value]]) -> npt.NDArray[_Value]:
+    def per_pair(self, column: Callable[[Clusters], npt.NDArray[_Value]]) -> npt.NDArray[_Value]:
         """(S,) values of the selected clusters from a column (C,) of the tables of
         their bundles."""
         scene = copy.copy(self.scene)
@@ -202,7 +202,7 @@ class Selection:
         self, column: Callable[[Clusters], npt.NDArray[_Value]], dtype: type[_Value]
     ) -> npt.NDArray[_Value]:
         # The dtype is given, because a scene without bundles has no column.
-        return np.repeat(self._per_pair(column).astype(dtype), np.diff(self._first()))
+        return np.repeat(self.per_pair(column).astype(dtype), np.diff(self._first()))
 
 
 class CutOptions(TypedDict, total=False):

@@ -13,7 +13,7 @@ from v3dg.cameras import AXES, Axis, Camera
 from v3dg.gaussians import Gaussians
 from v3dg.scene import Scene, Subject
 
-ASSUMED = "as most trained assets have it"
+ASSUMED = "as in most trained assets"
 """The reason that `up_of` returns if nothing is known."""
 
 # With fewer cameras, all of them may be tilted.
@@ -63,9 +63,9 @@ def up_of(
         if max(heights) > _NEAR_AN_AXIS * max(float(np.linalg.norm(top)), 0.5):
             return AXES[int(np.argmax(heights))], f"guessed from {len(tops)} cameras"
     if isinstance(subject, Scene):
-        return "z", "as scenes have it"
+        return "z", "as in most scenes"
     if beside(path).name.lower().endswith(".glb"):
-        return "y", "as glTF has it"
+        return "y", "as in glTF"
     flat = _flat_axis(_middles(subject))
     if flat is not None:
         return flat, "guessed from the plane of its gaussians"

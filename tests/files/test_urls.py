@@ -668,7 +668,7 @@ def test_an_address_is_checked_once_more_when_a_connection_is_made(web, monkeypa
         (
             "redirects to a file",
             ConnectionError,
-            "the server sent us on to what is no address of the web",
+            "the server redirects to something that is no web address",
         ),
         ("gzip bomb", ConnectionError, "expected the file as it is, got a compressed answer"),
         ("404 without end", FileNotFoundError, "the server answered 404"),

@@ -505,7 +505,7 @@ def test_a_file_that_is_read_is_not_written_over(folder, tmp_path):
         ("build", "a.ply", "-o", "b.v3dg"),
         ("export", "a.v3dg", "-o", "a.v3dg"),
     ):
-        fails(2, "which is read; choose another name", *command, cwd=tmp_path)
+        fails(2, "another file than the input", *command, cwd=tmp_path)
     assert {name: (tmp_path / name).read_bytes() for name in before} == before
 
 

@@ -204,7 +204,7 @@ def test_what_cannot_be_meant_is_refused(folder):
         "3",
         cwd=folder,
     )
-    fails(2, "expected a bundle to write anew", "convert", "tuft.ply", "x.v3dg", cwd=folder)
+    fails(2, "expected a bundle as the input", "convert", "tuft.ply", "x.v3dg", cwd=folder)
     fails(2, "and no level or cut", "convert", "tuft.v3dg", "x.v3dg", "--level", "1", cwd=folder)
     fails(
         2,

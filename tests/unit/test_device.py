@@ -17,7 +17,7 @@ from v3dg import _core, _device
 from v3dg._device import CPU, Device
 
 BUILT_WITHOUT = "v3dg was built without CUDA; install it again where nvcc is found"
-NO_DEVICE = "expected a CUDA device and its driver, found none"
+NO_DEVICE = "expected a CUDA device and its driver, got none"
 
 
 def test_arrays_go_to_a_device_and_back(device):

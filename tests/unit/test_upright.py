@@ -83,7 +83,7 @@ def test_few_or_tumbling_cameras_do_not_tell(rng):
 
 def test_kind_of_file_tells(rng):
     assert up_of(spread(rng, (3, 2, 0.5)), path="a.GLB")[0] == "y"
-    assert up_of(v3dg.Scene()) == ("z", "as scenes have it")
+    assert up_of(v3dg.Scene()) == ("z", "as in most scenes")
 
 
 def test_nothing_is_no_error(rng):
@@ -113,9 +113,9 @@ def test_bundle_keeps_what_is_up_and_commands_say_what_they_took(rng, tmp_path):
     for name, line in (
         (
             "flat.ply",
-            "flat.ply: z is up, guessed from the plane of its gaussians; --up says otherwise\n",
+            "flat.ply: z is up, guessed from the plane of its gaussians; change it with --up\n",
         ),
-        ("flat.v3dg", "flat.v3dg: x is up, as its file says; --up says otherwise\n"),
+        ("flat.v3dg", "flat.v3dg: x is up, as its file says; change it with --up\n"),
     ):
         how = ("--size", 32, 32, "--device", "cpu", "-o")
         done = run("render", tmp_path / name, *how, tmp_path / f"{name}.png")
@@ -129,7 +129,7 @@ def test_bundle_keeps_what_is_up_and_commands_say_what_they_took(rng, tmp_path):
         assert (tmp_path / f"{name}.png").read_bytes() == (tmp_path / "given.png").read_bytes()
     done = run("export", tmp_path / "flat.v3dg", "-o", tmp_path / "web", "--quiet")
     assert done.returncode == 0, done.stderr
-    assert "flat.v3dg: x is up, as its file says; --up says otherwise\n" in done.stdout
+    assert "flat.v3dg: x is up, as its file says; change it with --up\n" in done.stdout
 
 
 def at_a_terminal(*arguments, answers, cwd):
@@ -199,12 +199,12 @@ def test_commands_that_use_what_is_up_ask_at_a_terminal_once(rng, tmp_path):
         "render", "round.ply", *how, "a.png", answers="x\n", cwd=tmp_path
     )
     assert (code, asked.count(ASKED)) == (0, 1), asked
-    assert said.endswith("round.ply: x is up, as you said; --up says otherwise\n")
+    assert said.endswith("round.ply: x is up, as you answered; change it with --up\n")
     assert run("render", "round.ply", *how, "b.png", "--up", "x", cwd=tmp_path).returncode == 0
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     done = run("render", "round.ply", *how, "b.png", cwd=tmp_path)
     assert done.stdout.endswith(
-        "round.ply: -y is up, as most trained assets have it; --up says otherwise\n"
+        "round.ply: -y is up, as in most trained assets; change it with --up\n"
     )
 
 

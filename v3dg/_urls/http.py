@@ -373,7 +373,7 @@ def _next_url(url: "URL", location: str) -> "URL":
     if not is_web:
         raise Problem(
             ConnectionError,
-            "the server sent us on to what is no address of the web; check the address",
+            "the server redirects to something that is no web address; check the address",
         )
     return target
 
@@ -388,7 +388,7 @@ def _tag_of(answer: "ClientResponse") -> str:
 def _range_of(answer: "ClientResponse") -> _ContentRange:
     match = _RANGE.fullmatch(answer.headers.get("Content-Range", "").strip())
     if not match:
-        raise Problem(ConnectionError, "the server sent a part of the file and does not say which")
+        raise Problem(ConnectionError, "the server sent a part of the file without saying which")
     last = _number(match[2])
     if last is not None:
         last += 1

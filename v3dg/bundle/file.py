@@ -239,10 +239,10 @@ class BundleFile:
         counts = []
         for name in ("clusters.level", "groups.parent", "pages.offset", "pages"):
             entry = header.get(name)
-            side = _only_side(entry)
-            if side is None:
-                self._fail(f"{name}: expected a tensor with one side, got {shown(entry)}")
-            counts.append(side)
+            length = _length_of_vector(entry)
+            if length is None:
+                self._fail(f"{name}: expected a one-dimensional tensor, got {shown(entry)}")
+            counts.append(length)
         largest = max(counts)
         text = (
             f"more than {shown(largest)} bytes for tensors, got {self.num_bytes}; "
@@ -352,15 +352,15 @@ class BundleFile:
         _core.read_pages(self.path, self._fd, out, self.codec.name, hashes, **vars(run))
 
 
-def _only_side(entry: object) -> int | None:
-    """The length of a tensor with one side, from its entry in a header; None for
+def _length_of_vector(entry: object) -> int | None:
+    """The length of a one-dimensional tensor, from its entry in a header; None for
     anything else."""
     if not isinstance(entry, dict):
         return None
     shape = entry.get("shape")
     if not isinstance(shape, list) or len(shape) != 1:
         return None
-    side = shape[0]
-    if type(side) is not int or side < 0:
+    length = shape[0]
+    if type(length) is not int or length < 0:
         return None
-    return side
+    return length

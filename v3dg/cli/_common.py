@@ -154,7 +154,7 @@ def check_output(output: Path, *inputs: Path) -> None:
         check_usage(
             str(output),
             is_another,
-            f"another file than {shown(path)}, which is read; choose another name",
+            f"another file than the input {shown(path)}; choose another name",
         )
 
 

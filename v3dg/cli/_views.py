@@ -198,7 +198,7 @@ def choose_up(
     axis, reason = up_of(subject, cameras, path)
     if reason == ASSUMED and is_at_terminal():
         axis = ask_up(path, axis)
-        reason = "as you said"
+        reason = "as you answered"
     return axis, lines_of_up(path, axis, reason)
 
 
@@ -207,7 +207,7 @@ def lines_of_up(path: Path, axis: Axis, reason: str) -> list[str]:
     --up."""
     if not reason:
         return []
-    return [f"{beside(path).name}: {axis} is up, {reason}; --up says otherwise"]
+    return [f"{beside(path).name}: {axis} is up, {reason}; change it with --up"]
 
 
 def is_at_terminal() -> bool:

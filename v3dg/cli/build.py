@@ -128,7 +128,7 @@ def _executor_at(address: str | None) -> Iterator[Executor | None]:
         reason = " ".join(str(error).split()) or "no answer"
         raise RuntimeError(f"{expected} that answers, got none ({reason})") from None
     except Exception as error:
-        # of any kind, as of one that speaks of other things, or another version
+        # A server of another kind or version may cause an error of any type.
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:_MOST_REASON]
         raise RuntimeError(f"{expected}, got something else ({reason})") from None
     with client:
@@ -154,19 +154,20 @@ def _greet(address: str) -> None:
     try:
         comm.get_address_host_port(address)
     except ValueError as error:
-        raise RuntimeError(f"{expected}, as tcp://host:8786, got no address ({error})") from None
+        text = f"{expected} such as tcp://host:8786, got no address ({error})"
+        raise RuntimeError(text) from None
     try:
         asyncio.run(connect())
     except (OSError, asyncio.TimeoutError) as error:
         reason = " ".join(str(error).split()) or "no answer"
         raise RuntimeError(f"{expected} that answers, got none ({reason})") from None
-    except TypeError as error:  # TLS without certificates
+    except TypeError as error:  # the scheduler uses TLS, and there are no certificates
         raise RuntimeError(
-            f"{expected} that can be asked, got none ({error}); set dask's security"
+            f"{expected} without TLS, got one that needs it ({error}); configure dask's security"
         ) from None
     except Exception:
-        # what dask makes of another protocol, whose first eight bytes it takes for a
-        # size
+        # The error that dask raises for another protocol, whose first eight bytes it
+        # takes for a size.
         advice = "give the address that `dask scheduler` prints"
         raise RuntimeError(
             f"{expected}, got a server that speaks another protocol; {advice}"
@@ -182,7 +183,7 @@ def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor
             _common.tell(f"[{len(results) + 1}/{len(outputs)}] {shown(asset)}")
         try:
             results.append(_build(options, assets[asset], output, executor))
-        except SchedulerError as error:  # which the others would wait for, too
+        except SchedulerError as error:  # every other asset would wait for it, too
             raise SchedulerError(f"{error}; {_progress_text(results, outputs)}") from None
         except _common.FAILURES as error:
             failure = cleaned(_common.failure_text(error))
@@ -351,8 +352,8 @@ def _resume_advised(output: Path) -> Iterator[None]:
         raise KeyboardInterrupt(f"interrupted{_resume_advice(output)}") from None
     except SchedulerError as error:
         raise SchedulerError(f"{error}{_resume_advice(output)}") from None
-    except OSError as error:  # for example of a full disk
-        if error.errno is None:  # of a URL, whose text says all
+    except OSError as error:  # such as that of a full disk
+        if error.errno is None:  # the error of a URL, whose text is complete
             raise type(error)(f"{error}{_resume_advice(output)}") from None
         text = f"{error.strerror}{_resume_advice(output)}"
         raise OSError(error.errno, text, error.filename) from None

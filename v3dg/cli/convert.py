@@ -68,8 +68,8 @@ def run(options: Convert) -> None:
     if _is_bundle(output):
         if not isinstance(subject, Bundle) or part_options:
             raise _common.UsageError(
-                f"{output}: expected a bundle to write anew, and no level or cut of it; "
-                "v3dg build makes one of an asset"
+                f"{output}: expected a bundle as the input, without options that choose a part "
+                "of it; v3dg build makes a bundle from an asset"
             )
         part = _Part(subject.gaussians, {"codec": options.codec or subject.codec})
         _write_bundle(options, subject)

@@ -58,8 +58,8 @@ def run(options: Export) -> None:
     subject, cameras = open_with_cameras(options.subject)
     if isinstance(subject, Gaussians):
         name = shown(options.subject)
-        expected = f"expected a scene or a bundle, got an asset; make one of it: v3dg build {name}"
-        raise ValueError(f"{name}: {expected}")
+        advice = f"build a bundle from it: v3dg build {name}"
+        raise ValueError(f"{name}: expected a scene or a bundle, got an asset; {advice}")
     up, notes = choose_up(options.up, subject, cameras, options.subject)
     if folder.suffix.lower() in USD_SUFFIXES:
         _common.check_usage(
@@ -131,11 +131,11 @@ def _lines(folder: Path, written: _Written, seconds: float) -> list[str]:
 
 
 def _advice(folder: Path, written: _Written) -> list[str]:
-    """How to look at an export."""
+    """The lines that say how to open an export in a browser."""
     quoted = shlex.quote(str(folder))
     lines = []
     if written.needs:
-        lines.append("it needs its engine beside it, once:")
+        lines.append("the page needs its engine in the same folder:")
         lines += [f"  {line.format(quoted)}" for line in written.needs]
     lines.append(f"to look at it: python -m http.server --bind 127.0.0.1 --directory {quoted}")
     lines.append("  then open http://127.0.0.1:8000/")
@@ -143,6 +143,6 @@ def _advice(folder: Path, written: _Written) -> list[str]:
 
 
 def _web_folder(subject: Path) -> Path:
-    """Where a page goes if nothing else is said."""
+    """The default folder of a page."""
     local = beside(subject)
     return local.with_name(f"{local.stem}_web")

@@ -140,7 +140,7 @@ def _bundle_info(bundle: Bundle) -> _Description:
         "",
         *_common.table_lines(columns, levels),
         "",
-        "errors: what the fits were left with, a pixel, at the size at which a level is drawn",
+        "errors: mean residual of the fits per pixel, at the size at which a level is drawn",
     ]
     if bundle.config:
         text = _common.printable(_config_text(bundle.config))

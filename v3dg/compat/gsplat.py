@@ -362,7 +362,7 @@ def _locate() -> Callable[..., tuple[torch.Tensor | None, ...]]:
             check(
                 "means2d, depths",
                 is_all,
-                "no loss but that of pictures; project the means for another",
+                "a loss of pictures only, got one of these tensors; project the means for it",
             )
             return (None,) * 7
 

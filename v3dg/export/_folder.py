@@ -63,7 +63,7 @@ def check_outside(folder: Path, inputs: Iterable[str | os.PathLike[str] | None])
         parents = [parent for parent in Path(os.path.realpath(path)).parents if parent.exists()]
         if any(os.path.samestat(parent.stat(), status) for parent in parents):
             raise ValueError(
-                f"{folder}: {os.fspath(path)}, which is read, is in it; choose another folder"
+                f"{folder}: the input {os.fspath(path)} is in it; choose another folder"
             )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _files
-from v3dg._files import telling as telling
+from v3dg._files import value_errors as value_errors
 from v3dg._json import Node
 from v3dg._numbers import check as check
 from v3dg.gaussians import Gaussians, gaussian_bytes
@@ -135,7 +135,7 @@ class Archive:
         self._path = path
         start = file.read(4)  # zipfile accepts a zip that begins anywhere in the file
         check(path, start == b"PK\3\4", f"a zip, got a file that begins with {start!r}")
-        with telling(path, "a zip that is not damaged"):
+        with value_errors(path, "a zip that is not damaged"):
             self._zip = zipfile.ZipFile(file)
             self._max_bytes = max(_FREE_BYTES, file.seek(0, os.SEEK_END))
         self.names = self._zip.namelist()
@@ -153,7 +153,7 @@ class Archive:
         check(self._path, is_readable, f"{name!a} stored or deflated in the zip, got neither")
         if getattr(member, "CRC", None) == 0:  # torch writes no checksum if it is configured so
             del member.CRC  # without the attribute, zipfile does not compare it
-        with telling(self._path, "a zip that is not damaged"), self._zip.open(member) as file:
+        with value_errors(self._path, "a zip that is not damaged"), self._zip.open(member) as file:
             content = file.read(
                 size
             )  # without a limit, zipfile expands everything before it truncates

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from v3dg._numbers import refuse
 from v3dg.formats._packing import DEGREES, Floats, assemble
-from v3dg.formats._reading import Archive, AssetFile, Claims, Path, check, telling, whole_file
+from v3dg.formats._reading import Archive, AssetFile, Claims, Path, check, value_errors, whole_file
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import normalised
 
@@ -57,7 +57,8 @@ _ALLOWED_MODULES = (
 
 
 # A value that a pickle builds: None, a number, text, a tuple, a dict, a _Named or a
-# _Tensor. `telling` turns the errors of operations on another kind into ValueErrors.
+# _Tensor. `value_errors` turns the errors of operations on another kind into
+# ValueErrors.
 _Value: TypeAlias = Any
 _Numbers: TypeAlias = NDArray[np.number]
 
@@ -129,7 +130,7 @@ def _fields_of(path: Path, archive: Archive) -> tuple[dict[str, _Tensor], str]:
         f"{root}byteorder" not in archive.names or archive.read(f"{root}byteorder") == b"little"
     )
     check(path, is_little, "little-endian numbers, got a checkpoint of another byte order")
-    with telling(path, "a checkpoint of tensors and plain values"):
+    with value_errors(path, "a checkpoint of tensors and plain values"):
         content = _Unpickler().run(pickle)
     return _fields(path, content), root
 

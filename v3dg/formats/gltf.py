@@ -20,7 +20,7 @@ from v3dg._numbers import Floats
 from v3dg._version import __version__
 from v3dg.formats import spz
 from v3dg.formats._packing import SH_C0, assemble, check_writable
-from v3dg.formats._reading import AssetFile, Claims, check, telling, whole, whole_file
+from v3dg.formats._reading import AssetFile, Claims, check, value_errors, whole, whole_file
 from v3dg.formats._reading import Path as AnyPath
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import normalised
@@ -172,7 +172,7 @@ class _Glb:
             len(content) >= 20,
             f"a .glb file, glTF 2.0 that is whole, got {len(content)} bytes",
         )
-        with telling(path, "a .glb file, glTF 2.0 that is whole"):
+        with value_errors(path, "a .glb file, glTF 2.0 that is whole"):
             magic, version, total, size, kind = struct.unpack_from("<IIIII", content)
             if (magic, version, total, kind) != (
                 _MAGIC,

@@ -30,7 +30,7 @@ from v3dg.formats._reading import (
     Claims,
     check,
     least_bytes,
-    telling,
+    value_errors,
     whole,
     whole_file,
 )
@@ -159,7 +159,7 @@ def _labels(path: Path, pixels: _Pixels, palette: _Palette) -> _packing.Integers
 
 
 def _meta(path: Path, text: bytes) -> dict[str, Node]:
-    with telling(path, "JSON in meta.json"):
+    with value_errors(path, "JSON in meta.json"):
         document = parse_json(text.decode("utf-8"))
     meta = Node(document, os.fspath(path), "")
     advice = "convert it with splat-transform first"
@@ -224,7 +224,7 @@ def _decoded(
         path, has_size and row in (None, width), f"{expected} in {name!a}, got {width} x {height}"
     )
     with (
-        telling(path, f"a WebP picture in {name!a}"),
+        value_errors(path, f"a WebP picture in {name!a}"),
         WebPImageFile(io.BytesIO(content)) as picture,
     ):
         if picture.size != (width, height):

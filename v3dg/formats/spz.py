@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 from v3dg import _files
 from v3dg.formats import _packing
 from v3dg.formats._packing import SQRT2, Floats, assemble
-from v3dg.formats._reading import AssetFile, Claims, Path, check, least_bytes, telling, whole_file
+from v3dg.formats._reading import (
+    AssetFile,
+    Claims,
+    Path,
+    check,
+    least_bytes,
+    value_errors,
+    whole_file,
+)
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import normalised
 
@@ -62,7 +70,7 @@ def open_file(path: Path) -> AssetFile:
     with claims.open(path) as file:
         header = file.read(_MAX_START)
     if header[:2] == b"\x1f\x8b":
-        with telling(path, "a gzip stream that is not damaged"):
+        with value_errors(path, "a gzip stream that is not damaged"):
             header = zlib.decompressobj(31).decompress(header, _HEADER.size)
     checked = _checked_header(path, header, claims)
     return whole_file(path, checked.num_gaussians, checked.sh_degree, read)
@@ -229,13 +237,13 @@ def _sections_of_gzip(
     path: Path, content: bytes, claims: Claims
 ) -> tuple[_Header, list[memoryview]]:
     stream = zlib.decompressobj(31)
-    with telling(path, "a gzip stream that is not damaged"):
+    with value_errors(path, "a gzip stream that is not damaged"):
         start = stream.decompress(content, _HEADER.size)
     header = _checked_header(path, start, claims)
     check(path, header.version <= 3, f"version 1 to 3 in gzip, got {header.version}")
     sizes = header.section_bytes
     total = sum(sizes)
-    with telling(path, "a gzip stream that is not damaged"):
+    with value_errors(path, "a gzip stream that is not damaged"):
         # The limit is never 0, which would mean none.
         body = stream.decompress(stream.unconsumed_tail, total + _MAX_TRAILER)
         if not stream.eof and len(body) >= total:
@@ -280,7 +288,7 @@ def _sections_of_zstd(
         packed, expanded = _STREAM_SIZES.unpack_from(content, table + i * _STREAM_SIZES.size)
         fits = expanded == size and packed <= num_bytes - first
         check(path, fits, f"{size} bytes in stream {i}, got {expanded} of {packed} in the file")
-        with telling(path, "a zstd stream that is not damaged"):
+        with value_errors(path, "a zstd stream that is not damaged"):
             reader = zstandard.ZstdDecompressor().stream_reader(content[first : first + packed])
             section = reader.read(size + 1)
         check(path, len(section) == size, f"{size} bytes in stream {i}, got another number")

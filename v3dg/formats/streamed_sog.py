@@ -13,7 +13,7 @@ import numpy as np
 
 from v3dg._json import Node, parse_json
 from v3dg.formats import sog
-from v3dg.formats._reading import AssetFile, Claims, check, telling, whole, whole_file
+from v3dg.formats._reading import AssetFile, Claims, check, value_errors, whole, whole_file
 from v3dg.gaussians import Gaussians
 
 _LEVEL = re.compile(r"[0-9]{1,9}")
@@ -77,7 +77,7 @@ def _used(
 def _index(path: Path, text: bytes) -> tuple[Node, list[PurePosixPath], PurePosixPath | None]:
     """The tree, the names of the files, and the name of the environment's file if there
     is one."""
-    with telling(path, "JSON"):
+    with value_errors(path, "JSON"):
         index = Node(parse_json(text.decode("utf-8")), os.fspath(path), "")
     if index.has("version") and index.field("version").value != 1:
         raise index.field("version").error("streamed SOG version 1")

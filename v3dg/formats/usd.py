@@ -24,7 +24,7 @@ from v3dg import _extras, _files
 from v3dg._numbers import check
 from v3dg.cameras import Axis, Floats, is_rotation
 from v3dg.formats._packing import check_writable
-from v3dg.formats._reading import AssetFile, telling
+from v3dg.formats._reading import AssetFile, value_errors
 from v3dg.formats._reading import Path as AnyPath
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import normalised, quaternion_from_rotation
@@ -132,7 +132,7 @@ def _opened(path: AnyPath, expected: str) -> Iterator[tuple[ModuleType, Usd.Prim
     )
     usd = pxr()
     os.close(_files.open_regular(path))
-    with telling(path, expected):
+    with value_errors(path, expected):
         stage = usd.Usd.Stage.Open(os.fspath(path))
         if not any(_prims(usd, stage.GetPseudoRoot())):
             raise ValueError("no ParticleField3DGaussianSplat")

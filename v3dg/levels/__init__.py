@@ -40,41 +40,42 @@ def build_bundle(
     differently).
 
     Args:
-        asset: At least one gaussian that can be drawn; or the file of it, as for
+        asset: Gaussians, at least one of which can be drawn; or a file, as for
             `read_asset`.
         config: Settings; ours by default.
-        seed: Of the views that groups are fitted to.
-        progress: Show a bar with the level, its groups done, the time left and their
-            mean loss; four lines where stderr is no terminal. Or a function that is
-            called with the gaussians that are fitted, of how many, and a text; what it
-            raises ends the build. The four lines are also logged in any case, as INFO
-            of the logger `v3dg`.
-        device: Where to compute; the bundle is on the host in any case. "auto" and
-            "cuda" are the asset's or the current CUDA device and all others of its
-            kind, where torch can use it; "auto" else the CPU.
-        resume_path: The file of the bundle, which is written there as it is built, and
-            opened from there; a build of the same asset, config, seed and device goes
-            on from what it finds.
+        seed: Seed of the views that groups are fitted to.
+        progress: True shows a bar with the level, the number of fitted groups, the time
+            left and the mean loss, or prints four lines if stderr is not a terminal. A
+            function is called with the number of fitted gaussians, the total, and a
+            text; an exception that it raises ends the build. The four lines are always
+            logged, as INFO of the logger `v3dg`.
+        device: The device that computes; the bundle is always on the host. "cuda" is
+            the asset's CUDA device or else the current one, and all others of its kind.
+            "auto" is the same where torch can use CUDA, otherwise the CPU.
+        resume_path: The file of the bundle: the build writes each level there, and
+            opens the bundle from there at the end. A build of the same asset, config,
+            seed and device continues from the levels that it finds.
         unusable: Whether gaussians with wrong values (not finite, negative scales,
             opacities outside 0 to 1) are left out, with a `v3dg.cleaning.AssetWarning`,
-            or are an error. Those that no pixel can show, because their opacity is
-            below 1/255, are left out in any case. How many of each kind is kept in the
-            bundle's config as "dropped".
-        executor: Whose workers build, as `dask.distributed.Client.get_executor()`; by
-            default, threads of this process. They are to have devices of one kind with
-            this process, which builds the topmost levels, and to reach `resume_path`,
-            where they write their parts (docs/cluster.md).
-        codec: How the bundle keeps gaussians, see `v3dg.Bundle`. Where that rounds,
-            levels are fitted to what those below them were rounded to.
+            or are an error. Gaussians that no pixel can show, because their opacity is
+            below 1/255, are always left out. The bundle's config has the number of each
+            kind as "dropped".
+        executor: The executor whose workers build, such as
+            `dask.distributed.Client.get_executor()`; threads of this process by
+            default. The workers need devices of the same kind as this process, which
+            builds the topmost levels, and access to `resume_path`, where they write
+            their parts (docs/cluster.md).
+        codec: The codec of the bundle, see `v3dg.Bundle`. If it rounds, levels are
+            fitted to the rounded gaussians of the levels below them.
 
     Raises:
         ValueError: The asset has nothing that can be drawn, or a setting is wrong.
-        RuntimeError: The device is "cuda", and something is missing for it; another
-            build is using `resume_path`; or a worker is of another kind, or ended.
-        OSError: `resume_path` cannot be written; what is finished stays there.
-        MemoryError: The device has too little memory; the message has the numbers.
-        KeyboardInterrupt: Ctrl-C; threads have stopped, what is finished is at
-            `resume_path`.
+        RuntimeError: The device is "cuda" and cannot be used; another build is using
+            `resume_path`; or a worker has a device of another kind, or ended.
+        OSError: `resume_path` cannot be written; finished levels stay there.
+        MemoryError: The device has too little memory; the message says how much.
+        KeyboardInterrupt: Ctrl-C was pressed; threads have stopped, and finished levels
+            are at `resume_path`.
     """
     asset = loaded(asset)
     check_type("asset", asset, Gaussians, "Gaussians")

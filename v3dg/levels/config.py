@@ -1,4 +1,4 @@
-"""How a bundle is built."""
+"""The settings of a build, with their ranges and defaults."""
 
 import math
 from dataclasses import dataclass, fields, replace
@@ -28,8 +28,8 @@ _Setting = int | float | bool | str
 
 @dataclass(frozen=True)
 class BuildConfig:
-    """How a bundle is built. The defaults are ours, with the reasons in docs/levels.md;
-    `paper()` is V3DG's.
+    """The settings of a build. docs/levels.md gives the reasons for the defaults;
+    `paper()` has the settings of V3DG.
 
     Numbers have their least and their greatest value beside their type. Whole numbers
     are 32 bits wide in the core, others float32, whose squares and products with each
@@ -44,8 +44,8 @@ class BuildConfig:
         init: Start of a coarser cluster: "merge" alike gaussians in pairs, or "prune"
             the lesser half.
         prune_growth: Factor for the scales of gaussians that survive pruning.
-        targets: What a level is fitted to: the "finest" level below that its views can
-            show, or the "previous" one.
+        targets: The level whose pictures a level is fitted to: the "finest" level below
+            that its views can show, or the "previous" one.
         steps: Maximum number of steps of Adam for each group; 0 keeps the start.
         first_steps: Steps at level 1; each level takes twice as many as the one below,
             up to `steps`.
@@ -56,31 +56,33 @@ class BuildConfig:
             levels show finer gaussians; targets of the previous level keep it.
         image_size: Side of the views in px; 0 shows a group at the size at which it
             will be selected.
-        px2_per_gaussian: That size: px² of the group's footprint for each gaussian that
-            it is simplified to.
-        distance: From the camera to the centre of the group, in radii.
+        px2_per_gaussian: The size at which a group is shown: px² of its footprint for
+            each gaussian that it is simplified to.
+        distance: Distance from the camera to the centre of the group, in radii of the
+            group.
         filter_px2: Variance of the low-pass that the coarser levels are drawn with,
-            px²; the last one with a pixel's, 1/12, if that is more, unless this is 0.
+            px². The last level has at least the variance of a pixel, 1/12, unless this
+            is 0.
         smooth: Whether the asset's gaussians are about as wide as they are far apart,
-            so that one sample a pixel shows it well from near. Its coarser levels have
-            no filter, but the last one a pixel's, and a group of level 1 is selected
-            where pictures of the asset tell that it is no worse than its leaves, or at
-            half the size if there are more than a million leaves. Where levels are
-            fitted, and with a filter, it is measured: some groups of level 1 are fitted
-            with 0.05 px² and without, and an asset that hardly gains by the filter is
-            smooth.
-        asset_filter_px2: The filter of level 0: what the asset was trained with (0.3
-            for the original 3DGS) at the size of its photographs; without, it is better
-            seen from farther away. Coarser levels are fitted to the asset without a
-            filter.
+            so that one sample a pixel shows it well from near. Coarser levels of such
+            an asset have no filter, except the last one, which has that of a pixel. A
+            group of level 1 is then selected where pictures of the asset show that it
+            is no worse than its leaves, or at half the size if there are more than a
+            million leaves. "measured" decides it by a measurement if levels are fitted
+            with a filter: some groups of level 1 are fitted with 0.05 px² and without,
+            and an asset that hardly gains by the filter is smooth.
+        asset_filter_px2: The filter of level 0. The filter of the training (0.3 for the
+            original 3DGS) suits pictures of the size of the photographs; without a
+            filter, the asset looks better from farther away. Coarser levels are fitted
+            to the asset without a filter.
         asset_antialiased: Whether the asset was trained with opacities compensated for
             its filter.
         loss_l1, loss_dssim, loss_alpha: Weights of the parts of the loss.
         step_position: Step size of positions, in radii of the group, or in world units
-            if `position_in_world`; the others are of log scales, quaternions, logits
-            and SH coefficients.
-        final_step: The factor that the step sizes have reached in the end, by
-            exponential decay.
+            if `position_in_world`. The other step sizes are those of log scales,
+            quaternions, logits and SH coefficients.
+        final_step: The factor by which the step sizes have decayed exponentially at the
+            last step.
         beta2: Decay of Adam's running mean of squared gradients.
 
     Raises:
@@ -96,7 +98,7 @@ class BuildConfig:
     init: Literal["merge", "prune"] = "merge"
     prune_growth: Annotated[float, (0.001, 1000)] = 2 ** (1 / 6)  # once a level
     targets: Literal["finest", "previous"] = "finest"
-    steps: Annotated[int, (0, 1_000_000)] = 600  # at most some hours
+    steps: Annotated[int, (0, 1_000_000)] = 600  # the largest number takes some hours
     first_steps: Annotated[int, (0, 1_000_000)] = 150
     views_per_step: Annotated[int, (1, 1024)] = 2  # a step is not interrupted
     num_views: Annotated[int, (0, 1 << 16)] = 64  # all are drawn before the first step

@@ -1,5 +1,5 @@
-"""From files of an asset to the file of its bundle: builds it if needed, and resumes an
-interrupted build."""
+"""Builds the file of a bundle from the files of an asset, and resumes an interrupted
+build."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -46,7 +46,7 @@ def build_file(
     """Build the bundle of an asset's file, or of several that make one asset, straight
     into a file.
 
-    While it is built it is at `levels_path`; an asset that does not fit in memory is
+    The unfinished bundle is at `levels_path`. An asset that does not fit in memory is
     sorted in a scratch folder beside it.
 
     Args:
@@ -59,16 +59,15 @@ def build_file(
             memory.
         up: The axis that is up in the asset, which the bundle records for viewers and
             exports.
-        config, seed, progress, device, unusable, executor, codec: As for
-            `build_bundle`.
+        config, seed, progress, device, unusable, executor, codec: See `build_bundle`.
 
     Returns:
         The bundle, opened from its file, and whether it was built.
 
     Raises:
-        ValueError: Memory is too little (the message says how much is needed), or the
-            file name does not end in .v3dg.
-        ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: As
+        ValueError: The memory is too small (the message says how much is needed), or
+            the file name does not end in .v3dg.
+        ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: See
             `read_asset` and `build_bundle`.
     """
     config = _checked_config(config)

@@ -39,7 +39,7 @@ from v3dg.levels.scratch import RowFile, scratch_folder
 MOST_GAUSSIANS = 1 << 32
 """An asset must have fewer gaussians than this."""
 
-_MOST_IN_BUCKET = 1 << 18  # a quarter of a unit of a build, so that few gaussians are read in vain
+_MOST_IN_BUCKET = 1 << 18  # a quarter of a unit of a build, so that few unneeded gaussians are read
 _MOST_IN_BLOCK_BYTES = 1 << 28  # a larger block is not faster: its rows are read in random order
 _SENT_AT_ONCE = 1 << 12  # gaussians that a thread writes to a bucket at a time
 _OVERHEAD_BYTES = 24 << 20
@@ -135,8 +135,8 @@ def _check_disk(folder: Path, num_bytes: int) -> None:
     free = shutil.disk_usage(folder).free
     if free < num_bytes:
         raise OSError(
-            f"{folder}: expected {in_mib(num_bytes)} free for scratch, got {in_mib(free)}; "
-            "free some, write to another disk, or give enough memory to need no scratch"
+            f"{folder}: expected {in_mib(num_bytes)} free for scratch files, got {in_mib(free)}; "
+            "free some space, write to another disk, or allow more memory"
         )
 
 
@@ -288,7 +288,7 @@ def _new_words(path: Path, width: int) -> external_split.WordFile:
 
 
 def _name_of(tiles: Sequence[_Tile]) -> str:
-    """What messages call the asset in these files."""
+    """The name of the asset in messages."""
     if len(tiles) == 1:
         return shown(tiles[0].path)
     return f"one of {len(tiles)} files"

@@ -1,4 +1,5 @@
-"""How much memory of the host a build may use, and how many units fit into it."""
+"""The memory of the host that a build may use, and the number of units that fit into
+it."""
 
 import os
 import re
@@ -39,8 +40,8 @@ def in_bytes(memory: int | str | None) -> int:
 
 
 def pool_bytes(memory: int | str | None) -> int | Literal["auto"] | None:
-    """What a renderer is given as its memory: bytes, "auto", or None; ValueError for
-    anything else."""
+    """The memory of a renderer's pool: bytes, "auto", or None; ValueError for anything
+    else."""
     if memory is None:
         return None
     if isinstance(memory, str) and memory == "auto":

@@ -1,11 +1,11 @@
 """Whether the dask scheduler behind an executor still answers, so that no build waits
 for it without end.
 
-A client of dask's that keeps its connection sends messages and waits for results: it
-does not notice that a scheduler has stopped, on a machine that hangs, say. So the
-scheduler is asked for next to nothing, again and again, while units are built. Only its
-silence ends a build: units may take as long as they need, and workers that die are the
-scheduler's to notice.
+A dask client with an open connection sends messages and waits for results: it does not
+notice that a scheduler has stopped, for example because its machine hangs. So the
+scheduler is sent a small request again and again while units are built. Only its
+silence ends a build: units may take as long as they need, and the scheduler itself
+notices workers that die.
 """
 
 import asyncio
@@ -19,22 +19,23 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# A scheduler that lives may be busy for long with the graphs of others, which its one
-# thread works on.
+# A working scheduler may be busy for a long time with the graphs of other clients,
+# which its only thread processes.
 _MOST_SILENCE_S = 120.0
-_TICK_S = 5.0  # between two questions
-_ADVICE = "look after it; finished units are kept, and a build that is resumed goes on from them"
+_TICK_S = 5.0  # between two requests
+_ADVICE = "check it; finished units are kept, and a resumed build continues from them"
 
 
 class SchedulerError(RuntimeError):
-    """A scheduler does not answer any more, or has dropped what it was asked to do."""
+    """A scheduler does not answer any more, or has dropped the units that it was
+    given."""
 
 
 class Watch:
-    """Asks the scheduler of one client, while that waits for results.
+    """Sends requests to the scheduler of a client that waits for results.
 
     Attributes:
-        name: Of the scheduler, as errors give it.
+        name: The scheduler's name in error messages.
     """
 
     def __init__(self, client: "Client") -> None:
@@ -43,8 +44,8 @@ class Watch:
         self._question: Future[None] | None = None
         self._silent_s = 0.0
 
-    def hear(self) -> None:
-        """Note that a result has come, which is an answer, too."""
+    def note_answer(self) -> None:
+        """Note that a result has arrived, which counts as an answer."""
         self._silent_s = 0.0
 
     def tick(self) -> None:
@@ -52,7 +53,7 @@ class Watch:
         answer.
 
         Ticks are counted and no clock is read: a process that was itself stopped for a
-        while has heard nothing, and must not conclude anything from that.
+        while received nothing, and must not conclude anything from that.
         """
         self._silent_s += _TICK_S
         if self._question is not None and self._question.done():
@@ -97,7 +98,7 @@ def completed(futures: Collection[Future[T]], watch: Watch | None) -> Iterator[F
                     f"{watch.name}: connection lost, or units cancelled; {_ADVICE}"
                 )
             if ended:
-                watch.hear()
+                watch.note_answer()
             else:
                 watch.tick()
         yield from ended

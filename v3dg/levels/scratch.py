@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from v3dg import _files
 
-_MARK = "v3dg-scratch"  # a file by which the folder is known
+_MARK = "v3dg-scratch"  # a file that marks the folder as ours
 
 _Scalar = TypeVar("_Scalar", np.float32, np.uint32)
 
@@ -45,7 +45,8 @@ class RowFile(AbstractContextManager["RowFile[_Scalar]"], Generic[_Scalar]):
         rows = np.empty(shape, self._dtype)
         with _files.naming_errors(self.path):
             if not _files.read_at(self._descriptor, rows, first * self._row_bytes):
-                raise OSError(f"{self.path}: expected rows {first} to {last} of scratch, got fewer")
+                expected = f"expected rows {first} to {last} of a scratch file"
+                raise OSError(f"{self.path}: {expected}, got fewer")
         return rows
 
     def blocks(self, first: int, last: int, size: int) -> Iterator[npt.NDArray[_Scalar]]:
@@ -77,7 +78,7 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
         foreign_names = sorted(set(present) - own_names)
         if foreign_names:
             raise ValueError(
-                f"{folder}: expected scratch of a build, got {foreign_names[0]!a}; move it "
+                f"{folder}: expected scratch files of a build, got {foreign_names[0]!a}; move it "
                 "elsewhere"
             )
         # The mark comes before any other file and goes after the last: without it none

@@ -46,10 +46,10 @@ class Level:
 class LevelBuilder:
     """Makes the levels of a plan: of a whole asset, or of any subtree of it.
 
-    What a group becomes depends on the leaves under it, the config, the seed, its level
-    and its number in the level, and on nothing else. So on the CPU the same groups get
-    the same bits, whatever the plan. On CUDA, how many groups are fitted at once can
-    change how a group is spread over the GPU, and thereby the last bits.
+    The result for a group depends only on the leaves under it, the config, the seed,
+    its level and its number in the level. So on the CPU the same groups get the same
+    bits, whatever the plan. On CUDA, how many groups are fitted at once can change how
+    a group is spread over the GPU, and thereby the last bits.
     """
 
     plan: Plan
@@ -82,8 +82,8 @@ class LevelBuilder:
     def levels_above(
         self, lower_levels: dict[int, Level], finished: Iterable[Level], show: Show
     ) -> Iterator[Level]:
-        """Yield the levels above `lower_levels`, by number, which keeps those that the
-        next are fitted to."""
+        """Yield the levels above `lower_levels`, by number; that dict keeps the levels
+        that later ones are fitted to."""
         saved = iter(finished)
         num_levels = len(self.plan.levels)
         last = max(lower_levels)
@@ -195,7 +195,7 @@ def _view(
     target: Level, plan: Plan, number: int, config: BuildConfig
 ) -> tuple[Offsets, npt.NDArray[np.float32]]:
     """The targets of a level's groups: (G + 1,) offsets of their gaussians; (G, 4)
-    balls to look at."""
+    balls that the views show."""
     source = config.target_of(number)
     leaf_offset = plan.levels[number].leaf_offset
     if source == 0:

@@ -1,5 +1,5 @@
-"""Whether an asset is smooth: its gaussians as wide as they are far apart, so that no
-filter is needed."""
+"""Measures whether an asset is smooth: its gaussians are as wide as they are far apart,
+so that no filter is needed."""
 
 from dataclasses import replace
 

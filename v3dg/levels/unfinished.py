@@ -91,12 +91,12 @@ class PageFile:
 
 
 class Unfinished:
-    """A bundle that is being built, in a file that replaces `bundle_path` at the end;
-    without, it stays.
+    """A bundle that is being built, in a file that replaces `bundle_path` at the end,
+    or stays where it is if that is None.
 
     A truncated record is ignored; a damaged record or page is an error. The file is
-    locked while a build uses it, and removed after a build that finished no level but
-    the leaves.
+    locked while a build uses it, and removed after a build that finished only the
+    leaves.
     """
 
     def __init__(
@@ -135,8 +135,8 @@ class Unfinished:
         return self
 
     def _continue(self, descriptor: int, magic: bytes) -> None:
-        """Read what an interrupted build of the same bundle finished; begin an empty
-        file."""
+        """Read the levels that an interrupted build of the same bundle finished, or
+        begin an empty file."""
         head = os.pread(descriptor, len(self._plan.header), 0)
         if head == self._plan.header:
             os.ftruncate(descriptor, self._plan.num_bytes)
@@ -154,8 +154,8 @@ class Unfinished:
                 raise
         else:
             raise ValueError(
-                f"{self._path}: holds something else, or levels of another asset, config, seed, "
-                "device or version; remove it to start again"
+                f"{self._path}: expected levels of this build, got another file, or levels of "
+                "another asset, config, seed, device or version; remove it to start again"
             )
 
     def __exit__(self, *_: object) -> None:
@@ -169,7 +169,7 @@ class Unfinished:
             yield
         except (OSError, ValueError) as error:
             raise ValueError(
-                f"{self._path}: expected levels of an interrupted build, could not read them "
+                f"{self._path}: expected levels of an interrupted build, got an unreadable file "
                 f"({error}); remove it to start again"
             ) from error
 
@@ -279,10 +279,10 @@ def described(device: Device) -> tuple[str, str]:
 
 
 def discard_levels(resume_path: str | os.PathLike[str]) -> None:
-    """Remove what an interrupted build left there, if anything.
+    """Remove the levels that an interrupted build left at this path, if there are any.
 
     Raises:
-        ValueError: There is something else, which stays.
+        ValueError: The file is something else; it stays.
         RuntimeError: A build is using it.
         OSError: It cannot be removed.
     """
@@ -290,13 +290,14 @@ def discard_levels(resume_path: str | os.PathLike[str]) -> None:
         with _open_locked(resume_path) as file:
             head = os.pread(file.fileno(), len(_MAGIC), 0)
             is_ours = _MAGIC.startswith(head) or _is_bundle(resume_path)
-            expected = "levels of an interrupted build, got something else; move it elsewhere"
+            expected = "levels of an interrupted build, got another file; move it elsewhere"
             check(resume_path, is_ours, expected)
             os.unlink(resume_path)
 
 
 def _is_bundle(path: str | os.PathLike[str]) -> bool:
-    """Whether a build was killed when all was done but the move."""
+    """Whether a build was killed after the bundle was complete and before it was
+    moved."""
     try:
         Bundle.open(path)
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""The build of a whole asset: its units on an executor, then what is above them."""
+"""The build of a whole asset: its units on an executor, then the levels above them."""
 
 import os
 import socket
@@ -33,22 +33,22 @@ from v3dg.levels.simplify import Level, LevelBuilder, LevelTables, Show
 from v3dg.levels.smooth import measured_config
 from v3dg.levels.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
 
-# Leaves of a unit: enough to keep a GPU busy, and little memory. The last bits of a
-# bundle depend on it.
+# Leaves of a unit: enough to keep a GPU busy, in little memory. The last bits of a
+# bundle depend on this number.
 UNIT_LEAVES = 1 << 20
-# By how much balls of level 1 of a smooth asset grow that is too large to be measured:
-# it is then selected at half the size (docs/levels.md).
+# Factor by which the balls of level 1 grow if a smooth asset is too large to be
+# measured: level 1 is then selected at half the size (docs/levels.md).
 _UNMEASURED = 2.0
-# Units that a GPU works on at once, so that others fill what the smallest levels of one
-# leave idle.
+# Units that a GPU works on at once, so that it is not idle during the smallest levels
+# of one.
 _UNITS_ON_GPU = 4
 
 _Levels = dict[int, FinishedLevel]
 
 
 def devices_for(device: str | Device, asset: Gaussians | None = None) -> list[Device]:
-    """Where to build: with "auto" and "cuda" also on all devices like the asset's or
-    the current one."""
+    """The devices of a build: for "auto" and "cuda", the asset's or the current one and
+    all others of its kind."""
     first = _device.resolve(device)
     if not first.is_cuda or str(device) not in ("auto", "cuda"):
         return [first]
@@ -102,7 +102,7 @@ def build_into(
 
 
 def _parts(plan: Plan, units: Sequence[Plan], file: BundlePlan) -> list[Part]:
-    """The units, and last what is above them."""
+    """The parts of the units, and last the part above them."""
 
     def runs(number: int, count: int) -> list[PageRun]:
         first, last = plan.first_page[number : number + 2]
@@ -120,7 +120,7 @@ def _parts(plan: Plan, units: Sequence[Plan], file: BundlePlan) -> list[Part]:
 
 @dataclass(frozen=True, eq=False)
 class _Build:
-    """The work on all units of a plan, and on what is above them."""
+    """The work on all units of a plan, and on the levels above them."""
 
     config: BuildConfig
     seed: int
@@ -173,8 +173,8 @@ class _Build:
         )
 
     def grown(self, tables: Sequence[LevelTables], device: Device) -> list[LevelTables]:
-        """The tables with larger balls: of level 1 by what is measured, if the asset is
-        one unit."""
+        """The tables with larger balls; the growth of level 1 is measured if the asset
+        is one unit."""
         ball = tables[1].ball
         level_1 = self.plan.levels[1]
         growth = np.full(len(ball), _UNMEASURED, np.float32)
@@ -251,8 +251,8 @@ class _Build:
     def _collect(
         self, submit: Callable[[int], Future[_Levels]], watch: Watch | None = None
     ) -> None:
-        """Have units built, and save what comes back; what fails, or an interrupt, ends
-        the others."""
+        """Build units, and save their levels; a failure or an interrupt ends the other
+        units."""
         units: dict[Future[_Levels], int] = {}
         try:
             for unit in self._todo:
@@ -316,11 +316,11 @@ class UnitTask:
             if number not in self.finished:
                 hashes = self.pages.write(self.runs[number], level.gaussians)
                 yield number, FinishedLevel(level.tables, hashes)
-            del level  # while the next is made, its memory is free
+            del level  # frees its memory while the next one is made
 
 
 class WorkerDevice(NamedTuple):
-    """What the device of every worker must be, so that they all give the same bits."""
+    """The device that every worker must have, so that all give the same bits."""
 
     kind: str  # "cpu" or "cuda"
     description: str
@@ -341,8 +341,8 @@ def build_in_worker(task: UnitTask, expected_device: WorkerDevice, _: bytes) -> 
     worker_device = WorkerDevice(expected_device.kind, *described(device))
     if worker_device != expected_device:
         raise RuntimeError(
-            f"{worker}: expected {expected_device} as where the build began, "
-            f"got {worker_device}; the last bits would differ"
+            f"{worker}: expected {expected_device} like the main process, "
+            f"got {worker_device}; results would differ in their last bits"
         )
     assert isinstance(task.pages, PageFile)
     if not task.pages.path.exists():

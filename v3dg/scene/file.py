@@ -87,7 +87,7 @@ def write_scene(
     check(
         path,
         is_scene(Path(path)),
-        "a file name ending in .json, not meta.json; v3dg.open goes by it",
+        "a file name ending in .json, not meta.json; v3dg.open needs it",
     )
     check_type("scene", scene, Scene, "a Scene")
     cameras = cameras or {}
@@ -128,7 +128,7 @@ def _paths_of_bundles(scene: Scene, folder: str) -> list[str]:
     paths = []
     for number, bundle in enumerate(scene.bundles):
         if not bundle.path or is_url(bundle.path):
-            problem = "got one in memory or at a URL; write it and open that"
+            problem = "got one in memory or at a URL; write it to a file and open that"
             refuse(f"scene.bundles[{number}]", f"one that was opened from a file, {problem}")
         paths.append(os.path.relpath(bundle.path, folder))
     return paths
@@ -343,7 +343,7 @@ def _open_bundles(
         if file is None:
             tried = " or ".join(map(str, paths))
             problem = node.problem(
-                f"expected a bundle at {tried}, found none; build it with `v3dg build`"
+                f"expected a bundle at {tried}, got none; build it with `v3dg build`"
             )
             raise FileNotFoundError(str(problem))
         files[key] = file

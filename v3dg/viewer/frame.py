@@ -363,8 +363,8 @@ class SceneView:
             finest = select(self.scene, camera, tolerance=0.0, device=self.device)
             window = (0, 0, end_of_whole, camera.height)
             whole = self._draw(finest, camera, window, "appearance", job.stop).color
-        level = cut._per_pair(lambda clusters: clusters.level)
-        size = cut._per_pair(lambda clusters: np.diff(clusters.offset))
+        level = cut.per_pair(lambda clusters: clusters.level)
+        size = cut.per_pair(lambda clusters: np.diff(clusters.offset))
         figures = Stats(
             gaussians_selected=cut.num_gaussians,
             gaussians_in_frustum=planes.gaussians_in_frustum,

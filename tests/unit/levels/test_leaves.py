@@ -382,7 +382,7 @@ def test_too_small_a_disk_is_told_before_work_begins(tmp_path, small, monkeypatc
     small()
     monkeypatch.setattr(on_disk.shutil, "disk_usage", lambda _: SimpleNamespace(free=1 << 20))
     with (
-        pytest.raises(OSError, match=r"s: expected 3 MiB free for scratch, got 1 MiB"),
+        pytest.raises(OSError, match=r"s: expected 3 MiB free for scratch files, got 1 MiB"),
         leaves_on_disk([tmp_path / "a.ply"], tmp_path / "s", memory=0, config=CONFIG),
     ):
         pass
@@ -450,11 +450,11 @@ def test_scratch_in_use_and_files_of_others_are_kept(tmp_path, small):
         first.read(0, 1000)
     (tmp_path / "s").mkdir()
     (tmp_path / "s" / "letter").write_text("dear")
-    with pytest.raises(ValueError, match="expected scratch of a build, got 'letter'"), leaves():
+    with pytest.raises(ValueError, match="expected scratch files of a build, got 'letter'"), leaves():
         pass
     assert (tmp_path / "s" / "letter").read_text() == "dear"
     (tmp_path / "s" / "letter").rename(tmp_path / "s" / "order")  # of a name that scratch has, too
-    with pytest.raises(ValueError, match="expected scratch of a build, got 'order'"), leaves():
+    with pytest.raises(ValueError, match="expected scratch files of a build, got 'order'"), leaves():
         pass
     assert (tmp_path / "s" / "order").read_text() == "dear"
     shutil.rmtree(tmp_path / "s")
