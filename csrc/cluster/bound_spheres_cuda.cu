@@ -1,6 +1,6 @@
-// Bounding balls of all segments in step: blocks find the sphere of each segment that reaches
-// farthest from its centre, then a warp a segment adds it to the core set and moves the centre.
-// Segments that are done cost a look at a flag.
+// Finds the bounding balls of all segments in lockstep: blocks find the sphere of each segment that
+// reaches farthest from its centre, then one warp a segment adds it to the core set and moves the
+// centre. A finished segment costs only the test of a flag.
 
 #include <vector>
 
@@ -19,14 +19,14 @@ static_assert(kCoreSize <= 32, "a lane holds one sphere of the core set");
 enum class Phase : int { search, measure, done };
 
 struct Search {
-    Center center;  // what the farthest sphere is wanted for
+    Center center;  // the farthest sphere is sought from it
     Center best;
     double best_radius, core_radius;
     int core_size;
     Phase phase;
 };
 
-// A sphere of a segment and how far it reaches. Larger is farther; ties: the lower index.
+// A sphere of a segment and its farthest distance. Ties go to the lower index.
 struct Farthest {
     double distance;
     uint32_t index;
@@ -57,7 +57,7 @@ __global__ void start_kernel(const Ball* spheres, const int64_t* offset, size_t 
     searches[s] = search;
 }
 
-// A block takes a chunk of a segment.
+// Each block searches a chunk of a segment.
 __global__ void farthest_kernel(const Ball* spheres, const int64_t* offset,
                                 const uint32_t* segment_of_chunk, const uint32_t* first_chunk,
                                 const Search* searches, Farthest* found) {
@@ -87,29 +87,29 @@ __global__ void farthest_kernel(const Ball* spheres, const int64_t* offset,
 // hold; returns its radius.
 __device__ double center_core(const Ball& mine, int count, Center& center) {
     const unsigned lane = threadIdx.x % 32;
-    const auto find = [&](const Center& at) {
+    const auto find = [&](const Center& place) {
         const bool counts = static_cast<int>(lane) < count;
-        return farthest_of_warp({counts ? reach(at, mine) : -1.0, lane});
+        return farthest_of_warp({counts ? reach(place, mine) : -1.0, lane});
     };
-    Center at = center;
-    Farthest far = find(at);
+    Center place = center;
+    Farthest far = find(place);
     double best_radius = far.distance;
     for (int step = kFirstCoreStep; step <= kLastCoreStep; ++step) {
         const Ball sphere{__shfl_sync(kAllLanes, mine.x, far.index),
                           __shfl_sync(kAllLanes, mine.y, far.index),
                           __shfl_sync(kAllLanes, mine.z, far.index),
                           __shfl_sync(kAllLanes, mine.radius, far.index)};
-        if (!move_center(sphere, far.distance, step, at)) break;
-        far = find(at);
+        if (!move_center(sphere, far.distance, step, place)) break;
+        far = find(place);
         if (far.distance < best_radius) {
             best_radius = far.distance;
-            center = at;
+            center = place;
         }
     }
     return best_radius;
 }
 
-// A warp takes a segment.
+// Each warp advances a segment.
 __global__ void advance_kernel(const Ball* spheres, const int64_t* offset, size_t num_segments,
                                const uint32_t* first_chunk, const Farthest* found, double margin,
                                Search* searches, Ball* cores, Ball* balls) {
@@ -180,14 +180,17 @@ void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double 
     DeviceBuffer<Farthest> found(segment_of_chunk.size(), stream);
     launch("bound_spheres: start", start_kernel, blocks_for(num_segments, kBlockSize), kBlockSize,
            0, stream, spheres.data, offsets.data(), num_segments, searches.data(), ball.data);
-    // The core set grows from two spheres by one a pass; then come the last look and the radius.
+    // The core set grows from two spheres by one a pass. Two more passes measure it and find the
+    // radius.
     for (int pass = 0; pass < kCoreSize + 1; ++pass) {
         launch("bound_spheres: farthest", farthest_kernel,
                static_cast<unsigned>(segment_of_chunk.size()), kBlockSize, 0, stream, spheres.data,
-               offsets.data(), segments.data(), first_chunks.data(), searches.data(), found.data());
+               offsets.data(), segments.data(), first_chunks.data(), searches.data(),
+               farthest_of_chunk.data());
         launch("bound_spheres: advance", advance_kernel, blocks_for(num_segments, kWarps),
                kBlockSize, 0, stream, spheres.data, offsets.data(), num_segments,
-               first_chunks.data(), found.data(), margin, searches.data(), cores.data(), ball.data);
+               first_chunks.data(), farthest_of_chunk.data(), margin, searches.data(), cores.data(),
+               ball.data);
     }
 }
 

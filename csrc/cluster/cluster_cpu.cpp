@@ -1,5 +1,5 @@
-// Median split: segments in parallel, and a task a node, down to a size where tasks cost more than
-// they win. Bounding balls: one thread a segment.
+// The median split handles segments in parallel and starts a task a node, down to a size where
+// tasks cost more than they gain. Each bounding ball is found by one thread.
 
 #include "base/threads.h"
 #include "cluster/cluster.h"
@@ -58,9 +58,9 @@ void move_median(IndexedPoint* first, IndexedPoint* middle, IndexedPoint* last) 
     });
 }
 
-// Splits points first .. last into the node's 2^depth leaves. Plain arguments: LLVM's OpenMP, which
-// stands in for gcc's where threads are checked (.ci/sanitize), forgets to copy others into a task
-// that runs at once.
+// Splits points first .. last into the node's 2^depth leaves. Arguments are plain values because
+// LLVM's OpenMP, which replaces GCC's where threads are checked (.ci/sanitize), does not copy
+// others into a task that runs at once.
 void split_node(IndexedPoint* points, ptrdiff_t first, ptrdiff_t last, int depth, int64_t* order) {
     if (depth == 0) {
         for (ptrdiff_t i = first; i < last; ++i) order[i] = points[i].index;
@@ -95,21 +95,21 @@ size_t farthest(const Center& center, const Ball* spheres, size_t count, double*
 // Moves `center` towards the centre of the smallest ball around a few spheres; returns its radius.
 double center_core(const Ball* core, size_t count, Center* center) {
     double best_radius;
-    Center at = *center;
-    size_t far = farthest(at, core, count, &best_radius);
+    Center place = *center;
+    size_t far = farthest(place, core, count, &best_radius);
     double radius = best_radius;
     for (int step = kFirstCoreStep; step <= kLastCoreStep; ++step) {
-        if (!move_center(core[far], radius, step, at)) break;
-        far = farthest(at, core, count, &radius);
+        if (!move_center(core[far], radius, step, place)) break;
+        far = farthest(place, core, count, &radius);
         if (radius < best_radius) {
             best_radius = radius;
-            *center = at;
+            *center = place;
         }
     }
     return best_radius;
 }
 
-// Centre of nearly the smallest ball around the spheres.
+// Returns the centre of nearly the smallest ball around the spheres.
 Center center_of(const Ball* spheres, size_t count) {
     Center center = center_of(spheres[0]);
     if (count == 1) return center;

@@ -5,12 +5,12 @@
 
 #include <algorithm>
 #include <atomic>
-#include <chrono>
 #include <cmath>
 #include <numeric>
 #include <stdexcept>
 #include <string>
 
+#include "base/clock.h"
 #include "base/parallel_for.h"
 #include "base/stop.h"
 #include "project/project.h"
@@ -18,11 +18,6 @@
 #include "rasterize/rasterize_math.h"
 
 namespace v3dg {
-
-static double now() {
-    return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch())
-        .count();
-}
 
 // Gaussians that are projected together: a run of one draw, short enough that it reaches few rows
 // of tiles where neighbours in memory are neighbours in space.

@@ -1,22 +1,17 @@
 #include "draw/scene_frame.h"
 
 #include <algorithm>
-#include <chrono>
 #include <memory>
 #include <stdexcept>
 #include <string>
 
+#include "base/clock.h"
 #include "draw/false_color.h"
 #include "math/sh.h"
 
 namespace v3dg {
 
 namespace {
-
-double now() {
-    return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch())
-        .count();
-}
 
 // A workspace lent to one caller at a time, kept from frame to frame; a second caller gets one of
 // its own. Without a lock, which a fork() in the middle would leave closed.

@@ -1,3 +1,6 @@
+// Views of random cuts of a bundle. Each follows from its number: a share of the gaussians, a size,
+// a camera, the cut of that budget, and a window in which it is compared.
+
 #include "levels/cut_views.h"
 
 #include <algorithm>
@@ -13,19 +16,19 @@ namespace v3dg {
 
 namespace {
 
-constexpr double kNarrowestPx = 8, kMostPx = 1 << 15;  // of a side of a picture
-constexpr double kHomePx2 =
-    2;  // a gaussian: the size at which a cut is selected at the default tolerance
-// A side of a picture, in the size at which its cut is at home.
+constexpr double kNarrowestPx = 8, kMostPx = 1 << 15;  // limits of a picture's side, px
+// px² a gaussian at which a cut is selected at the default tolerance: the native size.
+constexpr double kNativePx2 = 2;
+// The range of a picture's side, relative to the native size of its cut.
 constexpr double kLeastSize = 0.18, kOctavesOfSize = 5.75;
-constexpr double kDistance = 2.5;     // from the centre, in radii
-constexpr double kNear = 0.01;        // in radii
-constexpr int kMostTries = 16;        // to find a gaussian that a picture shows
-constexpr double kMostOfAsset = 0.7;  // of its gaussians, in a cut
-constexpr double kShare =
-    0.99;  // of the gaussians that the radius holds; the rest may float far away
+constexpr double kDistance = 2.5;     // distance from the centre, in radii
+constexpr double kNear = 0.01;        // radii
+constexpr int kMostTries = 16;        // attempts to find a gaussian that a picture shows
+constexpr double kMostOfAsset = 0.7;  // largest share of the asset's gaussians in a cut
+// The share of the gaussians within the radius; the rest may float far away.
+constexpr double kShare = 0.99;
 
-// Numbers of one view.
+// The random numbers of one view.
 class Random {
   public:
     Random(uint64_t seed, uint64_t stream) : seed_(seed), stream_(stream) {}
@@ -42,7 +45,7 @@ class Random {
     uint64_t seed_, stream_, counter_ = 0;
 };
 
-// Looks at the centre from anywhere around it, one px wide.
+// Returns a camera that looks at the centre from anywhere around it; its picture is one px wide.
 Camera camera_around(const CutPictures& pictures, Random& random) {
     double outwards[3], up[3], right[3];
     random.direction(outwards);
@@ -62,7 +65,7 @@ Camera camera_around(const CutPictures& pictures, Random& random) {
     return camera;
 }
 
-// The same picture, so many times as large.
+// Returns the camera with its picture scaled.
 Camera resized(Camera camera, double scale) {
     const double width = std::ceil(scale * camera.width), height = std::ceil(scale * camera.height);
     camera.cx = scale * camera.cx + (width - scale * camera.width) / 2;
@@ -75,8 +78,8 @@ Camera resized(Camera camera, double scale) {
     return camera;
 }
 
-// The same picture somewhere among the pixels of a screen, with what is beside it where it is
-// narrow.
+// Returns the camera with its picture shifted to a random place among the pixels of a screen, and
+// widened where it is narrow.
 Camera on_screen(Camera camera, Random& random) {
     const double width = std::max(camera.width, kNarrowestPx),
                  height = std::max(camera.height, kNarrowestPx);
@@ -87,16 +90,16 @@ Camera on_screen(Camera camera, Random& random) {
     return camera;
 }
 
-// A part of the picture around a gaussian. What is twice as large in the asset is seen twice as
-// often.
+// Returns a window of the picture around a random gaussian. A gaussian that is twice as large in
+// the asset is chosen twice as often.
 Camera window_of(const Camera& camera, double widest_px, const CutPictures& pictures,
                  Random& random) {
     double at[2] = {camera.width / 2, camera.height / 2};
     for (int tries = 0; tries < kMostTries; ++tries) {
         const std::vector<double>& weight = pictures.weight;
-        const auto found =
+        const auto chosen =
             std::upper_bound(weight.begin(), weight.end(), random.uniform() * weight.back());
-        const auto i = std::min(static_cast<size_t>(found - weight.begin()), weight.size() - 1);
+        const auto i = std::min(static_cast<size_t>(chosen - weight.begin()), weight.size() - 1);
         double p[3];
         for (int row = 0; row < 3; ++row) {
             p[row] = camera.translation[row];
@@ -125,18 +128,21 @@ SelectOutput selected(const ClusterTable& table, const Camera& camera, const Sel
     const int32_t bundle = 0;
     const double position[3] = {}, quaternion[4] = {1, 0, 0, 0}, scale = 1;
     const float importance = 1;
-    SelectInput in{{&table, 1},
-                   {{&bundle, 1}, {position, 3}, {quaternion, 4}, {&scale, 1}, {&importance, 1}},
-                   Eyes(camera),
-                   rule};
+    const InstanceTable instance{.bundle = {&bundle, 1},
+                                 .position = {position, 3},
+                                 .quaternion = {quaternion, 4},
+                                 .scale = {&scale, 1},
+                                 .importance = {&importance, 1}};
+    const SelectInput in{
+        .bundles = {&table, 1}, .instances = instance, .eyes = Eyes(camera), .rule = rule};
     SelectOutput out;
     cpu::select(in, out);
     return out;
 }
 
-// How a picture is compared: a window of at most so many px, and the samples of a side of a pixel
-// of the asset. The larger its gaussians are seen, the smoother it is; what is small costs little.
-// `size`: of the picture, in that at which the asset itself is at home.
+// The way in which a picture is compared: the largest side of the window, and the samples of a side
+// of a pixel of the asset. The larger its gaussians appear, the smoother the picture is; small
+// pictures cost little. `size` is that of the picture, relative to the asset's native size.
 struct Comparison {
     double widest_px;
     int samples;
@@ -173,36 +179,43 @@ Camera camera_at(const Surroundings& ball, double distance, const double outward
 }
 
 Surroundings surroundings_of(Span<const float> means, double share) {
-    Surroundings found{};
+    Surroundings ball{};
     std::vector<double> values(means.size / 3);
     for (size_t k = 0; k < 3; ++k) {
         for (size_t i = 0; i < values.size(); ++i)
             values[i] = static_cast<double>(means[3 * i + k]);
-        found.center[k] = median(values);
+        ball.center[k] = median(values);
     }
     for (size_t i = 0; i < values.size(); ++i) {
         double d[3];
         for (size_t k = 0; k < 3; ++k)
-            d[k] = static_cast<double>(means[3 * i + k]) - found.center[k];
+            d[k] = static_cast<double>(means[3 * i + k]) - ball.center[k];
         values[i] = std::sqrt(dot3(d, d));
     }
     const auto farthest =
         static_cast<std::ptrdiff_t>(share * static_cast<double>(values.size() - 1));
     std::nth_element(values.begin(), values.begin() + farthest, values.end());
-    found.radius = values[static_cast<size_t>(farthest)];
-    if (!(found.radius > 0)) found.radius = 1;
-    return found;
+    ball.radius = values[static_cast<size_t>(farthest)];
+    if (!(ball.radius > 0)) ball.radius = 1;
+    return ball;
 }
 
 CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const float>& asset,
                              Span<const Camera> cameras, uint64_t seed) {
     const Span<const float> means{asset.means, 3 * asset.size};
-    CutPictures pictures{table, means, cameras, seed, 0, 0, {}, surroundings_of(means, kShare)};
+    CutPictures pictures{.table = table,
+                         .means = means,
+                         .cameras = cameras,
+                         .seed = seed,
+                         .most = 0,
+                         .least = 0,
+                         .weight = {},
+                         .ball = surroundings_of(means, kShare)};
     for (const int32_t c : table.top_cluster)
         pictures.least += static_cast<double>(table.num_gaussians(static_cast<size_t>(c)));
     pictures.least = std::max(pictures.least, 1.0);
     pictures.most = std::max(kMostOfAsset * static_cast<double>(asset.size), pictures.least);
-    // What is twice as large is looked at twice as often.
+    // A gaussian that is twice as large is looked at twice as often.
     double sum = 0;
     for (size_t i = 0; i < asset.size; ++i) {
         double scale[3];
@@ -217,7 +230,8 @@ CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const
 CutView cut_view(const CutPictures& pictures, uint64_t number) {
     Random random(pictures.seed, number);
     const double part = random.uniform();
-    double all = static_cast<double>(pictures.weight.size());  // that a picture has without levels
+    // Gaussians of a picture without levels.
+    double all = static_cast<double>(pictures.weight.size());
     const double share =
         pictures.most * std::pow(pictures.least / pictures.most, part * part) / all;
     const double size = kLeastSize * std::exp2(kOctavesOfSize * random.uniform());
@@ -232,15 +246,15 @@ CutView cut_view(const CutPictures& pictures, uint64_t number) {
         camera = camera_around(pictures, random);
     }
     const double longer = std::max(camera.width, camera.height);
-    const double area_px2 = size * size * kHomePx2 * share * all;
+    const double area_px2 = size * size * kNativePx2 * share * all;
     const double scale = std::sqrt(area_px2 / (camera.width * camera.height));
     const double longer_px = std::clamp(longer * scale, rule.culls ? kNarrowestPx : 0.0, kMostPx);
     camera = resized(camera, longer_px / longer);
     if (!rule.culls) camera = on_screen(camera, random);
     rule.budget = static_cast<uint64_t>(std::ceil(share * all));
     SelectOutput whole = selected(pictures.table, camera, rule);
-    // From inside of groups these are refined at any tolerance, and a budget below what is left of
-    // them is met by nothing but the coarsest clusters: then by coarser levels alone.
+    // A camera inside of groups refines these at any tolerance, and only the coarsest clusters meet
+    // a budget below what remains of them. Then coarser levels alone are used.
     const Span<const int32_t>& levels = pictures.table.level;
     const int32_t coarsest = levels.size > 0 ? levels[levels.size - 1] : 0;
     while (std::isinf(whole.tolerance_px2) &&

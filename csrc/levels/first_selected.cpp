@@ -1,3 +1,6 @@
+// Compares pictures of the leaves and of level 1 at several sizes, and chooses for each group the
+// growth of its ball from the sum of the log loss ratios over sizes.
+
 #include "levels/first_selected.h"
 
 #include <algorithm>
@@ -12,24 +15,25 @@ namespace v3dg {
 
 namespace {
 
-// By how much balls grow: a group is selected at 1.5 to 0.19 px² a gaussian at the default
-// tolerance.
+// Limits of the growth of balls: at the default tolerance a group is selected at 1.5 to 0.19 px² a
+// gaussian.
 constexpr double kLeast = 1.4, kMost = 4, kDefaultPx2 = 3;
 constexpr double kPx2[FirstSelected::kSizes] = {0.2, 0.5, 1.2,
-                                                3};  // a gaussian of half of the groups
-constexpr double kWidestPx = 2048, kBorderPx = 4;    // of a picture, and around the ball
+                                                3};  // median px² a gaussian of groups
+constexpr double kWidestPx = 2048, kBorderPx = 4;  // width of a picture, and border around the ball
 constexpr double kDistance = 8,
-                 kShare = 0.999;  // from the centre, in radii; of the gaussians in the ball
-// A pixel counts by this power of how far it is off, as people see it. By this measure a level is
-// as good as the leaves, by FLIP, where it has so many times their loss.
+                 // Distance from the centre, in radii; share of the gaussians in the ball.
+    kShare = 0.999;
+// A pixel counts by this power of its error, as it is perceived. By this measure a level is as good
+// as the leaves, by FLIP, where its loss is this many times theirs.
 constexpr float kPower = 0.7f;
 constexpr double kAsGood = 1.15;
-// Groups that few pixels show are taken to be like all: so many times the mean loss of a group is
-// added, in the proportion that all groups have. And it counts little what they look like: so much
-// more for leaves.
+// Groups that few pixels show are treated as average: this many times the mean loss of a group is
+// added, in the proportion of all groups. Their appearance also matters little, so this much more
+// is added for leaves.
 constexpr double kLikeAll = 0.2, kOutOfSight = 0.05;
-constexpr double kNothing = 1e-9;  // a loss, or a footprint in the ball, below which there is none
-constexpr int kSteps = 64;         // of sizes that are looked at
+constexpr double kNothing = 1e-9;  // losses and footprints in the ball below it count as 0
+constexpr int kSteps = 64;         // number of sizes that are tried
 
 double mean_of(const std::vector<double>& values) {
     return std::accumulate(values.begin(), values.end(), 0.0) / static_cast<double>(values.size());
@@ -54,8 +58,8 @@ FirstSelected::FirstSelected(Span<const float> means, Span<const Ball> balls,
     }
 }
 
-// Looks at the ball from afar, from evenly all around; pixels lie elsewhere by a part of one each
-// time.
+// Cameras look at the ball from afar, evenly all around; their pixels are shifted by a fraction of
+// a pixel each time.
 Camera FirstSelected::camera(size_t picture) const {
     const size_t side = picture % kSides;
     const double z = 1 - (2 * static_cast<double>(side) + 1) / kSides;
@@ -63,7 +67,7 @@ Camera FirstSelected::camera(size_t picture) const {
     const double flat = std::sqrt(1 - z * z);
     const double outwards[3] = {flat * std::cos(angle), flat * std::sin(angle), z};
     double up[3] = {0, 0, 1}, right[3];
-    cross3(up, outwards, right);  // no side is straight above
+    cross3(up, outwards, right);  // no view is from straight above
     for (double& x : right) x /= flat;
     Camera camera = camera_at(around_, kDistance, outwards, right);
     camera.fx = camera.fy = focal_[picture / kSides];
@@ -95,7 +99,8 @@ std::vector<float> FirstSelected::growth() const {
     std::vector<float> growth;
     for (size_t g = 0; g < footprint_.size(); ++g) {
         double px2[kSizes],
-            worse[kSizes];  // logarithms; how much worse the level is than the leaves
+            // Logarithms: of px², and of how much worse the level is than the leaves.
+            worse[kSizes];
         for (size_t size = 0; size < kSizes; ++size) {
             px2[size] = std::log(footprint_[g] * focal_[size] * focal_[size]);
             const double of_level = of_level_[size][g] + kLikeAll * mean_of_level[size] + kNothing;
@@ -103,15 +108,18 @@ std::vector<float> FirstSelected::growth() const {
                 of_leaves_[size][g] + (kLikeAll + kOutOfSight) * mean_of_leaves[size] + kNothing;
             worse[size] = std::log(of_level / of_leaves / kAsGood);
         }
-        // From the smallest size on, as long as the sum over sizes says that the level is better.
+        // This goes from the smallest size on, as long as the sum over sizes says that the level is
+        // better.
         double sum = 0, least = INFINITY, first = kMost;
         for (int step = 0; step < kSteps; ++step) {
             const double times = kMost * std::pow(kLeast / kMost, step / (kSteps - 1.0));
-            const double at = std::log(kDefaultPx2 / (times * times));
-            const auto above = static_cast<size_t>(std::upper_bound(px2, px2 + kSizes, at) - px2);
+            const double log_px2 = std::log(kDefaultPx2 / (times * times));
+            const auto above =
+                static_cast<size_t>(std::upper_bound(px2, px2 + kSizes, log_px2) - px2);
             const size_t next = std::clamp<size_t>(above, 1, kSizes - 1), last = next - 1;
             const double width = px2[next] - px2[last];
-            const double part = width > 0 ? std::clamp((at - px2[last]) / width, 0.0, 1.0) : 0.0;
+            const double part =
+                width > 0 ? std::clamp((log_px2 - px2[last]) / width, 0.0, 1.0) : 0.0;
             sum += worse[last] + part * (worse[next] - worse[last]);
             if (sum < least) {
                 least = sum;
@@ -131,7 +139,7 @@ void losses_of_pixels(const PictureColors& colors, size_t width, size_t height,
         for (size_t i = 0; i < 3 * kSamples * width; ++i)
             truth[3 * (y / kSamples * width + i / (3 * kSamples)) + i % 3] +=
                 std::min(colors.truth[3 * kSamples * width * y + i], 1.0f) / (kSamples * kSamples);
-    // As little is seen of what is off in a single pixel, its neighbours share it. The border is
+    // An error in a single pixel is hardly visible, so its neighbours share it. The border is
     // empty.
     const auto shared = [](const std::vector<float>& from, size_t i, size_t step) {
         const float before = i < step ? 0.0f : from[i - step];

@@ -1,3 +1,6 @@
+// Fits the groups of a level on CUDA, as many at once as their pictures fit into memory, while the
+// host reports progress and passes on a request to cancel.
+
 #include "levels/fit_level_cuda.h"
 
 #include <algorithm>
@@ -6,6 +9,7 @@
 #include <thread>
 #include <vector>
 
+#include "base/event.h"
 #include "levels/fit_targets_cuda.h"
 
 namespace v3dg {
@@ -13,7 +17,8 @@ namespace cuda {
 
 namespace {
 
-// Bytes of target pictures that may wait at once; a quarter of what is free, if that is less.
+// The largest size of target pictures that wait at once, in bytes; a quarter of the free memory, if
+// that is less.
 constexpr size_t kTargetBytes = size_t(1) << 30;
 constexpr std::chrono::microseconds kBetweenLooks{50};
 
@@ -31,39 +36,21 @@ class Signals {
     ~Signals() { cudaFreeHost(host_); }
 
     volatile FitSignals& host() { return *host_; }
-    FitSignals* device() const { return host_; }  // the same address
+    FitSignals* device() const { return host_; }  // the address is the same on the device
 
   private:
     FitSignals* host_ = nullptr;
 };
 
-class Event {
-  public:
-    Event() {
-        check(cudaEventCreateWithFlags(&event_, cudaEventDisableTiming),
-              "cudaEventCreateWithFlags");
-    }
-    Event(const Event&) = delete;
-    Event& operator=(const Event&) = delete;
-    ~Event() { cudaEventDestroy(event_); }
-
-    void record(cudaStream_t stream) { check(cudaEventRecord(event_, stream), "cudaEventRecord"); }
-    bool has_happened() const {
-        const cudaError_t state = cudaEventQuery(event_);
-        if (state == cudaErrorNotReady) return false;
-        check(state, "fit_groups_kernel");
-        return true;
-    }
-
-  private:
-    cudaEvent_t event_ = nullptr;
-};
-
-// Groups in the order in which they are taken: those that take longest first.
+// Returns the groups in the order in which they are taken: those that take longest come first.
 std::vector<FitJob> jobs_of(const FitConfig& config, Span<const FitGroup> groups) {
     std::vector<FitJob> jobs(groups.size);
     for (size_t g = 0; g < groups.size; ++g)
-        jobs[g] = {groups[g], 0, 0, static_cast<uint32_t>(g), fit_view(config, groups[g], 0).size};
+        jobs[g] = {.group = groups[g],
+                   .first_pixel = 0,
+                   .first_view = 0,
+                   .error = static_cast<uint32_t>(g),
+                   .size = fit_view(config, groups[g], 0).size};
     std::stable_sort(jobs.begin(), jobs.end(), [](const FitJob& a, const FitJob& b) {
         return a.group.count > b.group.count;
     });
@@ -109,11 +96,15 @@ class LevelFit {
         draw_targets(config_, jobs, on_device.data, target_, views, targets, frame_, stream_);
 
         Signals signals;
-        const FitGroupsInput in{config_,         visiting_stride(config_),
-                                on_device,       targets,
-                                views,           steps_.data(),
-                                rows_,           error_.data(),
-                                signals.device()};
+        const FitGroupsInput in{.config = config_,
+                                .stride = visiting_stride(config_),
+                                .jobs = on_device,
+                                .targets = targets,
+                                .views = views,
+                                .steps = steps_.data(),
+                                .rows = rows_,
+                                .error = error_.data(),
+                                .signals = signals.device()};
         fit_groups(in, extent_, stream_);
         done_.record(stream_);
         const uint64_t done_before = progress_.groups_done;
@@ -123,12 +114,12 @@ class LevelFit {
             progress_.loss_sum =
                 loss_before + std::ldexp(static_cast<double>(signals.host().loss_sum), -32);
         };
-        while (!done_.has_happened()) {
+        while (!done_.has_happened("fit_groups_kernel")) {
             report();
             if (progress_.cancel) signals.host().cancel = 1;
             std::this_thread::sleep_for(kBetweenLooks);
         }
-        // Of two blocks that are done at once, the one that counted first may tell last.
+        // Where two blocks finish at once, the one that counted first may report last.
         if (!progress_.cancel) signals.host().groups_done = jobs.size;
         report();
     }

@@ -1,4 +1,4 @@
-// Targets are pictures of a frame, thousands at once, drawn larger and box-averaged.
+// Draws targets: pictures of a frame, thousands at once, drawn larger and box-averaged.
 
 #include "levels/fit_targets_cuda.h"
 
@@ -11,16 +11,16 @@ namespace cuda {
 
 namespace {
 
-// What is drawn in one frame, unless one picture alone exceeds it.
+// Limits of what is drawn in one frame, unless one picture alone exceeds them.
 constexpr uint64_t kPixelsAtOnce = uint64_t(1) << 24, kGaussiansAtOnce = uint64_t(1) << 22;
 constexpr unsigned kThreads = 128;
 
-// A picture among those of a frame: where its parts begin.
+// A picture among those of a frame, with the begins of its parts.
 struct TargetPicture {
     uint32_t job;
     uint32_t first_item, first_record, first_tile;
-    uint64_t picture;      // of the job's
-    uint64_t first_pixel;  // of the large picture
+    uint64_t picture;      // number among the job's pictures
+    uint64_t first_pixel;  // index in the large picture
 };
 
 __global__ void views_kernel(FitConfig config, Span<const FitJob> jobs, uint64_t pictures,
@@ -43,7 +43,7 @@ struct TargetTables {
     Placement* placements;
 };
 
-// A block takes a picture, its threads the items.
+// Each block prepares a picture, and its threads the items.
 __global__ void pictures_kernel(TargetTables t, unsigned long long num_items,
                                 unsigned long long num_records, ItemList items) {
     if (blockIdx.x == 0 && threadIdx.x == 0) {
@@ -71,18 +71,19 @@ __global__ void pictures_kernel(TargetTables t, unsigned long long num_items,
     const uint32_t count = static_cast<uint32_t>(job.group.target_count);
     for (uint32_t i = threadIdx.x; i * kItemSize < count; i += blockDim.x) {
         const uint32_t first = i * kItemSize;
-        items.items[p.first_item + i] = {blockIdx.x,
-                                         static_cast<uint32_t>(job.group.target_first) + first,
-                                         min(static_cast<uint32_t>(kItemSize), count - first),
-                                         p.first_record + first,
-                                         t.appearance,
-                                         0,
-                                         0,
-                                         1.0f};
+        items.items[p.first_item + i] = {
+            .placement = blockIdx.x,
+            .first = static_cast<uint32_t>(job.group.target_first) + first,
+            .count = min(static_cast<uint32_t>(kItemSize), count - first),
+            .record = p.first_record + first,
+            .appearance = t.appearance,
+            .sharers = 0,
+            .cluster = 0,
+            .weight = 1.0f};
     }
 }
 
-// A block takes a picture, its threads the pixels of the small one.
+// Each block averages a picture, and its threads the pixels of the small one.
 __global__ void average_kernel(TargetTables t, float4* targets) {
     const TargetPicture& p = t.pictures[blockIdx.x];
     const FitJob& job = t.jobs[p.job];
@@ -141,9 +142,12 @@ void draw_targets(const FitConfig& config, Span<const FitJob> jobs, const FitJob
             if (!pictures.empty() &&
                 (pixels + size * size > kPixelsAtOnce || gaussians + count > kGaussiansAtOnce))
                 break;
-            pictures.push_back({static_cast<uint32_t>(next / pictures_of_job),
-                                static_cast<uint32_t>(items), static_cast<uint32_t>(gaussians),
-                                static_cast<uint32_t>(tiles), next % pictures_of_job, pixels});
+            pictures.push_back({.job = static_cast<uint32_t>(next / pictures_of_job),
+                                .first_item = static_cast<uint32_t>(items),
+                                .first_record = static_cast<uint32_t>(gaussians),
+                                .first_tile = static_cast<uint32_t>(tiles),
+                                .picture = next % pictures_of_job,
+                                .first_pixel = pixels});
             pixels += size * size;
             gaussians += count;
             items += (count + kItemSize - 1) / kItemSize;
@@ -152,18 +156,21 @@ void draw_targets(const FitConfig& config, Span<const FitJob> jobs, const FitJob
         }
         const uint32_t num_images = static_cast<uint32_t>(pictures.size());
         TargetTables tables{
-            config,
-            jobs_on_device,
-            views,
-            pictures_on_device.copy_from({pictures.data(), pictures.size()}, stream),
-            {target.filter_px2, target.antialiased, false},
-            color.reserve(3 * pixels, stream),
-            alpha.reserve(pixels, stream),
-            images.reserve(num_images, stream),
-            placements.reserve(num_images, stream)};
-        FrameBatch batch{model.data(), tables.placements, tables.images, num_images,
-                         static_cast<uint32_t>(tiles)};
-        batch.has_depth = false;
+            .config = config,
+            .jobs = jobs_on_device,
+            .views = views,
+            .pictures = pictures_on_device.copy_from({pictures.data(), pictures.size()}, stream),
+            .appearance = {target.filter_px2, target.antialiased, false},
+            .color = color.reserve(3 * pixels, stream),
+            .alpha = alpha.reserve(pixels, stream),
+            .images = images.reserve(num_images, stream),
+            .placements = placements.reserve(num_images, stream)};
+        const FrameBatch batch{.models = model.data(),
+                               .placements = tables.placements,
+                               .images = tables.images,
+                               .num_images = num_images,
+                               .num_tiles = static_cast<uint32_t>(tiles),
+                               .has_depth = false};
         frame
             .draw(
                 batch,

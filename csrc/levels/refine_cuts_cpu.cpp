@@ -1,3 +1,5 @@
+// One picture is drawn at a time, on all threads; views are made some ahead.
+
 #include "levels/refine_cuts.h"
 
 #include <algorithm>
@@ -16,14 +18,18 @@ namespace {
 
 constexpr size_t kGaussiansAtOnce = 256, kViewsAtOnce = 32;
 
-// Colour and alpha of one picture.
+// The memory of one picture: colour and alpha.
 class Canvas {
   public:
     Picture<float> start(const Camera& camera) {
         width_ = static_cast<int>(camera.width);
         height_ = static_cast<int>(camera.height);
         values_.resize(4 * num_pixels());
-        return {{0, 0, width_, height_}, {}, color(), alpha(), nullptr};
+        return {.window = {0, 0, width_, height_},
+                .background = {},
+                .color = color(),
+                .alpha = alpha(),
+                .depth = nullptr};
     }
     int width() const { return width_; }
     int height() const { return height_; }
@@ -36,7 +42,7 @@ class Canvas {
     std::vector<float> values_;
 };
 
-// Puts the slope of the loss in place of the picture.
+// Puts the slopes of the loss in place of the picture.
 void compare(const FitConfig& config, int samples, Canvas& picture, Canvas& target) {
     const auto width = static_cast<size_t>(picture.width()),
                height = static_cast<size_t>(picture.height());
@@ -54,18 +60,16 @@ void compare(const FitConfig& config, int samples, Canvas& picture, Canvas& targ
     const float weight =
         weight_of_picture(std::accumulate(loss_of_row.begin(), loss_of_row.end(), 0.0),
                           static_cast<double>(width * height));
-    for (size_t i = 0; i < 3 * width * height; ++i)
-        picture.color()[i] = l1_vjp(picture.color()[i], config.loss.l1 / 3 * weight);
     for (size_t i = 0; i < width * height; ++i)
-        picture.alpha()[i] = l1_vjp(picture.alpha()[i], config.loss.alpha * weight);
+        put_slopes(config.loss, weight, picture.color() + 3 * i, picture.alpha()[i]);
 }
 
-// The views of pictures, some ahead.
+// Makes the views of pictures, some ahead.
 class Views {
   public:
     Views(const CutPictures& pictures, size_t count)
         : pictures_(pictures), count_(count), views_(kViewsAtOnce) {}
-    // Of number 0 first, and then of one after another.
+    // Returns a view. Numbers must be asked for in ascending order from 0.
     const CutView& operator[](size_t number) {
         if (number % kViewsAtOnce == 0)
             parallel_for(std::min(kViewsAtOnce, count_ - number), 1,
@@ -79,22 +83,26 @@ class Views {
     std::vector<CutView> views_;
 };
 
-// The gaussians of one view, the picture of them, and the way back.
+// The gaussians of one view, their picture, and its backward pass.
 class CutFrame {
   public:
     explicit CutFrame(const FitConfig& config)
         : appearance_{config.filter_px2, config.antialiased, false} {}
 
-    // The rows of so many gaussians, which are written before they are drawn.
+    // Returns the rows of `count` gaussians, which the caller writes before they are drawn.
     const GaussianRows<float>& start(size_t count, int sh_degree) {
         values_.resize(num_values(sh_degree) * count);
         rows_ = rows_in(values_.data(), count, sh_degree);
         return rows_;
     }
-    // The picture, in whose place its slopes are put.
+    // Draws the picture. Before backward(), the caller puts its slopes in its place.
     Canvas& draw(const Camera& camera) {
         model_.emplace(rows_);
-        draw_ = {&model_->planes(), 0, rows_.size, view_of_world<float>(camera), appearance_};
+        draw_ = {.model = &model_->planes(),
+                 .first = 0,
+                 .count = rows_.size,
+                 .view = view_of_world<float>(camera),
+                 .appearance = appearance_};
         pinhole_ = pinhole_of<float>(camera);
         picture_ = canvas_.start(camera);
         render<float>({draw_}, pinhole_, picture_, true, workspace_);
@@ -138,8 +146,8 @@ void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows,
                      [&](size_t g) { copy_in_grey(rows, index[g], shown, g); });
         Canvas& picture = frame.draw(view.camera);
         const size_t count = picture.num_pixels();
-        for (size_t k = 0; k < 3 * count; ++k) picture.color()[k] = k % 3 == 0 ? 1.0f : 0.0f;
-        std::fill_n(picture.alpha(), count, 0.0f);
+        for (size_t i = 0; i < count; ++i)
+            put_sum_slopes(picture.color() + 3 * i, picture.alpha()[i]);
         const GaussianRows<const float> gradient = frame.backward();
         for (size_t g = 0; g < index.size(); ++g) {
             seen.weight[index[g]] += blend_weight(gradient.sh[3 * g], count);
@@ -154,7 +162,7 @@ void refine_cuts(const FitConfig& config, const FitTarget& target, uint64_t targ
     const GaussianRows<float>& rows = levels.rows;
     const size_t num = num_values(rows.sh_degree);
     std::vector<float> moments(2 * num * rows.size, 0.0f);
-    const Moments kept{moments.data(), moments.data() + num * rows.size};
+    const Moments adam_moments{moments.data(), moments.data() + num * rows.size};
     Workspace<float> of_target;
     Canvas wanted;
     const auto steps = static_cast<size_t>(config.steps);
@@ -163,12 +171,12 @@ void refine_cuts(const FitConfig& config, const FitTarget& target, uint64_t targ
     for (size_t i = 0; i < steps && !progress.cancel; ++i) {
         const CutView& view = views[i];
         const Camera larger = enlarged(view.camera, view.samples);
-        render<float>({{target.model,
-                        0,
-                        target_count,
-                        view_of_world<float>(larger),
-                        {target.filter_px2, target.antialiased, false}}},
-                      pinhole_of<float>(larger), wanted.start(larger), false, of_target);
+        const Draw<float> whole{.model = target.model,
+                                .first = 0,
+                                .count = target_count,
+                                .view = view_of_world<float>(larger),
+                                .appearance = {target.filter_px2, target.antialiased, false}};
+        render<float>({whole}, pinhole_of<float>(larger), wanted.start(larger), false, of_target);
 
         const std::vector<uint32_t> index = gaussians_of(pictures.table, view);
         const GaussianRows<float>& shown = frame.start(index.size(), rows.sh_degree);
@@ -181,7 +189,7 @@ void refine_cuts(const FitConfig& config, const FitTarget& target, uint64_t targ
         parallel_for(index.size(), kGaussiansAtOnce, [&](size_t g) {
             if (index[g] < target_count) return;
             move_gaussian(rows, index[g], gradient, g, levels.radius[index[g]], step, config.beta2,
-                          kept);
+                          adam_moments);
         });
         ++progress.groups_done;
     }

@@ -12,7 +12,7 @@
 
 namespace v3dg {
 
-// The same view with so many times the resolution.
+// Returns the camera with its resolution multiplied.
 V3DG_HD inline Camera enlarged(Camera camera, int factor) {
     for (double* px : {&camera.fx, &camera.fy, &camera.cx, &camera.cy, &camera.width,
                        &camera.height, &camera.x0, &camera.y0, &camera.x1, &camera.y1})
@@ -20,8 +20,13 @@ V3DG_HD inline Camera enlarged(Camera camera, int factor) {
     return camera;
 }
 
-// Colour or alpha of a pixel of the target, from `samples` a side: value k of each of `width`
-// pixels.
+// Returns the number of pixels of a camera's picture.
+inline size_t num_pixels(const Camera& camera) {
+    return static_cast<size_t>(camera.width) * static_cast<size_t>(camera.height);
+}
+
+// Returns value k of a pixel of the target, averaged over `samples` x `samples` pixels; `width` is
+// that of the small picture.
 V3DG_HD inline float box_average(const float* plane, size_t width, size_t num_values, size_t k,
                                  size_t x, size_t y, int samples) {
     const auto side = static_cast<size_t>(samples);
@@ -32,36 +37,50 @@ V3DG_HD inline float box_average(const float* plane, size_t width, size_t num_va
     return sum / static_cast<float>(samples * samples);
 }
 
-// How far a pixel is off: the difference of its colour and alpha, weighed as in the loss.
+// Returns the loss of a pixel from the differences of its colour and alpha.
 V3DG_HD inline float loss_of_pixel(const LossWeights& loss, const float color[3], float alpha) {
     return loss.l1 / 3 * (::fabsf(color[0]) + ::fabsf(color[1]) + ::fabsf(color[2])) +
            loss.alpha * ::fabsf(alpha);
 }
 
-// A picture counts by how much of its loss is taken away, not by how large that is: else small
-// pictures, which levels are farther off in, would be made better at the cost of large ones. Below
-// this loss a picture is right, and counts by what is left.
+// Returns the weight of a picture, which is by its relative loss, not by its absolute one.
+// Otherwise small pictures, in which levels have larger errors, would improve at the cost of large
+// ones. A picture whose loss is below kLeastLoss is right, and its absolute loss counts.
 constexpr double kLeastLoss = 1e-4;
 V3DG_HD inline float weight_of_picture(double loss_sum, double num_pixels) {
     return static_cast<float>(1 / (loss_sum + kLeastLoss * num_pixels));
 }
 
-// What Adam keeps of value k of gaussian i of n, at k * n + i.
+// Puts the slopes of the loss by a pixel in place of its differences; `weight` is that of the
+// picture.
+V3DG_HD inline void put_slopes(const LossWeights& loss, float weight, float color[3],
+                               float& alpha) {
+    for (int k = 0; k < 3; ++k) color[k] = l1_vjp(color[k], loss.l1 / 3 * weight);
+    alpha = l1_vjp(alpha, loss.alpha * weight);
+}
+
+// Puts the slopes of the sum of a picture's first channel in place of a pixel.
+V3DG_HD inline void put_sum_slopes(float color[3], float& alpha) {
+    for (int k = 0; k < 3; ++k) color[k] = k == 0 ? 1.0f : 0.0f;
+    alpha = 0;
+}
+
+// The moments of Adam: value k of gaussian i of n is at k * n + i.
 struct Moments {
     float *m, *v;
 };
 
-// A step of gaussian i, of which `gradient` has row g: position in parts of `radius`, scales by
-// their logarithm and opacity by its logit, both in the range that a fit keeps them in.
+// Moves gaussian i by a step; its gradient is row g of `gradient`. The position moves in fractions
+// of `radius`, scales by their logarithm and opacity by its logit, both within the range of a fit.
 V3DG_HD inline void move_gaussian(const GaussianRows<float>& rows, size_t i,
                                   const GaussianRows<const float>& gradient, size_t g, float radius,
                                   const FitStep& step, float beta2, const Moments& moments) {
-    size_t at = i;
+    size_t moment = i;
     const auto moved = [&](float value, float slope, float size) {
-        if (!(::fabsf(slope) <= FLT_MAX)) slope = 0;  // would never be forgotten
-        const float next = adam_step(value, slope, moments.m[at], moments.v[at], size, beta2,
-                                     step.correction1, step.correction2);
-        at += rows.size;
+        if (!(::fabsf(slope) <= FLT_MAX)) slope = 0;  // the moments would never forget it
+        const float next = adam_step(value, slope, moments.m[moment], moments.v[moment], size,
+                                     beta2, step.correction1, step.correction2);
+        moment += rows.size;
         return next;
     };
     for (int k = 0; k < 3; ++k)
@@ -95,34 +114,40 @@ V3DG_HD inline void copy_gaussian(const GaussianRows<const float>& source, size_
     for (size_t k = 0; k < num_sh; ++k) rows.sh[num_sh * to + k] = source.sh[num_sh * from + k];
 }
 
-// The same in grey, of SH degree 0: its gradient by that colour is what is seen of it, whatever its
-// own is.
+// Copies a gaussian in grey, of SH degree 0. The gradient by that colour says how much is seen of
+// it, whatever its own colour is.
 V3DG_HD inline void copy_in_grey(const GaussianRows<const float>& source, size_t from,
                                  const GaussianRows<float>& rows, size_t to) {
     copy_shape(source, from, rows, to);
     for (size_t k = 0; k < 3; ++k) rows.sh[3 * to + k] = 0;
 }
 
-// The part of a picture of so many pixels that a gaussian fills, from the gradient of the picture's
-// sum by the colour of a gaussian that copy_in_grey made.
+// Returns the fraction of a picture that a gaussian fills, from the gradient of the picture's sum
+// by the colour of a gaussian that copy_in_grey made.
 V3DG_HD inline double blend_weight(float gradient, size_t num_pixels) {
     return static_cast<double>(gradient) / (kShBase0 * static_cast<double>(num_pixels));
 }
 
-// How many values a gaussian has.
+// Returns the number of values of a gaussian.
 V3DG_HD inline size_t num_values(int sh_degree) {
     return 11 + 3 * static_cast<size_t>(num_sh_bases(sh_degree));
 }
 
-// `count` rows in one piece of memory, num_values() for each gaussian; what has to lie at a
-// multiple of 16 bytes comes first.
+// Returns `count` rows in one block of memory, num_values() for each gaussian. Values that must be
+// aligned to 16 bytes come first.
 V3DG_HD inline GaussianRows<float> rows_in(float* memory, size_t count, int sh_degree) {
     const size_t num_sh = 3 * static_cast<size_t>(num_sh_bases(sh_degree));
     float* rest = memory + (4 + num_sh) * count;
-    return {rest, memory, rest + 3 * count, rest + 6 * count, memory + 4 * count, count, sh_degree};
+    return {.means = rest,
+            .quats = memory,
+            .scales = rest + 3 * count,
+            .opacities = rest + 6 * count,
+            .sh = memory + 4 * count,
+            .size = count,
+            .sh_degree = sh_degree};
 }
 
-// The gaussians of a view's clusters.
+// Returns the gaussians of a view's clusters.
 inline std::vector<uint32_t> gaussians_of(const ClusterTable& table, const CutView& view) {
     std::vector<uint32_t> gaussians;
     for (const int32_t c : view.clusters)

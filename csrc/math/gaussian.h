@@ -14,10 +14,10 @@ constexpr double kMinAlpha = 1.0 / 255;     // contributions below it are skippe
 constexpr double kMaxAlpha = 0.999;         // alpha is cut here
 constexpr double kMinTransmittance = 1e-4;  // a pixel that stops as gsplat's do stops before this
 constexpr double kLog2MinAlpha = -7.994353436858858;
-constexpr double kReachSigmas = 3.33;  // where opacity 1 has fallen below 1/255
+constexpr double kReachSigmas = 3.33;  // opacity 1 has fallen below 1/255 there
 constexpr double kLn2 = 0.6931471805599453;
-constexpr double kFalloffScale =
-    0.8493218002880191;  // sqrt(log2(e) / 2): exp(-d²/2) = 2^-(scale d)²
+// sqrt(log2(e) / 2): exp(-d²/2) = 2^-(scale d)².
+constexpr double kFalloffScale = 0.8493218002880191;
 
 template <class V>
 struct Gaussian3d {
@@ -27,8 +27,8 @@ struct Gaussian3d {
     V opacity;
 };
 
-// Gaussians as rows, the way users hold them, on the host or on a device: (N, 3), (N, 4), (N, 3),
-// (N,) and (N, bases, 3). T is const where they are only read. On a device, quaternions and SH
+// Gaussians as rows, which is how users hold them, on the host or on a device: (N, 3), (N, 4), (N,
+// 3), (N,) and (N, bases, 3). T is const where they are only read. On a device, quaternions and SH
 // coefficients start at a multiple of 16 bytes.
 template <class T>
 struct GaussianRows {
@@ -38,7 +38,13 @@ struct GaussianRows {
 
     V3DG_HD int num_sh() const { return 3 * num_sh_bases(sh_degree); }
     V3DG_HD operator GaussianRows<const T>() const {
-        return {means, quats, scales, opacities, sh, size, sh_degree};
+        return {.means = means,
+                .quats = quats,
+                .scales = scales,
+                .opacities = opacities,
+                .sh = sh,
+                .size = size,
+                .sh_degree = sh_degree};
     }
 };
 
@@ -54,8 +60,8 @@ V3DG_HD inline void copy_shape(const GaussianRows<const T>& source, size_t from,
     rows.opacities[to] = source.opacities[from];
 }
 
-// The same as the CPU's rasterizer reads them: a plane an attribute. Planes hold `kPlanePadding`
-// elements more than there are gaussians, so that a vector load may run past the last.
+// Gaussians as the CPU's rasterizer reads them: a plane an attribute. Planes have `kPlanePadding`
+// elements of padding, so that a vector load may run past the last gaussian.
 constexpr size_t kPlanePadding = 16;
 template <class T>
 struct GaussianPlanes {
@@ -67,13 +73,13 @@ struct GaussianPlanes {
     int sh_degree;
 };
 
-// Colours of a bundle's clusters that gaussians are drawn in, in place of their own.
+// Colours of a bundle's clusters in which their gaussians are drawn, instead of the gaussians' own.
 struct Palette {
     const float* sh = nullptr;  // (C, 3) coefficients of the constant basis; null: no palette
-    const int64_t* first_row = nullptr;  // [C] where clusters begin among the gaussians, ascending
+    const int64_t* first_row = nullptr;  // first gaussian of each cluster, ascending
     uint32_t num_clusters = 0;
 
-    // The cluster that a gaussian of the bundle belongs to.
+    // Returns the cluster of a gaussian of the bundle.
     V3DG_HD uint32_t cluster_of(uint64_t row) const {
         uint32_t first = 0, last = num_clusters - 1;
         while (first < last) {
@@ -87,8 +93,8 @@ struct Palette {
     }
 };
 
-// The same as a CUDA frame reads what stays on the device: four planes of (N, 4) that hold a
-// PackedGaussian each, and the SH coefficients as rows, of which `sh_stride` floats apart begin.
+// Gaussians as a CUDA frame reads them from resident memory: four planes of (N, 4) that hold a
+// PackedGaussian each, and the SH coefficients as rows that begin `sh_stride` floats apart.
 struct PackedPlanes {
     const float* plane[4];
     const float* sh;
@@ -96,8 +102,9 @@ struct PackedPlanes {
     Palette palette;
 };
 
-// How many standard deviations a gaussian reaches at most: no fewer than extent_of() leads to.
-// Negative where it is too faint to be drawn, not a number where it is none.
+// Returns an upper bound of a gaussian's reach in standard deviations, which is not below the one
+// that extent_of() uses. It is negative where the gaussian is too faint to be drawn, and not a
+// number where the opacity is invalid.
 V3DG_HD inline float reach_in_sigmas(float opacity) {
     if (opacity < float(kMinAlpha)) return -1.0f;
     const float sigmas =
@@ -105,8 +112,8 @@ V3DG_HD inline float reach_in_sigmas(float opacity) {
     return opacity <= 1 ? sigmas : NAN;
 }
 
-// The same from its mean in its model's units. Also not a number where the gaussian may have no
-// area.
+// Returns an upper bound of a gaussian's reach from its mean, in its model's units. It is also not
+// a number where the gaussian may have no area.
 V3DG_HD inline float reach_of(const Gaussian3d<float>& g) {
     const float sigmas = reach_in_sigmas(g.opacity);
     if (sigmas < 0) return -1.0f;
@@ -115,9 +122,9 @@ V3DG_HD inline float reach_of(const Gaussian3d<float>& g) {
     return least > 0 ? most * sigmas : NAN;
 }
 
-// A gaussian in the form that is quickest to project, for what is projected more than once. Its
-// covariance is F Fᵀ with F = [f[0] f[3] 0; f[1] f[4] f[6]; f[2] f[5] f[7]], columns from the
-// longest on.
+// A gaussian in the form that is quickest to project, for models that are projected more than once.
+// Its covariance is F Fᵀ with F = [f[0] f[3] 0; f[1] f[4] f[6]; f[2] f[5] f[7]], whose columns
+// start with the longest.
 struct PackedGaussian {
     float mean[3];
     float reach;
@@ -125,7 +132,7 @@ struct PackedGaussian {
     float log2_opacity;
 };
 
-// Doubles that are rounded as it is written, whatever they are compiled with.
+// These operations round exactly as written, whatever the compiler's options are.
 V3DG_HD inline double product_of(double a, double b) {
 #ifdef __CUDA_ARCH__
     return __dmul_rn(a, b);
@@ -141,7 +148,7 @@ V3DG_HD inline double sum_of(double a, double b) {
 #endif
 }
 
-// 1 / b, ready for quotient_of().
+// Returns 1 / b for use in quotient_of().
 V3DG_HD inline double inverse_of(double b) {
 #ifdef __CUDA_ARCH__
     double r;
@@ -153,8 +160,8 @@ V3DG_HD inline double inverse_of(double b) {
     return 1 / b;
 #endif
 }
-// a / b of numbers that are far from the ends of the range of doubles, as those that float32 leads
-// to are; for them it is how a device divides, without the test whether they are.
+// Returns a / b. Precondition: the numbers are far from the ends of the range of doubles, as are
+// all that float32 leads to. It is a device's own division without the test for other numbers.
 V3DG_HD inline double quotient_of(double a, double b, double inverse) {
 #ifdef __CUDA_ARCH__
     const double q = __dmul_rn(a, inverse);
@@ -164,7 +171,7 @@ V3DG_HD inline double quotient_of(double a, double b, double inverse) {
     return a / b;
 #endif
 }
-// Rounded to float32. Whoever reads the result counts what is below 2^-126 as 0.
+// Rounds to float32. Readers of the result treat what is below 2^-126 as 0.
 V3DG_HD inline float rounded(double x) {
 #ifdef __CUDA_ARCH__
     float y;
@@ -175,13 +182,14 @@ V3DG_HD inline float rounded(double x) {
 #endif
 }
 
-// Every rounding is written out, so that all kernels that pack a gaussian come to the same bits.
+// Packs a gaussian. Every rounding is explicit, so that all kernels that pack a gaussian get the
+// same bits.
 V3DG_HD inline PackedGaussian pack_gaussian(const Gaussian3d<float>& g) {
     PackedGaussian out{};
     for (int k = 0; k < 3; ++k) out.mean[k] = g.mean[k];
     out.log2_opacity = log2_of(g.opacity);
     out.reach = reach_of(g);
-    // Columns of its rotation, as rotation_of_quat() has it.
+    // These are the columns of its rotation, as in rotation_of_quat().
     const double w = g.quat[0], x = g.quat[1], y = g.quat[2], z = g.quat[3];
     const double xx = product_of(x, x), yy = product_of(y, y), zz = product_of(z, z),
                  wx = product_of(w, x), wz = product_of(w, z), xz = product_of(x, z);
@@ -195,7 +203,7 @@ V3DG_HD inline PackedGaussian pack_gaussian(const Gaussian3d<float>& g) {
         {product_of(s, ::fma(w, y, xz)), product_of(s, ::fma(y, z, -wx)),
          ::fma(sum_of(xx, yy), -s, 1.0)},
     };
-    // Without indices that registers could not be used for.
+    // Indices are constants, so that the compiler can use registers.
     float scale[3] = {g.scale[0], g.scale[1], g.scale[2]};
     for (int pass = 0; pass < 3; ++pass) {
         const int k = pass % 2;

@@ -1,3 +1,5 @@
+// Codebooks by Lloyd's algorithm, from a guess by density; palettes by cutting sets in two.
+
 #include "quantize/codebook.h"
 
 #include <algorithm>
@@ -12,12 +14,12 @@ namespace {
 
 constexpr size_t kBins = 4096;
 constexpr int kRounds = 16;
-// Of a table's entries, the share that is spread evenly over the range: rare values keep a
+// The share of a table's entries that is spread evenly over the range, so that rare values have a
 // neighbour.
 constexpr double kEven = 0.25;
 
-// Entries as dense as the cube root of the values' density: best for many entries (Panter and
-// Dite).
+// Places entries as densely as the cube root of the values' density, which is best for many entries
+// (Panter and Dite).
 void guess_codebook(const std::vector<double>& ordered, Span<double> table) {
     const double low = ordered.front(), width = (ordered.back() - low) / kBins;
     std::vector<double> density(kBins, 0.0);
@@ -30,19 +32,19 @@ void guess_codebook(const std::vector<double>& ordered, Span<double> table) {
     for (size_t bin = 0; bin < kBins; ++bin) {
         const double share = (1 - kEven) * density[bin] / total + kEven / kBins;
         for (; entry < table.size; ++entry) {
-            const double at = (entry + 0.5) / table.size;
-            if (at > before + share && bin + 1 < kBins) break;
-            table[entry] = low + width * (bin + (at - before) / share);
+            const double quantile = (entry + 0.5) / table.size;
+            if (quantile > before + share && bin + 1 < kBins) break;
+            table[entry] = low + width * (bin + (quantile - before) / share);
         }
         before += share;
     }
 }
 
-// Neighbouring rows of an order that one vector stands for.
+// A part of an order of rows; one vector stands for all of them.
 struct Part {
     size_t first, last;
-    double error;  // squared distances to the mean, summed
-    size_t axis;   // that has the most of them
+    double error;  // sum of squared distances to the mean
+    size_t axis;   // axis with the largest share of it
     uint32_t number;
     std::vector<double> mean;
 
@@ -64,7 +66,12 @@ Part part_of(Span<const float> vectors, size_t width, const std::vector<uint32_t
         }
     const auto widest = std::max_element(errors.begin(), errors.end()) - errors.begin();
     const double error = std::accumulate(errors.begin(), errors.end(), 0.0);
-    return {first, last, error, static_cast<size_t>(widest), number, std::move(mean)};
+    return {.first = first,
+            .last = last,
+            .error = error,
+            .axis = static_cast<size_t>(widest),
+            .number = number,
+            .mean = std::move(mean)};
 }
 
 }  // namespace
@@ -114,7 +121,7 @@ VectorPalette make_palette(Span<const float> vectors, size_t width, size_t size)
         auto middle = std::stable_partition(first, last, [&](uint32_t row) {
             return vectors[row * width + part.axis] <= part.mean[part.axis];
         });
-        if (middle == first || middle == last)  // differences that rounding hides
+        if (middle == first || middle == last)  // the differences are lost in rounding
             middle = first + (part.last - part.first) / 2;
         const auto cut = static_cast<size_t>(middle - order.begin());
         parts.push(part_of(vectors, width, order, part.first, cut, ++number));

@@ -1,5 +1,7 @@
 #pragma once
 
+// Gaussians as codes of few bits: pages of bundles, pages on the host, and slots of a pool.
+
 #include <cstring>
 
 #include "base/buffer.h"
@@ -10,10 +12,10 @@
 namespace v3dg {
 
 // A page of K clusters: the codes of its gaussians, a row of words each; those of their higher
-// coefficients; the ranges of its clusters. T is const where it is only read.
+// coefficients; and the ranges of its clusters. T is const where the page is only read.
 template <class T>
 struct PageCodes {
-    Span<const int64_t> offset;  // [K + 1] rows of gaussians of each cluster, ascending
+    Span<const int64_t> offset;  // [K + 1] first row of each cluster, ascending
     T* words;                    // page_bytes()
     int sh_degree;
 
@@ -29,7 +31,7 @@ struct PageCodes {
     }
 };
 
-// Writes one gaussian to a row.
+// Decodes one gaussian to a row.
 V3DG_HD inline void decode_row(const uint32_t* record, const uint32_t* sh_words,
                                const ClusterRanges& ranges, const GaussianRows<float>& out,
                                size_t row) {
@@ -45,11 +47,12 @@ V3DG_HD inline void decode_row(const uint32_t* record, const uint32_t* sh_words,
     out.opacities[row] = g.opacity;
 }
 
-// Pages of a bundle on the host, as its file has them. Borrows words and offsets, owns the ranges.
+// Pages of a bundle on the host, as its file has them. It borrows words and offsets and owns the
+// ranges.
 class CodedPages {
   public:
-    // words: all pages, P of them; first_cluster: [P + 1]; offset: [C + 1]. Throws
-    // std::invalid_argument, naming the cluster, where ranges are not are_valid().
+    // words: all P pages; first_cluster: [P + 1]; offset: [C + 1]. Throws std::invalid_argument,
+    // naming the cluster, where ranges are not are_valid().
     CodedPages(const uint32_t* words, Span<const int64_t> first_cluster, Span<const int64_t> offset,
                int sh_degree);
     const Codes& codes() const { return codes_; }
@@ -63,24 +66,30 @@ class CodedPages {
 };
 
 // Memory for the codes of pages that come and go, which is drawn from as if it were one bundle. It
-// is divided into slots of a page each, which hold as many rows and as many clusters: the rows of
-// all slots follow on each other, and so do their clusters, with gaussians or without. A page's
-// ranges move with it, its gaussians and its clusters are neighbours as in its own bundle, and
-// nothing else has to know where it is.
+// is divided into slots of a page each, which hold equally many rows and equally many clusters. The
+// rows of all slots are contiguous, and so are their clusters, with gaussians or without. A page's
+// ranges move with it, and its gaussians and its clusters are neighbours as in its own bundle, so
+// nothing else has to know where the page is.
 struct CodeSlots {
     uint32_t *records, *sh;
     unsigned char* ranges;
-    int64_t* offset;  // as Codes has it; what is written into a slot keeps it ascending
+    int64_t* offset;  // see Codes::offset; it stays ascending when a slot is written
     uint32_t range_size, sh_stride;
     size_t num_clusters;
 
-    // Of pages of a bundle.
+    // Returns the codes of the pages of a bundle.
     Codes codes(int sh_degree) const {
-        return {records, sh, ranges, {offset, num_clusters + 1}, sh_degree, range_size, sh_stride};
+        return {.records = records,
+                .sh = sh,
+                .ranges = ranges,
+                .offset = {offset, num_clusters + 1},
+                .sh_degree = sh_degree,
+                .range_size = range_size,
+                .sh_stride = sh_stride};
     }
 };
 
-// What a slot takes for each row, and for each place of a cluster.
+// Bytes of a slot for each row, and for each cluster.
 constexpr size_t slot_row_bytes(int sh_degree) {
     return 4 * (kRecordWords + num_sh_words(sh_degree));
 }
@@ -88,14 +97,14 @@ constexpr size_t slot_cluster_bytes(int sh_degree) {
     return range_bytes(sh_degree) + sizeof(int64_t);
 }
 
-// A page, and the slot that it goes to.
+// A page, and the slot that it is written to.
 struct SlotPage {
     PageCodes<const uint32_t> page;
-    size_t row, cluster;  // first of the slot
-    size_t num_clusters;  // of the slot; those that the page does not have are empty
+    size_t row, cluster;  // the first of the slot
+    size_t num_clusters;  // clusters of the slot; those that the page lacks are empty
 };
 
-// Writes what decodes the k-th cluster of a slot.
+// Writes the ranges and the offset of the k-th cluster of a slot.
 V3DG_HD inline void write_cluster(const SlotPage& from, size_t k, const CodeSlots& to) {
     const PageCodes<const uint32_t>& page = from.page;
     const size_t begin =
@@ -112,7 +121,7 @@ V3DG_HD inline void write_cluster(const SlotPage& from, size_t k, const CodeSlot
                 range_bytes(page.sh_degree));
 }
 
-// Clusters, in any order, and where their gaussians are to be.
+// Clusters to decode, in any order, and their rows in the result.
 struct DecodeInput {
     Codes codes;
     Span<const int32_t> cluster;  // [S]
@@ -120,30 +129,31 @@ struct DecodeInput {
 };
 
 namespace cpu {
-// Codes gaussians to the nearest step of the ranges of their clusters; what was decoded from a page
-// gives the same page again. A scale of 0 becomes 2^-14 of the largest of its gaussian; scales are
-// kept from 2^-64 to 2^64, means within 2^126, colours within 32,768, higher coefficients within
-// 1,024 and opacities from 0 to 1. Throws std::invalid_argument where a value is not finite.
+// Encodes gaussians to the nearest step of the ranges of their clusters. Gaussians that were
+// decoded from a page give the same page again. A scale of 0 becomes 2^-14 of the largest of its
+// gaussian; scales are clamped from 2^-64 to 2^64, means within 2^126, colours within 32,768,
+// higher coefficients within 1,024 and opacities from 0 to 1. Throws std::invalid_argument where a
+// value is not finite.
 void encode_page(const GaussianRows<const float>& in, const PageCodes<uint32_t>& page);
 
-// The gaussians of a page. Throws std::invalid_argument, naming the cluster, where ranges are not
-// are_valid().
+// Decodes the gaussians of a page. Throws std::invalid_argument, naming the cluster, where ranges
+// are not are_valid().
 void decode_page(const PageCodes<const uint32_t>& page, const GaussianRows<float>& out);
 
-// The gaussians of clusters.
+// Decodes the gaussians of clusters.
 void decode(const DecodeInput& in, const GaussianRows<float>& out);
 
-// Brings a page, whose ranges are_valid(), to its slot.
+// Writes a page, whose ranges are_valid(), to its slot.
 void write_slot(const SlotPage& from, const CodeSlots& to);
 }  // namespace cpu
 
-// The same bits. The codes and `out` are on the device, all else on the host. Work is queued on the
-// stream. Throws std::runtime_error when CUDA reports an error.
+// Both halves give the same bits. The codes and `out` are on the device, all else on the host. Work
+// is queued on the stream. Throws std::runtime_error when CUDA reports an error.
 namespace cuda {
 void decode(const DecodeInput& in, const GaussianRows<float>& out, Stream stream);
 
-// As cpu::write_slot() for several pages, in memory that the device can read; what they and the
-// slots point to is on the device.
+// As cpu::write_slot() for several pages. `pages` is in memory that the device can read; the memory
+// that the pages and the slots point to is on the device.
 void write_slots(const SlotPage* pages, size_t num_pages, const CodeSlots& to, Stream stream);
 }  // namespace cuda
 

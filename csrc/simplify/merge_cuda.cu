@@ -1,6 +1,5 @@
-// Merging: a block takes a group through all its rounds. Nodes are in device memory, where a group
-// of hundreds stays in the caches, and pass through shared memory in tiles while partners are
-// sought.
+// Each block merges one group through all its rounds. Nodes are in device memory, where a group of
+// hundreds stays in the caches, and pass through shared memory in tiles while partners are sought.
 
 #include <algorithm>
 #include <cfloat>
@@ -17,7 +16,8 @@ namespace {
 constexpr int kBlockSize = 256, kWarps = kBlockSize / 32;
 constexpr int kTileSize = 128;  // nodes in shared memory
 constexpr int64_t kMostRows = int64_t(1)
-                              << 21;  // of the groups that are merged at once: 350 MiB of scratch
+                              // Rows of the groups that are merged at once: 350 MiB of scratch.
+                              << 21;
 
 // Scratch for one row of a group.
 struct Scratch {
@@ -25,16 +25,22 @@ struct Scratch {
     double* row_weight;
     MergePair *pairs, *sorted;
     int *alive, *next,
-        *last;  // a node is known by the first row it holds; its other rows follow in a list
+        *last;  // A node is identified by its first row; its other rows follow in a linked list.
     uint8_t* is_used;
 
     __device__ Scratch at(int64_t row) const {
-        return {nodes + row, row_weight + row, pairs + row, sorted + row,
-                alive + row, next + row,       last + row,  is_used + row};
+        return {.nodes = nodes + row,
+                .row_weight = row_weight + row,
+                .pairs = pairs + row,
+                .sorted = sorted + row,
+                .alive = alive + row,
+                .next = next + row,
+                .last = last + row,
+                .is_used = is_used + row};
     }
 };
 
-// Makes each row a node; returns the scale of distances.
+// Makes each row a node; returns the inverse squared spacing that distances are compared with.
 __device__ double start_nodes(const GaussianRows<const float>& in, int64_t first, int count,
                               int64_t wanted, const Scratch& group) {
     double low[3] = {DBL_MAX, DBL_MAX, DBL_MAX}, minus_high[3] = {DBL_MAX, DBL_MAX, DBL_MAX};
@@ -99,7 +105,7 @@ __device__ void find_partners(const Scratch& group, int n, double inverse_spacin
     }
 }
 
-// Sorts the pairs, each to the place after those that come before it.
+// Sorts the pairs: the place of each is the number of pairs before it.
 __device__ void sort_pairs(const Scratch& group, int n) {
     __shared__ MergePair tile[kBlockSize];
     for (int base = 0; base < n; base += kBlockSize) {
@@ -124,8 +130,8 @@ __device__ void sort_pairs(const Scratch& group, int n) {
     }
 }
 
-// Takes the sorted pairs whose gaussians no pair before has, `allowed` at most, to the front of
-// `pairs`; returns how many. One warp does it.
+// Moves the sorted pairs that share no gaussian with a pair before, `allowed` at most, to the front
+// of `pairs`; returns how many there are. Called by one warp.
 __device__ int choose_pairs(const Scratch& group, int n, int64_t allowed) {
     const int lane = static_cast<int>(threadIdx.x % 32);
     int chosen = 0;
@@ -167,15 +173,15 @@ __device__ void join_pairs(const Scratch& group, int num_pairs) {
     }
 }
 
-// Closes the gaps in the list of nodes. One warp does it.
+// Closes the gaps in the list of nodes. Called by one warp.
 __device__ void drop_joined(const Scratch& group, int n) {
     const int lane = static_cast<int>(threadIdx.x % 32);
-    int kept = 0;
+    int num_kept = 0;
     for (int first = 0; first < n; first += 32) {
         const int node = first + lane < n ? group.alive[first + lane] : -1;
         const unsigned alive = __ballot_sync(kAllLanes, node >= 0);
-        if (node >= 0) group.alive[kept + __popc(alive & ((1u << lane) - 1))] = node;
-        kept += __popc(alive);
+        if (node >= 0) group.alive[num_kept + __popc(alive & ((1u << lane) - 1))] = node;
+        num_kept += __popc(alive);
         __syncwarp();
     }
 }
@@ -213,7 +219,7 @@ __global__ void __launch_bounds__(kBlockSize)
     const Scratch group = scratch.at(first - in_offset[first_group]);
     const double inverse_spacing2 = start_nodes(in, first, n, wanted, group);
     __shared__ int num_pairs;
-    // Rounds: each node finds its cheapest partner, and the cheapest disjoint pairs join.
+    // In each round every node finds its cheapest partner, and the cheapest disjoint pairs join.
     while (n > wanted) {
         __syncthreads();
         find_partners(group, n, inverse_spacing2);
@@ -239,7 +245,7 @@ __global__ void __launch_bounds__(kBlockSize)
 void merge(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
            Span<const int64_t> out_offset, const GaussianRows<float>& out, Stream stream) {
     const size_t num_groups = in_offset.size - 1;
-    // Runs of groups that share the scratch.
+    // A run is the groups that share the scratch.
     const auto end_of_run = [&](size_t first) {
         size_t last = first + 1;
         while (last < num_groups && in_offset[last + 1] - in_offset[first] <= kMostRows) ++last;
@@ -254,8 +260,14 @@ void merge(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
     DeviceBuffer<MergePair> pairs(rows, stream), sorted(rows, stream);
     DeviceBuffer<int> alive(rows, stream), next(rows, stream), last(rows, stream);
     DeviceBuffer<uint8_t> is_used(rows, stream);
-    const Scratch scratch{nodes.data(), row_weight.data(), pairs.data(), sorted.data(),
-                          alive.data(), next.data(),       last.data(),  is_used.data()};
+    const Scratch scratch{.nodes = nodes.data(),
+                          .row_weight = row_weight.data(),
+                          .pairs = pairs.data(),
+                          .sorted = sorted.data(),
+                          .alive = alive.data(),
+                          .next = next.data(),
+                          .last = last.data(),
+                          .is_used = is_used.data()};
     for (size_t first = 0; first < num_groups; first = end_of_run(first))
         launch("merge", merge_kernel, static_cast<unsigned>(end_of_run(first) - first), kBlockSize,
                0, stream, in, in_offsets.data(), out_offsets.data(), first, scratch, out);

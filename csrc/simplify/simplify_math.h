@@ -1,5 +1,8 @@
 #pragma once
 
+// Formulas of pruning and merging. They are compiled without contraction and use no function whose
+// last bits differ between libraries, so that both halves get the same bits.
+
 #include <cmath>
 #include <cstdint>
 
@@ -10,10 +13,10 @@
 
 namespace v3dg {
 
-// Importance by which pruning decides: the cube of opacity * (s1 s2 s3)^(2/3) (V3DG, section 3.2:
-// product of scale and opacity), which orders gaussians as that does and needs no roots, whose last
-// bits differ from library to library. Squares of volumes of float32 scales do not overflow
-// float64; what vanishes is smaller than anything that is seen.
+// Returns the importance by which pruning decides: the cube of opacity * (s1 s2 s3)^(2/3) (V3DG,
+// section 3.2: product of scale and opacity). It orders gaussians as the product does and needs no
+// roots, whose last bits differ from library to library. Squares of volumes of float32 scales do
+// not overflow float64; what underflows is too small to be seen.
 V3DG_HD inline double prune_score(const float scale[3], float opacity) {
     const double volume = static_cast<double>(scale[0]) * scale[1] * scale[2];
     const double o = opacity;
@@ -23,8 +26,8 @@ V3DG_HD inline double prune_score(const float scale[3], float opacity) {
 // Pruning keeps the same share of each of these cells of a median split.
 constexpr int kPruneHalvings = 3, kPruneCells = 1 << kPruneHalvings;
 
-// How many of a cell's gaussians are kept when `wanted` of first .. last are: rounded so that they
-// add up.
+// Computes how many of a cell's gaussians are kept when `wanted` of first .. last are. The shares
+// are rounded so that they add up.
 struct CellShares {
     int64_t first, last, wanted;
     V3DG_HD int64_t of(int64_t cell_first, int64_t cell_last) const {
@@ -34,10 +37,10 @@ struct CellShares {
     }
 };
 
-// Surface area of an ellipsoid over 4 pi, within 1.2 %: the mean of its shadow, sqrt(b2c2 x2 + a2c2
-// y2 + a2b2 z2), over directions along axes, between two and between all three, with the weights
-// that make the largest error of any shape the smallest. Roots alone, whose bits no library
-// decides.
+// Returns the surface area of an ellipsoid over 4 pi, within 1.2 %. It is the mean of the
+// ellipsoid's shadow, sqrt(b2c2 x2 + a2c2 y2 + a2b2 z2), over directions along axes, between two
+// and between all three; the weights minimise the largest error of any shape. It uses no function
+// but roots, whose bits are the same in every library.
 V3DG_HD inline double ellipsoid_area(double a, double b, double c) {
     constexpr double kAlongOne = 0.0604247, kBetweenTwo = 0.1013528, kBetweenThree = 0.5029995;
     const double bc = b * c, ac = a * c, ab = a * b;
@@ -47,22 +50,22 @@ V3DG_HD inline double ellipsoid_area(double a, double b, double c) {
            kBetweenThree * sqrt((bc2 + ac2 + ab2) / 3);
 }
 
-// Upper triangle xx xy xz yy yz zz of R diag(s²) Rᵀ.
+// Computes the upper triangle xx xy xz yy yz zz of R diag(s²) Rᵀ.
 V3DG_HD inline void covariance_of(const double quat[4], const double scale[3], double cov[6]) {
     double r[9];
     rotation_of_quat(quat, r);
-    int at = 0;
+    int entry = 0;
     for (int i = 0; i < 3; ++i)
         for (int k = i; k < 3; ++k) {
-            cov[at] = 0;
+            cov[entry] = 0;
             for (int j = 0; j < 3; ++j)
-                cov[at] += r[3 * i + j] * r[3 * k + j] * scale[j] * scale[j];
-            ++at;
+                cov[entry] += r[3 * i + j] * r[3 * k + j] * scale[j] * scale[j];
+            ++entry;
         }
 }
 
-// Scales of a covariance and the rotation to its axes, whose columns they belong to: cyclic Jacobi
-// rotations.
+// Computes the scales of a covariance and the rotation to its axes, whose columns belong to the
+// scales, by cyclic Jacobi rotations.
 V3DG_HD inline void scale_and_axes_of(const double cov[6], double scale[3], double e[3][3]) {
     double a[3][3] = {{cov[0], cov[1], cov[2]}, {cov[1], cov[3], cov[4]}, {cov[2], cov[4], cov[5]}};
     for (int i = 0; i < 3; ++i)
@@ -102,8 +105,9 @@ V3DG_HD inline void scale_and_axes_of(const double cov[6], double scale[3], doub
         for (int k = 0; k < 3; ++k) e[k][2] = -e[k][2];
 }
 
+// Computes the quaternion of a rotation matrix.
 V3DG_HD inline void quat_of_axes(const double e[3][3], double quat[4]) {
-    // The largest of the four components first, so that nothing small is divided by.
+    // The largest of the four components comes first, so that nothing small is divided by.
     const double four[4] = {1 + e[0][0] + e[1][1] + e[2][2], 1 + e[0][0] - e[1][1] - e[2][2],
                             1 - e[0][0] + e[1][1] - e[2][2], 1 - e[0][0] - e[1][1] + e[2][2]};
     int largest = 0;
@@ -119,7 +123,7 @@ V3DG_HD inline void quat_of_axes(const double e[3][3], double quat[4]) {
     for (int k = 0; k < 4; ++k) quat[k] = by_largest[largest][k];
 }
 
-// What merging looks at of a gaussian. Weights are area * opacity.
+// The features of a gaussian that merging compares. Weights are area * opacity.
 struct MergeFeature {
     double mean[3], color[3], weight;
 };
@@ -146,8 +150,9 @@ V3DG_HD inline MergeNode merge_node_of(const GaussianRows<const float>& in, int6
     return node;
 }
 
-// What a pair loses: the variance that joining adds, in place (over the area that each gaussian
-// that is left stands for) and in colour. Ward's criterion, weighted by what the gaussians cover.
+// Returns what a pair loses: the variance that joining adds, in place (relative to the area of each
+// gaussian that will be left) and in colour. This is Ward's criterion, weighted by what the
+// gaussians cover.
 V3DG_HD inline double merge_cost(const MergeFeature& a, const MergeFeature& b,
                                  double inverse_spacing2) {
     constexpr double kColorWeight = 6;
@@ -160,7 +165,7 @@ V3DG_HD inline double merge_cost(const MergeFeature& a, const MergeFeature& b,
            (place * inverse_spacing2 + kColorWeight * color);
 }
 
-// One over the squared size of the box around the means, per gaussian that is wanted.
+// Returns one over the squared size of the box around the means, per gaussian that is wanted.
 V3DG_HD inline double inverse_spacing2_of(const double low[3], const double high[3],
                                           int64_t wanted) {
     double extent2 = 0;
@@ -168,8 +173,8 @@ V3DG_HD inline double inverse_spacing2_of(const double low[3], const double high
     return extent2 > 0 ? static_cast<double>(wanted) / extent2 : 0;
 }
 
-// Two gaussians, a before b, and what joining them costs. The cheaper pair is before the other;
-// ties by index.
+// Two gaussians, a before b, and the cost of joining them. Cheaper pairs come first; ties go by
+// index.
 struct MergePair {
     double cost;
     int a, b;
@@ -178,23 +183,24 @@ V3DG_HD inline bool is_before(const MergePair& x, const MergePair& y) {
     return x.cost != y.cost ? x.cost < y.cost : (x.a != y.a ? x.a < y.a : x.b < y.b);
 }
 
-// Most pairs that one round joins of `count` gaussians: half of what is still to go, so that what
-// was joined is weighed again.
+// Returns the largest number of pairs of `count` gaussians that one round joins: half of what
+// remains to be joined, so that costs are updated in between.
 V3DG_HD inline int64_t pairs_in_round(int64_t count, int64_t wanted) {
     return (count - wanted + 1) / 2;
 }
 
-// Makes `a` what both are together.
+// Joins `b` into `a`.
 V3DG_HD inline void join(MergeNode& a, const MergeNode& b) {
     MergeFeature& f = a.feature;
     const double weight = f.weight + b.feature.weight, share = b.feature.weight / weight;
     double d[3];
     for (int k = 0; k < 3; ++k) d[k] = b.feature.mean[k] - f.mean[k];
-    int at = 0;
+    int entry = 0;
     for (int i = 0; i < 3; ++i)
         for (int k = i; k < 3; ++k) {
-            a.cov[at] += share * (b.cov[at] - a.cov[at]) + share * (1 - share) * d[i] * d[k];
-            ++at;
+            a.cov[entry] +=
+                share * (b.cov[entry] - a.cov[entry]) + share * (1 - share) * d[i] * d[k];
+            ++entry;
         }
     for (int k = 0; k < 3; ++k) {
         f.mean[k] += share * d[k];
