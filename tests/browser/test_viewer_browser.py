@@ -542,7 +542,8 @@ def test_photographs_lie_over_the_picture_of_their_camera(browser, site, tmp_pat
         with Tab(browser, captured.url) as tab:
             tab.settled()
             at = tab.page.evaluate(
-                "viewer.overlay.projection.place([0, 3 - viewer.fileCameras.frustumSize * viewer.scene.radius, 0])"
+                "viewer.overlay.projection.place("
+                "[0, 3 - viewer.fileCameras.frustumSize * viewer.scene.radius, 0])"
             )
             tab.page.mouse.click(*at)
             tab.page.wait_for_selector("#photograph:visible")

@@ -129,7 +129,13 @@ def test_bad_input_is_named_and_nothing_is_left(place):
         2, "--chunk: expected at least 1, got 0", "export", "a b1.v3dg", "--chunk", "0", cwd=place
     )
     fails(1, "expected a file ending in", "export", "town.txt", cwd=place)
-    fails(1, "got an asset; build a bundle from it: v3dg build asset.ply", "export", "asset.ply", cwd=place)
+    fails(
+        1,
+        "got an asset; build a bundle from it: v3dg build asset.ply",
+        "export",
+        "asset.ply",
+        cwd=place,
+    )
     fails(
         1, "chunk: expected at least", "export", "a b1.v3dg", "-o", "x/y", "--chunk", "1", cwd=place
     )

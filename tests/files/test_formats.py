@@ -326,7 +326,8 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path, suffix, name, row, value
 
 def test_an_encoding_is_for_ply_only(tmp_path):
     with pytest.raises(
-        ValueError, match=r"encoding: expected the default for .*a\.spz, which is not a \.ply, got 'ascii'"
+        ValueError,
+        match=r"encoding: expected the default for .*a\.spz, which is not a \.ply, got 'ascii'",
     ):
         write_asset(tmp_path / "a.spz", random_gaussians(1, 0), encoding="ascii")
 

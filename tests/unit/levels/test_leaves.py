@@ -450,11 +450,17 @@ def test_scratch_in_use_and_files_of_others_are_kept(tmp_path, small):
         first.read(0, 1000)
     (tmp_path / "s").mkdir()
     (tmp_path / "s" / "letter").write_text("dear")
-    with pytest.raises(ValueError, match="expected scratch files of a build, got 'letter'"), leaves():
+    with (
+        pytest.raises(ValueError, match="expected scratch files of a build, got 'letter'"),
+        leaves(),
+    ):
         pass
     assert (tmp_path / "s" / "letter").read_text() == "dear"
     (tmp_path / "s" / "letter").rename(tmp_path / "s" / "order")  # of a name that scratch has, too
-    with pytest.raises(ValueError, match="expected scratch files of a build, got 'order'"), leaves():
+    with (
+        pytest.raises(ValueError, match="expected scratch files of a build, got 'order'"),
+        leaves(),
+    ):
         pass
     assert (tmp_path / "s" / "order").read_text() == "dear"
     shutil.rmtree(tmp_path / "s")

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[3]
 CSRC = ROOT / "csrc"
 CHECK = ROOT / ".ci" / "check_threads.py"
 needs_clang = pytest.mark.skipif(
