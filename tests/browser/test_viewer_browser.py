@@ -673,6 +673,19 @@ def test_flight_is_recorded_and_played(tab):
     np.testing.assert_allclose(tab.position(), end, rtol=1e-5)
 
 
+def test_path_is_played_in_a_frame_that_began_before_it_came(tab):
+    start = tab.page.evaluate(
+        """() => {
+            const { view } = viewer.look;
+            const views = [view, { ...view, position: [9, 9, 9] }];
+            viewer.path.play({ type: "play", fps: 0.1, views });
+            viewer.path.playFrame(performance.now() - 50);
+            return view.position;
+        }"""
+    )
+    assert tab.page.evaluate("viewer.camera.position") == start
+
+
 def test_film_of_a_path_is_saved(tab, tmp_path):
     av = pytest.importorskip("av")
     tab.open("Path")

@@ -116,7 +116,8 @@ export class CameraPath {
     if (!this.film) return;
     const { views, fps, start } = this.film;
     const end = views.length - 1;
-    const place = Math.min(((now - start) / 1000) * fps, end);
+    // The time of a frame may be a little before the message that came in it.
+    const place = M.clamp(((now - start) / 1000) * fps, 0, end);
     this.app.camera.put(views[Math.floor(place)]);
     if (place >= end) this.film = null;
   }
