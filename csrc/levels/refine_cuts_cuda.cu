@@ -70,7 +70,7 @@ ModelPicture picture_of(const GaussianRows<const float>& rows, float filter_px2,
                         const Camera& camera, const PicturePlanes& planes) {
     const float black[3] = {};
     return {rows, view_of_world<float>(camera), filter_px2, antialiased,
-            frame_image(pinhole_of<float>(camera), static_cast<int>(camera.width),
+            frame_image(camera.intrinsics<float>(), static_cast<int>(camera.width),
                         static_cast<int>(camera.height), black, planes)};
 }
 

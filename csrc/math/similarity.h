@@ -1,13 +1,12 @@
 #pragma once
 
-// Poses of instances, and a camera in the world as one instance sees it: composed in double
-// precision, then rounded. Decisions depend on it, so whoever calls it is compiled without
-// contraction.
+// Poses of instances, and the pose of a camera in the frame of an instance: composed in double
+// precision, then rounded. Decisions depend on it, so its callers are compiled without contraction.
 
 #include <cfloat>
 
-#include "math/camera.h"
 #include "math/quat.h"
+#include "math/view.h"
 
 namespace v3dg {
 
@@ -18,8 +17,8 @@ struct Pose {
     double scale;
 };
 
-// Whether a pose is one: what is not finite, of no size, or turned by a quaternion of zeros, is not
-// drawn.
+// Whether a pose is valid: finite, of positive scale, and with a quaternion other than zero. Others
+// are not drawn.
 V3DG_HD inline bool is_placed(const Pose& pose) {
     double sum = pose.scale;
     for (int k = 0; k < 3; ++k) sum += fabs(pose.position[k]);
@@ -39,7 +38,7 @@ struct InstanceAxes {
     double eye[3];
 };
 
-V3DG_HD inline InstanceAxes axes_of_instance(const Camera& camera, const Pose& pose) {
+V3DG_HD inline InstanceAxes axes_of_instance(const CameraPose& camera, const Pose& pose) {
     const double inverse_scale = 1.0 / pose.scale;
     double rotation[9];
     rotation_of_quat(pose.quaternion, rotation);
@@ -62,7 +61,7 @@ V3DG_HD inline InstanceAxes axes_of_instance(const Camera& camera, const Pose& p
     return out;
 }
 
-// What projection needs of it.
+// The transform that projection needs.
 V3DG_HD inline ModelView<float> model_view_from_instance(const InstanceAxes& in, const Pose& pose) {
     double linear[9], translation[3];
     for (int k = 0; k < 9; ++k) linear[k] = pose.scale * in.axes[k];

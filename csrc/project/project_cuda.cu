@@ -63,15 +63,13 @@ struct SphereTest {
 template <class Source>
 __device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, const float p[3],
                                   float reach, float reach_scale) {
-    const Pinhole<float>& cam = in.image.camera;
-    const float inv_z = 1 / p[2], slope_x = p[0] * inv_z, slope_y = p[1] * inv_z;
-    const float u = cam.fx * slope_x + cam.cx, v = cam.fy * slope_y + cam.cy;
-    const float half = sphere_of_image(reach_scale * reach, inv_z, slope_x, slope_y,
-                                       in.item.appearance.filter_px2);
+    const Intrinsics<float>& cam = in.image.camera;
+    const auto [u, v, half] =
+        cam.image_of_sphere(p, reach, reach_scale, in.item.appearance.filter_px2);
     const float middle_x = 0.5f * cam.width, middle_y = 0.5f * cam.height;
     const float from_x = fabsf(u - middle_x), from_y = fabsf(v - middle_y);
-    const bool is_outside = !(p[2] >= cam.near_depth) | (reach < 0) | (from_x - half >= middle_x) |
-                            (from_y - half >= middle_y);
+    const bool is_outside = !(cam.depth_of(p) >= cam.near_depth) | (reach < 0) |
+                            (from_x - half >= middle_x) | (from_y - half >= middle_y);
     // With its centre in the image it is in the frustum for certain, unless it is made too faint.
     const bool is_faded = Source::kFades && in.item.weight < 1;
     const bool is_inside =
@@ -120,7 +118,7 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in,
     for (int i = 0; i < 3; ++i) s.p[i] = p[i];
     const Ellipse<float> e = Source::project(in, view, place, g, s, r.color);
     float half_x, half_y;
-    const Pinhole<float>& cam = in.image.camera;
+    const Intrinsics<float>& cam = in.image.camera;
     // The sphere has told that it is not too faint.
     bool is_in_frustum = is_one & extent_of(1.0f, e, s, half_x, half_y);
     is_in_frustum &= meets_image(e.u, half_x, cam.width) & meets_image(e.v, half_y, cam.height);
@@ -302,7 +300,7 @@ __device__ void store_tables(ItemTables<Model>& tables, uint32_t item_word, uint
         loaded.image = tables.placement.image;
         store_word(tables.image, load_word(in.images[loaded.image]));
         __syncwarp();
-        if (threadIdx.x % 32 == 0) tables.limits = slope_limits(tables.image.camera);
+        if (threadIdx.x % 32 == 0) tables.limits = tables.image.camera.limits();
     }
     if (tables.placement.model != loaded.model) {
         loaded.model = tables.placement.model;
@@ -326,11 +324,8 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
     const ModelView<float>& view = kIsShared ? of_sharer : tables.placement.view;
     const auto reach_scale_of = [&] {
         const float* linear = view.linear;
-        const float scale =
-            sqrt_of(linear[6] * linear[6] + linear[7] * linear[7] + linear[8] * linear[8]);
-        return sees_its_axis(tables.limits)
-                   ? max_of(tables.image.camera.fx, tables.image.camera.fy) * scale
-                   : NAN;
+        return tables.image.camera.sphere_scale(
+            tables.limits, linear[6] * linear[6] + linear[7] * linear[7] + linear[8] * linear[8]);
     };
     const float reach_scale = sees ? reach_scale_of() : 0;
     unsigned head = 0, waiting = 0;

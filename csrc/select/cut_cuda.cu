@@ -41,10 +41,10 @@ constexpr unsigned kFewInstances = 8192, kFewLanes = 8;  // and so do their part
 // The sides of the frustum for each bundle, which every instance would take eight divisions of
 // doubles to find out: as an argument where there are few bundles, in memory where there are more.
 struct BundleSides {
-    FrustumSides few[kFewBundles];
-    const FrustumSides* many;  // null where there are few
+    CameraSides few[kFewBundles];
+    const CameraSides* many;  // null where there are few
 
-    __device__ FrustumSides operator[](size_t bundle) const {
+    __device__ CameraSides operator[](size_t bundle) const {
         if (many != nullptr) return many[bundle];
         return few[bundle];
     }
@@ -170,9 +170,9 @@ __device__ Placed place_instance(const PlacedScene& scene, size_t i, const Eyes&
 
 // A thread a bundle.
 __global__ void sides_kernel(const BundleOnDevice* bundles, size_t num_bundles, Eyes eyes,
-                             FrustumSides* sides) {
+                             CameraSides* sides) {
     const size_t b = size_t(blockIdx.x) * blockDim.x + threadIdx.x;
-    if (b < num_bundles) sides[b] = frustum_sides(eyes, bundles[b].table.pad_px);
+    if (b < num_bundles) sides[b] = sides_of_eyes(eyes, bundles[b].table.pad_px);
 }
 
 // `kAreTwo`: whether the eyes are.
@@ -436,13 +436,13 @@ void Cut::cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule
     BundleSides sides{};
     const size_t num_bundles = scene.num_bundles();
     if (num_bundles > kFewBundles) {
-        FrustumSides* many = sides_.reserve(num_bundles, stream);
+        CameraSides* many = sides_.reserve(num_bundles, stream);
         launch("sides_kernel", sides_kernel, blocks_for(num_bundles, kCutThreads), kCutThreads, 0,
                stream, placed.bundles, num_bundles, eyes, many);
         sides.many = many;
     } else {
         for (size_t b = 0; b < num_bundles; ++b)
-            sides.few[b] = frustum_sides(eyes, scene.bundle(b).on_device().table.pad_px);
+            sides.few[b] = sides_of_eyes(eyes, scene.bundle(b).on_device().table.pad_px);
     }
     for (const bool is_second : {false, true}) {
         const Scratch& scratch = scratches[is_second];
