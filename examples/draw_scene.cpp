@@ -83,7 +83,7 @@ int main(int num_arguments, char** arguments) {
     camera.cy = kHeight / 2;
     camera.x1 = camera.width = kWidth;
     camera.y1 = camera.height = kHeight;
-    camera.near = 0.01;
+    camera.near_depth = 0.01;
 
     std::vector<float> color(3 * kWidth * kHeight), alpha(kWidth * kHeight);
     const Picture<float> picture{

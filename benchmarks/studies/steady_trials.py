@@ -42,7 +42,7 @@ _FAR = 1.15
 _FAR_FRAMES = 30
 _SWAY = 12  # frames to one side
 _ARRIVAL_FRAMES = 8  # as csrc/residency/page_table.h has them
-_HEADROOM_PARTS = 32  # as csrc/select/select_math.h has them
+_HEADROOM_PARTS = 32  # as csrc/select/budget_math.h has them
 
 
 @dataclass

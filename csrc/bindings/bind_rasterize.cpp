@@ -70,7 +70,7 @@ class HostTape final : public Tape {
                 model_.size(),
                 view_of_world<T>(camera.camera),
                 {T(look.filter_px2), look.antialiased, false}},
-          camera_(pinhole_of<T>(camera.camera)),
+          camera_(camera.camera.intrinsics<T>()),
           height_(camera.height()),
           width_(camera.width()),
           background_(look.background) {}
@@ -115,7 +115,7 @@ class HostTape final : public Tape {
   private:
     Model<T> model_;
     Draw<T> draw_;
-    Pinhole<T> camera_;
+    Intrinsics<T> camera_;
     int height_, width_;
     std::array<double, 3> background_;
     Workspace<T> workspace_;
@@ -219,9 +219,12 @@ py::tuple ellipses_of(const Rows& gaussians, const Camera& camera, double filter
     const NewArray<int32_t> radii(work.device(), {n, 2});
     const Ellipses<T> out{centers.span.data, depths.span.data, conics.span.data,
                           opacities.span.data, radii.span.data};
-    const EllipsesInput<T> in{gaussians.read<T>(),   view_of_world<T>(camera),
-                              pinhole_of<T>(camera), T(filter_px2),
-                              antialiased,           T(far_depth),
+    const EllipsesInput<T> in{gaussians.read<T>(),
+                              view_of_world<T>(camera),
+                              camera.intrinsics<T>(),
+                              T(filter_px2),
+                              antialiased,
+                              T(far_depth),
                               T(min_radius_px)};
     {
         const Unlocked unlocked;

@@ -43,7 +43,7 @@ BoundCamera make_camera(const py::array& viewmat, const py::array& K, int width,
     camera.cy = k[5];
     camera.width = width;
     camera.height = height;
-    camera.near = near;
+    camera.near_depth = near;
     set_window({0, 0, width, height}, camera);
     return out;
 }

@@ -59,7 +59,7 @@ struct NewPicture {
                                  const cuda::PicturePlanes& planes = {}) const {
         const auto& of = shade.background;
         const float b[3] = {float(of[0]), float(of[1]), float(of[2])};
-        return cuda::frame_image(pinhole_of<float>(camera), static_cast<int>(width),
+        return cuda::frame_image(camera.intrinsics<float>(), static_cast<int>(width),
                                  static_cast<int>(height), b, planes);
     }
 #endif

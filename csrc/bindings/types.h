@@ -6,8 +6,8 @@
 #include <array>
 
 #include "bindings/array.h"
+#include "camera/camera.h"
 #include "frame/image.h"
-#include "math/camera.h"
 #include "math/gaussian.h"
 #include "select/select.h"
 

@@ -40,7 +40,7 @@ struct RenderCounts {
 // std::length_error past about 3e9 gaussians. Once `stop` is true, returns soon and leaves the
 // picture and the counts unfinished.
 template <class T>
-RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera,
+RenderCounts render(const std::vector<Draw<T>>& draws, const Intrinsics<T>& camera,
                     const Picture<T>& picture, bool keep_source, Workspace<T>& workspace,
                     const std::atomic<bool>* stop = nullptr);
 
@@ -52,14 +52,14 @@ struct Pick {
 };
 
 // Returns whether there is any.
-bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, int x, int y,
+bool pick(const std::vector<Draw<float>>& draws, const Intrinsics<float>& camera, int x, int y,
           Pick& picked);
 
 // Gradients of the gaussians of a single draw from those of the picture that `workspace` was left
 // by. Adds to nothing: `out` and `centers` are overwritten for gaussians with a record and left
 // alone for others.
 template <class T>
-void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Picture<T>& picture,
+void render_backward(const Draw<T>& draw, const Intrinsics<T>& camera, const Picture<T>& picture,
                      const PictureGradient<T>& d_picture, const Workspace<T>& workspace,
                      const GaussianRows<T>& out, const CenterGradients<T>& centers,
                      T d_background[3]);

@@ -134,7 +134,7 @@ constexpr uint64_t kFewGaussians = 65536;
 // few gaussians of a piece tell where it is drawn and how much it covers.
 template <class T>
 static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws,
-                                    const std::vector<Piece>& pieces, const Pinhole<T>& camera,
+                                    const std::vector<Piece>& pieces, const Intrinsics<T>& camera,
                                     const Window& window, const std::atomic<bool>* stop) {
     if (pieces.empty() || pieces.back().first + pieces.back().count <= kFewGaussians)
         return {window};
@@ -180,7 +180,7 @@ static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws,
 // Draws one band; `is_first` of a picture's bands finds out what each piece reaches.
 template <class T>
 static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& pieces,
-                        bool is_first, const Pinhole<T>& camera, const Picture<T>& picture,
+                        bool is_first, const Intrinsics<T>& camera, const Picture<T>& picture,
                         bool keep_source, Workspace<T>& ws, const std::atomic<bool>* stop,
                         RenderCounts& counts) {
     const double start = now();
@@ -256,7 +256,7 @@ static Picture<T> band_of(const Picture<T>& picture, const Window& band) {
 }
 
 template <class T>
-RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera,
+RenderCounts render(const std::vector<Draw<T>>& draws, const Intrinsics<T>& camera,
                     const Picture<T>& picture, bool keep_source, Workspace<T>& ws,
                     const std::atomic<bool>* stop) {
     RenderCounts counts{};
@@ -281,7 +281,7 @@ static uint64_t num_tiles_of(const Record<T>& r) {
 }
 
 template <class T>
-void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Picture<T>& picture,
+void render_backward(const Draw<T>& draw, const Intrinsics<T>& camera, const Picture<T>& picture,
                      const PictureGradient<T>& d_picture, const Workspace<T>& ws,
                      const GaussianRows<T>& out, const CenterGradients<T>& centers,
                      T d_background[3]) {
@@ -355,7 +355,7 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
     });
 }
 
-bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, int x, int y,
+bool pick(const std::vector<Draw<float>>& draws, const Intrinsics<float>& camera, int x, int y,
           Pick& picked) {
     float color[3], alpha;
     const Picture<float> pixel{{x, y, x + 1, y + 1}, {0, 0, 0}, color, &alpha, nullptr};
@@ -377,12 +377,12 @@ bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, i
     return picked.weight > 0.0f;
 }
 
-#define V3DG_INSTANTIATE(T)                                                                \
-    template RenderCounts render<T>(const std::vector<Draw<T>>&, const Pinhole<T>&,        \
-                                    const Picture<T>&, bool, Workspace<T>&,                \
-                                    const std::atomic<bool>*);                             \
-    template void render_backward<T>(const Draw<T>&, const Pinhole<T>&, const Picture<T>&, \
-                                     const PictureGradient<T>&, const Workspace<T>&,       \
+#define V3DG_INSTANTIATE(T)                                                                   \
+    template RenderCounts render<T>(const std::vector<Draw<T>>&, const Intrinsics<T>&,        \
+                                    const Picture<T>&, bool, Workspace<T>&,                   \
+                                    const std::atomic<bool>*);                                \
+    template void render_backward<T>(const Draw<T>&, const Intrinsics<T>&, const Picture<T>&, \
+                                     const PictureGradient<T>&, const Workspace<T>&,          \
                                      const GaussianRows<T>&, const CenterGradients<T>&, T*);
 V3DG_INSTANTIATE(float)
 V3DG_INSTANTIATE(double)

@@ -44,7 +44,7 @@ SceneFrameCounts draw_all(const std::vector<Draw<float>>& draws, const Camera& c
     SceneFrameCounts counts{};
     std::unique_ptr<Workspace<float>> workspace = shared_workspace().take();
     counts.render =
-        render<float>(draws, pinhole_of<float>(camera), picture, false, *workspace, stop);
+        render<float>(draws, camera.intrinsics<float>(), picture, false, *workspace, stop);
     shared_workspace().give_back(std::move(workspace));
     return counts;
 }
@@ -243,7 +243,7 @@ bool cpu::pick_cut(const HostScene& scene, const Camera& camera, const GivenCut&
                    ScenePick& picked) {
     const CutDraws cut(scene, camera, given);
     Pick found{};
-    if (!pick(cut.draws(), pinhole_of<float>(camera), static_cast<int>(camera.x0),
+    if (!pick(cut.draws(), camera.intrinsics<float>(), static_cast<int>(camera.x0),
               static_cast<int>(camera.y0), found))
         return false;
     picked = {cut.pair_of(found.gaussian), found.weight, found.depth};

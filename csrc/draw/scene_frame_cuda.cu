@@ -8,7 +8,7 @@
 namespace v3dg {
 namespace cuda {
 
-FrameImage frame_image(const Pinhole<float>& camera, int width, int height,
+FrameImage frame_image(const Intrinsics<float>& camera, int width, int height,
                        const float background[3], const PicturePlanes& planes) {
     return {camera,
             width,

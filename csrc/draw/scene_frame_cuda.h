@@ -9,7 +9,7 @@ namespace v3dg {
 namespace cuda {
 
 // The only picture of a frame; `first_tile` and the tiles are filled in.
-FrameImage frame_image(const Pinhole<float>& camera, int width, int height,
+FrameImage frame_image(const Intrinsics<float>& camera, int width, int height,
                        const float background[3], const PicturePlanes& planes);
 
 // Gaussians that stay as they are, and packed.

@@ -5,8 +5,8 @@
 #include <cstdint>
 
 #include "frame/counters.h"
-#include "math/camera.h"
 #include "math/gaussian.h"
+#include "math/view.h"
 
 namespace v3dg {
 

@@ -4,7 +4,7 @@
 
 #include <cstdint>
 
-#include "math/camera.h"
+#include "camera/camera.h"
 
 namespace v3dg {
 
@@ -73,7 +73,7 @@ struct PicturePlanes {
 
 // One picture of a batch.
 struct FrameImage {
-    Pinhole<float> camera;
+    Intrinsics<float> camera;
     int width, height;
     int tile_columns, tile_rows;
     uint32_t first_tile;  // number in the batch; tiles are numbered row by row

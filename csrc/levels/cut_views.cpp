@@ -61,7 +61,7 @@ Camera camera_around(const CutPictures& pictures, Random& random) {
     camera.fx = camera.fy = std::sqrt(kDistance * kDistance - 1) / 2;
     camera.cx = camera.cy = 0.5;
     camera.width = camera.height = 1;
-    camera.near = kNear * pictures.ball.radius;
+    camera.near_depth = kNear * pictures.ball.radius;
     return camera;
 }
 
@@ -107,7 +107,7 @@ Camera window_of(const Camera& camera, double widest_px, const CutPictures& pict
                 p[row] +=
                     camera.rotation[3 * row + k] * static_cast<double>(pictures.means[3 * i + k]);
         }
-        if (!(p[2] > camera.near)) continue;
+        if (!(p[2] > camera.near_depth)) continue;
         const double x = camera.fx * p[0] / p[2] + camera.cx,
                      y = camera.fy * p[1] / p[2] + camera.cy;
         if (!(x >= 0 && x < camera.width && y >= 0 && y < camera.height)) continue;

@@ -5,7 +5,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "math/camera.h"
+#include "camera/camera.h"
 #include "math/gaussian.h"
 #include "residency/cluster_table.h"
 

@@ -75,7 +75,7 @@ Camera FirstSelected::camera(size_t picture) const {
     camera.height = camera.x1 = camera.y1 = camera.width;
     camera.cx = camera.width / 2 + random_uniform(0, picture, 0) - 0.5;
     camera.cy = camera.height / 2 + random_uniform(0, picture, 1) - 0.5;
-    camera.near = around_.radius;
+    camera.near_depth = around_.radius;
     return camera;
 }
 

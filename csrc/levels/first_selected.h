@@ -6,9 +6,9 @@
 #include <vector>
 
 #include "base/span.h"
+#include "camera/camera.h"
 #include "levels/cut_views.h"
 #include "math/bounds.h"
-#include "math/camera.h"
 
 namespace v3dg {
 

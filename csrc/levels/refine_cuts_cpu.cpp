@@ -103,9 +103,9 @@ class CutFrame {
                  .count = rows_.size,
                  .view = view_of_world<float>(camera),
                  .appearance = appearance_};
-        pinhole_ = pinhole_of<float>(camera);
+        intrinsics_ = camera.intrinsics<float>();
         picture_ = canvas_.start(camera);
-        render<float>({draw_}, pinhole_, picture_, true, workspace_);
+        render<float>({draw_}, intrinsics_, picture_, true, workspace_);
         return canvas_;
     }
     GaussianRows<const float> backward() {
@@ -113,7 +113,7 @@ class CutFrame {
         const GaussianRows<float> gradient =
             rows_in(gradients_.data(), rows_.size, rows_.sh_degree);
         float d_background[3] = {};
-        render_backward<float>(draw_, pinhole_, picture_,
+        render_backward<float>(draw_, intrinsics_, picture_,
                                {canvas_.color(), canvas_.alpha(), nullptr}, workspace_, gradient,
                                {}, d_background);
         return gradient;
@@ -125,7 +125,7 @@ class CutFrame {
     GaussianRows<float> rows_{};
     std::optional<Model<float>> model_;
     Draw<float> draw_{};
-    Pinhole<float> pinhole_{};
+    Intrinsics<float> intrinsics_{};
     Canvas canvas_;
     Picture<float> picture_{};
     Workspace<float> workspace_;
@@ -176,7 +176,7 @@ void refine_cuts(const FitConfig& config, const FitTarget& target, uint64_t targ
                                 .count = target_count,
                                 .view = view_of_world<float>(larger),
                                 .appearance = {target.filter_px2, target.antialiased, false}};
-        render<float>({whole}, pinhole_of<float>(larger), wanted.start(larger), false, of_target);
+        render<float>({whole}, larger.intrinsics<float>(), wanted.start(larger), false, of_target);
 
         const std::vector<uint32_t> index = gaussians_of(pictures.table, view);
         const GaussianRows<float>& shown = frame.start(index.size(), rows.sh_degree);

@@ -42,7 +42,7 @@ ModelPicture picture_of(const GaussianRows<const float>& rows, float filter_px2,
             .view = view_of_world<float>(camera),
             .filter_px2 = filter_px2,
             .antialiased = antialiased,
-            .image = frame_image(pinhole_of<float>(camera), static_cast<int>(camera.width),
+            .image = frame_image(camera.intrinsics<float>(), static_cast<int>(camera.width),
                                  static_cast<int>(camera.height), black, planes)};
 }
 

@@ -7,7 +7,7 @@
 
 #include "fit_group/fit_group_math.h"
 #include "levels/refine_cuts.h"
-#include "math/camera.h"
+#include "camera/camera.h"
 #include "math/quat.h"
 
 namespace v3dg {

@@ -6,8 +6,8 @@
 
 #include <cfloat>
 
-#include "math/camera.h"
 #include "math/quat.h"
+#include "math/view.h"
 
 namespace v3dg {
 
@@ -39,7 +39,7 @@ struct InstanceAxes {
     double eye[3];
 };
 
-V3DG_HD inline InstanceAxes axes_of_instance(const Camera& camera, const Pose& pose) {
+V3DG_HD inline InstanceAxes axes_of_instance(const CameraPose& camera, const Pose& pose) {
     const double inverse_scale = 1.0 / pose.scale;
     double rotation[9];
     rotation_of_quat(pose.quaternion, rotation);

@@ -1,7 +1,6 @@
 #pragma once
 
-// Where gaussians lie on an image, for those who train them: of each one, whether or not it is
-// drawn.
+// The ellipses of all gaussians on an image, whether or not they are drawn, for training.
 
 #include <cstdint>
 
@@ -10,9 +9,9 @@
 
 namespace v3dg {
 
-// Arrays of N gaussians. Zeros for those that are not in sight: before the near plane or behind the
-// far depth, nowhere an alpha of 1/255, outside of the image, or within `min_radius_px` of their
-// centres.
+// Arrays of N gaussians. A gaussian that is not in sight has zeros: one that is nearer than the
+// near plane or farther than the far depth, has an alpha of 1/255 nowhere, lies outside of the
+// image, or reaches at most `min_radius_px` from its centre.
 template <class T>
 struct Ellipses {
     T* centers;      // (N, 2) px
@@ -26,7 +25,7 @@ template <class T>
 struct EllipsesInput {
     GaussianRows<const T> rows;
     ModelView<T> view;
-    Pinhole<T> camera;
+    Intrinsics<T> camera;
     T filter_px2;
     bool antialiased;
     T far_depth, min_radius_px;
@@ -43,7 +42,7 @@ struct EllipsesInput {
         T half_x, half_y;
         const bool is_drawable = extent_of(g.opacity, e, s, half_x, half_y);
         const int32_t x = rounded_up(half_x), y = rounded_up(half_y);
-        const bool is_seen = is_drawable & (s.p[2] >= camera.near_depth) & (s.p[2] <= far_depth) &
+        const bool is_seen = is_drawable & (e.depth >= camera.near_depth) & (e.depth <= far_depth) &
                              meets_image(e.u, T(x), camera.width) &
                              meets_image(e.v, T(y), camera.height) &
                              ((T(x) > min_radius_px) | (T(y) > min_radius_px));
@@ -61,7 +60,7 @@ struct EllipsesInput {
     }
 
   private:
-    // Means nothing for what is not a number.
+    // The result is undefined for NaN.
     static V3DG_HD int32_t rounded_up(T x) {
         const auto whole = static_cast<int32_t>(min_of(max_of(x, T(0)), T(1 << 30)));
         return whole + (T(whole) < x ? 1 : 0);

@@ -1,5 +1,7 @@
 #pragma once
 
+// Contract of projection on the CPU. It is compiled once for each instruction set.
+
 #include <climits>
 #include <cstddef>
 #include <cstdint>
@@ -12,11 +14,11 @@
 
 namespace v3dg {
 
-// What of the whole image a run of gaussians reaches, whichever window of it is drawn.
+// What a run of gaussians reaches in the whole image, whichever window of it is drawn.
 struct Reach {
     uint64_t in_frustum = 0;              // gaussians whose extent meets the image
-    uint64_t drawn = 0;                   // of them, those that reach a pixel centre
-    uint64_t entries = 0;                 // of those in the lists of tiles, by their pixel boxes
+    uint64_t drawn = 0;                   // gaussians that reach a pixel centre
+    uint64_t entries = 0;                 // their entries in the lists of tiles
     int top = INT_MAX, bottom = INT_MIN;  // rows that hold all those pixels
 };
 
@@ -26,7 +28,7 @@ struct Reach {
 // camera's image. `source` (or null) receives `source_base` plus the gaussian's place behind
 // `skip`. Returns the number of records.
 V3DG_DECLARE_PER_ISA(template <class T> size_t project(
-    const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole<T>& camera,
+    const Draw<T>& draw, uint64_t skip, uint64_t count, const Intrinsics<T>& camera,
     const Window& window, Record<T>* records, uint32_t* source, uint32_t source_base, Reach& reach))
 
 // Writes the gradients of the `count` gaussians `source` (places in one draw) from those of their
@@ -34,6 +36,6 @@ V3DG_DECLARE_PER_ISA(template <class T> size_t project(
 V3DG_DECLARE_PER_ISA(template <class T>
                      void project_backward(const Draw<T>& draw, const uint32_t* source,
                                            const RecordGradient<T>* d_records, size_t count,
-                                           const Pinhole<T>& camera, const GaussianRows<T>& out))
+                                           const Intrinsics<T>& camera, const GaussianRows<T>& out))
 
 }  // namespace v3dg

@@ -10,20 +10,20 @@
 namespace v3dg {
 namespace cuda {
 
-// Gives each record of a frame its slots, `first_slot` of the first, and counts all of them in the
-// counters. Does nothing when the items are over a capacity.
+// Gives each record of a frame its slots, from `first_slot` of the record on, and counts all slots
+// in the counters. Does nothing when the items exceed a capacity.
 void place_slots(const ItemList& items, const uint32_t* item_records, const RecordBox* boxes,
                  uint32_t* first_slot, cudaStream_t stream);
 
 struct ProjectBackwardInput {
-    // Items of kItemSize gaussians, the last of what is left. The records of item i stand in a row
+    // Items have kItemSize gaussians, except for the last. The records of item i are consecutive
     // from i * kItemSize on, in the order of their gaussians.
     const uint32_t* item_records;  // how many of an item's gaussians became records
     RecordPlanes records;
     const uint32_t* source;  // each record's gaussian
     GaussianRows<const float> rows;
     ModelView<float> view;
-    Pinhole<float> camera;
+    Intrinsics<float> camera;
     float filter_px2;
     bool antialiased;
 };

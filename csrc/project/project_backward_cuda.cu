@@ -1,5 +1,5 @@
-// A block takes an item, a thread one of its records. SH coefficients go through shared memory, a
-// row a gaussian, and come back as their own gradients.
+// Backward pass of projection. A block has an item, a thread one of its records. SH coefficients
+// are brought into shared memory, one row a gaussian, where their gradients replace them.
 
 #include <type_traits>
 
@@ -13,8 +13,8 @@ namespace cuda {
 namespace {
 
 constexpr int kThreads = kItemSize;
-constexpr uint32_t kFewSlots = 16;  // a thread adds up so many by itself, a warp more
-constexpr int kWordsAtOnce = 6;     // that a thread asks for before it stores the first
+constexpr uint32_t kFewSlots = 16;  // a thread adds up to this many by itself, a warp adds more
+constexpr int kWordsAtOnce = 6;     // how many a thread loads before it stores the first
 
 template <class Value>
 __device__ void add_slot(const Value* of_slot, uint32_t i, Value& sum) {
@@ -25,8 +25,8 @@ __device__ void add_slot(const Value* of_slot, uint32_t i, Value& sum) {
     sum += slot;
 }
 
-// Sum of `num` slots, in their order or, when there are many, in another that is fixed as well. All
-// lanes of the warp take part. Returns whether any was touched.
+// Sums `num` slots, in their order or, when there are many, in another fixed order. All lanes of
+// the warp take part. Returns whether any slot was touched.
 template <class Value>
 __device__ bool sum_of_slots(const GradientSlots& slots, const Value* of_slot, uint32_t first,
                              uint32_t num, Value& sum) {
@@ -101,7 +101,7 @@ __device__ void store_row(float* rows, uint64_t i, const float* row) {
     for (int k = 0; k < kWidth; ++k) rows[kWidth * i + k] = row[k];
 }
 
-// How a row of SH coefficients is moved and where the next one begins; odd, against bank conflicts.
+// How a row of SH coefficients is moved. The stride is odd, against bank conflicts.
 template <int kDegree>
 struct ShRow {
     static constexpr int kValues = 3 * num_sh_bases(kDegree);
@@ -126,7 +126,7 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
 
     const uint64_t record = first + threadIdx.x;
     const bool is_record = threadIdx.x < in.item_records[blockIdx.x];
-    const uint64_t i = is_record ? in.source[record] : 0;  // its gaussian
+    const uint64_t i = is_record ? in.source[record] : 0;  // the gaussian of the record
     Gaussian3d<float> g{};
     float color[3] = {0, 0, 0};
     if (is_record) {  // early, so that it arrives while the slots are added up
@@ -205,7 +205,7 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
                         : Word{};
 }
 
-// `sizes` of the gradients by the centres of the gaussians, which start as zeros.
+// Writes the sizes of the gradients of the gaussians' centres. `sizes` starts as zeros.
 __global__ void __launch_bounds__(kThreads)
     center_sizes_kernel(ProjectBackwardInput in, GradientSlots slots, CenterSize<float>* sizes) {
     const uint64_t record = static_cast<uint64_t>(blockIdx.x) * kItemSize + threadIdx.x;

@@ -1,10 +1,11 @@
+// Projection on the CPU, forward and backward, a vector of gaussians at a time. In the forward pass
+// the lanes are neighbours in the planes. Compiled once for each instruction set.
+
 #include "project/project.h"
 
 #include <algorithm>
 
 #include "quantize/quantize_math.h"
-
-// A vector of gaussians at a time: lanes are neighbours in the planes.
 
 namespace v3dg {
 namespace V3DG_ISA {
@@ -14,7 +15,7 @@ template <class T>
 struct PlaneSource {
     const GaussianPlanes<T>& m;
 
-    // Those of the lanes that there are, from row i on.
+    // Loads the gaussians from row i on; planes are padded, so all lanes may be read.
     V3DG_INLINE Gaussian3d<Vec<T>> load_gaussians(uint64_t i, uint64_t) const {
         Gaussian3d<Vec<T>> g;
         for (int k = 0; k < 3; ++k) g.mean[k] = load(m.mean[k] + i);
@@ -29,7 +30,7 @@ struct PlaneSource {
     }
 };
 
-// Codes of one cluster. Lanes past its end repeat its last gaussian.
+// Gaussians as codes, of one cluster. Lanes past its end repeat its last gaussian.
 struct CodeSource {
     using V = Vec<float>;
 
@@ -58,7 +59,7 @@ struct CodeSource {
     }
 
   private:
-    // `width` words each, of rows that begin `stride` words apart.
+    // Loads `width` words of each row; rows begin `stride` words apart.
     static V3DG_INLINE void load_words(const uint32_t* rows, int width, uint64_t stride,
                                        uint64_t count, Bits<V>* words) {
         for (int lane = 0; lane < kLanes<float>; ++lane) {
@@ -68,13 +69,13 @@ struct CodeSource {
     }
 };
 
-// Tiles that the pixels from `first` to `last` lie in, along one axis.
+// The number of tiles that the pixels from `first` to `last` lie in, along one axis.
 template <class I>
 static V3DG_INLINE I tiles_of(I first, I last) {
     return last / kTileSize - first / kTileSize + 1;
 }
 
-// The colours of the clusters of the gaussians from `at` on, in the lanes that `kept` has bits for.
+// Loads the colours of the clusters of the gaussians from `at` on, for the lanes in `kept`.
 template <class V>
 static V3DG_INLINE void load_palette(const Palette& palette, uint64_t at, unsigned kept, V sh[3]) {
     for (int k = 0; k < 3; ++k) sh[k] = V{};
@@ -112,10 +113,10 @@ static V3DG_INLINE void write_records(const Source& from, const Draw<T>& draw, u
     }
 }
 
-// As project(), of the rows from `first` on.
+// project() for rows of one source, from `first` on.
 template <class Source, class T>
 static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t first, uint64_t count,
-                           const Pinhole<T>& camera, const Window& window, Record<T>* records,
+                           const Intrinsics<T>& camera, const Window& window, Record<T>* records,
                            uint32_t* source, uint32_t source_base, Reach& reach) {
     using V = Vec<T>;
     using I = decltype(V{} < V{});
@@ -129,7 +130,7 @@ static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t fir
         const Gaussian3d<V> g = from.load_gaussians(at, count - done);
         Projection<V> s;
         to_view(draw.view, g.mean, s.p);
-        const auto in_front = s.p[2] >= all_lanes<V>(camera.near_depth);
+        const auto in_front = camera.depth_of(s.p) >= all_lanes<V>(camera.near_depth);
         if ((bits_of(in_front) & lanes) == 0) continue;
         Ellipse<V> e = project_gaussian(g, draw.view, camera, draw.appearance.filter_px2,
                                         draw.appearance.antialiased, s, draw.appearance.is_limited);
@@ -174,9 +175,9 @@ static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t fir
     return num_records;
 }
 
-// As project(), a cluster at a time.
+// project() for codes, a cluster at a time.
 static size_t project_codes(const Draw<float>& draw, uint64_t skip, uint64_t count,
-                            const Pinhole<float>& camera, const Window& window,
+                            const Intrinsics<float>& camera, const Window& window,
                             Record<float>* records, uint32_t* source, uint32_t source_base,
                             Reach& reach) {
     const Codes& codes = *draw.codes;
@@ -199,7 +200,7 @@ static size_t project_codes(const Draw<float>& draw, uint64_t skip, uint64_t cou
 }
 
 template <class T>
-size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole<T>& camera,
+size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Intrinsics<T>& camera,
                const Window& window, Record<T>* records, uint32_t* source, uint32_t source_base,
                Reach& reach) {
     if constexpr (std::is_same<T, float>::value)
@@ -210,10 +211,11 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
                         records, source, source_base, reach);
 }
 
-// Scattered gaussians: lanes are filled one by one, which is small beside the arithmetic.
+// The gaussians are scattered, so lanes are filled one by one, which costs little beside the
+// arithmetic.
 template <class T>
 void project_backward(const Draw<T>& draw, const uint32_t* source,
-                      const RecordGradient<T>* d_records, size_t count, const Pinhole<T>& camera,
+                      const RecordGradient<T>* d_records, size_t count, const Intrinsics<T>& camera,
                       const GaussianRows<T>& out) {
     using V = Vec<T>;
     constexpr size_t kWidth = kLanes<T>;
@@ -267,10 +269,10 @@ void project_backward(const Draw<T>& draw, const uint32_t* source,
 }
 
 #define V3DG_INSTANTIATE(T)                                                                      \
-    template size_t project<T>(const Draw<T>&, uint64_t, uint64_t, const Pinhole<T>&,            \
+    template size_t project<T>(const Draw<T>&, uint64_t, uint64_t, const Intrinsics<T>&,         \
                                const Window&, Record<T>*, uint32_t*, uint32_t, Reach&);          \
     template void project_backward<T>(const Draw<T>&, const uint32_t*, const RecordGradient<T>*, \
-                                      size_t, const Pinhole<T>&, const GaussianRows<T>&);
+                                      size_t, const Intrinsics<T>&, const GaussianRows<T>&);
 V3DG_INSTANTIATE(float)
 V3DG_INSTANTIATE(double)
 #undef V3DG_INSTANTIATE

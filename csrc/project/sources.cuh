@@ -1,7 +1,12 @@
 #pragma once
 
-// Where the project kernels read gaussians: from rows, from planes of packed gaussians, or from
+// The sources that the project kernels read gaussians from: rows, planes of packed gaussians, or
 // codes.
+//
+// A source computes a gaussian in steps, because most gaussians reach no pixel centre. fetch()
+// loads early what its sphere follows from; sphere() returns its mean and its reach; project() its
+// ellipse and its colour, for a Projection whose p is set; shade() replaces the colour, for models
+// for which has_shade() is true.
 
 #include "base/launch.cuh"
 #include "project/project_cuda.h"
@@ -10,14 +15,14 @@
 namespace v3dg {
 namespace cuda {
 
-// What an item needs.
+// The tables of an item.
 template <class Model>
 struct ItemTables {
     alignas(16) Placement placement;
     alignas(16) FrameImage image;
     alignas(16) Model model;
     DrawItem item;
-    SlopeLimits<float> limits;  // of the image
+    Intrinsics<float>::Limits limits;  // of the image's camera
 };
 
 __device__ inline float4 load4(const float* rows, uint32_t row) {
@@ -33,7 +38,7 @@ __device__ void color_of(const Coefficient& sh, const float mean[3], const Model
     color_of_coefficients(kDegree, direction, sh, color);
 }
 
-// The coefficients are loaded as they are used: all at once are more than there are registers.
+// Loads the coefficients as they are used, because there are not enough registers for all at once.
 template <int kDegree>
 __device__ void color_of_row(const float* row, const float mean[3], const ModelView<float>& view,
                              float color[3]) {
@@ -47,17 +52,12 @@ __device__ void color_of_row(const float* row, const float mean[3], const ModelV
     color_of<kDegree>(coefficient, mean, view, color);
 }
 
-// A source tells what a gaussian is, in steps, because most reach no pixel centre: a lane fetch()es
-// what the sphere around it follows from, early; sphere() is its mean and its reach; project() its
-// ellipse, where s.p is set, and its colour; shade() another colour, of models that has_shade()
-// tells.
-
-// Gaussians as rows.
+// The base of sources with a row for each gaussian.
 template <class RowModel>
 struct OfRows {
     using Model = RowModel;
     using Fetched = float4;
-    struct Place {};  // a row is all that is needed
+    struct Place {};  // the row alone is the place
     static constexpr bool kFades = false;
 
     static __device__ Place start(const ItemTables<Model>&) { return {}; }
@@ -67,7 +67,7 @@ struct OfRows {
     }
 };
 
-// As users hold them.
+// Gaussians as users hold them.
 struct RowSource : OfRows<GaussianRows<const float>> {
     static __device__ bool has(const Model&) { return true; }
     static __device__ bool has_shade(const Model& m) { return m.sh_degree > 0; }
@@ -92,7 +92,7 @@ struct RowSource : OfRows<GaussianRows<const float>> {
         gaussian.quat[1] = quat.y;
         gaussian.quat[2] = quat.z;
         gaussian.quat[3] = quat.w;
-        const float* sh = m.sh + 3 * size_t(g);  // where there is one coefficient
+        const float* sh = m.sh + 3 * size_t(g);  // valid where there is one coefficient
         if (m.sh_degree == 0)
             color_of_row<0>(sh, gaussian.mean, view, color);
         else if (m.sh_degree == kPlainColor)
@@ -116,6 +116,7 @@ struct RowSource : OfRows<GaussianRows<const float>> {
     }
 };
 
+// Gaussians as PackedGaussian, which are the quickest to project.
 struct PackedSource : OfRows<PackedPlanes> {
     static __device__ bool has(const Model& m) { return m.plane[0] != nullptr; }
     static __device__ bool has_shade(const Model& m) {
@@ -145,15 +146,15 @@ struct PackedSource : OfRows<PackedPlanes> {
     }
 };
 
-// Codes come to the same bits as the rows that they are decoded to, packed.
+// Gaussians as codes. The result has the same bits as that of the rows that they decode to, packed.
 struct CodeSource {
     using Model = CodedGaussians;
     using Fetched = uint4;
     static constexpr bool kFades = false;
     struct Place {
-        uint32_t cluster, end;  // of the rows of the cluster
+        uint32_t cluster, end;  // the cluster of a row, and the end of the cluster's rows
     };
-    // What follows from an opacity's code.
+    // Numbers that depend on the code of the opacity alone.
     struct OpacityEntry {
         float reach_in_sigmas, log2_opacity;
     };
@@ -166,7 +167,7 @@ struct CodeSource {
         __shared__ OpacityEntry entries[kMostOpacity + 1];
         return entries;
     }
-    // For a whole block.
+    // Fills the table of opacities. For the whole block.
     static __device__ void prepare() {
         for (unsigned code = threadIdx.x; code <= kMostOpacity; code += blockDim.x) {
             const float opacity = static_cast<float>(code) * kOpacityStep;
@@ -174,7 +175,7 @@ struct CodeSource {
         }
         __syncthreads();
     }
-    // Where the item's first gaussian is; for a whole warp.
+    // The place of the item's first gaussian. For the whole warp.
     static __device__ Place start(const ItemTables<Model>& in) {
         const Span<const int64_t>& offset = in.model.codes.offset;
         const uint32_t next = in.item.cluster + 1 + threadIdx.x % 32;
@@ -183,7 +184,7 @@ struct CodeSource {
         const uint32_t cluster = in.item.cluster + __popc(__ballot_sync(kAllLanes, is_before));
         return {cluster, static_cast<uint32_t>(__ldg(offset.data + cluster + 1))};
     }
-    // To a row of the same cluster or of a later one.
+    // Moves the place to a row of the same cluster or of a later one.
     static __device__ void advance(const Model& m, Place& place, uint32_t g) {
         while (g >= place.end)
             place.end = static_cast<uint32_t>(__ldg(m.codes.offset.data + ++place.cluster + 1));
@@ -265,7 +266,7 @@ struct CodeSource {
     }
 };
 
-// The same for frames of which some items have weights below 1.
+// A source for frames in which some items have weights below 1.
 template <class Source>
 struct Faded : Source {
     static constexpr bool kFades = true;

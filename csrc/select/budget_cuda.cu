@@ -1,10 +1,10 @@
 // Chooses the tolerance of a budget. change_kernel adds up by how many gaussians the cuts of
-// neighbouring tolerances differ; choose_kernel chooses the least tolerance from which on no cut
-// has too many.
+// neighbouring bins differ (budget_math.h); choose_kernel chooses the smallest tolerance from which
+// on no cut exceeds the budget.
 //
-// Both run for two rounds. The first looks at no tolerance below half of the last choice, so that
-// it need not look at the tables of what is far away. The second does nothing unless that was too
-// much.
+// Both run for two rounds. The first considers no tolerance below half of the last choice, which
+// spares it the tables of distant instances. The second does nothing unless a smaller tolerance
+// might have been chosen.
 
 #include "base/scan.cuh"
 #include "select/cut_parts.cuh"
@@ -15,12 +15,11 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kChooseThreads = 1024;
-// Bins of a warp of choose_kernel.
+// The number of bins of a warp of choose_kernel.
 constexpr uint32_t kWarpBins = (kNumBudgetBins + kChooseThreads - 1) / kChooseThreads * 32;
 constexpr float kMostGuess = 1 << 20;
 
-// Adds the numbers of gaussians by which the cut of each tolerance differs from that of the
-// tolerance before.
+// Adds up by how many gaussians the cut of each bin differs from that of the bin before.
 __global__ void change_kernel(PlacedScene scene, SelectRule rule, BudgetRound round,
                               const unsigned* num_parts, Count* change) {
     if (round.is_over()) return;
@@ -38,7 +37,7 @@ __global__ void change_kernel(PlacedScene scene, SelectRule rule, BudgetRound ro
             if (mine.drawn >> k & 1) kept += mine.size(k);
         const auto add = [&](const BundleOnDevice& bundle, const InstanceView& view, int32_t c) {
             const ClusterTable& table = bundle.table;
-            const InstanceCut<AskedGroups> cut{table, view, rule, {table, view, rule}, rule.culls};
+            const InstanceCut<AskedGroups> cut = cut_by_asking(table, view, rule);
             const BinRange bins = cut.bins(c);
             if (bins.is_empty()) return false;
             const Count size = static_cast<Count>(table.num_gaussians(c));
@@ -57,8 +56,8 @@ __global__ void change_kernel(PlacedScene scene, SelectRule rule, BudgetRound ro
     if (threadIdx.x == 0 && at_first > 0) atomicAdd(&change[0], at_first);
 }
 
-// One block. Chooses the tolerance after the last one whose cut exceeds the budget, or in steps one
-// that is not below. Where there is none, no parts are left to cut.
+// Chooses the tolerance of the bin after the last one whose cut exceeds the budget, or in steps one
+// that is not below it. Where there is none, leaves no parts to cut. Runs in one block.
 __global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change, CutChoice* choice,
                               BudgetState* state, unsigned* num_parts) {
     if (round.is_over()) return;

@@ -1,21 +1,24 @@
 #pragma once
 
+// The state of a budget over consecutive pictures of one camera.
+
 #include <algorithm>
 #include <memory>
 
-#include "math/camera.h"
-#include "select/select_math.h"
+#include "camera/camera.h"
+#include "select/budget_math.h"
+#include "select/rule.h"
 
 namespace v3dg {
 
-// What pictures that follow each other, of one camera, know of the ones before: where the tolerance
-// of a budget is, and for how long nothing has moved. A copy goes on by itself.
+// What consecutive pictures of one camera know of the ones before: the tolerance of a budget, and
+// for how long nothing has moved. A copy is independent.
 class BudgetSteps {
   public:
-    uint32_t last_bin = kNoBin;  // on the host, what tolerance_of_budget() keeps
+    uint32_t last_bin = kNoBin;  // the state of tolerance_of_budget(), on the host
 
-    // The rule of the next picture, which shows `scene`: an object that stays as it is, and that a
-    // change makes another of. Without a fade nothing follows from the pictures before.
+    // The rule of the next picture, which shows `scene`. A scene that changes becomes another
+    // object. Without a fade the pictures before have no influence.
     SelectRule next(SelectRule rule, const Eyes& eyes, const std::shared_ptr<const void>& scene) {
         if (!rule.fade.is_on()) return rule;
         const bool is_same_scene = !scene_.owner_before(scene) && !scene.owner_before(scene_);
@@ -34,12 +37,13 @@ class BudgetSteps {
     bool has_begun_ = false;
     SelectRule rule_{};
     Eyes eyes_;
-    std::weak_ptr<const void> scene_;  // keeps no scene, and no other one can take its place
+    std::weak_ptr<const void> scene_;  // keeps no scene alive, and its address cannot be reused
     int32_t frames_at_rest_ = 0;
 };
 
-// What body(rule, last_bin) returns for the next of the pictures that `steps` knows, which count it
-// unless it throws. Null: nothing came before, and the rule is as it is.
+// Returns body(rule, last_bin) for the next picture after those that `steps` knows. `steps` counts
+// the picture unless body throws. Where it is null, nothing came before and the rule is not
+// changed.
 template <class Body>
 auto in_steps(BudgetSteps* steps, const SelectRule& rule, const Eyes& eyes,
               const std::shared_ptr<const void>& scene, const Body& body) {

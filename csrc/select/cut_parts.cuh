@@ -1,6 +1,6 @@
 #pragma once
 
-// A scene's tables in parts that warps work on, and the clusters that a lane has of a part.
+// The parts of a scene's tables that warps work on, and the clusters of a part that a lane has.
 
 #include "base/launch.cuh"
 #include "select/select_cuda.h"
@@ -15,37 +15,37 @@ constexpr unsigned kPartSize = 32 * kLaneClusters;
 constexpr unsigned kCutThreads = 256, kCutWarps = kCutThreads / 32;
 static_assert(kLaneClusters == 8, "a byte says which of them are drawn");
 
-// Clusters [first, first + kPartSize) of one instance's table; or where `lanes` is not zero, for
-// its bits k a lane of instance + k: its top clusters, or the last of its table.
+// Clusters [first, first + kPartSize) of one instance's table. Or, where `lanes` is not zero, one
+// lane for each of its bits k: the top clusters of instance + k, or the last clusters of its table.
 struct CutPart {
     uint32_t instance, first, lanes;
 };
 
-// From where on a single lane has all clusters of a table, which are its coarsest.
+// The first of the last clusters of a table, its coarsest, which a single lane can ask.
 __device__ inline uint32_t last_of_table(const ClusterTable& table) {
     return static_cast<uint32_t>(table.num_clusters() - 1) / kLaneClusters * kLaneClusters;
 }
 
-// A scene and what place_kernel finds out about its instances.
+// A scene, and what place_kernel writes about its instances.
 struct PlacedScene {
     const BundleOnDevice* bundles;
     InstanceTable instances;
     InstanceView* views;  // of instances whose tables are asked
-    // Of instances with a lane of their own: a bit for each top that is drawn, or 0 where the lane
+    // For instances that a single lane asks: a bit for each top that is drawn, or 0 where the lane
     // asks the last clusters of the table.
     uint8_t* tops;
     CutPart* parts;
 };
 
-// What the search for the tolerance of a budget hands to the next one.
+// The state that one search for the tolerance of a budget leaves for the next.
 struct BudgetState {
-    float guess = 0.0f;          // a tolerance that is probably below the one that will be chosen
+    float guess = 0.0f;          // a tolerance that is probably below the next choice
     unsigned again = 0;          // whether it was above, so that the second round counts
-    uint32_t last_bin = kNoBin;  // as tolerance_of_budget() keeps it
+    uint32_t last_bin = kNoBin;  // the state of tolerance_of_budget()
 };
 
-// One search for the tolerance of a budget: the first round looks at no tolerance below the guess,
-// the second at all. Without a budget there is one round, and no state.
+// A round of the search for the tolerance of a budget. The first round considers no tolerance below
+// the guess, the second all of them. Without a budget there is one round, and no state.
 struct BudgetRound {
     const BudgetState* state;
     bool is_second;
@@ -58,14 +58,14 @@ struct BudgetRound {
     }
 };
 
-// Enqueues the choice of the tolerance. `change`: kNumBudgetBins zeros before the first round.
-// num_parts: on the device; becomes 0 where no cut fits the budget.
+// Enqueues the choice of the tolerance. `change` has kNumBudgetBins zeros before the first round.
+// `num_parts` is on the device, and becomes 0 where no cut fits the budget.
 void choose_tolerance(const PlacedScene& scene, const SelectRule& rule, const BudgetRound& round,
                       unsigned num_blocks, unsigned* num_parts, Count* change, CutChoice* choice,
                       BudgetState* state, cudaStream_t stream);
 
-// Weights of a lane's clusters, kWhole or less each: 16 bits for each, from the lowest on. The lane
-// picks one by shifting, for an index would put them into memory.
+// Weights of a lane's clusters, at most kWhole each: 16 bits for each, from the lowest on. A weight
+// is read by shifting, because an index would put the words into memory.
 struct alignas(16) LaneWeights {
     uint64_t low, high;
 
@@ -79,13 +79,13 @@ struct alignas(16) LaneWeights {
 };
 static_assert(kLaneClusters == 8 && kWhole < 1 << 16, "two words hold the weights of a lane");
 
-// What a lane has of a part: clusters of one instance, and a bit for each that is drawn. Weights
-// are of cuts with a fade alone.
+// The clusters of a part that a lane has: those of one instance, and a bit for each that is drawn.
+// Weights are set in cuts with a fade alone.
 struct LaneClusters {
     const BundleOnDevice* bundle;
     uint32_t instance;
-    uint32_t first;  // of a table
-    bool is_alone;   // in having its instance; else all lanes of the warp have the same one
+    uint32_t first;  // cluster of a table
+    bool is_alone;   // whether no other lane has the instance; else all lanes of the warp have it
     bool are_tops;
     unsigned drawn;
     LaneWeights weights;
@@ -93,7 +93,7 @@ struct LaneClusters {
     __device__ int32_t cluster(unsigned k) const {
         return are_tops ? bundle->table.top_cluster[k] : static_cast<int32_t>(first + k);
     }
-    // Gaussians of `count` neighbours from the k-th cluster on.
+    // The number of gaussians of `count` neighbours from the k-th cluster on.
     __device__ unsigned size(unsigned k, unsigned count = 1) const {
         const int32_t c = cluster(k);
         return static_cast<unsigned>(bundle->table.offset[c + count] - bundle->table.offset[c]);
@@ -101,12 +101,17 @@ struct LaneClusters {
     __device__ const ClusterBounds& bounds() const { return bundle->bounds[first / kLaneClusters]; }
 };
 
-// Those of a table are not asked yet.
+// The clusters of a lane, of which those of a table are not asked yet.
 __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const CutPart& part) {
     const unsigned lane = threadIdx.x % 32;
     const bool is_alone = part.lanes != 0;
-    LaneClusters mine{nullptr, part.instance, part.first + kLaneClusters * lane, is_alone, false, 0,
-                      {}};
+    LaneClusters mine{.bundle = nullptr,
+                      .instance = part.instance,
+                      .first = part.first + kLaneClusters * lane,
+                      .is_alone = is_alone,
+                      .are_tops = false,
+                      .drawn = 0,
+                      .weights = {}};
     if (is_alone) {
         if ((part.lanes >> lane & 1) == 0) return mine;
         mine.instance += lane;
@@ -119,11 +124,11 @@ __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const 
     return mine;
 }
 
-// Asks the clusters of the tables that the warps of a block have parts of, for the lanes whose
-// bounds do not tell that none of theirs is drawn; for the whole block. All warps ask together, a
-// lane a cluster and four owners at a time, so that none waits long for another whose part has more
-// to ask. Gives each owner a bit for each of its clusters for which ask(bundle, view, cluster) was
-// positive, and what that was where it `kKeepsWeights`.
+// Asks the clusters of the tables that the warps of a block have parts of. For the whole block. A
+// lane owns clusters to ask where their bounds do not show that none of them is drawn. All warps
+// ask together, a lane a cluster and four owners at a time, so that no warp waits long for one
+// whose part has more to ask. Each owner receives a bit for each of its clusters for which
+// ask(bundle, view, cluster) is positive, and with `kKeepsWeights` also the number itself.
 template <bool kKeepsWeights, class Ask>
 __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
                              Tolerances tolerances, LaneClusters& mine, const Ask& ask) {
@@ -134,13 +139,13 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
     __shared__ InstanceView views[kCutWarps];
     __shared__ Table tables[kCutWarps];
     __shared__ unsigned num_owners[kCutWarps];
-    __shared__ uint8_t owners[kCutThreads],
-        drawn[kCutThreads];  // threads that own clusters; of each thread
+    __shared__ uint8_t owners[kCutThreads];  // threads that own clusters
+    __shared__ uint8_t drawn[kCutThreads];   // the bits of each thread
     __shared__ LaneWeights weights[kKeepsWeights ? kCutThreads : 1];
     static_assert(kCutThreads <= 256, "a byte says which thread");
     const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
     bool is_owner = false;
-    if (!mine.is_alone && mine.bundle != nullptr) {  // the same in the whole warp
+    if (!mine.is_alone && mine.bundle != nullptr) {  // uniform in the warp
         const auto* view = reinterpret_cast<const uint32_t*>(scene.views + mine.instance);
         for (unsigned w = lane; w < sizeof(InstanceView) / sizeof *view; w += 32)
             reinterpret_cast<uint32_t*>(views + warp)[w] = view[w];
@@ -174,7 +179,7 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
         if (is_one) {
             const Table& of = tables[owner / 32];
             const bool is_alone = of.bundle == nullptr;
-            const uint32_t instance = of.first + owner % 32;  // where it is
+            const uint32_t instance = of.first + owner % 32;  // valid where it is alone
             const BundleOnDevice* bundle =
                 is_alone ? &scene.bundles[scene.instances.bundle[instance]] : of.bundle;
             const InstanceView& view = is_alone ? scene.views[instance] : views[owner / 32];

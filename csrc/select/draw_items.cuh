@@ -1,15 +1,16 @@
 #pragma once
 
-// Where a cut is written: as pairs, or as the items of a frame. A lane first counts what it will
-// write of its clusters, and writes that once it knows what is before it.
+// The lists that a cut is written to: pairs, or the items of a frame. A lane first counts what it
+// will write for its clusters, and writes once it knows how much is before it.
 
 #include "select/cut_parts.cuh"
 
 namespace v3dg {
 namespace cuda {
 
+// How much a lane will write.
 struct WriteCount {
-    unsigned units, gaussians;  // units: elements of the list
+    unsigned units, gaussians;  // units are elements of the list
 };
 
 // Selected clusters as (instance, cluster), and with a fade their weights.
@@ -45,8 +46,8 @@ struct PairOutput {
     }
 };
 
-// Neighbouring clusters that are drawn together, for the lane's instance; or one that is drawn for
-// all instances of `sharers`, bits above the first of the part.
+// Neighbouring clusters that are drawn together for the lane's instance; or one cluster that is
+// drawn for all instances of `sharers`, whose bits count from the first instance of the part.
 struct DrawnRun {
     unsigned k, num_clusters;
     uint32_t sharers;
@@ -55,16 +56,15 @@ struct DrawnRun {
     __device__ unsigned gaussians_an_item() const { return kItemSize / num_instances; }
 };
 
-// Whether a warp is quicker when it goes through a cluster's gaussians one by one, each for all
-// instances at once, than when it goes through the instances one by one. An item costs as much as
-// two more rounds.
+// Whether a warp is faster when it takes a cluster's gaussians one by one, each for all instances
+// at once, than when it takes the instances one by one. An item costs as much as two more rounds.
 __device__ inline bool is_worth_sharing(unsigned num_gaussians, unsigned num_instances) {
     return num_instances > 1 &&
            num_gaussians <= num_instances * (blocks_for(num_gaussians, 32) + 2);
 }
 
-// Calls visit(DrawnRun) in the lane that writes the run; for whole warps. With a fade, clusters of
-// different weights are not drawn together.
+// Calls visit(DrawnRun) in the lane that writes the run. For the whole warp. With a fade, clusters
+// of different weights are not drawn together.
 template <bool kFades, class Visit>
 __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
     if (!mine.is_alone) {
@@ -77,7 +77,7 @@ __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
                 if (kFades && mine.weights[end] != mine.weights[k]) break;
                 ++end;
             }
-            visit(DrawnRun{k, end - k, 0, 1});
+            visit(DrawnRun{.k = k, .num_clusters = end - k, .sharers = 0, .num_instances = 1});
         }
         return;
     }
@@ -90,19 +90,19 @@ __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
         const unsigned sharers = __ballot_sync(kAllLanes, is_whole) & same, count = __popc(sharers);
         if (!is_drawn) continue;
         if (!is_whole || !is_worth_sharing(mine.size(k), count))
-            visit(DrawnRun{k, 1, 0, 1});
+            visit(DrawnRun{.k = k, .num_clusters = 1, .sharers = 0, .num_instances = 1});
         else if (threadIdx.x % 32 + 1 == static_cast<unsigned>(__ffs(sharers)))
-            visit(DrawnRun{k, 1, sharers, count});
+            visit(DrawnRun{.k = k, .num_clusters = 1, .sharers = sharers, .num_instances = count});
     }
 }
 
-// Selected clusters as items. Neighbouring clusters are drawn by the same items, and so are coarse
-// ones that neighbouring instances have in common. Each is written for every picture.
+// Selected clusters as items. Neighbouring clusters share items, and so do coarse clusters that
+// neighbouring instances have in common. Each item is written for every picture.
 template <bool kHasFade>
 struct ItemOutput {
     static constexpr bool kFades = kHasFade;
     ItemList items;
-    uint32_t num_pictures, num_placements;  // of one of them
+    uint32_t num_pictures, num_placements;  // placements of one picture
 
     __device__ WriteCount count(const LaneClusters& mine) const {
         WriteCount count{0, 0};
@@ -132,14 +132,14 @@ struct ItemOutput {
                     const unsigned count = min(step, size - skip);
                     if (first < items.item_capacity &&
                         record + run.num_instances * count <= items.record_capacity)
-                        items.items[first] = {placement + picture * num_placements,
-                                              gaussian + skip,
-                                              count,
-                                              static_cast<uint32_t>(record),
-                                              appearance,
-                                              run.sharers,
-                                              place,
-                                              weight};
+                        items.items[first] = {.placement = placement + picture * num_placements,
+                                              .first = gaussian + skip,
+                                              .count = count,
+                                              .record = static_cast<uint32_t>(record),
+                                              .appearance = appearance,
+                                              .sharers = run.sharers,
+                                              .cluster = place,
+                                              .weight = weight};
                     record += run.num_instances * count;
                 }
         });

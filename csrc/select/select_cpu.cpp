@@ -1,5 +1,6 @@
-// Threads work on chunks of instances. What the decision asks of a group is answered once; its
-// clusters then look it up.
+// Selection on the CPU. Threads work on chunks of instances. Each question about a group is
+// answered once for an instance, and its clusters look the answer up; so the decision is composed
+// in two passes (select_math.h).
 
 #include "select/select.h"
 
@@ -16,10 +17,10 @@ namespace {
 
 constexpr size_t kChunk = 16;
 constexpr size_t kBudgetParts = 16;
-constexpr size_t kManyInstances =
-    16;  // of a bundle, for which its runs pay: those cost about one instance
+// Runs of a bundle are found where it has this many instances; they cost about as much as one.
+constexpr size_t kManyInstances = 16;
 
-// Answers for the groups of one instance: how far each is refined, or its bins.
+// Answers for the groups of one instance: how far each is refined, and its bins.
 struct KnownRefinements {
     const uint16_t* of_group;
 
@@ -35,16 +36,16 @@ struct KnownBins {
     uint32_t first_unrefined(int32_t g) const { return of_group[g].unrefined; }
 };
 
-// What to select from, with what all instances share.
+// The input, and numbers that all instances share.
 struct View {
     const SelectInput& in;
-    std::vector<FrustumSides> sides;  // of each bundle
-    std::vector<ClusterRuns> runs;    // likewise, once found; none where it has few instances
-    size_t most_groups = 0, most_clusters = 0;  // of any bundle
+    std::vector<CameraSides> sides;  // one a bundle
+    std::vector<ClusterRuns> runs;   // one a bundle after find_runs(); empty for few instances
+    size_t most_groups = 0, most_clusters = 0;  // the most that a bundle has
 
     explicit View(const SelectInput& input) : in(input) {
         for (const ClusterTable& table : in.bundles) {
-            sides.push_back(frustum_sides(in.eyes, table.pad_px));
+            sides.push_back(sides_of_eyes(in.eyes, table.pad_px));
             most_groups = std::max(most_groups, table.ball.size);
             most_clusters = std::max(most_clusters, table.num_clusters());
         }
@@ -60,7 +61,7 @@ struct View {
     }
 };
 
-// Clusters of a table, and groups among which are all of theirs.
+// A range of clusters of a table, and a range of groups that contains all of theirs.
 struct Asked {
     ClusterRange clusters, groups;
 };
@@ -86,7 +87,7 @@ struct SeenInstance {
         return is_placed ? source_of_cut(table, view, rule, SIZE_MAX) : CutSource::nowhere;
     }
 
-    // With answers that are filled in before clusters ask.
+    // The decision by answers that are filled in before it is asked.
     template <class Groups>
     InstanceCut<Groups> cut(const SelectRule& rule, const Groups& groups) const {
         return {table, view, rule, groups, rule.culls && !is_inside(table.bounds, view)};
@@ -94,15 +95,15 @@ struct SeenInstance {
 
     AskedGroups groups(const SelectRule& rule) const { return {table, view, rule}; }
 
-    // What is asked at these tolerances.
+    // The clusters and groups that have to be asked at these tolerances.
     Asked asked(const View& of, size_t i, const SelectRule& rule, Tolerances tolerances) const {
         const ClusterRuns& runs = of.runs[of.in.instances.bundle[i]];
         Asked asked{{0, static_cast<uint32_t>(table.num_clusters())},
                     {0, static_cast<uint32_t>(table.ball.size)}};
         if (runs.count == 0 || !table.pages.is_whole()) return asked;
         asked.clusters = clusters_to_ask(table, runs, view, rule, tolerances);
-        // Of most clusters, these are most groups, and to find them out costs more than to ask the
-        // rest.
+        // Most clusters have most of the groups, and then finding the range costs more than asking
+        // all groups.
         if (asked.clusters.end - asked.clusters.first > table.num_clusters() / 2) return asked;
         int32_t first = static_cast<int32_t>(table.ball.size), last = -1;
         for (uint32_t c = asked.clusters.first; c < asked.clusters.end; ++c) {
@@ -116,11 +117,11 @@ struct SeenInstance {
     }
 };
 
-// What a thread works in.
+// Scratch memory of a thread.
 struct Scratch {
-    std::vector<uint16_t> refinement;  // of each group
+    std::vector<uint16_t> refinement;  // one a group
     std::vector<int32_t> chosen;       // clusters
-    std::vector<float> priority;       // of each group, where pages are asked for
+    std::vector<float> priority;       // one a group, where needs are wanted
 
     explicit Scratch(const View& view)
         : refinement(view.most_groups),
@@ -128,10 +129,9 @@ struct Scratch {
           priority(view.in.needs.empty() ? 0 : view.most_groups) {}
 };
 
-// Answers for all groups of an instance. What it reads comes as copies, which nothing that it
-// writes can change, so that the compiler works on several groups at once. Those that are absent,
-// which it could not ask for at once, are not refined whatever the answer, and those that fade in
-// no further than they have.
+// Answers for the groups of an instance. The inputs are copies, which no write can alias, so that
+// the compiler vectorises the first loop. Which pages are resident would prevent that, so the
+// second loop lowers the answers for groups that are absent or still fade in.
 template <Footprint footprint, bool kFades>
 void ask_groups(ClusterTable table, const InstanceView view, SelectRule rule,
                 const ClusterRange asked, uint16_t* __restrict refinement) {
@@ -159,13 +159,13 @@ void ask_groups(const SeenInstance& seen, const SelectRule& rule, const ClusterR
         ask_groups<Footprint::solid_angle, false>(seen.table, seen.view, rule, asked, refinement);
 }
 
-// Returns how many of the clusters suffice and writes which.
+// The first pass of the decision: writes the clusters of positive weight, and returns their number.
 size_t find_sufficient(const ClusterTable table, const InstanceView view, const SelectRule rule,
                        const ClusterRange asked, const uint16_t* __restrict refinement,
                        int32_t* __restrict cluster) {
     const InstanceCut<KnownRefinements> cut{table, view, rule, {refinement}, false};
     size_t num_sufficient = 0;
-    // Without a branch, because none could be foretold.
+    // Branch-free: the outcome is unpredictable.
     for (size_t c = asked.first; c < asked.end; ++c) {
         cluster[num_sufficient] = static_cast<int32_t>(c);
         num_sufficient += cut.weight(c) > 0;
@@ -173,7 +173,7 @@ size_t find_sufficient(const ClusterTable table, const InstanceView view, const 
     return num_sufficient;
 }
 
-// Positive floats order as their bits do.
+// Raises a need to a priority, on any threads. Positive floats order as their bits do.
 void raise(uint32_t& need, float priority) {
     uint32_t bits, before = __atomic_load_n(&need, __ATOMIC_RELAXED);
     std::memcpy(&bits, &priority, sizeof bits);
@@ -182,7 +182,7 @@ void raise(uint32_t& need, float priority) {
     }
 }
 
-// Tells which pages an instance needs whose table is asked.
+// Records which pages an instance needs whose table is asked.
 template <class Cut>
 void tell_needs(const Cut& cut, const SelectRule& rule, Span<uint32_t> needs,
                 std::vector<float>& priority) {
@@ -196,7 +196,7 @@ void tell_needs(const Cut& cut, const SelectRule& rule, Span<uint32_t> needs,
     }
 }
 
-// Appends what instance i draws.
+// Appends the clusters that instance i draws.
 void select_instance(const View& view, const SelectRule& rule, size_t i, Scratch& scratch,
                      SelectOutput& out) {
     const SeenInstance seen(view, i);
@@ -226,8 +226,8 @@ void select_instance(const View& view, const SelectRule& rule, size_t i, Scratch
     });
 }
 
-// Adds to `change`, for each tolerance that a budget chooses from, by how many gaussians the cut of
-// instance i differs from that of the tolerance before. `bins` has room for those of its groups.
+// Adds to `change`, for each bin of a budget, by how many gaussians the cut of instance i differs
+// from that of the bin before. `bins` has room for those of its groups.
 void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins,
                     std::vector<int64_t>& change) {
     const SelectRule& rule = view.in.rule;
@@ -254,11 +254,11 @@ void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins,
     }
 }
 
-// Sets the tolerance of `rule`. Returns whether a cut fits; if none does, `least_count` is what the
-// coarsest one has.
+// Sets the tolerance of `rule` by its budget. Returns whether a cut fits; if none does,
+// `least_count` is the number of gaussians of the coarsest cut.
 bool meet_budget(const View& view, SelectRule& rule, int64_t& least_count) {
     const size_t num_instances = view.in.instances.bundle.size;
-    // Each part takes every kBudgetParts-th instance, because neighbours cost about the same.
+    // Each part has every kBudgetParts-th instance, because neighbours cost about the same.
     std::vector<std::vector<int64_t>> changes(std::min(kBudgetParts, num_instances));
     parallel_for(changes.size(), 1, [&](size_t part) {
         changes[part].assign(kNumBudgetBins + 1, 0);

@@ -1,5 +1,8 @@
 #pragma once
 
+// Contract of selection on CUDA: cuts of a scene on the device, as the items of a frame or as
+// pairs.
+
 #include "frame/draw_list.h"
 #include "frame/image.h"
 #include "residency/scene_tables.h"
@@ -11,19 +14,19 @@ namespace cuda {
 struct CutPart;
 struct BudgetState;
 
-// What the host reads of the pages that a cut needs, once it is over.
+// What a cut reports to the host about the pages that it needs.
 struct NeedsReport {
-    unsigned count;  // of the pages; of those that there is no room for, nothing else is told
+    unsigned count;  // of all pages, including those that there is no room for
     float tolerance_px2;
 };
 
-// Where a cut tells which pages it needs. Everything is on the device but the report, which is
+// Memory for the pages that a cut needs. It is on the device, except for the report, which is
 // memory of the host that the device writes to.
 struct NeedList {
-    uint32_t* words =
-        nullptr;  // the number of pages, then a word a page of all bundles; cleared by the cut
+    // The number of pages, then one word for each page of all bundles; the cut clears them.
+    uint32_t* words = nullptr;
     size_t num_words = 0;
-    uint32_t* const* need = nullptr;  // the words of each bundle
+    uint32_t* const* need = nullptr;  // where the words of each bundle begin
     PageRequest* list = nullptr;
     unsigned capacity = 0;  // of the list, and of the report
     NeedsReport* report = nullptr;
@@ -33,36 +36,36 @@ struct NeedList {
 // The bundles of a scene of which only some pages are resident.
 struct PartlyResident {
     const BundleOnDevice* bundles;
-    NeedList needs;  // without a report: nobody asks
+    NeedList needs;  // without a report where they are not wanted
 };
 
-// Cuts of scenes on the device that is current when it is made: the memory that a cut needs in
-// between. One cut uses it at a time. The cuts of one scene take turns by themselves, on any
-// threads and streams; whoever cuts several scenes orders those. Scenes and streams are of the same
-// device.
+// Cuts scenes on the device that is current when it is constructed, and owns the scratch memory of
+// a cut, which one cut uses at a time. Cuts of one scene are ordered by the scene's lock, on any
+// threads and streams; the caller orders cuts of several scenes. Scenes and streams belong to the
+// same device.
 //
-// Nothing waits, and nothing is allocated for a scene that is not larger than the largest before. A
-// graph that captured a cut goes on using the memory, and so holds until a larger scene is cut.
+// No function but select() waits. Memory is allocated only for a scene that is larger than all
+// before. A graph that captured a cut uses that memory, so it is valid until a larger scene is cut.
 class Cut {
   public:
-    // Selected clusters as the items of a frame, once for each eye. Instance i of n becomes
-    // placement i of model bundle[i] in image 0, and n + i in that of a second eye; `pictures` are
-    // written to `images`. Clears nothing.
+    // Writes the selected clusters as the items of a frame, once for each eye. Instance i of n
+    // becomes placement i of model bundle[i] in image 0, and placement n + i in the image of a
+    // second eye. Writes `pictures` to `images`. Clears nothing.
     void cut_items(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
                    const EyeImages& pictures, FrameImage* images, Placement* placements,
                    const ItemList& items, cudaStream_t stream,
                    const PartlyResident* resident = nullptr);
 
-    // How many zeros items.zeros has to have for that.
+    // How many zeros cut_items() needs in items.zeros.
     static size_t num_zeros(const SceneTables& scene, const SelectRule& rule);
 
-    // The same for pairs that were selected before, on the device, and one camera.
+    // Writes pairs that were selected before, and lie on the device, as items, for one camera.
     void given_items(const SceneTables& scene, const Camera& camera, const GivenCut& given,
                      const FrameImage& image, FrameImage* images, Placement* placements,
                      const ItemList& items, cudaStream_t stream);
 
-    // Selected clusters as pairs on the host, for which it waits. `last_bin` as SelectInput has it;
-    // null: it stays on the device.
+    // Selects clusters as pairs on the host, and waits for them. `last_bin` is as in SelectInput;
+    // where it is null, that state stays on the device.
     void select(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
                 SelectOutput& out, cudaStream_t stream, const PartlyResident* resident = nullptr,
                 uint32_t* last_bin = nullptr);
@@ -86,7 +89,7 @@ class Cut {
     BudgetState* budget_state(cudaStream_t stream);
 
     const int device_ = current_device();
-    DeviceBuffer<FrustumSides> sides_;
+    DeviceBuffer<CameraSides> sides_;
     DeviceBuffer<InstanceView> views_;
     DeviceBuffer<uint8_t> tops_;
     DeviceBuffer<CutPart> parts_;

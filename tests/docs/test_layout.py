@@ -20,21 +20,23 @@ CSRC = ROOT / "csrc"
 MAY_INCLUDE = {
     "base": set(),
     "math": {"base"},
+    "camera": {"base", "math"},
     "io": {"base"},
-    "frame": {"base", "math"},
+    "frame": {"base", "math", "camera"},
     "cluster": {"base", "math"},
     "simplify": {"base", "math", "cluster"},
     "gather": {"base", "math"},
     "quantize": {"base", "math"},
     "residency": {"base", "math", "io", "frame", "quantize"},
-    "select": {"base", "math", "frame", "residency"},
-    "project": {"base", "math", "frame", "quantize"},
+    "select": {"base", "math", "camera", "frame", "residency"},
+    "project": {"base", "math", "camera", "frame", "quantize"},
     "tile_bin": {"base", "math", "frame"},
     "rasterize": {"base", "math", "frame"},
-    "fit_group": {"base", "math", "frame", "project", "tile_bin", "rasterize"},
+    "fit_group": {"base", "math", "camera", "frame", "project", "tile_bin", "rasterize"},
     "draw": {
         "base",
         "math",
+        "camera",
         "frame",
         "quantize",
         "residency",
@@ -46,6 +48,7 @@ MAY_INCLUDE = {
     "levels": {
         "base",
         "math",
+        "camera",
         "frame",
         "residency",
         "select",
@@ -58,6 +61,7 @@ MAY_INCLUDE = {
     "bindings": {
         "base",
         "math",
+        "camera",
         "io",
         "frame",
         "cluster",
@@ -72,7 +76,17 @@ MAY_INCLUDE = {
         "levels",
     },
 }
-NOT_OPERATIONS = {"base", "math", "io", "frame", "residency", "draw", "levels", "bindings"}
+NOT_OPERATIONS = {
+    "base",
+    "math",
+    "camera",
+    "io",
+    "frame",
+    "residency",
+    "draw",
+    "levels",
+    "bindings",
+}
 TESTED_WITH = {"tile_bin": "rasterize"}
 KINDS = {"unit", "files", "system", "browser", "attack", "docs"}
 

@@ -1,0 +1,98 @@
+#pragma once
+
+// Where a camera stands: its pose in the world, and the transform from a model to view space. Both
+// are the same for every camera model; camera/camera.h has what depends on the model.
+
+#include <cstdint>
+#include <cstring>
+
+#include "base/host_device.h"
+
+namespace v3dg {
+
+// Position and orientation of a camera in the world, in double precision.
+struct CameraPose {
+    double rotation[9];     // world to camera, rows
+    double translation[3];  // of world to camera
+    double eye[3];          // the camera's position in the world
+};
+
+// Model space to view space: view = linear * (model - eye) + translation, linear = uniform scale *
+// rotation. Subtracting the eye first keeps the digits of points near it, however far from zero
+// both are.
+template <class T>
+struct ModelView {
+    T linear[9];            // row major
+    T translation[3];       // what rounding `eye` to 24 bits leaves, in view space
+    T eye[3], eye_rest[3];  // the camera's position in model space is their sum
+};
+
+// The leading 24 bits of a number, which a float holds. It masks bits instead of casting, because
+// GCC 12 takes (double)(float)x to be x where it vectorizes.
+V3DG_HD inline double leading_bits(double x) {
+    uint64_t bits;
+    std::memcpy(&bits, &x, sizeof bits);
+    bits &= ~((uint64_t(1) << 29) - 1);
+    std::memcpy(&x, &bits, sizeof bits);
+    return x;
+}
+
+// Places the eye, in double precision; `translation` is that of view = linear * model +
+// translation.
+template <class T>
+V3DG_HD inline void set_eye(const double linear[9], const double translation[3],
+                            const double eye[3], ModelView<T>& view) {
+    double rest[3] = {translation[0], translation[1], translation[2]};
+    for (int k = 0; k < 3; ++k) {
+        const double leading = leading_bits(eye[k]);
+        view.eye[k] = T(leading);
+        view.eye_rest[k] = T(eye[k] - leading);
+        for (int row = 0; row < 3; ++row) rest[row] += linear[3 * row + k] * leading;
+    }
+    for (int row = 0; row < 3; ++row) view.translation[row] = T(rest[row]);
+}
+
+// Transforms a point of the model to view space.
+template <class V, class T>
+V3DG_HD V3DG_INLINE void to_view(const ModelView<T>& mv, const V point[3], V p[3]) {
+    const V x = point[0] - mv.eye[0], y = point[1] - mv.eye[1], z = point[2] - mv.eye[2];
+    for (int i = 0; i < 3; ++i)
+        p[i] = mv.linear[3 * i] * x + mv.linear[3 * i + 1] * y + mv.linear[3 * i + 2] * z +
+               mv.translation[i];
+}
+
+// The vector from the eye to a point, both in model space.
+template <class V, class T>
+V3DG_HD V3DG_INLINE void from_eye(const ModelView<T>& mv, const V point[3], V direction[3]) {
+    for (int k = 0; k < 3; ++k) direction[k] = point[k] - mv.eye[k] - mv.eye_rest[k];
+}
+
+// The position of a camera: the point that its world-to-camera matrix maps to 0. The rotation in it
+// may be off by what float32 loses.
+V3DG_HD inline void eye_of(const double viewmat[16], double eye[3]) {
+    // The rotation's inverse by columns, which are cross products of its rows.
+    double determinant = 0.0;
+    for (int a = 0; a < 3; ++a) {
+        const int b = (a + 1) % 3, c = (a + 2) % 3;
+        eye[a] = 0.0;
+        for (int row = 0; row < 3; ++row) {
+            const double* next = viewmat + 4 * ((row + 1) % 3);
+            const double* after = viewmat + 4 * ((row + 2) % 3);
+            const double cofactor = next[b] * after[c] - next[c] * after[b];
+            eye[a] -= viewmat[4 * row + 3] * cofactor;
+            if (row == 0) determinant += viewmat[a] * cofactor;
+        }
+    }
+    for (int a = 0; a < 3; ++a) eye[a] /= determinant;
+}
+
+// The view of gaussians that are given in world space.
+template <class T>
+V3DG_HD inline ModelView<T> view_of_world(const CameraPose& pose) {
+    ModelView<T> view;
+    for (int k = 0; k < 9; ++k) view.linear[k] = T(pose.rotation[k]);
+    set_eye(pose.rotation, pose.translation, pose.eye, view);
+    return view;
+}
+
+}  // namespace v3dg

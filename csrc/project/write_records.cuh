@@ -1,0 +1,121 @@
+#pragma once
+
+// Projects the gaussians that the lanes of a warp hold, and writes a record for each that reaches a
+// pixel centre.
+
+#include "project/large_records.cuh"
+#include "project/project_math.h"
+#include "project/sphere_test.cuh"
+#include "project/warp_space.cuh"
+
+namespace v3dg {
+namespace cuda {
+
+// Properties of an item's gaussians.
+struct ItemTraits {
+    bool are_small;   // judged by the first of them
+    bool have_shade;  // whether the colour needs more than project() sets
+};
+
+// Makes the record of gaussian g at p in view space, except for its pixels, which are `box`.
+// Returns whether it reaches a pixel centre; where gaussians are not small, those few that miss all
+// centres in their box count as reaching one. It returns early neither for gaussians that reach
+// none nor for lanes without one, because other lanes of the warp go on.
+template <class Source>
+__device__ bool project_one(const ItemTables<typename Source::Model>& in,
+                            const ModelView<float>& view, typename Source::Place place, uint32_t g,
+                            const float p[3], bool is_one, const ItemTraits& traits,
+                            Record<float>& r, PixelBox<int>& box, unsigned& num_in_frustum) {
+    Projection<float> s;
+    for (int i = 0; i < 3; ++i) s.p[i] = p[i];
+    const Ellipse<float> e = Source::project(in, view, place, g, s, r.color);
+    float half_x, half_y;
+    const Intrinsics<float>& cam = in.image.camera;
+    // The sphere test has shown that it is not too faint.
+    bool is_in_frustum = is_one & extent_of(1.0f, e, s, half_x, half_y);
+    is_in_frustum &= meets_image(e.u, half_x, cam.width) & meets_image(e.v, half_y, cam.height);
+    num_in_frustum += is_in_frustum;
+    box = pixel_box(e, half_x, half_y, cam);
+    if (traits.are_small) drop_missed_rows(e, s, cam.width, box);
+    set_ellipse(e, r);
+    const bool reaches_pixel = is_in_frustum & box.holds_pixels();
+    if (reaches_pixel && traits.have_shade) Source::shade(in.model, view, place, g, r.color);
+    return reaches_pixel;
+}
+
+// Writes the records of the lanes' gaussians, in their order, and counts them into tiles. Returns
+// the number of records. `sharers` are the placements of a shared item.
+template <class Source, bool kIsShared>
+__device__ unsigned write_records(WarpSpace<typename Source::Model>& space,
+                                  const Placement* sharers, const typename Source::Place& start,
+                                  const ItemTraits& traits, bool has_one, const Queued& mine,
+                                  uint32_t first, FrameCounters& counters, const ProjectOutput& out,
+                                  unsigned& num_in_frustum) {
+    const auto& in = space.tables;
+    const unsigned lane = threadIdx.x % 32;
+    // A lane without a gaussian computes one that exists, and drops it.
+    const uint32_t place = has_one ? mine.place : kIsShared ? __ffs(in.item.sharers) - 1 : 0;
+    const uint32_t g = in.item.first + (kIsShared ? place / 32 : place);
+    const ModelView<float>& view = kIsShared ? sharers[place % 32].view : in.placement.view;
+    Record<float> r;
+    PixelBox<int> box;
+    const bool reaches_pixel =
+        project_one<Source>(in, view, start, g, mine.p, has_one, traits, r, box, num_in_frustum);
+    const unsigned kept = __ballot_sync(kAllLanes, reaches_pixel);
+    if (kept == 0) return 0;
+    const unsigned rank = __popc(kept & ((1u << lane) - 1));
+    const EntryBox blocks = entry_box(box);
+    TileBox tiles = tile_box(blocks);
+    const uint32_t tile = tiles.top * static_cast<uint32_t>(in.image.tile_columns) + tiles.left;
+    const bool is_large = reaches_pixel && (tiles.count > kFewTiles || tile > kMostFewTile);
+    const auto pixels = [&] {
+        return RecordBox{.x0 = static_cast<uint16_t>(box.x0),
+                         .x1 = static_cast<uint16_t>(box.x1),
+                         .y0 = static_cast<uint16_t>(box.y0),
+                         .y1 = static_cast<uint16_t>(box.y1)};
+    };
+    if (reaches_pixel) {
+        space.ellipses[kEllipseVectors * rank] = {r.u, r.v, r.l11, r.l12};
+        space.ellipses[kEllipseVectors * rank + 1] = {r.l22, r.log2_opacity, r.color[0],
+                                                      r.color[1]};
+        reinterpret_cast<float2*>(out.records.rest)[first + rank] = {r.color[2], r.depth};
+        const uint32_t depth =
+            entry_depth(r.depth, in.image.camera.near_depth, out.records.depth_mask);
+        out.few[first + rank] = is_large ? kManyTiles : few_tiles(depth, tile, blocks);
+        if (out.source != nullptr) {  // the frame keeps a tape
+            out.source[first + rank] = g;
+            out.records.box[first + rank] = pixels();
+        }
+    }
+    if (!reaches_pixel || is_large) tiles.count = 0;
+    const unsigned large = __ballot_sync(kAllLanes, is_large);
+    if (large != 0) {
+        const unsigned before = space.num_large,
+                       place = before + __popc(large & ((1u << lane) - 1));
+        if (is_large) {
+            space.large[place] = static_cast<uint8_t>(first + rank - in.item.record);
+            space.boxes[place] = pixels();
+        }
+        __syncwarp();
+        if (lane == 0) space.num_large = before + __popc(large);
+    }
+    __syncwarp();
+    if (large != 0 && space.num_large >= 32) write_large(space, counters, out, false);
+    float4* ellipses =
+        reinterpret_cast<float4*>(out.records.ellipse) + kEllipseVectors * size_t(first);
+    const unsigned num_records = __popc(kept);
+#pragma unroll
+    for (unsigned w = lane; w < kEllipseVectors * 32; w += 32)
+        if (w < kEllipseVectors * num_records) ellipses[w] = space.ellipses[w];
+    count_tiles(
+        out.tiles.count, tiles.count,
+        [&](unsigned k) {
+            return in.image.first_tile + tile + tiles.rows_to(k) * in.image.tile_columns +
+                   tiles.columns_to(k);
+        },
+        space.tiles);
+    return num_records;
+}
+
+}  // namespace cuda
+}  // namespace v3dg

@@ -1,0 +1,93 @@
+#pragma once
+
+// Bounds on neighbouring clusters, which show that none of them is drawn without asking each. They
+// never change a decision: the margins are larger than what rounding does to either side.
+
+#include <cmath>
+#include <cstdint>
+
+#include "residency/cluster_bounds.h"
+#include "residency/cluster_table.h"
+#include "select/fade_math.h"
+#include "select/footprint.h"
+#include "select/frustum.h"
+
+namespace v3dg {
+
+// A relative margin between a metric and a bound on it, larger than their rounding.
+constexpr float kBoundMargin = 1e-3f;
+
+// Whether all groups above the clusters fit for certain, so that none of the clusters is drawn.
+V3DG_HD inline bool parents_fit(const ClusterBounds& bounds, const InstanceView& view,
+                                const SelectRule& rule) {
+    if (bounds.has_root || rule.footprint == Footprint::paper) return false;
+    const float distance = sqrtf(distance2_to(bounds.parents, view)) - bounds.parents.radius;
+    return distance > 0.0f && footprint_at(bounds.most_parent_radius, distance * distance, view) *
+                                      bounds.most_parent_weight * rule.fade.factor <=
+                                  (1.0f - kBoundMargin) * rule.tolerance_px2;
+}
+
+// Whether each cluster has a group of its own that is refined for certain, so that none of the
+// clusters is drawn.
+V3DG_HD inline bool owns_are_refined(const ClusterBounds& bounds, const InstanceView& view,
+                                     const SelectRule& rule) {
+    if (bounds.has_leaf || bounds.least_own_level <= rule.min_level ||
+        rule.footprint == Footprint::paper)
+        return false;
+    const float distance = sqrtf(distance2_to(bounds.owns, view)) + bounds.owns.radius;
+    return footprint_at(bounds.least_own_radius, distance * distance, view) *
+               bounds.least_own_weight * rule.fade.inverse >
+           (1.0f + kBoundMargin) * rule.tolerance_px2;
+}
+
+// The tolerances that a bound is to hold for: that of the rule, or that and all larger ones.
+enum class Tolerances { this_one, from_this_on };
+
+// False only if none of the clusters is drawn at these tolerances. Bounds do not know which pages
+// are absent, and the groups of absent pages fit whatever their bounds are.
+V3DG_HD inline bool may_draw(const ClusterTable& table, const ClusterBounds& bounds,
+                             const InstanceView& view, const SelectRule& rule,
+                             Tolerances tolerances) {
+    return !(rule.culls && is_outside(bounds.box, view)) && !parents_fit(bounds, view, rule) &&
+           (tolerances == Tolerances::from_this_on || !table.pages.is_whole() ||
+            !owns_are_refined(bounds, view, rule));
+}
+
+// Clusters [first, end) of a table.
+struct ClusterRange {
+    uint32_t first, end;
+};
+
+// A ball whose radius is at most half of its distance covers at least pi x2 steradians, where x2 is
+// the square of radius over distance, and at most this many times that.
+constexpr float kMostOfPi = 1.08f;
+// These are far from where float32 loses digits and from where squares overflow.
+constexpr float kLeastRunTolerance = 1e-20f, kLeastRunX2 = 1e-30f, kMostRunDistance = 1e18f;
+
+// The clusters that have to be asked: whole runs, outside of which bounds show that no cluster is
+// drawn at these tolerances.
+V3DG_HD inline ClusterRange clusters_to_ask(const ClusterTable& table, const ClusterRuns& runs,
+                                            const InstanceView& view, const SelectRule& rule,
+                                            Tolerances tolerances) {
+    const float distance = sqrtf(distance2_to(runs.groups, view));
+    const float nearest = distance - runs.groups.radius, farthest = distance + runs.groups.radius;
+    const float x2 =
+        rule.tolerance_px2 / (float(kPi) * view.px2_per_steradian);  // of the tolerance's ball
+    uint32_t first = 0, last = runs.count;
+    if (rule.footprint == Footprint::solid_angle && nearest >= runs.least_distance &&
+        farthest <= kMostRunDistance && rule.tolerance_px2 >= kLeastRunTolerance &&
+        x2 >= kLeastRunX2) {
+        const float low = (1.0f - kBoundMargin) * x2 / rule.fade.factor;
+        const float most = nearest * sqrtf(low / kMostOfPi);
+        while (first < last && runs.most_parent[first] <= most) ++first;
+        const float high = (1.0f + kBoundMargin) * x2 / rule.fade.inverse;
+        const float least = farthest * sqrtf(high);
+        if (tolerances == Tolerances::this_one && table.pages.is_whole() &&
+            runs.least_level > rule.min_level)
+            while (first < last && runs.least_own[last - 1] > least) --last;
+    }
+    const uint32_t end = min_of(runs.begin[last], static_cast<uint32_t>(table.num_clusters()));
+    return {min_of(runs.begin[first], end), end};
+}
+
+}  // namespace v3dg

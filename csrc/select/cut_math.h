@@ -1,0 +1,124 @@
+#pragma once
+
+// The decision whether a cluster is drawn, and with which weight. select_math.h proves it exact.
+
+#include <cstddef>
+#include <cstdint>
+
+#include "residency/cluster_table.h"
+#include "select/budget_math.h"
+#include "select/fade_math.h"
+#include "select/footprint.h"
+#include "select/frustum.h"
+
+namespace v3dg {
+
+// Whether the top clusters, which nothing replaces, are the cut at full weight, and no page is
+// wanted. With the paper's footprint that does not follow from their groups: it may decrease
+// towards the root, so a group may fail to fit below one that does.
+V3DG_HD inline bool tops_fit(const ClusterTable& table, const InstanceView& view,
+                             const SelectRule& rule) {
+    if (rule.footprint == Footprint::paper) return false;
+    for (size_t i = 0; i < table.top_group.size; ++i)
+        if (!fits(wanted_metric_px2(table, table.top_group[i], view, rule), rule)) return false;
+    return true;
+}
+
+// Which clusters the cut of an instance is found among.
+enum class CutSource {
+    nowhere,  // none: the instance is hidden
+    tops,     // the top clusters
+    table,    // all clusters
+};
+
+// Whether the instance is culled as a whole.
+V3DG_HD inline bool is_hidden(const ClusterTable& table, const InstanceView& view,
+                              const SelectRule& rule) {
+    return rule.culls && is_outside(table.bounds, view);
+}
+
+// The source of an instance's cut. The tops are tried only where there are at most `most_tops`.
+V3DG_HD inline CutSource source_of_cut(const ClusterTable& table, const InstanceView& view,
+                                       const SelectRule& rule, size_t most_tops) {
+    if (is_hidden(table, view, rule)) return CutSource::nowhere;
+    const bool has_few_tops = table.top_cluster.size <= most_tops;
+    return has_few_tops && tops_fit(table, view, rule) ? CutSource::tops : CutSource::table;
+}
+
+// The bins of a budget whose cuts contain a cluster.
+struct BinRange {
+    uint32_t first, end;
+
+    V3DG_HD bool is_empty() const { return first >= end; }
+};
+
+// Answers the questions of the decision about a group by computing them each time. The bins of a
+// budget count as if all pages were resident, so that the tolerance does not depend on which are.
+struct AskedGroups {
+    const ClusterTable& table;
+    const InstanceView& view;
+    const SelectRule& rule;
+
+    V3DG_HD int32_t refinement(int32_t g) const {
+        return min_of(v3dg::refinement(metric_px2(table, g, view, rule), rule),
+                      arrival(table.pages, g, rule));
+    }
+    // The first bins of a budget in which the group fits, and in which it is no longer refined.
+    V3DG_HD uint32_t first_fitting(int32_t g) const {
+        return bin_of_metric(wanted_metric_px2(table, g, view, rule) * rule.fade.factor,
+                             rule.tolerance_px2);
+    }
+    V3DG_HD uint32_t first_unrefined(int32_t g) const {
+        return bin_of_metric(wanted_metric_px2(table, g, view, rule) * rule.fade.inverse,
+                             rule.tolerance_px2);
+    }
+};
+
+// The decision about each cluster of an instance's table. `Groups` is AskedGroups, or answers the
+// same questions from memory.
+template <class Groups>
+struct InstanceCut {
+    const ClusterTable& table;
+    const InstanceView& view;
+    const SelectRule& rule;
+    Groups groups;
+    bool culls;  // whether some of the clusters may lie outside of the frustum
+
+    V3DG_HD bool is_culled(size_t c) const { return culls && is_outside(table.box[c], view); }
+
+    // The weight of the cluster, of kWhole, if it is not culled: how far the group above is refined
+    // less how far its own is. The head of select_math.h says why the cut is exact.
+    V3DG_HD int32_t weight(size_t c) const {
+        const int32_t own = table.own_group[c], parent = table.parent_group[c];
+        const int32_t below = own < 0 ? 0 : groups.refinement(own);
+        const int32_t above = parent < 0 ? kWhole : groups.refinement(parent);
+        return above - below;
+    }
+
+    // As weight(), but 0 for clusters that are culled or not in the cut.
+    V3DG_HD int32_t drawn_weight(size_t c) const {
+        const int32_t drawn = weight(c);
+        return drawn > 0 && !is_culled(c) ? drawn : 0;
+    }
+
+    // The bins of a budget whose cuts contain the cluster; with a fade, those that may.
+    V3DG_HD BinRange bins(size_t c) const {
+        const int32_t own = table.own_group[c], parent = table.parent_group[c];
+        const BinRange range{own < 0 ? 0 : groups.first_unrefined(own),
+                             parent < 0 ? kNumBudgetBins : groups.first_fitting(parent)};
+        return range.is_empty() || is_culled(c) ? BinRange{0, 0} : range;
+    }
+};
+
+// The cut of an instance on a half that computes each answer when it is asked.
+V3DG_HD inline InstanceCut<AskedGroups> cut_by_asking(const ClusterTable& table,
+                                                      const InstanceView& view,
+                                                      const SelectRule& rule) {
+    return {.table = table,
+            .view = view,
+            .rule = rule,
+            .groups = {.table = table, .view = view, .rule = rule},
+            .culls = rule.culls};
+}
+
+}  // namespace v3dg

@@ -1,0 +1,52 @@
+#pragma once
+
+// Counters and states that the blocks of a cut's kernels share.
+
+#include <algorithm>
+
+#include "select/cut_parts.cuh"
+
+namespace v3dg {
+namespace cuda {
+
+// Of place_kernel: few, so that a few thousand instances spread over the device.
+constexpr unsigned kPlaceThreads = 64;
+
+// Memory of one round of a cut. It starts as zeros, except for the states of cut_kernel, which
+// place_kernel clears.
+struct CutScratch {
+    unsigned *place_ticket, *cut_ticket;
+    unsigned* num_parts;
+    Count* place_state;               // a word for each block of place_kernel
+    Count *unit_state, *count_state;  // a word for each ticket of cut_kernel
+    unsigned num_places;              // how many blocks of cut_kernel run at once
+
+    // How many parts a block takes together: one a warp, or fewer where that spreads them over all
+    // blocks, because warps without a part help the others to ask.
+    __device__ unsigned parts_at_once(unsigned parts) const {
+        return min(max(blocks_for(parts, num_places), 1u), kCutWarps);
+    }
+};
+
+// The number of blocks of place_kernel. At least one, because an empty scene has a picture, too.
+inline unsigned place_blocks(size_t num_instances) {
+    return std::max(1u, blocks_for(num_instances, kPlaceThreads));
+}
+
+// How many zeros a CutScratch needs: for three counters and the states of place_kernel's blocks.
+inline size_t zeros_of_round(size_t num_instances) { return 2 + place_blocks(num_instances); }
+
+// `states` has two words a ticket.
+inline CutScratch scratch_in(Count* zeros, Count* states, size_t num_tickets, unsigned num_places) {
+    auto* counters = reinterpret_cast<unsigned*>(zeros);
+    return {.place_ticket = counters,
+            .cut_ticket = counters + 1,
+            .num_parts = counters + 2,
+            .place_state = zeros + 2,
+            .unit_state = states,
+            .count_state = states + num_tickets,
+            .num_places = num_places};
+}
+
+}  // namespace cuda
+}  // namespace v3dg

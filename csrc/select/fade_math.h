@@ -1,0 +1,45 @@
+#pragma once
+
+// Comparisons of a metric with the tolerance, and the weights that come of them with a fade.
+
+#include <cstdint>
+
+#include "residency/cluster_table.h"
+#include "select/rule.h"
+
+namespace v3dg {
+
+// Without a fade, a group either fits or is refined. With one, neither holds within the fade.
+V3DG_HD inline bool fits(float metric_px2, const SelectRule& rule) {
+    return metric_px2 * rule.fade.factor <= rule.tolerance_px2;
+}
+V3DG_HD inline bool is_refined(float metric_px2, const SelectRule& rule) {
+    return !(metric_px2 * rule.fade.inverse <= rule.tolerance_px2);
+}
+
+// Weights are integers, of which kWhole is 1, so that they add up without rounding.
+constexpr int32_t kWhole = 1 << 15;
+
+V3DG_HD inline float share_of(int32_t weight) {
+    return static_cast<float>(weight) * (1.0f / kWhole);
+}
+
+// How far a group is refined: 0 where it fits, kWhole where it is refined, and a ramp in between.
+// It never decreases with the metric, because none of its steps does.
+V3DG_HD inline int32_t refinement(float metric_px2, const SelectRule& rule) {
+    const float low = rule.tolerance_px2 * rule.fade.inverse,
+                high = rule.tolerance_px2 * rule.fade.factor;
+    const float ramp = (metric_px2 - low) / (high - low);
+    const float between = ramp > 0.0f ? (ramp < 1.0f ? ramp : 1.0f) : 0.0f;  // NaN becomes 0
+    const int32_t rounded = static_cast<int32_t>(between * kWhole + 0.5f);
+    return fits(metric_px2, rule) ? 0 : is_refined(metric_px2, rule) ? kWhole : rounded;
+}
+
+// How far the page of a group has faded in, of kWhole. A group is refined at most that far. Neither
+// number decreases towards the root, so their minimum does not, and the cut stays exact.
+V3DG_HD inline int32_t arrival(const PageTable& pages, int32_t g, const SelectRule& rule) {
+    static_assert(kWhole % kArrivalFrames == 0, "frames are whole parts");
+    return rule.fade.is_on() ? pages.arrived(g, rule.frame) * (kWhole / kArrivalFrames) : kWhole;
+}
+
+}  // namespace v3dg

@@ -1,0 +1,190 @@
+#pragma once
+
+// Places instances in front of the cameras, chooses the source of each one's cut, and deals out the
+// tables that have to be asked as parts. A thread has an instance.
+
+#include "base/scan.cuh"
+#include "select/cut_scratch.cuh"
+
+namespace v3dg {
+namespace cuda {
+
+constexpr unsigned kFewBundles = 8;
+// Parts are kept small where there are few instances, so that they spread over the device, too.
+constexpr unsigned kFewInstances = 8192, kFewLanes = 8;
+
+// The sides of the frustum for each bundle, which would cost every instance eight divisions of
+// doubles. They are an argument of the kernel where there are few bundles, and in memory where
+// there are more.
+struct BundleSides {
+    CameraSides few[kFewBundles];
+    const CameraSides* many;  // null where there are few
+
+    __device__ CameraSides operator[](size_t bundle) const {
+        if (many != nullptr) return many[bundle];
+        return few[bundle];
+    }
+};
+
+// The placement of an instance in front of an eye. Of n instances, instance i has placement eye * n
+// + i.
+__device__ inline Placement placement_of(const InstanceAxes& axes, const Pose& pose, int32_t bundle,
+                                         unsigned eye) {
+    return {.view = model_view_from_instance(axes, pose),
+            .model = static_cast<uint32_t>(bundle),
+            .image = eye};
+}
+
+// One record for each lane of a warp, in shared memory on the way from registers to memory.
+template <class Record>
+struct RecordRow {
+    Record* records;
+
+    __device__ void set(const Record& mine) const { records[threadIdx.x % 32] = mine; }
+    // Writes the records of the lanes that have one to their places, which are consecutive from
+    // `first` on, as whole rows of memory. All lanes of the warp take part.
+    __device__ void write(bool has_one, Record* first) const {
+        constexpr unsigned kVectors = sizeof(Record) / sizeof(uint4);
+        static_assert(sizeof(Record) % sizeof(uint4) == 0 && alignof(Record) % sizeof(uint4) == 0,
+                      "records are whole vectors");
+        const unsigned writers = __ballot_sync(kAllLanes, has_one);
+        __syncwarp();
+        if (writers == 0) return;
+        const auto* from = reinterpret_cast<const uint4*>(records);
+        auto* to = reinterpret_cast<uint4*>(first);
+#pragma unroll
+        for (unsigned k = 0; k < kVectors; ++k) {
+            const unsigned v = 32 * k + threadIdx.x % 32;
+            if (writers >> v / kVectors & 1) to[v] = from[v];
+        }
+        __syncwarp();  // before the next records are set
+    }
+};
+
+// The source of an instance's cut.
+struct Placed {
+    CutSource source;
+    ClusterRange asked;  // clusters, where the source is the table
+    bool is_alone;       // whether a single lane asks them
+};
+
+// Places instance i, if there is one, and writes its view, its placements and its tops. All lanes
+// of the warp take part, with consecutive instances.
+__device__ inline Placed place_instance(const PlacedScene& scene, size_t i, const Eyes& eyes,
+                                        const BundleSides& sides, const SelectRule& rule,
+                                        Placement* placements) {
+    __shared__ InstanceView space[kPlaceThreads];
+    static_assert(sizeof(Placement) <= sizeof(InstanceView), "rows of both use the same memory");
+    InstanceView* of_warp = space + threadIdx.x / 32 * 32;
+    const RecordRow<Placement> placement_row{reinterpret_cast<Placement*>(of_warp)};
+    const RecordRow<InstanceView> view_row{of_warp};
+    const size_t num_instances = scene.instances.scale.size, first = i - threadIdx.x % 32;
+    const Pose pose = i < num_instances
+                          ? scene.instances.pose(i)
+                          : Pose{.position = nullptr, .quaternion = nullptr, .scale = 0.0};
+    CutSource source = CutSource::nowhere;
+    ClusterRange asked{0, 0};
+    bool is_alone = false;
+    int32_t bundle = 0;
+    InstanceView view;
+    if (i < num_instances && is_placed(pose)) {
+        bundle = scene.instances.bundle[i];
+        const ClusterTable& table = scene.bundles[bundle].table;
+        {
+            const InstanceAxes axes = axes_of_instance(eyes.camera[0], pose);
+            view =
+                view_from_instance(eyes, sides[bundle], axes, pose, scene.instances.importance[i]);
+            // Set before it is known whether the instance is seen, so that the axes need not be
+            // kept until then.
+            if (placements != nullptr) placement_row.set(placement_of(axes, pose, bundle, 0));
+        }
+        source = source_of_cut(table, view, rule, kLaneClusters);
+        if (source == CutSource::tops) {
+            const InstanceCut<AskedGroups> cut = cut_by_asking(table, view, rule);
+            unsigned drawn = 0;
+            for (unsigned k = 0; k < table.top_cluster.size; ++k)
+                if (!cut.is_culled(table.top_cluster[k])) drawn |= 1u << k;
+            scene.tops[i] = static_cast<uint8_t>(drawn);
+            if (drawn == 0) source = CutSource::nowhere;
+        }
+        // A budget's tolerance is not known yet.
+        if (source == CutSource::table) {
+            asked = clusters_to_ask(
+                table, scene.bundles[bundle].runs, view, rule,
+                rule.budget == kNoBudget ? Tolerances::this_one : Tolerances::from_this_on);
+            is_alone = asked.first < asked.end && asked.first >= last_of_table(table);
+            if (is_alone) scene.tops[i] = 0;
+        }
+        is_alone |= source == CutSource::tops;
+    }
+    const bool is_seen = source != CutSource::nowhere;
+    if (placements != nullptr) {
+        placement_row.write(is_seen, placements + first);
+        if (eyes.are_two) {
+            if (is_seen)
+                placement_row.set(
+                    placement_of(axes_of_instance(eyes.camera[1], pose), pose, bundle, 1));
+            placement_row.write(is_seen, placements + num_instances + first);
+        }
+    }
+    if (source == CutSource::table) view_row.set(view);
+    view_row.write(source == CutSource::table, scene.views + first);
+    return {.source = source, .asked = asked, .is_alone = is_alone};
+}
+
+// Writes the parts of a block's instances behind those of the blocks before, and clears the states
+// of cut_kernel. For the whole block. Returns how many parts there are up to here.
+//
+// Neighbours that a single lane asks each, with no other table in between, make one part, which the
+// first of them writes.
+__device__ inline unsigned write_parts(const PlacedScene& scene, const Placed& placed, size_t block,
+                                       size_t i, const CutScratch& scratch) {
+    const unsigned lane = threadIdx.x % 32, below = (1u << lane) - 1;
+    const unsigned lanes = __ballot_sync(kAllLanes, placed.is_alone);
+    const unsigned tables =
+        __ballot_sync(kAllLanes, placed.source == CutSource::table && !placed.is_alone);
+    const unsigned table_below = tables & below, table_above = tables & ~below;
+    const unsigned width = scene.instances.scale.size <= kFewInstances ? kFewLanes : 32;
+    const unsigned first = lane / width * width;
+    const unsigned from =
+        max(first, table_below != 0 ? 32 - __clz(static_cast<int>(table_below)) : 0);
+    const unsigned to = min(first + width, table_above != 0 ? __ffs(table_above) - 1 : 32);
+    const bool begins = placed.is_alone && (lanes & below) >> from == 0;
+    const unsigned parts =
+        placed.is_alone ? begins : blocks_for(placed.asked.end - placed.asked.first, kPartSize);
+
+    unsigned total;
+    const unsigned before_in_block = block_prefix(parts, total);
+    __shared__ unsigned before_block;
+    if (threadIdx.x < 32) {
+        const unsigned before =
+            static_cast<unsigned>(prefix_of_part(scratch.place_state, block, total));
+        if (threadIdx.x == 0) before_block = before;
+    }
+    __syncthreads();
+    const unsigned before = before_block;
+    CutPart* part = scene.parts + before + before_in_block;
+    if (begins) {
+        const unsigned until = to < 32 ? (1u << to) - 1 : kAllLanes;
+        *part = {
+            .instance = static_cast<uint32_t>(i), .first = 0, .lanes = (lanes & until) >> lane};
+    } else if (!placed.is_alone) {
+        for (unsigned p = 0; p < parts; ++p)
+            part[p] = {.instance = static_cast<uint32_t>(i),
+                       .first = placed.asked.first + p * kPartSize,
+                       .lanes = 0};
+    }
+    // Together, the blocks clear as many tickets as there are places. This block also clears those
+    // whose first part is its own where tickets have kCutWarps parts.
+    const auto clear = [&](unsigned first, unsigned end, unsigned step) {
+        for (unsigned t = first; t < end; t += step)
+            scratch.unit_state[t] = scratch.count_state[t] = 0;
+    };
+    clear(static_cast<unsigned>(i), scratch.num_places, gridDim.x * kPlaceThreads);
+    clear(blocks_for(before, kCutWarps) + threadIdx.x, blocks_for(before + total, kCutWarps),
+          kPlaceThreads);
+    return before + total;
+}
+
+}  // namespace cuda
+}  // namespace v3dg

@@ -1,0 +1,39 @@
+"""The seam for camera models: a second one goes through projection as the pinhole
+does."""
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+CSRC = ROOT / "csrc"
+PROGRAM = ROOT / "tests" / "cpp" / "second_camera.cpp"
+# Folders that make pictures of their own, by a pinhole that they choose themselves.
+MAKERS_OF_PINHOLES = {"camera", "fit_group"}
+
+
+def compiler() -> str | None:
+    return shutil.which(os.environ.get("CXX", "c++"))
+
+
+@pytest.mark.skipif(compiler() is None, reason="needs a C++ compiler")
+def test_second_camera_model_goes_through_projection(tmp_path: Path) -> None:
+    """It satisfies the concept, and its ellipses and gradients are those of its
+    formula."""
+    program = tmp_path / "second_camera"
+    command = [compiler(), "-std=c++20", "-I", CSRC, PROGRAM, "-o", program]
+    compiled = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert compiled.returncode == 0, compiled.stderr
+    done = subprocess.run([program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "")
+
+
+def test_pinholes_are_named_by_those_who_make_them_alone() -> None:
+    """All others name the model in use, Intrinsics, so that a second one is a file and
+    its place in camera/camera.h."""
+    sources = [p for p in CSRC.rglob("*") if p.suffix in {".h", ".cuh", ".cpp", ".cu"}]
+    users = {p.parent.name for p in sources if "Pinhole<" in p.read_text(encoding="utf-8")}
+    assert users == MAKERS_OF_PINHOLES
