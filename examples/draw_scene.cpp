@@ -1,5 +1,6 @@
 // Draws a small scene with the core alone, without Python: two instances of a bundle of one level,
-// chosen and drawn in one call, as a .ppm. Built by `cmake --build build/cpu --target draw_scene`.
+// selected and drawn in one call, to a .ppm. Build it with `cmake --build build/cpu --target
+// draw_scene`.
 
 #include <cmath>
 #include <cstdio>
@@ -14,7 +15,7 @@ using namespace v3dg;
 constexpr size_t kGaussians = 2000, kClusterSize = 250, kClusters = kGaussians / kClusterSize;
 constexpr int kWidth = 320, kHeight = 240;
 
-// Gaussians on a spiral around a unit sphere, clusters from pole to pole.
+// Gaussians on a spiral around a unit sphere, whose clusters go from pole to pole.
 struct Globe {
     std::vector<float> means, quats, scales, opacities, sh;
 
@@ -32,8 +33,13 @@ struct Globe {
         }
     }
     GaussianRows<const float> rows() const {
-        return {
-            means.data(), quats.data(), scales.data(), opacities.data(), sh.data(), kGaussians, 0};
+        return {.means = means.data(),
+                .quats = quats.data(),
+                .scales = scales.data(),
+                .opacities = opacities.data(),
+                .sh = sh.data(),
+                .size = kGaussians,
+                .sh_degree = 0};
     }
 };
 
@@ -41,7 +47,7 @@ int main(int num_arguments, char** arguments) {
     const Globe globe;
     const Model<float> model(globe.rows());
 
-    // A bundle of one level: no groups, so every cluster is a leaf and a root.
+    // The bundle has one level and no groups, so every cluster is a leaf and a root.
     std::vector<Box> boxes(kClusters, Box{{-1.2f, -1.2f, -1.2f}, {1.2f, 1.2f, 1.2f}});
     const std::vector<int32_t> no_group(kClusters, -1);
     const std::vector<float> filters(kClusters, 0.0f);
@@ -49,28 +55,28 @@ int main(int num_arguments, char** arguments) {
     std::vector<int64_t> offset;
     for (size_t c = 0; c <= kClusters; ++c)
         offset.push_back(static_cast<int64_t>(c * kClusterSize));
-    ClusterTable given{};
-    given.own_group = {no_group.data(), kClusters};
-    given.parent_group = {no_group.data(), kClusters};
-    given.box = {boxes.data(), kClusters};
-    given.offset = {offset.data(), offset.size()};
-    const HostTable table(given, {{filters.data(), kClusters}, {antialiased.data(), kClusters}});
+    ClusterTable clusters{};
+    clusters.own_group = {no_group.data(), kClusters};
+    clusters.parent_group = {no_group.data(), kClusters};
+    clusters.box = {boxes.data(), kClusters};
+    clusters.offset = {offset.data(), offset.size()};
+    const HostTable table(clusters, {{filters.data(), kClusters}, {antialiased.data(), kClusters}});
 
     const std::vector<int32_t> bundle_of_instance{0, 0};
     const std::vector<double> position{-1.3, 0, 0, 1.3, 0, 0}, quaternion{1, 0, 0, 0, 1, 0, 0, 0},
         scale{1, 0.7};
     const std::vector<float> importance{1, 1};
-    const SceneModel drawn{&model.planes(), table.appearance(), {}};
-    const HostScene scene{{&table.table(), 1},
-                          {&drawn, 1},
-                          {{bundle_of_instance.data(), 2},
-                           {position.data(), 6},
-                           {quaternion.data(), 8},
-                           {scale.data(), 2},
-                           {importance.data(), 2}},
-                          {}};
+    const SceneModel drawn{
+        .planes = &model.planes(), .appearance = table.appearance(), .palette = {}};
+    const InstanceTable instances{.bundle = {bundle_of_instance.data(), 2},
+                                  .position = {position.data(), 6},
+                                  .quaternion = {quaternion.data(), 8},
+                                  .scale = {scale.data(), 2},
+                                  .importance = {importance.data(), 2}};
+    const HostScene scene{
+        .tables = {&table.table(), 1}, .models = {&drawn, 1}, .instances = instances};
 
-    // A camera at (0, 0, -6) that looks along z.
+    // The camera is at (0, 0, -6) and looks along z.
     Camera camera{};
     const double viewmat[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 6, 0, 0, 0, 1};
     for (int row = 0; row < 3; ++row) {
@@ -86,8 +92,11 @@ int main(int num_arguments, char** arguments) {
     camera.near_depth = 0.01;
 
     std::vector<float> color(3 * kWidth * kHeight), alpha(kWidth * kHeight);
-    const Picture<float> picture{
-        {0, 0, kWidth, kHeight}, {0.1f, 0.1f, 0.15f}, color.data(), alpha.data(), nullptr};
+    const Picture<float> picture{.window = {0, 0, kWidth, kHeight},
+                                 .background = {0.1f, 0.1f, 0.15f},
+                                 .color = color.data(),
+                                 .alpha = alpha.data(),
+                                 .depth = nullptr};
     SelectRule rule{};
     rule.tolerance_px2 = 3.0f;
     const SceneFrameCounts counts = cpu::draw_scene(scene, camera, rule, {&picture, 1});

@@ -9,8 +9,8 @@
 #include "base/device.h"
 #include "frame/tile_list.h"
 #include "project/project_cuda.h"
-#include "rasterize/rasterize_cuda.h"
-#include "tile_bin/tile_bin_cuda.h"
+#include "rasterize/rasterize.h"
+#include "tile_bin/tile_bin.h"
 
 namespace v3dg {
 namespace cuda {

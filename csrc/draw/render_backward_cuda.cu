@@ -6,7 +6,7 @@
 #include <string>
 #include <vector>
 
-#include "rasterize/rasterize_backward.h"
+#include "rasterize/rasterize.h"
 
 namespace v3dg {
 namespace cuda {

@@ -1,7 +1,7 @@
 #pragma once
 
-// Half-warps blend cells of 4 x 4 pixels, and go through them again for the gradients: what each
-// gaussian gets from a cell is summed over the cell's pixels into a slot of its own.
+// Half-warps blend cells of 4 x 4 pixels, and walk them again for the gradients: each gaussian's
+// gradient from a cell is summed over the cell's pixels into a slot of its own.
 
 #include "fit_group/cell_lists.cuh"
 #include "frame/record.cuh"
@@ -27,12 +27,14 @@ __device__ CellPixel pixel_at(const Fit& fit, int cell_x, int cell_y) {
             x < fit.job.size && y < fit.job.size};
 }
 
+// Entries of a list that are loaded at once.
 template <class Index>
 struct alignas(kAtOnce * sizeof(Index)) CellEntries {
     Index record[kAtOnce];
 };
 
-// Of a large group: copies the records of a part of both half-warps' lists to shared memory.
+// Copies the records of a part of both half-warps' lists to shared memory. Small groups have theirs
+// there anyway.
 template <class Fit>
 __device__ void stage_records(const Fit& fit, uint32_t begin, uint32_t end) {
     if (Fit::kSmall) return;
@@ -48,7 +50,7 @@ __device__ void stage_records(const Fit& fit, uint32_t begin, uint32_t end) {
     __syncwarp();
 }
 
-// kAtOnce records of a half-warp's list, from entry i on; `begin` is that of the chunk.
+// kAtOnce records of a half-warp's list, from entry i on; `begin` is the first entry of the chunk.
 struct CellRecords {
     const Record<float>* record[kAtOnce];
 };
@@ -71,7 +73,7 @@ __device__ CellRecords records_at(const Fit& fit, const CellList<Fit>& list, uin
     return out;
 }
 
-// What kAtOnce gaussians give to a pixel, one behind the other.
+// The contributions of kAtOnce gaussians to a pixel, front to back.
 struct Blended {
     float alpha[kAtOnce], before[kAtOnce], weight[kAtOnce];
     float3 color[kAtOnce];
@@ -82,8 +84,8 @@ __device__ inline Blended blend_records(const CellPixel& p, const CellRecords& r
     Blended out;
 #pragma unroll
     for (int q = 0; q < kAtOnce; ++q) {
-        // As vectors (frame/record.cuh): nvcc rounds the falloff of a record that is taken apart
-        // otherwise.
+        // The record is read as vectors (frame/record.cuh), because nvcc rounds the falloff of a
+        // record that was copied differently.
         const Record<float>& r = *records.record[q];
         const float4 a = *reinterpret_cast<const float4*>(&r.u);
         const float4 b = *reinterpret_cast<const float4*>(&r.l22);
@@ -94,23 +96,23 @@ __device__ inline Blended blend_records(const CellPixel& p, const CellRecords& r
     return out;
 }
 
-// Where a pass reads and writes.
+// The memory that a pass reads and writes.
 struct BlendTargets {
     float* slots;          // train
-    uint32_t slot_base;    // of the first of them
+    uint32_t slot_base;    // number of the first slot
     const float* d_dssim;  // train; may be null
     float* picture;        // draw
     float2* errors;        // measure
 };
 
-// Half-warps add up the fragments of a chunk with one lane or, where it has fewer gaussians, two
-// for each.
+// Half-warps add up the fragments of a chunk with one lane for each gaussian or, where the chunk
+// has fewer gaussians, with two.
 template <class Fit>
 constexpr int kLanesOfSum = kCellPixels / (Fit::kChunk < kCellPixels ? Fit::kChunk : kCellPixels);
 
-// Sums over the half-warp's cell, for record r, which is gaussian `i` of the chunk; all lanes come
-// here, those without a gaussian with a null `slot`. What RowSums says of a row is written out:
-// through it nvcc rounds the sums otherwise, and bundles would change in their last bits.
+// Sums over the half-warp's cell, for record r, which is gaussian `i` of the chunk. All lanes call
+// it; those without a gaussian have a null `slot`. The sums of a row are spelled out instead of
+// using RowSums: nvcc would round them differently, and bundles would change in their last bits.
 template <class Fit>
 __device__ void add_up(const Fit& fit, const CellPixel& p, uint32_t i, const Record<float>& r,
                        float* slot) {
@@ -159,7 +161,7 @@ __device__ void add_up(const Fit& fit, const CellPixel& p, uint32_t i, const Rec
         if (kLanes == 1 || (k < 5) == (part == 0)) slot[k] = all[k];
 }
 
-// A warp takes two cells side by side in view b. `unit` numbers the pair.
+// Blends two neighbouring cells in view b, by a whole warp. `unit` numbers the pair.
 template <Pass kPass, class Fit>
 __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, int pair_x,
                             int cell_y, uint32_t unit, const BlendTargets& targets) {
@@ -169,9 +171,9 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
     const int left_cell = cell_y % kRegionCells * kRegionCells + 2 * pair_x % kRegionCells;
     const int cell = left_cell + lane / kCellPixels;
     const size_t num_pixels = static_cast<size_t>(fit.job.size) * fit.job.size;
-    const size_t at = static_cast<size_t>(p.y) * fit.job.size + p.x;
+    const size_t pixel = static_cast<size_t>(p.y) * fit.job.size + p.x;
     float4 target = make_float4(0, 0, 0, 0);
-    if (kPass != Pass::draw && p.inside) target = cameras.target[b][at];
+    if (kPass != Pass::draw && p.inside) target = cameras.target[b][pixel];
     const CellList<Fit> list = make_lists(fit, b, region, left_cell);
     if (kPass == Pass::train && list.filled == 0) return;
 
@@ -193,7 +195,8 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
     }
     if (kPass == Pass::draw) {
         if (p.inside)
-            for (int c = 0; c < 3; ++c) targets.picture[(3 * b + c) * num_pixels + at] = color[c];
+            for (int c = 0; c < 3; ++c)
+                targets.picture[(3 * b + c) * num_pixels + pixel] = color[c];
         return;
     }
     const float difference[4] = {color[0] - target.x, color[1] - target.y, color[2] - target.z,
@@ -218,18 +221,18 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
         for (int c = 0; c < 3; ++c) d[c] = l1_vjp(difference[c], d_color);
         d[3] = l1_vjp(difference[3], d_alpha);
         if (targets.d_dssim != nullptr)
-            for (int c = 0; c < 3; ++c) d[c] += targets.d_dssim[(3 * b + c) * num_pixels + at];
+            for (int c = 0; c < 3; ++c) d[c] += targets.d_dssim[(3 * b + c) * num_pixels + pixel];
     }
     fit.d_pixels()[lane] = make_float4(d[0], d[1], d[2], 0);
 
-    // Blends the same records again, to the same numbers, now that the sum over all of them is
+    // The same records are blended again, to the same numbers, now that the sum over all of them is
     // known.
     const auto slot_of = [&](uint32_t j) {
         const uint32_t slot =
             fit.slot_first(region)[j] + __popcll(fit.mask(region)[j] & ((CellMask(1) << cell) - 1));
         return targets.slots + kSums * static_cast<size_t>(slot - targets.slot_base);
     };
-    float2* const mine = fit.fragments() + lane;  // this pixel's
+    float2* const mine = fit.fragments() + lane;  // fragments of this pixel
     float behind =
         d[0] * color[0] + d[1] * color[1] + d[2] * color[2] + d[3] * (1 - fabsf(transmittance));
     transmittance = p.inside ? 1 : -1;
@@ -263,7 +266,7 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
         }
         __syncwarp();
     }
-    // Every pixel has stopped before the rest, whose sums are 0.
+    // Every pixel has stopped before the remaining records, whose sums are 0.
     for (uint32_t i = begin + lane % kCellPixels; i < list.length; i += kCellPixels) {
         float* slot = slot_of(list.entry[i]);
         for (int k = 0; k < kSums; ++k) slot[k] = 0;
@@ -279,12 +282,13 @@ __device__ int cell_pairs(const Fit& fit) {
     return (fit.job.size + 2 * kCell - 1) / (2 * kCell);
 }
 
-// 0, 1, 2, ... to the middle of [0, size), then alternately before and behind it.
+// Maps 0, 1, 2, ... to the middle of [0, size), then alternately before and behind it.
 __device__ inline int from_middle(int k, int size) {
     return size / 2 + (k % 2 ? -(k + 1) / 2 : k / 2);
 }
 
-// Warps take pairs of cells from a queue, those in the middle first, which have most to blend.
+// Warps take pairs of cells from a queue. Those in the middle come first, because they have most to
+// blend.
 template <Pass kPass, class Fit>
 __device__ void blend_regions(const Fit& fit, const FitCameras& cameras, int num_views,
                               int first_region, int last_region, const BlendTargets& targets) {

@@ -1,7 +1,7 @@
 #pragma once
 
-// Which gaussians reach which cells of 4 x 4 pixels: a mask for each record, a slot for each record
-// and cell, in which its gradients from there are summed, and the list of a cell.
+// The gaussians that reach each cell of 4 x 4 pixels: a mask for each record, a slot for each
+// record and cell, in which its gradients from there are summed, and the list of a cell.
 
 #include "base/scan.cuh"
 #include "fit_group/depth_order.cuh"
@@ -9,8 +9,8 @@
 namespace v3dg {
 namespace cuda {
 
-// Cells of the region at (left, top) that the record may reach, a bit each, row by row. Rounded to
-// pixel centres, because each cell costs a slot and a place in a list.
+// Returns the cells of the region at (left, top) that the record may reach, a bit each, row by row.
+// Rounding is to pixel centres, because each cell costs a slot and a place in a list.
 __device__ inline CellMask cells_of(const Record<float>& r, int left, int top) {
     const PixelBox<int> box{max(r.x0 - left, 0), min(r.x1 - left, kRegion - 1), max(r.y0 - top, 0),
                             min(r.y1 - top, kRegion - 1)};
@@ -31,7 +31,7 @@ __device__ inline CellMask cells_of(const Record<float>& r, int left, int top) {
     return reached;
 }
 
-// Of a large group: sorts the records, finds the cells of each, and waits for the team.
+// Sorts the records of a large group, finds the cells of each, and waits for the team.
 template <class Fit>
 __device__ void arrange_by_depth(const Fit& fit, int num_views) {
     for (uint32_t r = fit.first(); r < num_views * fit.n_padded; r += fit.stride()) {
@@ -58,12 +58,12 @@ __device__ uint32_t assign_slots(const Fit& fit, int num_views) {
     const uint32_t each = (count + fit.stride() - 1) / fit.stride();
     const uint32_t begin = min(count, (fit.team_rank * Fit::kThreads + threadIdx.x) * each);
     const uint32_t end = min(count, begin + each);
-    uint32_t own = 0;
-    for (uint32_t t = begin; t < end; ++t) own += __popcll(mask_at(t));
-    const uint32_t upto = warp_prefix(own);
+    uint32_t own_slots = 0;
+    for (uint32_t t = begin; t < end; ++t) own_slots += __popcll(mask_at(t));
+    const uint32_t upto = warp_prefix(own_slots);
     if (threadIdx.x % 32 == 31) fit.s.warp_total[threadIdx.x / 32] = upto;
     __syncthreads();
-    uint32_t before = upto - own, total = 0;
+    uint32_t before = upto - own_slots, total = 0;
     for (uint32_t w = 0; w < Fit::kWarps; ++w) {
         if (w < threadIdx.x / 32) before += fit.s.warp_total[w];
         total += fit.s.warp_total[w];
@@ -109,16 +109,16 @@ __device__ void sum_slots(const Fit& fit, int num_views, const float* slots, uin
     }
 }
 
-// The ranks of what reaches a half-warp's cell, nearest first. Both half-warps' lists are filled up
-// to one length, with the rank of a record that draws nothing.
+// The ranks of the records that reach a half-warp's cell, nearest first. Both half-warps' lists
+// have the same length including padding, which is the rank of a record that draws nothing.
 template <class Fit>
 struct CellList {
     const typename Fit::Index* entry;
     uint32_t length, filled;
 };
 
-// Makes the lists of two neighbouring cells in view b, and returns the lane's own; `cell` is the
-// left one's bit.
+// Makes the lists of two neighbouring cells in view b, and returns that of the lane's cell; `cell`
+// is the bit of the left one.
 template <class Fit>
 __device__ CellList<Fit> make_lists(const Fit& fit, int b, int region, int cell) {
     constexpr int kLoads = 4;

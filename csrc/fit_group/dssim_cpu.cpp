@@ -4,8 +4,8 @@
 
 namespace v3dg {
 
-// Both passes of the separable window; its own transpose, since it is symmetric and zeros lie
-// outside.
+// Applies both passes of the separable window. The window is its own transpose, because it is
+// symmetric and zeros lie outside.
 static void blur(const float* in, int width, int height, float* rows, float* out) {
     for (int y = 0; y < height; ++y)
         for (int x = 0; x < width; ++x) {
@@ -44,7 +44,8 @@ float dssim(const float* picture, const float* target, int width, int height, fl
     double sum = 0;
     const float scale = -weight / static_cast<float>(n);
     for (int i = 0; i < n; ++i) {
-        const auto ssim = ssim_of<float>({mx[i], my[i], xx[i], yy[i], xy[i]});
+        const auto ssim =
+            ssim_of<float>({.x = mx[i], .y = my[i], .xx = xx[i], .yy = yy[i], .xy = xy[i]});
         sum += 1 - ssim.value;
         d_mx[i] = scale * ssim.d_x;
         d_xx[i] = scale * ssim.d_xx;

@@ -1,6 +1,6 @@
 #pragma once
 
-// D-SSIM of the pictures of a group, as dssim.h has it for the CPU.
+// D-SSIM of the pictures of a group; dssim.h has the definition and the CPU's version.
 
 #include "fit_group/team.cuh"
 #include "math/ssim.h"
@@ -15,7 +15,7 @@ __device__ void dssim_backward(const Fit& fit, const FitCameras& cameras, int nu
     const int size = fit.job.size;
     const uint32_t num_pixels = size * size, count = 3 * num_views * num_pixels;
     const float scale = -fit.in.config.loss.dssim / (3 * static_cast<float>(num_pixels));
-    // The window's sums of `kMaps` maps along rows (step 1) or columns.
+    // Sums the maps over the window along rows (step 1) or columns.
     const auto blur = [&](const float* maps, uint32_t i, int place, int step, auto& sums) {
 #pragma unroll
         for (int k = -kSsimRadius; k <= kSsimRadius; ++k)
@@ -56,12 +56,13 @@ __device__ void dssim_backward(const Fit& fit, const FitCameras& cameras, int nu
     for_each_pixel([&](uint32_t, uint32_t i, float* maps) {
         float sums[5] = {0, 0, 0, 0, 0};
         blur(maps, i, i / size, size, sums);
-        const auto ssim = ssim_of<float>({sums[0], sums[1], sums[2], sums[3], sums[4]});
+        const auto ssim = ssim_of<float>(
+            {.x = sums[0], .y = sums[1], .xx = sums[2], .yy = sums[3], .xy = sums[4]});
         maps[5 * num_pixels + i] = scale * ssim.d_x;
         maps[6 * num_pixels + i] = scale * ssim.d_xx;
         maps[7 * num_pixels + i] = scale * ssim.d_xy;
     });
-    // Back through the window, which is its own transpose.
+    // The backward pass goes through the window, which is its own transpose.
     for_each_pixel([&](uint32_t, uint32_t i, float* maps) {
         float sums[3] = {0, 0, 0};
         blur(maps + 5 * num_pixels, i, i % size, 1, sums);
@@ -70,8 +71,8 @@ __device__ void dssim_backward(const Fit& fit, const FitCameras& cameras, int nu
     for_each_pixel([&](uint32_t plane, uint32_t i, float* maps) {
         float sums[3] = {0, 0, 0};
         blur(maps, i, i / size, size, sums);
-        const size_t at = static_cast<size_t>(plane) * num_pixels + i;
-        d_pictures[at] = sums[0] + 2 * pictures[at] * sums[1] + target_of(plane, i) * sums[2];
+        const size_t pixel = static_cast<size_t>(plane) * num_pixels + i;
+        d_pictures[pixel] = sums[0] + 2 * pictures[pixel] * sums[1] + target_of(plane, i) * sums[2];
     });
 }
 

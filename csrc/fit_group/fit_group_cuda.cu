@@ -1,39 +1,29 @@
-// A block, or a team of blocks, fits a group, start to end, then takes the next from a queue.
+// Each block, or team of blocks, fits a group from start to end, then takes the next from a queue.
 //
-// One step: threads project gaussians and order them by depth; half-warps take cells of 4 x 4
-// pixels, list the gaussians that reach them, blend them front to back, compare, and go through
-// them again for the gradients; what a gaussian gets from each cell has its own slot, and slots are
-// added up in a fixed order; threads carry that on to the parameters, and Adam moves them. So every
-// run has the same result, whatever order blocks and warps come in.
+// In each step threads project gaussians and order them by depth. Half-warps take cells of 4 x 4
+// pixels, list the gaussians that reach them, blend them front to back, compare, and walk them
+// again for the gradients. Each gaussian has its own slot for each cell, and slots are added up in
+// a fixed order; threads propagate the sums to the parameters, and Adam moves them. So every run
+// has the same result, whatever the order of blocks and warps.
 
-#include "fit_group/fit_group_cuda.h"
+#include "fit_group/fit_group.h"
 
 #include <algorithm>
 #include <stdexcept>
-#include <type_traits>
 
 #include "fit_group/blend_cells.cuh"
 #include "fit_group/fit_dssim.cuh"
 #include "fit_group/parameters.cuh"
+#include "fit_group/project_views.cuh"
 
 namespace v3dg {
 namespace cuda {
 
 namespace {
 
-constexpr uint32_t kSmallCount = 256;  // gaussians of a small group, whose picture is one region
+// Most gaussians of a small group, whose picture is one region.
+constexpr uint32_t kSmallCount = 256;
 constexpr int kStepsPerPoll = 16;
-
-// Calls `body` with the degree as a constant, which unrolls its loops.
-template <class Body>
-__device__ void with_degree(int degree, const Body& body) {
-    switch (degree) {
-        case 0: return body(std::integral_constant<int, 0>{});
-        case 1: return body(std::integral_constant<int, 1>{});
-        case 2: return body(std::integral_constant<int, 2>{});
-        default: return body(std::integral_constant<int, 3>{});
-    }
-}
 
 template <class Fit>
 __device__ void set_camera(const Fit& fit, FitCameras& cameras, int b, uint64_t picture) {
@@ -42,101 +32,6 @@ __device__ void set_camera(const Fit& fit, FitCameras& cameras, int b, uint64_t 
     cameras.camera[b] = camera_of(view, 1);
     cameras.target[b] =
         fit.in.targets + fit.job.first_pixel + picture * fit.job.size * fit.job.size;
-}
-
-template <class Fit>
-__device__ bool project_one(const Fit& fit, uint32_t i, const ModelView<float>& view,
-                            const Pinhole<float>& camera, Record<float>& r) {
-    const Gaussian3d<float> g = gaussian_of(fit, i);
-    Projection<float> p;
-    to_view(view, g.mean, p.p);
-    const Ellipse<float> e =
-        project_gaussian(g, view, camera, fit.in.config.filter_px2, fit.in.config.antialiased, p);
-    float half_x, half_y;
-    if (!(e.depth >= camera.near_depth) || !extent_of(g.opacity, e, p, half_x, half_y))
-        return false;
-    if (!meets_image(e.u, half_x, camera.width) || !meets_image(e.v, half_y, camera.height))
-        return false;
-    const PixelBox<int> box = pixel_box(e, half_x, half_y, camera);
-    if (!box.holds_pixels()) return false;
-    set_ellipse(e, box, r);
-    const float* sh = fit.at(fit.layout.value) + 11 * fit.n + fit.num_sh * i;
-    float direction[3];
-    from_eye(view, g.mean, direction);
-    with_degree(fit.in.rows.sh_degree, [&](auto degree) {
-        color_of_sh<float>(decltype(degree)::value, direction, sh, r.color);
-    });
-    return true;
-}
-
-template <class Fit>
-__device__ void project_views(const Fit& fit, const FitCameras& cameras, int num_views) {
-    for (uint32_t j = fit.first(); j < num_views * fit.n_padded; j += fit.stride()) {
-        const uint32_t b = j / fit.n_padded, i = j - b * fit.n_padded;
-        uint32_t key = kHiddenKey;
-        CellMask reached = 0;
-        if (i < fit.n) {
-            Record<float> r;
-            if (project_one(fit, i, cameras.view[b], cameras.camera[b], r)) {
-                fit.records()[j] = r;
-                key = __float_as_uint(r.depth);
-                if (Fit::kSmall) reached = cells_of(r, 0, 0);
-            }
-        }
-        fit.keys()[j] = key;
-        if (Fit::kSmall) fit.mask(0)[j] = reached;
-    }
-    if (fit.leads()) {
-        Record<float> r{};
-        r.log2_opacity = -100;
-        fit.ranked()[fit.nothing()] = r;
-    }
-}
-
-// From the sums of records to gradients of the parameters, for each view.
-template <class Fit>
-__device__ void project_views_backward(const Fit& fit, const FitCameras& cameras, int num_views,
-                                       int turn) {
-    const float* sums = fit.at(fit.layout.sums);
-    const float* value = fit.at(fit.layout.value);
-    for (uint32_t j = fit.first(); j < num_views * fit.n_padded; j += fit.stride()) {
-        const uint32_t b = j / fit.n_padded, place = Fit::kSmall ? j : fit.order()[j],
-                       i = place - b * fit.n_padded;
-        if (i >= fit.n) continue;
-        float* out = fit.gradient(turn, fit.view_rank + b);
-        float* d_sh = out + 11 * fit.n + fit.num_sh * i;
-        if (Fit::kSmall ? fit.mask(0)[place] == 0 : fit.keys()[place] == kHiddenKey) {
-            for (int k = 0; k < 11; ++k) out[k * fit.n + i] = 0;
-            for (int k = 0; k < fit.num_sh; ++k) d_sh[k] = 0;
-            continue;
-        }
-        const float* d = sums + kSumStride * j;
-        const ModelView<float>& view = cameras.view[b];
-        const Pinhole<float>& camera = cameras.camera[b];
-        const float filter_px2 = fit.in.config.filter_px2;
-        const bool antialiased = fit.in.config.antialiased;
-        const Gaussian3d<float> g = gaussian_of(fit, i);
-        Projection<float> p;
-        to_view(view, g.mean, p.p);
-        const Ellipse<float> e = project_gaussian(g, view, camera, filter_px2, antialiased, p);
-        const Ellipse<float> d_ellipse = falloff_vjp(
-            e.l11, e.l12, e.l22, FalloffSums<float>{d[0], d[1], d[2], d[3], d[4], d[5]});
-        Gaussian3d<float> d_g =
-            project_gaussian_vjp(g, view, camera, filter_px2, antialiased, p, e, d_ellipse);
-        const float* sh = value + 11 * fit.n + fit.num_sh * i;
-        float direction[3];
-        from_eye(view, g.mean, direction);
-        with_degree(fit.in.rows.sh_degree, [&](auto degree) {
-            float color[3];
-            constexpr int kDegree = decltype(degree)::value;
-            color_of_sh<float>(kDegree, direction, sh, color);
-            color_of_sh_vjp<float>(kDegree, direction, sh, color, d + 6, d_g.mean, d_sh);
-        });
-        for (int k = 0; k < 3; ++k) out[k * fit.n + i] = d_g.mean[k];
-        for (int k = 0; k < 4; ++k) out[(3 + k) * fit.n + i] = d_g.quat[k];
-        for (int k = 0; k < 3; ++k) out[(7 + k) * fit.n + i] = d_g.scale[k] * g.scale[k];
-        out[10 * fit.n + i] = d_g.opacity * g.opacity * (1 - g.opacity);
-    }
 }
 
 // Adds the |difference| of colour and alpha, summed over pixels, in every thread.
@@ -154,7 +49,7 @@ __device__ void measure_views(const Fit& fit, const FitCameras& cameras, int num
     if (fit.leads()) fit.team.unit = 0;
 }
 
-// Leaves the gradients of the parameters, for each view.
+// Computes the gradients of the parameters for each view.
 template <class Fit>
 __device__ void differentiate_views(const Fit& fit, const FitCameras& cameras, int num_views,
                                     int turn) {
@@ -175,7 +70,7 @@ __device__ void differentiate_views(const Fit& fit, const FitCameras& cameras, i
     targets.slots = is_near ? fit.at(fit.layout.near_slots)
                             : reinterpret_cast<float*>(fit.scratch + fit.layout.far_slots);
     const uint32_t capacity = is_near ? num_slots : fit.layout.num_far_slots;
-    // All regions at once, unless their slots are more than there is room for.
+    // This takes all regions at once, unless they have more slots than there is room for.
     const auto slots_before = [&](int region) {
         return region < fit.num_regions() ? fit.slot_first(region)[0] : num_slots;
     };
@@ -208,7 +103,7 @@ __device__ void sum_errors(const Fit& fit, double error[2][2]) {
     }
 }
 
-// Keeps the result if it is better than the start; `error` is summed over pixels, before and after.
+// Keeps the result if it is better than the start. `error` has sums over pixels, before and after.
 template <class Fit>
 __device__ void keep_if_better(const Fit& fit, double error[2][2]) {
     const FitConfig& config = fit.in.config;
@@ -226,29 +121,28 @@ __device__ void keep_if_better(const Fit& fit, double error[2][2]) {
         fit.in.error[2 * fit.job.error + k] = static_cast<float>(error[better][k]);
 }
 
-// The views held out, those of all steps, and those held out again, in batches of at most
+// Visits the views held out, those of all steps, and those held out again, in batches of at most
 // kViewsAtOnce.
 template <class Fit>
 __device__ void fit_one_group(const Fit& fit) {
     const FitConfig& config = fit.in.config;
     const int views_per_step = config.views_per_step;
     const int64_t num_visits = static_cast<int64_t>(config.steps) * views_per_step;
-    // Visits of steps count from 0; those of the views held out lie before and after.
+    // Visits of steps count from 0; visits of the views held out come before and after.
     const auto views_at = [&](int64_t visit) {
         const int64_t left = visit < 0            ? -visit
                              : visit < num_visits ? views_per_step - visit % views_per_step
                                                   : num_visits + kHeldOutViews - visit;
         return static_cast<int>(min(static_cast<int64_t>(kViewsAtOnce), left));
     };
-    // Of the views of a batch, this block's.
+    // Returns how many views of a batch are this block's.
     const auto own_of = [&](int num_views) {
         return fit.view_stride == 1                          ? num_views
                : static_cast<int>(fit.view_rank) < num_views ? 1
                                                              : 0;
     };
     const auto set_cameras = [&](FitCameras& cameras, int64_t first) {
-        const int b =
-            static_cast<int>(threadIdx.x) - (Fit::kThreads - 32);  // the warp with least to do
+        const int b = static_cast<int>(threadIdx.x) - (Fit::kThreads - 32);  // the least busy warp
         if (b == kViewsAtOnce && first >= 0 && first < num_visits)
             cameras.step = fit.in.steps[first / views_per_step];
         if (b < 0 || b >= own_of(views_at(first))) return;
@@ -259,7 +153,7 @@ __device__ void fit_one_group(const Fit& fit) {
                    is_of_step ? visited_view(config, fit.in.stride, visit)
                               : num_fitted_pictures(config) + held_out);
     };
-    double error[2][2] = {{0, 0}, {0, 0}};  // before and after
+    double error[2][2] = {{0, 0}, {0, 0}};  // before and after the fit
     start_parameters(fit);
     set_cameras(fit.s.cameras[0], -kHeldOutViews);
     if (fit.leads()) fit.team.unit = 0;
@@ -293,7 +187,7 @@ __device__ void fit_one_group(const Fit& fit) {
     if (fit.view_rank == 0) keep_if_better(fit, error);
 }
 
-// Powers take long, and all groups take the same steps.
+// The steps are computed once, because powers are slow and all groups take the same steps.
 __global__ void steps_kernel(const FitConfig config, FitStep* steps) {
     const unsigned i = blockIdx.x * blockDim.x + threadIdx.x;
     if (i < static_cast<unsigned>(config.steps)) steps[i] = fit_step(config, static_cast<int>(i));
@@ -310,7 +204,8 @@ __global__ void __launch_bounds__(Shape::kThreads, kBlocks)
     fit_groups_kernel(const FitGroupsInput in, const FitLayout layout, unsigned char* scratch,
                       unsigned num_blocks, FitTeam* teams, FitQueue* queue) {
     __shared__ FitShared s;
-    // Blocks are put together as they arrive, so that they only wait for blocks that run or will.
+    // Teams are formed in the order of arrival, so that blocks only wait for blocks that run or
+    // will run.
     if (threadIdx.x == 0) s.arrival = atomicAdd(&queue->arrived, 1u);
     __syncthreads();
     FitBlock<Shape> fit(in, layout, s, teams, num_blocks, scratch);
@@ -344,12 +239,12 @@ int attribute(cudaDeviceAttr name) {
     return value;
 }
 
-// Returns whether so many blocks, at most kBlocks, fit on a multiprocessor; nothing happens where
-// they do not.
+// Starts the kernel and returns true if so many blocks, at most kBlocks, fit on a multiprocessor;
+// otherwise does nothing.
 template <class Shape, int kBlocks>
 bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stream,
          int blocks = kBlocks) {
-    const size_t reserved = sizeof(FitShared) + 1024;  // ours, and the driver's own of each block
+    const size_t reserved = sizeof(FitShared) + 1024;  // our own, and the driver's of each block
     const size_t limit =
         (std::min<size_t>(
             attribute(cudaDevAttrMaxSharedMemoryPerBlockOptin) - sizeof(FitShared),
@@ -357,16 +252,19 @@ bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stre
         16 * 16;
     const size_t most_blocks =
         blocks * static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
-    // For a group. Together they need to run at the same time.
+    // The number of blocks a group; these need to run at the same time.
     size_t num_blocks = 1;
     if (attribute(cudaDevAttrCooperativeLaunch) != 0)
         num_blocks = std::clamp<size_t>(
             most_blocks / in.jobs.size, 1,
             Shape::kSmall ? std::min(in.config.views_per_step, kViewsAtOnce) : kLargestTeam);
     const size_t num_groups = std::min<size_t>(in.jobs.size, most_blocks / num_blocks);
-    const FitSizes sizes{most,       11 + static_cast<size_t>(in.rows.num_sh()),
-                         largest,    in.config.loss.dssim > 0,
-                         num_blocks, limit};
+    const FitSizes sizes{.most_gaussians = most,
+                         .floats_per_gaussian = 11 + static_cast<size_t>(in.rows.num_sh()),
+                         .largest_picture = largest,
+                         .has_dssim = in.config.loss.dssim > 0,
+                         .num_blocks = num_blocks,
+                         .shared_limit = limit};
     const FitLayout layout = layout_of<Shape>(sizes);
     if (layout.shared_bytes > limit) return false;
     const DeviceBuffer<unsigned char> scratch(
@@ -405,7 +303,7 @@ void fit_groups(const FitGroupsInput& in, const FitExtent& level, cudaStream_t s
     const uint32_t most = level.most;
     const int largest = level.largest;
     const auto multiprocessors = static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
-    // Three groups at once on a multiprocessor are quicker than two where it has many in turn.
+    // Three concurrent groups on a multiprocessor are faster than two where each has many to fit.
     const bool are_many = level.num_groups > multiprocessors,
                are_most = level.num_groups >= 6 * multiprocessors;
     const auto run_small = [&] {
@@ -414,7 +312,7 @@ void fit_groups(const FitGroupsInput& in, const FitExtent& level, cudaStream_t s
                run<FitShape<512, true, 16>, 1>(in, most, largest, stream) ||
                run<FitShape<256, true, 8>, 3>(in, most, largest, stream, 1);
     };
-    // Where multiprocessors have less shared memory, with fewer threads.
+    // Shapes with fewer threads are for multiprocessors with less shared memory.
     const bool runs = most <= kSmallCount && largest <= kRegion
                           ? run_small()
                           : run<FitShape<512, false, 32>, 1>(in, most, largest, stream) ||

@@ -1,7 +1,7 @@
 #pragma once
 
-// What both halves need to fit a group: its views, the parameters that Adam moves, the sizes of its
-// steps.
+// Formulas of a fit, for both halves: the views of a group, the parameters that Adam moves, and the
+// sizes of its steps.
 
 #include <numeric>
 
@@ -14,20 +14,22 @@
 
 namespace v3dg {
 
-// The paper's code looks at a 64 px image with a focal length of 88.9 px.
+// The paper's code uses a 64 px image with a focal length of 88.9 px.
 constexpr double kFocalPerSize = 88.9 / 64;
-// Room around the ball for what its gaussians draw beyond it.
+// Border around the ball for what its gaussians draw beyond it.
 constexpr double kMarginPx = 2.5;
-// Views that no step looks at: on them start and result are compared, and the residual is measured.
+// The number of views held out: no step looks at them. Start and result are compared on them, and
+// the residual is measured there.
 constexpr int kHeldOutViews = 8;
 
+// Multiplies matrices of 3 x 3, row major.
 V3DG_HD V3DG_INLINE void multiply(const double a[9], const double b[9], double out[9]) {
     for (int i = 0; i < 3; ++i)
         for (int k = 0; k < 3; ++k)
             out[3 * i + k] = a[3 * i] * b[k] + a[3 * i + 1] * b[3 + k] + a[3 * i + 2] * b[6 + k];
 }
 
-// Uniform rotation from three uniform numbers (Shoemake 1992).
+// Computes a uniform rotation from three uniform numbers (Shoemake 1992).
 V3DG_HD V3DG_INLINE void random_rotation(double u0, double u1, double u2, double r[9]) {
     const double a = sqrt_of(1 - u0), b = sqrt_of(u0), s = 2 * kPi * u1, t = 2 * kPi * u2;
     const double x = a * ::sin(s), y = a * ::cos(s), z = b * ::sin(t), w = b * ::cos(t);
@@ -35,13 +37,14 @@ V3DG_HD V3DG_INLINE void random_rotation(double u0, double u1, double u2, double
     rotation_of_quat(quat, 2.0, r);  // its length is 1
 }
 
-// How large a group is drawn where config.image_size is 0, px.
+// The size of a group's picture where config.image_size is 0, px.
 struct FitSize {
-    double focal, side;  // the side is whole blocks of 4 px
+    double focal, side;  // the side is a multiple of 4 px
 };
 
 V3DG_HD V3DG_INLINE FitSize size_of_group(const FitConfig& config, const FitGroup& group) {
-    // The focal length at which the ball's footprint (select_math.h) has the wanted number of px².
+    // This is the focal length at which the ball's footprint (select_math.h) has the wanted number
+    // of px².
     const double x2 = 1 / (static_cast<double>(config.distance) * config.distance);
     const double focal = sqrt_of(static_cast<double>(group.count) * config.px2_per_gaussian /
                                  solid_angle_of_ball(x2));
@@ -49,8 +52,8 @@ V3DG_HD V3DG_INLINE FitSize size_of_group(const FitConfig& config, const FitGrou
     return {focal, 4 * ::ceil((radius_px + kMarginPx) / 2)};
 }
 
-// View `index` of a group. Fixed views lie on a lattice on the sphere, turned at random, and those
-// held out, which follow them, on one of their own; fresh ones lie anywhere.
+// Returns view `index` of a group. Fixed views lie on a lattice on the sphere, rotated at random;
+// the views held out, which follow them, lie on another one. Fresh views lie anywhere.
 V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGroup& group,
                                           uint64_t index) {
     const auto uniform = [&](uint64_t counter) {
@@ -58,7 +61,7 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
     };
     double rotation[9];
     if (config.num_views > 0) {
-        // A Fibonacci lattice of directions, each with a random roll, all turned together.
+        // Directions lie on a Fibonacci lattice, each with a random roll, all rotated together.
         double lattice[9], turn[9];
         const auto num_fixed = static_cast<uint64_t>(config.num_views);
         const bool is_held_out = index >= num_fixed;
@@ -81,7 +84,7 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
         random_rotation(uniform(turned), uniform(turned + 1), uniform(turned + 2), turn);
         multiply(lattice, turn, rotation);
     } else {
-        // Far from the numbers that shift the picture.
+        // These counters are far from those that shift the picture.
         const uint64_t base = (uint64_t(1) << 63) + 4 * index;
         random_rotation(uniform(base), uniform(base + 1), uniform(base + 2), rotation);
     }
@@ -105,9 +108,9 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
     return view;
 }
 
-// A group looks at fixed views again and again, and at a fresh one each time. Which one at which
-// visit: `stride` is prime to the number of fixed views, so that all are visited, neighbours far
-// apart.
+// Maps visits to views. Fixed views are visited again and again; a fresh view is visited once.
+// `stride` is prime to the number of fixed views, so that all are visited, and successive ones are
+// far apart.
 inline uint64_t visiting_stride(const FitConfig& config) {
     const auto num_views = static_cast<uint64_t>(config.num_views);
     uint64_t stride = 29;
@@ -118,12 +121,27 @@ V3DG_HD inline uint64_t visited_view(const FitConfig& config, uint64_t stride, u
     return config.num_views > 0 ? visit * stride % static_cast<uint64_t>(config.num_views) : visit;
 }
 
-// Fresh ones that are held out take numbers that no step takes.
+// Returns the index of a view held out. Fresh ones have indices that no step uses.
 V3DG_HD inline uint64_t held_out_view(const FitConfig& config, int i) {
     return config.num_views > 0 ? static_cast<uint64_t>(config.num_views + i) : ~uint64_t(0) - i;
 }
 
-// World to view, of a ball that is scaled to radius 1.
+// A group is compared with pictures of its fixed views, or of the views of all steps, and then with
+// those of the views held out. These return how many there are, and the view of one.
+V3DG_HD inline uint64_t num_fitted_pictures(const FitConfig& config) {
+    return config.num_views > 0 ? static_cast<uint64_t>(config.num_views)
+                                : static_cast<uint64_t>(config.steps) * config.views_per_step;
+}
+V3DG_HD inline uint64_t num_pictures(const FitConfig& config) {
+    return num_fitted_pictures(config) + kHeldOutViews;
+}
+V3DG_HD inline uint64_t view_of_picture(const FitConfig& config, uint64_t picture) {
+    const uint64_t num_fitted = num_fitted_pictures(config);
+    return picture < num_fitted ? picture
+                                : held_out_view(config, static_cast<int>(picture - num_fitted));
+}
+
+// Returns the transform from the world to a view in which the ball has radius 1.
 V3DG_HD V3DG_INLINE ModelView<float> view_of_world(const FitConfig& config, const float center[3],
                                                    float radius, const FitView& view) {
     double linear[9], translation[3] = {0, 0, config.distance}, eye[3];
@@ -140,7 +158,7 @@ V3DG_HD V3DG_INLINE ModelView<float> view_of_world(const FitConfig& config, cons
     return mv;
 }
 
-// Group frame to view.
+// Returns the transform from the group's frame to a view.
 V3DG_HD V3DG_INLINE ModelView<float> view_of_group(const FitConfig& config, const FitView& view) {
     const float center[3] = {0, 0, 0};
     return view_of_world(config, center, 1, view);
@@ -148,16 +166,16 @@ V3DG_HD V3DG_INLINE ModelView<float> view_of_group(const FitConfig& config, cons
 
 V3DG_HD V3DG_INLINE Pinhole<float> camera_of(const FitView& view, float scale) {
     const float size = scale * static_cast<float>(view.size);
-    return {scale * view.focal,
-            scale * view.focal,
-            scale * view.cx,
-            scale * view.cy,
-            size,
-            size,
-            1e-3f};
+    return {.fx = scale * view.focal,
+            .fy = scale * view.focal,
+            .cx = scale * view.cx,
+            .cy = scale * view.cy,
+            .width = size,
+            .height = size,
+            .near_depth = 1e-3f};
 }
 
-constexpr float kLeastScale = 1e-5f;    // of the radius: far below what a pixel shows
+constexpr float kLeastScale = 1e-5f;    // relative to the radius; far below the size of a pixel
 constexpr float kLeastOpacity = 1e-4f;  // keeps the logit finite and movable
 constexpr float kLog2e = 1.4426950408889634f;
 
@@ -167,21 +185,21 @@ V3DG_HD V3DG_INLINE float logit_of_opacity(float opacity) {
     return ::logf(o / (1 - o));
 }
 
-// No mean leaves the box around the ball: from out there it may reach no picture of the group, and
-// would be left where nothing compares it with anything.
+// Clamps a mean's coordinate to the box around the ball. A mean outside might reach no picture of
+// the group, and would stay there, because nothing compares it.
 template <class V>
 V3DG_HD V3DG_INLINE V held_in_box(V x) {
     return min_of(all_lanes<V>(1.0f), max_of(all_lanes<V>(-1.0f), x));
 }
 
-// No scale outgrows the ball's radius, which holds those of all that the group stands for, and none
+// Returns a scale, which neither exceeds the ball's radius, as no gaussian of the target does, nor
 // vanishes: a value that ran away could not come back.
 template <class V>
 V3DG_HD V3DG_INLINE V scale_of_log(V x) {
     return exp2_in_range(min_of(all_lanes<V>(0.0f), max_of(all_lanes<V>(-20.0f), x * kLog2e)));
 }
-// Nor does an opacity come closer to 0 and 1 than `kLeastOpacity`, where its gradient vanishes.
-// Alpha is cut at 0.999, so no more is needed.
+// Returns an opacity, which keeps `kLeastOpacity` from 0 and 1, where its gradient vanishes. Alpha
+// is limited to 0.999, so no more is needed.
 template <class V>
 V3DG_HD V3DG_INLINE V opacity_of_logit(V x) {
     constexpr float kMost = 13.287568f;  // log2 of 1 / kLeastOpacity - 1
@@ -189,7 +207,7 @@ V3DG_HD V3DG_INLINE V opacity_of_logit(V x) {
                         min_of(all_lanes<V>(kMost), max_of(all_lanes<V>(-kMost), x * -kLog2e))));
 }
 
-// What one step of Adam takes.
+// The step sizes of one step of Adam.
 struct FitStep {
     float position, quat, log_scale, logit, sh0, sh_rest;  // position in the units of the config
     float correction1, correction2;
@@ -198,14 +216,15 @@ struct FitStep {
 V3DG_HD inline FitStep fit_step(const FitConfig& config, int index) {
     const double progress = config.steps > 1 ? static_cast<double>(index) / (config.steps - 1) : 0;
     const float decay = static_cast<float>(::pow(static_cast<double>(config.final_step), progress));
-    return {decay * config.step_position,
-            decay * config.step_quat,
-            decay * config.step_log_scale,
-            decay * config.step_logit,
-            decay * config.step_sh0,
-            decay * config.step_sh_rest,
-            static_cast<float>(1 / (1 - ::pow(kAdamBeta1, index + 1.0))),
-            static_cast<float>(1 / (1 - ::pow(static_cast<double>(config.beta2), index + 1.0)))};
+    const double beta2 = static_cast<double>(config.beta2);
+    return {.position = decay * config.step_position,
+            .quat = decay * config.step_quat,
+            .log_scale = decay * config.step_log_scale,
+            .logit = decay * config.step_logit,
+            .sh0 = decay * config.step_sh0,
+            .sh_rest = decay * config.step_sh_rest,
+            .correction1 = static_cast<float>(1 / (1 - ::pow(kAdamBeta1, index + 1.0))),
+            .correction2 = static_cast<float>(1 / (1 - ::pow(beta2, index + 1.0)))};
 }
 
 V3DG_HD inline float position_step(const FitConfig& config, const FitGroup& group,
@@ -213,7 +232,8 @@ V3DG_HD inline float position_step(const FitConfig& config, const FitGroup& grou
     return config.position_in_world ? step.position / group.radius : step.position;
 }
 
-// What start and result are compared by, from the mean |difference| of colour and alpha.
+// Returns the loss that start and result are compared by, from the mean |difference| of colour and
+// alpha.
 V3DG_HD inline double residual_loss(const LossWeights& loss, const double error[2]) {
     return loss.l1 * error[0] + loss.alpha * error[1];
 }

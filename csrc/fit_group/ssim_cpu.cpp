@@ -11,8 +11,10 @@ namespace {
 constexpr size_t kRowsAtOnce = 4;
 
 size_t mirrored(size_t place, int offset, size_t size) {
-    const auto at = static_cast<ptrdiff_t>(place) + offset, end = static_cast<ptrdiff_t>(size) - 1;
-    return static_cast<size_t>(at < 0 ? -at : (at > end ? 2 * end - at : at));
+    const auto shifted = static_cast<ptrdiff_t>(place) + offset,
+               end = static_cast<ptrdiff_t>(size) - 1;
+    return static_cast<size_t>(shifted < 0 ? -shifted
+                                           : (shifted > end ? 2 * end - shifted : shifted));
 }
 
 void add(SsimSums<double>& to, double weight, const SsimSums<double>& s) {
@@ -26,12 +28,13 @@ void add(SsimSums<double>& to, double weight, const SsimSums<double>& s) {
 template <class T>
 double sum_of_row(const SsimInput<T>& in, size_t row) {
     const size_t row_size = in.width * in.channels;
-    std::vector<SsimSums<double>> columns(row_size);  // down the window
+    std::vector<SsimSums<double>> columns(row_size);  // sums down the window
     for (int k = -kSsimRadius; k <= kSsimRadius; ++k) {
         const size_t first = mirrored(row, k, in.height) * row_size;
         for (size_t i = 0; i < row_size; ++i) {
             const double x = in.picture[first + i], y = in.target[first + i];
-            add(columns[i], ssim_weight<double>(k), {x, y, x * x, y * y, x * y});
+            add(columns[i], ssim_weight<double>(k),
+                {.x = x, .y = y, .xx = x * x, .yy = y * y, .xy = x * y});
         }
     }
     double sum = 0;

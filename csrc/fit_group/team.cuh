@@ -2,12 +2,12 @@
 
 // The blocks that fit a group together, and their memory.
 //
-// Small groups keep what is read again and again in shared memory. A block fits one or, where there
-// are few, a pair of blocks, each looking at every other view. Large groups lie in global memory,
-// and are fitted by teams where there are fewer groups than multiprocessors.
+// Small groups keep what is read repeatedly in shared memory. One block fits a group or, where
+// there are few groups, a pair of blocks, each of which looks at every other view. Large groups are
+// in global memory, and are fitted by teams where there are fewer groups than multiprocessors.
 
 #include "base/launch.cuh"
-#include "fit_group/fit_group_cuda.h"
+#include "fit_group/fit_group_math.h"
 #include "fit_group/fit_memory.h"
 
 namespace v3dg {
@@ -17,7 +17,7 @@ constexpr unsigned kLargestTeam = 16;
 
 // The views that a block looks at together.
 struct FitCameras {
-    FitStep step;  // that these views are part of
+    FitStep step;  // the step of these views
     ModelView<float> view[kViewsAtOnce];
     Pinhole<float> camera[kViewsAtOnce];
     const float4* target[kViewsAtOnce];
@@ -25,27 +25,27 @@ struct FitCameras {
 
 constexpr int kBetweenGroups = 2;
 
-// What the blocks that fit a group share beside arrays.
+// State that the blocks of a group share besides arrays.
 struct FitTeam {
-    unsigned arrived;  // at barriers, ever
+    unsigned arrived;  // arrivals at barriers so far
     unsigned unit, ticket;
-    int cancel[kBetweenGroups + 1];    // by turn within steps, and between groups
-    uint32_t num_slots[kLargestTeam];  // of each block's part
-    double error[kViewsAtOnce][2][2];  // of each block's views, before and after
+    int cancel[kBetweenGroups + 1];    // alternates within steps, and has one between groups
+    uint32_t num_slots[kLargestTeam];  // slots of each block's part
+    double error[kViewsAtOnce][2][2];  // errors of each block's views, before and after
 };
 
-// What a block has in shared memory beside arrays.
+// State of a block in shared memory besides arrays.
 struct FitShared {
-    FitCameras cameras[2];  // of this step and the next
-    FitTeam own;            // of a block for itself
+    FitCameras cameras[2];  // cameras of this step and the next
+    FitTeam own;            // team of a single block
     uint32_t warp_total[32];
     FitJob job;
     unsigned arrival;
     int cancel;
 };
 
-// A block that fits groups, one after the other: its place among those that fit a group with it,
-// the barriers between them, and where their arrays are.
+// A block that fits groups, one after another: its place among the blocks that fit a group with it,
+// the barriers between them, and the places of their arrays.
 template <class Shape>
 struct FitBlock : Shape {
     using Shape::kChunk, Shape::kSmall, Shape::kThreads, Shape::kWarps;
@@ -54,15 +54,15 @@ struct FitBlock : Shape {
     const FitGroupsInput& in;
     const FitLayout& layout;
     FitShared& s;
-    FitTeam& all;   // the blocks that fit the group: of a small one those that share its views
-    FitTeam& team;  // those that look at the same views: a block of a small group has its own
+    FitTeam& all;   // The blocks that fit the group; those of a small group share its views.
+    FitTeam& team;  // The blocks that look at the same views; a block of a small group is alone.
     const unsigned team_rank, team_size;
-    const unsigned view_rank, view_stride;  // the views of a batch that the block looks at
+    const unsigned view_rank, view_stride;  // the block's views of a batch
     unsigned char* const scratch;
-    unsigned char* const
-        exchange;  // of small groups: gradients by view, where blocks share the views
+    // Gradients by view of small groups whose blocks share the views.
+    unsigned char* const exchange;
     unsigned char* const hot;
-    // The group.
+    // The current group.
     const FitJob& job;
     uint32_t n = 0, n_padded = 0;
     int num_sh = 0;
@@ -97,7 +97,7 @@ struct FitBlock : Shape {
 
     __device__ bool leads() const { return threadIdx.x == 0 && team_rank == 0; }
     __device__ bool leads_all() const { return leads() && view_rank == 0; }
-    // Numbers the team's threads; neighbouring warps are in different blocks.
+    // Returns the number of a thread in the team; neighbouring warps are in different blocks.
     __device__ uint32_t first() const {
         return (threadIdx.x / 32 * team_size + team_rank) * 32 + threadIdx.x % 32;
     }
@@ -105,7 +105,7 @@ struct FitBlock : Shape {
 
     __device__ unsigned num_blocks() const { return team_size * view_stride; }
 
-    // Barrier of those that look at the same views.
+    // Waits for all blocks that look at the same views.
     __device__ void sync() const {
         if (team_size > 1)
             arrive_and_wait(-1);
@@ -113,9 +113,9 @@ struct FitBlock : Shape {
             __syncthreads();
     }
 
-    // Barrier of all blocks that fit the group, after which s.cancel is the same in all of them:
-    // what read_cancel() left in `note`, which nobody may overwrite before all have come to another
-    // barrier.
+    // Waits for all blocks that fit the group. Afterwards s.cancel is the same in all of them: the
+    // value that read_cancel() left in `note`, which must not be overwritten before all have
+    // reached another barrier.
     __device__ void sync_all(int note) const {
         if (num_blocks() > 1)
             arrive_and_wait(note);
@@ -148,17 +148,16 @@ struct FitBlock : Shape {
         return reinterpret_cast<float*>((place.is_shared ? shared_memory() : scratch) +
                                         place.offset);
     }
-    // Gaussians have places: those of view b begin at b * n_padded. What is blended has ranks. In a
-    // small group ranks are places, and lists follow `order`; in a large one they are positions by
-    // depth, in which the records are sorted.
+    // Gaussians have places: those of view b begin at b * n_padded. Blended records have ranks. In
+    // a small group ranks are places, and lists follow `order`; in a large one they are positions
+    // by depth, in which the records are sorted.
     __device__ Record<float>* records() const { return hot_at<Record<float>>(layout.records); }
     __device__ Record<float>* ranked() const {
         return hot_at<Record<float>>(kSmall ? layout.records : layout.sorted);
     }
     __device__ uint32_t num_places() const { return kViewsAtOnce * n_padded; }
-    __device__ uint32_t nothing() const {
-        return num_places();
-    }  // the rank of a record that draws nothing
+    // Returns the rank of a record that draws nothing.
+    __device__ uint32_t nothing() const { return num_places(); }
     __device__ uint32_t* keys() const { return hot_at<uint32_t>(layout.keys); }
     __device__ Index* order() const { return hot_at<Index>(layout.order); }
     __device__ CellMask* mask(int region) const {
@@ -171,9 +170,9 @@ struct FitBlock : Shape {
     __device__ Index* list(int half) const {
         return hot_at<Index>(layout.lists + (2 * warp() + half) * layout.list_size);
     }
-    // The gradient by the exponent of a gaussian at a pixel, and its weight there,
+    // Returns the gradient by the exponent of a gaussian at a pixel, and its weight there,
     // [gaussian][pixel]. Rows have a spare column, so that lanes that read one pixel each of
-    // different gaussians meet different banks.
+    // different gaussians access different banks.
     __device__ float2* fragments() const {
         return reinterpret_cast<float2*>(shared_memory() + layout.fragments +
                                          threadIdx.x / 32 * fragments_bytes(kChunk));
@@ -181,14 +180,15 @@ struct FitBlock : Shape {
     __device__ float4* d_pixels() const {
         return reinterpret_cast<float4*>(fragments() + kChunk * 33);
     }
-    // Of a large group, the records of a chunk, for each half-warp.
+    // Returns the records of a chunk of a large group, for each half-warp.
     __device__ Record<float>* staged() const {
         return reinterpret_cast<Record<float>*>(shared_memory() + layout.staged) +
                2 * kChunk * (threadIdx.x / 32);
     }
     __device__ int num_regions() const { return regions_across * regions_across; }
-    // Gradient by the values from view b of a batch. Blocks that share views write the gradients of
-    // one batch while others may still read those of the batch before, so there are two `turn`s.
+    // Returns the gradient by the values from view b of a batch. Blocks that share views write the
+    // gradients of one batch while others may still read those of the batch before, so there are
+    // two `turn`s.
     __device__ float* gradient(int turn, int b) const {
         if (view_stride == 1) return at(layout.by_view) + static_cast<size_t>(b) * num_values;
         return reinterpret_cast<float*>(exchange) +

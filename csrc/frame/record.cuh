@@ -1,6 +1,6 @@
 #pragma once
 
-// A record as kernels load and store it: vectors of 16 bytes, and the last one in halves.
+// A record as kernels load and store it: as vectors of 16 bytes, the last one in halves.
 
 #include <cstddef>
 
@@ -11,7 +11,7 @@ namespace v3dg {
 namespace cuda {
 
 constexpr int kRecordVectors = 3;
-constexpr int kEllipseVectors = 2;  // of those, the ones in RecordPlanes::ellipse
+constexpr int kEllipseVectors = 2;  // the vectors in RecordPlanes::ellipse
 static_assert(sizeof(Record<float>) == kRecordVectors * sizeof(float4) &&
                   offsetof(Record<float>, l22) == 16 && offsetof(Record<float>, color) == 24 &&
                   offsetof(Record<float>, depth) == 36 && offsetof(Record<float>, x0) == 40,
@@ -26,10 +26,21 @@ __device__ inline const float2* rest_of(const RecordPlanes& records, uint32_t re
 
 __device__ inline Record<float> record_of_vectors(const float4& a, const float4& b, const float2& c,
                                                   const RecordBox& box) {
-    return {a.x, a.y, a.z, a.w, b.x, b.y, {b.z, b.w, c.x}, c.y, box.x0, box.x1, box.y0, box.y1};
+    return {.u = a.x,
+            .v = a.y,
+            .l11 = a.z,
+            .l12 = a.w,
+            .l22 = b.x,
+            .log2_opacity = b.y,
+            .color = {b.z, b.w, c.x},
+            .depth = c.y,
+            .x0 = box.x0,
+            .x1 = box.x1,
+            .y0 = box.y0,
+            .y1 = box.y1};
 }
 
-// Loads of the planes what the caller uses.
+// Loads a record; the compiler leaves out fields that the caller does not use.
 __device__ inline Record<float> load_record(const RecordPlanes& records, uint32_t record,
                                             const RecordBox& box) {
     const float4* ellipse = ellipse_of(records, record);

@@ -1,12 +1,13 @@
 #pragma once
 
-// A batch of records, nearest first, blended over the pixels of a tile.
+// Blends a batch of records, nearest first, over the pixels of a tile.
 //
-// Many gaussians cover a few pixels. So a warp takes 32 records that may reach its sub-tile, each
-// lane finds which pixels one of them reaches, and the bits are transposed: a pixel then walks its
-// own records only. Where gaussians cover many pixels, a lane has two neighbours, which share most
-// of their records and what is loaded and computed for a row; a sub-tile has 16 x 4 pixels then,
-// else 8 x 4. Either way a pixel gets the same bits.
+//
+// Many gaussians cover a few pixels. So a warp takes 32 records that may reach its sub-tile; each
+// lane finds the pixels that one of them reaches, and the bits are transposed: a pixel then walks
+// its own records only. Where gaussians cover many pixels, a lane has two neighbouring pixels,
+// which share most of their records and the loads and computations for a row; a sub-tile has 16 x 4
+// pixels then, otherwise 8 x 4. A pixel gets the same bits either way.
 
 #include <type_traits>
 
@@ -19,16 +20,16 @@ namespace cuda {
 static_assert(SubTile<2>::kColumns == 2 && SubTile<2>::kHeight == 4 && kEntryBlockSize == 4,
               "place_of(), subs_of(), publish_alive() and reached_cells() know this");
 
-// What a lane has of a sub-tile.
+// The pixels of a sub-tile that a lane blends.
 template <int kPixels>
 struct BlendedPixels {
-    float x[kPixels], y;  // of the centres
+    float x[kPixels], y;  // pixel centres
     float transmittance[kPixels];
     float color[3][kPixels];
     float depth[kPixels];
 };
 
-// Where a lane's first pixel is in TilePixels.
+// Returns the place of a lane's first pixel in TilePixels.
 template <int kPixels>
 __device__ unsigned place_of(unsigned sub, unsigned lane) {
     if (kPixels == 1) return 32 * sub + (lane ^ (16 * (sub % 2)));
@@ -45,7 +46,7 @@ __device__ inline void store(const float (&from)[2], float* to) {
     *reinterpret_cast<float2*>(to) = {from[0], from[1]};
 }
 
-// Vectors of the record that begins at a place in shared memory. No clobber keeps these loads
+// Load vectors of the record that begins at a place in shared memory. No clobber keeps these loads
 // behind plain stores: records are written by copy_async() only, which is waited for.
 template <int kVector>
 __device__ float4 vector_at(uint32_t place) {
@@ -74,8 +75,8 @@ __device__ inline void list_record(uint32_t place, uint32_t record) {
 #endif
 }
 
-// An element of BlendShared::list, whose writing ends with a clobber. This load fills 32 bits;
-// after a plain one nvcc extends the number again.
+// Loads an element of BlendShared::list; its writing ends with a clobber. This load fills 32 bits;
+// after a plain load nvcc would extend the number again.
 __device__ inline uint32_t listed_at(uint32_t place) {
     uint32_t listed = 0;
 #ifdef __CUDA_ARCH__
@@ -84,7 +85,7 @@ __device__ inline uint32_t listed_at(uint32_t place) {
     return listed;
 }
 
-// The lowest `count` bits, less than 32, in one operation.
+// Returns the lowest `count` bits, fewer than 32, in one instruction.
 __device__ inline uint32_t low_bits(uint32_t bits, uint32_t count) {
     uint32_t low = 0;
 #ifdef __CUDA_ARCH__
@@ -93,23 +94,23 @@ __device__ inline uint32_t low_bits(uint32_t bits, uint32_t count) {
     return low;
 }
 
-// Of a sub-tile's among the tile's blocks, a bit each.
+// Returns a bit for each of the tile's blocks that belongs to a sub-tile.
 template <int kPixels>
 __device__ uint32_t blocks_of_sub(unsigned sub) {
     return ((1u << SubTile<kPixels>::kBlocks) - 1) << SubTile<kPixels>::kBlocks * sub;
 }
 
-// The sub-tiles that have one of the blocks, a bit each, where the first of its blocks is.
+// Returns a bit for each sub-tile that has one of the blocks, at the place of its first block.
 template <int kPixels>
 __device__ uint32_t subs_of(uint32_t blocks) {
     blocks |= blocks >> 1;
     return kPixels == 1 ? blocks & 0x55555555u : (blocks | blocks >> 2) & 0x11111111u;
 }
 
-// Tells the block which blocks of a sub-tile have died.
+// Publishes which blocks of a sub-tile have died.
 template <int kPixels>
 __device__ void publish_alive(bool is_alive, unsigned sub, BlendShared& s) {
-    constexpr int kAcross = kEntryBlockSize / kPixels;  // lanes of a block in a row
+    constexpr int kAcross = kEntryBlockSize / kPixels;  // lanes across a block of pixels
     const uint32_t alive = __ballot_sync(kAllLanes, is_alive);
     uint32_t dead = 0;
 #pragma unroll
@@ -121,11 +122,10 @@ __device__ void publish_alive(bool is_alive, unsigned sub, BlendShared& s) {
         atomicAnd(&s.alive_blocks, ~(dead << SubTile<kPixels>::kBlocks * sub));
 }
 
-// Bit j of lane i becomes bit i of lane j.
+// Transposes bits: bit j of lane i becomes bit i of lane j.
 __device__ inline uint32_t transpose_bits(uint32_t bits) {
     const unsigned lane = threadIdx.x % 32;
-    // Halves and bytes are put together whole: lanes 16, then 8 apart exchange what belongs to the
-    // other.
+    // Halves and bytes are exchanged whole: first lanes 16 apart, then lanes 8 apart.
     bits =
         __byte_perm(bits, __shfl_xor_sync(kAllLanes, bits, 16), (lane & 16) != 0 ? 0x3276 : 0x5410);
     bits =
@@ -134,16 +134,17 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
 #pragma unroll
     for (unsigned width = 4; width > 0; width /= 2) {
         const bool upper = (lane & width) != 0;
-        const uint32_t kept = upper ? ~low_half : low_half;
+        const uint32_t kept_bits = upper ? ~low_half : low_half;
         const uint32_t other = __shfl_xor_sync(kAllLanes, bits, width);
-        bits = (bits & kept) | (__funnelshift_l(other, other, upper ? 32 - width : width) & ~kept);
+        bits = (bits & kept_bits) |
+               (__funnelshift_l(other, other, upper ? 32 - width : width) & ~kept_bits);
         low_half ^= low_half << (width / 2);
     }
     return bits;
 }
 
-// Where pixels stop, kept in a register. Of an argument of the kernel, nvcc loads it for each
-// gaussian anew.
+// Returns the rule by which pixels stop, in a register. If it were read from an argument of the
+// kernel, nvcc would load it for each gaussian.
 template <class Stop>
 __device__ Stop stop_of(const BlendShared& s) {
     if constexpr (std::is_same_v<Stop, StopsBefore>)
@@ -152,15 +153,15 @@ __device__ Stop stop_of(const BlendShared& s) {
         return {s.stops_behind};
 }
 
-// A warp blends the batch over a sub-tile.
+// Blends the batch over a sub-tile; called by a whole warp.
 template <int kPixels, bool kWithDepth, class Stop>
 __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
     const Stop stop = stop_of<Stop>(s);
     unsigned lane = threadIdx.x % 32;
-    // Hidden from the compiler, which would keep what follows from the lane in registers from batch
-    // to batch and spill others.
+    // The lane is hidden from the compiler, which would otherwise keep values that follow from it
+    // in registers from batch to batch and spill others.
     asm volatile("" : "+r"(lane));
-    // The list stands from its end to its begin.
+    // The list is in reverse, from its end to its begin.
     constexpr uint32_t kEach = sizeof(s.list[0][0]);
     const auto list =
         static_cast<uint32_t>(__cvta_generic_to_shared(s.list[threadIdx.x / 32] + kBlendBatch));
@@ -176,7 +177,7 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
         listed += __popc(reaching);
     }
     __syncwarp();
-    asm volatile("" ::: "memory");  // for listed_at()
+    asm volatile("" ::: "memory");  // listed_at() relies on it
 
     using Sub = SubTile<kPixels>;
     const float corner_x = static_cast<float>(left + sub % Sub::kColumns * Sub::kWidth) + 0.5f;
@@ -190,7 +191,7 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
     load(pixels.transmittance + place, p.transmittance);
     for (int c = 0; c < 3; ++c) load(pixels.color[c] + place, p.color[c]);
     if (kWithDepth) load(s.depth + place, p.depth);
-    // Of two pixels, all gaussians are infinitely far from the one that has stopped.
+    // Of two pixels, one that has stopped is put infinitely far from all gaussians.
     constexpr float kNowhere = INFINITY;
     bool alive = false;
     for (int k = 0; k < kPixels; ++k) {
@@ -205,18 +206,19 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
     for (; listed > 0; listed -= 32, last_of_group -= 32 * kEach) {
         uint32_t bits = 0;
         if (static_cast<int>(31 - lane) < listed) {
-            const uint32_t own = listed_at(last_of_group + kEach * lane);
-            const float4 a = vector_at<0>(own), b = vector_at<1>(own);
+            const uint32_t own_record = listed_at(last_of_group + kEach * lane);
+            const float4 a = vector_at<0>(own_record), b = vector_at<1>(own_record);
             bits = reached_cells<kPixels>(a.x - corner_x, a.y - corner_y, a.z, a.w, b.x, b.y);
         }
         bits = transpose_bits(bits);
         if (!alive) bits = 0;
-        // Where the next record begins is looked up ahead; after the last one it means nothing.
+        // The place of the next record is looked up ahead; after the last record it is meaningless.
         int highest = 31 - __clz(static_cast<int>(bits));
         uint32_t next = listed_at(last_of_group + kEach * highest);
         while (bits != 0) {
-            // A record is used as its vectors (frame/record.cuh): taken apart first, nvcc rounds
-            // the falloff otherwise than for the other number of pixels, and in the backward pass.
+            // A record is used as its vectors (frame/record.cuh). If it were copied to a Record
+            // first, nvcc would round the falloff differently than for the other number of pixels,
+            // and than in the backward pass.
             const float4 a = vector_at<0>(next), b = vector_at<1>(next);
             const float2 c = rest_at(next);
             bits = low_bits(bits, highest);
@@ -237,8 +239,9 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
             }
             if (!alive) bits = 0;
         }
-        // With StopsBefore one of two pixels that has stopped seems to go on: it is left with more
-        // light than a pixel stops at. So lanes of which both have stopped may walk up to here.
+        // With StopsBefore, one of two pixels that has stopped seems to go on, because it keeps
+        // more light than a pixel stops at. So lanes whose two pixels have stopped may walk up to
+        // here.
         if (kPixels > 1) alive = p.x[0] != kNowhere || p.x[kPixels - 1] != kNowhere;
         __syncwarp();
     }
@@ -251,13 +254,15 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
     publish_alive<kPixels>(alive, sub, s);
 }
 
-// The block blends the batch over the sub-tiles that have one of the blocks `reached`.
+// Blends the batch over the sub-tiles that have one of the blocks `reached`; called by the whole
+// block.
 template <int kPixels, bool kWithDepth, class Stop>
 __device__ void blend_batch(uint32_t reached, int left, int top, BlendShared& s) {
     const uint32_t subs = subs_of<kPixels>(reached), lane = threadIdx.x % 32;
-    // Of the sub-tile whose bit is the lane's: how many come before it.
+    // The lane whose number is the bit of a sub-tile counts the sub-tiles before it.
     const uint32_t before = subs >> lane & 1 ? __popc(subs & ((1u << lane) - 1)) : ~0u;
-    uint32_t taken = threadIdx.x / 32;  // the first ones are given, the others to whoever is done
+    // Each warp has its first sub-tile; later ones are taken when a warp is done.
+    uint32_t taken = threadIdx.x / 32;
     for (;;) {
         const uint32_t bit = __ballot_sync(kAllLanes, before == taken);
         if (bit == 0) break;

@@ -1,7 +1,7 @@
 #pragma once
 
-// Pieces of a tile's list: taken from the list nearest first, without entries over pixels that have
-// all stopped, and sorted.
+// Takes pieces from a tile's list, nearest first and without entries over pixels that have all
+// stopped, and sorts them.
 
 #include "frame/record.cuh"
 #include "rasterize/tile_lists.cuh"
@@ -11,15 +11,17 @@ namespace cuda {
 
 constexpr int kBlendThreads = 128;
 constexpr int kBlendWarps = kBlendThreads / 32;
-constexpr int kWindow = kEntriesAtOnce * kBlendThreads;  // entries looked at in one go
-constexpr int kPiece = 3 * kWindow / 2;                  // entries sorted at once, at most
-constexpr int kLog2SpreadAgain = 10;                  // buckets of what did not fit into a window
-constexpr int kLog2Sort = 9;                          // buckets of a piece
-constexpr uint32_t kMostAlike = 12;                   // entries of a bucket that is not crowded
-constexpr uint32_t kMostCrowded = kBlendThreads / 4;  // of an entry a thread, in crowded buckets
-constexpr int kFewEntries = 64;                       // sorted without buckets
-constexpr int kBlendBatch = 192;                      // records blended at once
-// Each takes some bits of depth or order, at least 4, after the first one, whose range is a guess.
+constexpr int kWindow = kEntriesAtOnce * kBlendThreads;  // entries read at once
+constexpr int kPiece = 3 * kWindow / 2;                  // most entries sorted at once
+constexpr int kLog2SpreadAgain = 10;                     // buckets of a list that is spread again
+constexpr int kLog2Sort = 9;                             // buckets of a piece
+constexpr uint32_t kMostAlike = 12;  // most entries of a bucket that is not crowded
+// Most of a sample, an entry a thread, in crowded buckets.
+constexpr uint32_t kMostCrowded = kBlendThreads / 4;
+constexpr int kFewEntries = 64;   // sorted without buckets
+constexpr int kBlendBatch = 192;  // records blended at once
+// Each level takes some bits of depth or order, at least 4, after the first one, whose range is a
+// guess.
 constexpr int kMostSpreadLevels = 1 + 26 / 4 + 28 / 4 + 2;
 constexpr uint32_t kNoBucket = ~0u;
 
@@ -27,37 +29,37 @@ constexpr uint32_t kNoBucket = ~0u;
 template <int kPixels>
 struct SubTile {
     static constexpr int kWidth = 8 * kPixels, kHeight = 4, kColumns = kFrameTileWidth / kWidth;
-    static constexpr int kCount = kColumns * kFrameTileHeight / kHeight;  // of a tile
-    static constexpr int kBlocks = kWidth / kEntryBlockSize;  // of a tile's, side by side
+    static constexpr int kCount = kColumns * kFrameTileHeight / kHeight;
+    static constexpr int kBlocks = kWidth / kEntryBlockSize;  // blocks of the tile, side by side
 };
 constexpr int kFrameTilePixels = kFrameTileWidth * kFrameTileHeight;
 
 static_assert(2 * kFewEntries <= kBlendThreads, "two threads rank an entry");
 
-// A part of the list, up to `end`, that lies in bucket order, in the entries or in the scratch.
+// A part of the list, up to `end`, that is in bucket order, in the entries or in the scratch.
 struct SpreadLevel {
     uint32_t end;
     bool in_scratch;
     Buckets buckets;
 };
 
-// Counts of the warps that look through a window of a list together. There are three: one is filled
-// while the one before is still read and the next one is emptied.
+// The counts of warps that look through a window of a list together. There are three windows: one
+// is filled while the one before is still read and the next one is cleared.
 struct ListWindow {
     uint32_t taken;
-    uint32_t end;  // the first entry that is beyond
+    uint32_t end;  // first entry outside of the window
 };
 
-// State of a tile's pixels, of 8 x 4 after each other. Of those with odd columns the upper and
-// lower halves are exchanged: the pixels of half a warp lie in different banks then, with one of
-// them a lane and with two.
+// The state of a tile's pixels, by areas of 8 x 4. In areas with odd columns the upper and lower
+// halves are exchanged, so that the pixels of half a warp lie in different banks, with one and with
+// two of them a lane.
 struct TilePixels {
     alignas(float2) float transmittance[kFrameTilePixels];
     alignas(float2) float color[3][kFrameTilePixels];
 };
 
 struct BlendShared {
-    EntryKey key[kPiece];  // of the piece, in any order
+    EntryKey key[kPiece];  // keys of the piece, in any order
     union {
         SpreadShared<kLog2SpreadAgain> spreading;
         struct {
@@ -65,46 +67,47 @@ struct BlendShared {
             uint32_t warp_sum[kBlendWarps];
             uint16_t by_bucket[kPiece];
         };
-        float4 record[kRecordVectors][kBlendBatch];  // without their boxes
+        float4 record[kRecordVectors][kBlendBatch];  // records without their boxes
     };
     uint16_t sorted[kPiece];       // places in `key`
-    uint32_t blocks[kBlendBatch];  // live ones that the batch's records may reach
-    // Of the batch, those that may reach the sub-tile of a warp, as addresses in shared memory.
-    // They stand from the last place on backwards; the first place is read ahead only.
+    uint32_t blocks[kBlendBatch];  // live blocks that each record of the batch may reach
+    // The records of the batch that may reach the sub-tile of a warp, as addresses in shared
+    // memory. They stand from the last place on backwards; the first place is read ahead only.
     uint16_t list[kBlendWarps][kBlendBatch + 1];
     TilePixels pixels;
-    uint32_t alive_blocks;    // as blocks_of(TileEntry)
-    uint32_t reached[2];      // by some record of the batch, in turn
-    uint32_t num_covered[2];  // the same counted once for each record, in turn
-    uint32_t subs_taken;      // of those reached
+    uint32_t alive_blocks;  // bits as in blocks_of(TileEntry)
+    uint32_t reached[2];    // blocks that the batch reaches; batches alternate
+    // Blocks counted once for each record that reaches them; batches alternate.
+    uint32_t num_covered[2];
+    uint32_t subs_taken;  // sub-tiles taken
     ListWindow window[3];
-    uint32_t lowest, highest;  // depths of the piece
-    uint32_t crowded;          // of some of its entries, those with many in their bucket
+    uint32_t lowest, highest;  // range of depths of the piece
+    uint32_t crowded;          // sampled entries in crowded buckets
     float stops_behind;        // StopsBehind::transmittance
     SpreadLevel level[kMostSpreadLevels];
-    // Sums of weight * depth, in the order of TilePixels. Frames without depth do not ask for this
-    // memory.
+    // Sums of weight * depth, in the order of TilePixels. Frames without depth do not allocate this
+    // member.
     alignas(float2) float depth[kFrameTilePixels];
 };
 static_assert(sizeof(BlendShared) < 1 << 15,
               "`list` has 16 bits; a block's memory begins within the lower half");
 static_assert(kBlendBatch % 32 == 0, "a warp takes 32 records");
 
-// The end of the bucket that entry `first` is in; the entries up to `last` are in bucket order.
+// Returns the end of the bucket of entry `first`; the entries up to `last` are in bucket order.
 __device__ inline uint32_t end_of_bucket(const TileEntry* entries, uint32_t first, uint32_t last,
                                          const Buckets& buckets) {
     const uint32_t bucket = buckets.of(entries[first].key);
-    for (uint32_t at = first; at < last; at += kBlendThreads) {
-        const uint32_t i = at + threadIdx.x;
+    for (uint32_t start = first; start < last; start += kBlendThreads) {
+        const uint32_t i = start + threadIdx.x;
         const uint32_t inside =
             __syncthreads_count(i < last && buckets.of(entries[i].key) == bucket);
-        if (inside < kBlendThreads) return at + inside;
+        if (inside < kBlendThreads) return start + inside;
     }
     return last;
 }
 
-// Adds those entries [first, end) to the piece that lie over live pixels. Takes none from the
-// bucket `beyond` on. Returns where it stopped and how many the piece now holds.
+// Adds the entries of [first, end) that lie over live pixels to the piece, but none from the bucket
+// `beyond` on. Returns where it stopped and how many entries the piece now holds.
 __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, uint32_t end,
                                     const Buckets& buckets, uint32_t beyond, uint32_t held,
                                     uint32_t window_number, BlendShared& s) {
@@ -161,8 +164,8 @@ __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, ui
     return {min(end, window.end), held + window.taken};
 }
 
-// Whether the first entry is blended before the second: where their depths are alike and not exact,
-// the records' own decide.
+// Returns whether the first entry is blended before the second. Where their depths are alike and
+// not exact, the records' own depths decide.
 __device__ inline bool precedes(EntryKey first, EntryKey second, const RecordPlanes& records) {
     const TileEntry one{first}, other{second};
     if (records.depth_of(one) != records.depth_of(other) || records.is_exact(other))
@@ -173,18 +176,19 @@ __device__ inline bool precedes(EntryKey first, EntryKey second, const RecordPla
     return depth_a != depth_b ? depth_a < depth_b : a < b;
 }
 
-// How many of the entries at places [first, last) of by_bucket come before the one at place p.
+// Returns how many of the entries at places [first, last) of by_bucket come before the one at place
+// p.
 __device__ inline uint32_t count_before(uint32_t p, uint32_t first, uint32_t last,
                                         const RecordPlanes& records, const BlendShared& s) {
     const auto entry_at = [&](uint32_t j) { return TileEntry{s.key[s.by_bucket[j]]}; };
-    const TileEntry own = entry_at(p);
+    const TileEntry entry = entry_at(p);
     uint32_t before = 0;
-    if (records.is_exact(own)) {
-        for (uint32_t j = first; j < last; ++j) before += entry_at(j).key < own.key;
+    if (records.is_exact(entry)) {
+        for (uint32_t j = first; j < last; ++j) before += entry_at(j).key < entry.key;
         return before;
     }
-    const uint32_t depth = records.depth_of(own);
-    uint32_t num_alike = 0, last_alike = 0;  // others
+    const uint32_t depth = records.depth_of(entry);
+    uint32_t num_alike = 0, last_alike = 0;  // other entries only
     for (uint32_t j = first; j < last; ++j) {
         const uint32_t other = records.depth_of(entry_at(j));
         before += other < depth;
@@ -193,17 +197,18 @@ __device__ inline uint32_t count_before(uint32_t p, uint32_t first, uint32_t las
             last_alike = j;
         }
     }
-    // The lanes that have to look records up do it together; most of them have one other.
+    // Lanes that have to look records up do it together; most have one other entry of the same
+    // depth.
     for (uint32_t j = last_alike; num_alike > 0; --j) {
         if (records.depth_of(entry_at(j)) != depth || j == p) continue;
-        before += precedes(entry_at(j).key, own.key, records);
+        before += precedes(entry_at(j).key, entry.key, records);
         --num_alike;
     }
     return before;
 }
 
-// Sorts the piece by buckets. Their counters are 0, then say where each begins, and in the end
-// where the next one does.
+// These sort the piece by buckets. The counters are 0 first, then the begin of each bucket, and at
+// the end the begin of the next.
 template <class SomeBuckets>
 __device__ void count_buckets(const SomeBuckets& buckets, uint32_t* bucket, uint32_t count,
                               BlendShared& s) {
@@ -242,14 +247,14 @@ __device__ inline void sort_piece(const RecordPlanes& records, uint32_t count, B
         for (int i = threadIdx.x; i < 1 << kLog2Sort; i += kBlendThreads) s.bucket[i] = 0;
     }
     __syncthreads();
-    if (threadIdx.x == 0) {  // for the next piece
+    if (threadIdx.x == 0) {  // the next piece starts from this
         s.lowest = ~0u;
         s.highest = 0;
     }
     if (few) return;
     count_buckets(buckets, s.bucket, count, s);
-    // Some entries tell whether most have many others in their bucket, each of which costs them a
-    // comparison.
+    // A sample of the entries tells whether most have many others in their bucket, each of which
+    // costs them a comparison.
     const bool is_crowded =
         threadIdx.x < count && s.bucket[buckets.of(s.key[threadIdx.x])] > kMostAlike;
     if (is_crowded) atomicAdd(&s.crowded, 1u);
@@ -264,7 +269,7 @@ __device__ inline void sort_piece(const RecordPlanes& records, uint32_t count, B
         scan_buckets<1 << kLog2Sort, kBlendThreads>(s.finer, s.warp_sum);
         sort_buckets(finer, s.finer, records, count, s);
     }
-    if (threadIdx.x == 0) s.crowded = 0;  // for the next piece
+    if (threadIdx.x == 0) s.crowded = 0;  // the next piece starts from this
 }
 
 }  // namespace cuda

@@ -1,11 +1,18 @@
 #pragma once
 
+// Blends the lists of tiles into pictures, front to back, and takes the gradients of pictures back
+// to those of their records.
+
 #include <cstddef>
+#include <cstdint>
 
 #include "base/isa.h"
+#include "base/stream.h"
 #include "frame/entry.h"
+#include "frame/gradient_slots.h"
 #include "frame/image.h"
 #include "frame/record.h"
+#include "frame/tile_list.h"
 
 namespace v3dg {
 
@@ -16,12 +23,50 @@ V3DG_DECLARE_PER_ISA(template <class T>
                                          const uint64_t* entry, size_t count, int left, int top,
                                          const Picture<T>& picture))
 
-// Gradients of a tile's sorted entries, one after the other into `d_entry`, and where that is not
-// null the sizes of those by their centres into `size`; both start as zeros. `d_background` (3) is
-// added to.
+// Writes the gradients of a tile's sorted entries, in their order, into `d_entry`. Where `size` is
+// not null, it gets the sizes of the gradients by the centres. Both are zero on entry.
+// `d_background` (3) is added to.
 V3DG_DECLARE_PER_ISA(template <class T> void rasterize_tile_backward(
     const Record<T>* records, EntryFormat format, const uint64_t* entry, size_t count, int left,
     int top, const Picture<T>& picture, const PictureGradient<T>& d_picture,
     RecordGradient<T>* d_entry, CenterSize<T>* size, T* d_background))
+
+namespace cuda {
+
+// The tape that the forward pass leaves for the backward pass; every pointer is on the device.
+struct RasterTape {
+    // The records of each tile in the order they were blended, without those that could change no
+    // pixel. It is as long as the entries, and tile t's records begin at tile_first[t].
+    uint32_t* order;
+    // [num_tiles] How many entries of `order` were written.
+    uint32_t* blended;
+};
+
+// Returns the largest number of plans that blending in parts takes. A frame with a tape has one
+// plan a tile.
+uint32_t most_plans(uint32_t num_tiles);
+
+// Blends each tile's list into the pictures that lists.images name; every pixel is written.
+// Overwrites lists.entries and lists.scratch. Does nothing where the counters are over a capacity.
+// The result does not depend on the order of the entries within a tile's list. `tape` may be null.
+void rasterize(const FrameLists& lists, const RasterTape* tape, Stream stream);
+
+// A picture as it was drawn, the lists it was blended from, and its gradients, all on the device.
+struct RasterizeBackwardInput {
+    FrameImage image;
+    RecordPlanes records;
+    const unsigned long long* tile_first;  // [num_tiles + 1] into order
+    const uint32_t* order;                 // each tile's records front to back
+    const uint32_t* blended;  // [num_tiles] of them, those in front of where all pixels had stopped
+    const TilePlan* plans;    // [num_tiles] in the order in which blocks take the tiles
+    PictureGradient<float> d_picture;
+};
+
+// Writes the slots and the gradient of the background (3) of one picture. `d_background_of_tile` is
+// scratch, (num_tiles, 3).
+void rasterize_backward(const RasterizeBackwardInput& in, const GradientSlots& slots,
+                        float* d_background_of_tile, float* d_background, Stream stream);
+
+}  // namespace cuda
 
 }  // namespace v3dg

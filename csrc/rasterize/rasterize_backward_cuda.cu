@@ -1,15 +1,16 @@
-// A block takes a tile, a warp 8 x 4 of its pixels, a lane one pixel; they walk the tile's list
-// front to back as the forward pass did.
+// Each block takes a tile, each warp 8 x 4 of its pixels, each lane one pixel; they walk the tile's
+// list front to back as the forward pass did.
 //
-// The sums over a warp's pixels are made for kRows gaussians at once: a lane stores what its pixel
-// gives to each of them, then lanes take over a row of 8 pixels of one gaussian each. That costs a
-// fifth of adding up across lanes gaussian by gaussian.
+//
+// The sums over a warp's pixels are made for kHeld gaussians at once: each lane stores the
+// contribution of its pixel to each of them, then each lane sums a row of 8 pixels of one gaussian.
+// That costs a fifth of adding up across lanes gaussian by gaussian.
 
 #include <cmath>
 
 #include "base/scan.cuh"
 #include "frame/record.cuh"
-#include "rasterize/rasterize_backward.h"
+#include "rasterize/rasterize.h"
 #include "rasterize/rasterize_math.h"
 
 namespace v3dg {
@@ -26,7 +27,7 @@ constexpr int kPairs = 768;  // (entry, warp) pairs of a batch
 constexpr int kHeld = 8;     // gaussians whose sums a warp makes at once
 constexpr int kGradientValues = sizeof(RecordGradient<float>) / sizeof(float);
 constexpr int kSizeValues = sizeof(CenterSize<float>) / sizeof(float);
-// What is summed of a gaussian.
+// The number of sums of a gaussian.
 template <bool kWithSize>
 constexpr int kValuesOf = kGradientValues + (kWithSize ? kSizeValues : 0);
 static_assert(kHeld * kWarpHeight == 32 && kWarpHeight == 4, "a lane sums one row of one gaussian");
@@ -34,42 +35,43 @@ constexpr int kTogether = 2;  // gaussians blended without a branch between them
 static_assert(kPairs >= kWarps, "one entry fits");
 static_assert(kBatch <= 255 && kBatch % 32 == 0 && kHeld % kTogether == 0, "");
 
-// What a pixel gives to a gaussian.
+// The contribution of a pixel to a gaussian.
 struct Share {
     float d_exponent, weight;
 };
-constexpr int kShareStride = 33;  // of the pixels of a gaussian; odd, against bank conflicts
-constexpr int kRowsStride = 40;   // of the sums of a value over rows of pixels; the same
+constexpr int kShareStride = 33;  // pixels of a gaussian; odd, against bank conflicts
+constexpr int kRowsStride = 40;   // row sums of a value; padded against bank conflicts, too
 static_assert(kRowsStride * kValuesOf<true> * sizeof(float) <= kHeld * kShareStride * sizeof(Share),
               "");
 
-// What is needed of a batch's entries until their pairs are added up.
+// The data of a batch's entries that is kept until their pairs are added up.
 struct Batch {
     uint32_t slot[kBatch];
     uint32_t first_pair[kBatch];
-    uint32_t took_part[kBatch];  // bit k: the k-th warp of those that might blend the entry did
+    uint32_t took_part[kBatch];  // bit k: the k-th of the warps that might blend the entry did so
 };
 
 template <bool kWithSize>
 struct Shared {
-    Record<float> record[kBatch + 1];      // the last is one that nothing shows of
+    Record<float> record[kBatch + 1];      // the last record is invisible
     uint32_t warps[kBatch];                // bit w: warp w may blend the entry
-    uint8_t list[kWarps][kBatch + kHeld];  // the entries that a warp may blend, then some of kBatch
+    uint8_t list[kWarps][kBatch + kHeld];  // entries that a warp may blend, padded with kBatch
     uint32_t pairs_of_warp[kBatch / 32];
     uint32_t alive;  // bit w: warp w has a pixel that has not stopped
     float4 d_color[kWarps][kWarpHeight]
-                  [kWarpWidth + 1];  // and by depth; the spare column is against conflicts
+                  // Gradients by colour and depth; the spare column avoids bank conflicts.
+                  [kWarpWidth + 1];
     Share share[kWarps][kHeld * kShareStride];
-    Batch batch[2];  // one is blended, the other one added up
+    Batch batch[2];  // one is blended while the other one is added up
     float pair[kPairs][kValuesOf<kWithSize>];
     float d_background[kWarps][3];
 };
 
 static_assert(sizeof(Shared<true>) <= 99 * 1024, "the most that a block can have on every device");
 
-// Parts of the tile, one bit a warp, that the record may reach. Compares without rounding to pixel
-// centres: a tile marks the slots of all records that it lists for a warp, and those decide which
-// gaussians get zeros.
+// Returns the parts of the tile, one bit a warp, that the record may reach. It compares without
+// rounding to pixel centres. A tile marks the slots of all records that it lists for a warp, so
+// this comparison decides which gaussians get zeros.
 __device__ uint32_t warps_of(const Record<float>& g, int left, int top) {
     const int x0 = max(g.x0 - left, 0) / kWarpWidth,
               x1 = min(g.x1 - left, kFrameTileWidth - 1) / kWarpWidth;
@@ -77,7 +79,7 @@ __device__ uint32_t warps_of(const Record<float>& g, int left, int top) {
               y1 = min(g.y1 - top, kFrameTileHeight - 1) / kWarpHeight;
     const EllipseRows<float> ellipse = ellipse_rows(g.l11, g.l12, g.l22, g.log2_opacity);
     const float u = g.u - left,
-                v = g.v - top;  // from the tile's corner, whose pixels' centres are at 1/2
+                v = g.v - top;  // relative to the tile's corner; pixel centres are at 1/2
     uint32_t warps = 0;
     for (int y = y0; y <= y1; ++y) {
         float low, high;
@@ -90,34 +92,41 @@ __device__ uint32_t warps_of(const Record<float>& g, int left, int top) {
     return warps;
 }
 
-// What the backward pass needs of a pixel.
+// The state of a pixel in the backward pass.
 struct PixelGradient {
     float x, y;
     float d_color[3], d_depth, d_weight;
     float total,
-        running;  // sum over gaussians of weight * (gradient by that weight): all, and so far
+        running;  // sum over gaussians of weight * (gradient by that weight): of all, and so far
     float transmittance;
 };
 
 // Reads the pixel at (column, row) of the picture; adds to `d_background`.
 __device__ PixelGradient read_pixel(const RasterizeBackwardInput& in, int column, int row,
                                     float d_background[3]) {
-    PixelGradient p{column + 0.5f, row + 0.5f, {0, 0, 0}, 0, 0, 0, 0, -1};
+    PixelGradient p{.x = column + 0.5f,
+                    .y = row + 0.5f,
+                    .d_color = {0, 0, 0},
+                    .d_depth = 0,
+                    .d_weight = 0,
+                    .total = 0,
+                    .running = 0,
+                    .transmittance = -1};
     if (column >= in.image.width || row >= in.image.height) return p;
-    const size_t at = static_cast<size_t>(row) * in.image.width + column;
-    const float alpha = in.image.planes.alpha[at], t = 1 - alpha;
+    const size_t pixel = static_cast<size_t>(row) * in.image.width + column;
+    const float alpha = in.image.planes.alpha[pixel], t = 1 - alpha;
     p.transmittance = 1;
-    p.d_weight = in.d_picture.alpha[at];
+    p.d_weight = in.d_picture.alpha[pixel];
     for (int c = 0; c < 3; ++c) {
-        const float d = in.d_picture.color[3 * at + c];
+        const float d = in.d_picture.color[3 * pixel + c];
         p.d_color[c] = d;
         p.d_weight -= d * in.image.background[c];
-        p.total += d * (in.image.planes.color[3 * at + c] - t * in.image.background[c]);
+        p.total += d * (in.image.planes.color[3 * pixel + c] - t * in.image.background[c]);
         d_background[c] = d * t;
     }
     if (in.d_picture.depth != nullptr && alpha > 0) {
-        const float depth = in.image.planes.depth[at];
-        p.d_depth = in.d_picture.depth[at] / alpha;
+        const float depth = in.image.planes.depth[pixel];
+        p.d_depth = in.d_picture.depth[pixel] / alpha;
         p.d_weight -= p.d_depth * depth;
         p.total += p.d_depth * depth * alpha;
     }
@@ -125,8 +134,8 @@ __device__ PixelGradient read_pixel(const RasterizeBackwardInput& in, int column
     return p;
 }
 
-// Sums over the warp's pixels for the gaussians it holds; `entry` is the place in the batch of the
-// one this lane works on, (left, top) the centre of the warp's first pixel. Lane = row of pixels *
+// Sums over the warp's pixels for the gaussians that it holds. `entry` is the place in the batch of
+// this lane's gaussian, (left, top) the centre of the warp's first pixel. Lane = row of pixels *
 // kHeld + gaussian.
 template <bool kWithDepth, bool kWithSize>
 __device__ void add_up(Shared<kWithSize>& s, Batch& batch, int warp, int held, int entry,
@@ -155,8 +164,8 @@ __device__ void add_up(Shared<kWithSize>& s, Batch& batch, int warp, int held, i
     }
     const Ellipse<float> d = falloff_vjp(l11, l12, l22, sums.of_falloff(f));
 
-    // Over the rows, in the place of the shares: lane l adds up the values l / kHeld, l / kHeld +
-    // 4, ...
+    // The sums over the rows take the place of the shares: lane l adds up the values l / kHeld, l /
+    // kHeld + 4, ...
     constexpr int kValues = kValuesOf<kWithSize>;
     const float value[kValuesOf<true>] = {
         d.u,   d.v,      d.l11,    d.l12,    d.l22,  d.log2_opacity,
@@ -192,7 +201,7 @@ __device__ Share blend_vjp(const Record<float>& g, PixelGradient& p) {
     return {exponent_vjp(alpha, before, weight, by_weight, p.total - p.running), weight};
 }
 
-// Takes this warp's pixels through the batch.
+// Blends the batch over this warp's pixels.
 template <bool kWithDepth, bool kWithSize>
 __device__ void blend_batch_vjp(Shared<kWithSize>& s, Batch& batch, int warp, int num,
                                 PixelGradient& p, float left, float top) {
@@ -256,7 +265,7 @@ __global__ void __launch_bounds__(kThreads, 2)
     Shared<kWithSize>& s = *reinterpret_cast<Shared<kWithSize>*>(shared_memory());
     const int lane = threadIdx.x % 32;
     const int warp = __shfl_sync(kAllLanes, static_cast<int>(threadIdx.x) / 32,
-                                 0);  // tells that all lanes agree
+                                 0);  // tells the compiler that all lanes agree
     const uint32_t tile = in.plans[blockIdx.x].tile;
     const int tile_column = tile % in.image.tile_columns, tile_row = tile / in.image.tile_columns;
     const int left = tile_column * kFrameTileWidth, top = tile_row * kFrameTileHeight;
@@ -316,7 +325,7 @@ __global__ void __launch_bounds__(kThreads, 2)
             for (int w = 0; w < warp; ++w) end_pair += s.pairs_of_warp[w];
             batch.first_pair[i] = end_pair - __popc(s.warps[i]);
         }
-        // The entries of the batch whose pairs there is room for.
+        // These are the entries of the batch whose pairs fit.
         num = __syncthreads_count(i < min(kBatch, count - first) && end_pair <= kPairs);
         blend_batch_vjp<kWithDepth, kWithSize>(s, batch, warp, num, p, warp_left + 0.5f,
                                                warp_top + 0.5f);
@@ -335,7 +344,7 @@ void start(const RasterizeBackwardInput& in, const GradientSlots& slots,
 
 constexpr int kSumThreads = 256;
 
-// A block a channel.
+// Each block sums a channel.
 __global__ void sum_over_tiles_kernel(const float* of_tile, uint32_t num_tiles, float* total) {
     __shared__ float of_warp[kSumThreads / 32];
     float sum = 0;

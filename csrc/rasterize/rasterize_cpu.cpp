@@ -1,3 +1,5 @@
+// Blends a tile, and computes the gradients of its records, on one thread.
+
 #include "rasterize/rasterize.h"
 
 #include "rasterize/simd_blend.h"
@@ -45,16 +47,16 @@ void rasterize_tile(const Record<T>* records, EntryFormat format, const uint64_t
                                               picture.window, stop, tile);
     });
     for_each_pixel(left, top, picture.window, [&](int p, size_t out) {
-        const Finished<T> of = finished(tile.transmittance[p], picture.min_transmittance);
-        const T alpha = 1 - of.transmittance;
+        const Finished<T> pixel = finished(tile.transmittance[p], picture.min_transmittance);
+        const T alpha = 1 - pixel.transmittance;
         for (int c = 0; c < 3; ++c)
             picture.color[3 * out + c] =
-                of.gain * tile.color[c][p] + of.transmittance * picture.background[c];
+                pixel.gain * tile.color[c][p] + pixel.transmittance * picture.background[c];
         picture.alpha[out] = alpha;
         if (picture.count != nullptr)
             picture.count[out] = tile.extra[p];
         else if (picture.depth != nullptr)
-            picture.depth[out] = alpha > 0 ? of.gain * tile.extra[p] / alpha : T(0);
+            picture.depth[out] = alpha > 0 ? pixel.gain * tile.extra[p] / alpha : T(0);
     });
 }
 
@@ -87,7 +89,7 @@ static void backward(const Record<T>* records, EntryFormat format, const uint64_
         grad.d_weight[p] = d_weight;
         grad.total[p] = total + d_weight * (1 - t);
     });
-    constexpr size_t kPrefetch = 48;  // so far ahead that a record arrives before it is its turn
+    constexpr size_t kPrefetch = 48;  // far enough ahead that a record arrives in time
     const BlockPixels<T> pixels;
     uint64_t alive = clear_tile(tile, left, top, picture.window, Extra::kNothing);
     for (size_t i = 0; i < count && alive != 0; ++i) {

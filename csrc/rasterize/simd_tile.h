@@ -3,9 +3,9 @@
 // The inner loops of the rasterizer, on one tile of 32 x 32 pixels that stays in the first-level
 // cache.
 //
-// A tile is 8 x 8 blocks of 4 x 4 pixels, one bit a block in a 64-bit mask: which blocks a gaussian
-// may touch, and which still have a pixel that has not stopped. A gaussian whose mask has no live
-// block costs a few integer operations.
+// A tile has 8 x 8 blocks of 4 x 4 pixels. Two 64-bit masks have a bit a block: the blocks that a
+// gaussian may touch, and those that still have a pixel that has not stopped. A gaussian whose mask
+// has no live block costs a few integer operations.
 
 #include <cstdint>
 
@@ -20,10 +20,10 @@ namespace V3DG_ISA {
 constexpr int kBlockPixels = kBlockSize * kBlockSize;
 constexpr int kTilePixels = kTileSize * kTileSize;
 
-// What a tile has beside colour and transmittance.
+// The sums of a tile besides colour and transmittance.
 enum class Extra { kNothing, kDepth, kCount };
 
-// Planes of a tile, block after block, 16 pixels each.
+// The planes of a tile, block after block, 16 pixels each.
 template <class T>
 struct TilePlanes {
     alignas(64) T transmittance[kTilePixels];
@@ -31,17 +31,18 @@ struct TilePlanes {
     alignas(64) T extra[kTilePixels];  // sum of weight * depth, or the number of gaussians
 };
 
-// What the backward pass reads of each pixel, and the sums it keeps.
+// The gradients of each pixel that the backward pass reads, and the sums that it keeps.
 template <class T>
 struct TileGradient {
     alignas(64) T d_color[3][kTilePixels];
-    alignas(64) T d_depth[kTilePixels];  // by sum of weight * depth
+    alignas(64) T d_depth[kTilePixels];  // gradient by the sum of weight * depth
     alignas(
-        64) T d_weight[kTilePixels];   // by every weight alike: alpha, and the background it hides
+        // The gradient by every weight alike, through alpha and the background that it hides.
+        64) T d_weight[kTilePixels];
     alignas(64) T total[kTilePixels];  // sum over gaussians of weight * (gradient by that weight)
 };
 
-// Blocks of the tile at (left, top) that the record's pixel box touches.
+// Returns the blocks of the tile at (left, top) that the record's pixel box touches.
 template <class T>
 V3DG_INLINE uint64_t blocks_of(const Record<T>& g, int left, int top) {
     const int x0 = (g.x0 > left ? g.x0 - left : 0) >> 2;
@@ -51,12 +52,12 @@ V3DG_INLINE uint64_t blocks_of(const Record<T>& g, int left, int top) {
     return EntryFormat::blocks_of(static_cast<uint64_t>(x0 | x1 << 3 | y0 << 6 | y1 << 9));
 }
 
-// Fewer touched blocks than this are not worth a closer look.
+// Fewer touched blocks than this are not worth an exact test.
 constexpr int kFewBlocks = 5;
 
-// Those of `blocks` that the ellipse itself reaches, not just its box: for each row of blocks, the
-// ellipse's extent in x over the row's pixel centres, with the margin of row_extent(). Rounds by
-// truncation, which is one instruction for a vector on every instruction set.
+// Returns those of `blocks` that the ellipse itself reaches, not just its box: for each row of
+// blocks, the ellipse's extent in x over the row's pixel centres, with the margin of row_extent().
+// It rounds by truncation, which is one instruction for a vector on every instruction set.
 template <class T>
 V3DG_INLINE uint64_t blocks_of_ellipse(const Record<T>& g, int left, int top, uint64_t blocks) {
     if (__builtin_popcountll(blocks) < kFewBlocks) return blocks;
@@ -81,13 +82,14 @@ V3DG_INLINE uint64_t blocks_of_ellipse(const Record<T>& g, int left, int top, ui
     return blocks & mask;
 }
 
-// Blocks of the tile that are alive and that the record, whose box must meet the tile, may change.
+// Returns the live blocks of the tile that the record may change. Precondition: its box meets the
+// tile.
 template <class T>
 V3DG_INLINE uint64_t live_blocks(const Record<T>& g, int left, int top, uint64_t alive) {
     return blocks_of_ellipse(g, left, top, blocks_of(g, left, top) & alive);
 }
 
-// Sets the planes to an empty picture and returns the blocks with a pixel in the window. Pixels
+// Clears the planes to an empty picture and returns the blocks with a pixel in the window. Pixels
 // outside count as stopped.
 template <class T>
 inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, const Window& window,
@@ -111,10 +113,12 @@ inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, const Window&
     return alive;
 }
 
+// The pixel centres of a block.
 template <class T>
 struct BlockPixels {
-    alignas(64) T x[kBlockPixels], y[kBlockPixels];  // centres, from the block's corner
-    alignas(64) T corner[kTileBlocks][kLanes<T>];  // of a block in the tile, the same in every lane
+    alignas(64) T x[kBlockPixels], y[kBlockPixels];  // centres relative to the block's corner
+    // Corner of a block in the tile, the same in every lane.
+    alignas(64) T corner[kTileBlocks][kLanes<T>];
     BlockPixels() {
         for (int k = 0; k < kTileBlocks; ++k)
             for (T& lane : corner[k]) lane = T(kBlockSize * k);
@@ -125,10 +129,10 @@ struct BlockPixels {
     }
 };
 
-// Gradients of one record. Takes the same steps on the same numbers as blend_block(), front to
-// back, so that the same pixels take part: `tile` starts empty again, and its color[0] holds the
-// running sum. Returns false where no pixel of the tile took part. `size` is written where
-// kWithSize.
+// Computes the gradients of one record. It takes the same steps on the same numbers as
+// blend_block(), front to back, so that the same pixels take part: `tile` starts empty again, and
+// its color[0] holds the running sum. Returns false where no pixel of the tile took part. `size` is
+// written where kWithSize.
 template <class T, bool kWithDepth, bool kWithSize = false>
 V3DG_INLINE bool blend_record_vjp(const Record<T>& g, uint64_t blocks, int left, int top,
                                   const BlockPixels<T>& pixels, const TileGradient<T>& grad,
@@ -193,8 +197,12 @@ V3DG_INLINE bool blend_record_vjp(const Record<T>& g, uint64_t blocks, int left,
     }
     if (!took_part) return false;
     out.ellipse = falloff_vjp(g.l11, g.l12, g.l22,
-                              FalloffSums<T>{sum_of(s_exponent), sum_of(s_t1), sum_of(s_t2),
-                                             sum_of(s_t1_dx), sum_of(s_t1_dy), sum_of(s_t2_dy)});
+                              FalloffSums<T>{.exponent = sum_of(s_exponent),
+                                             .t1 = sum_of(s_t1),
+                                             .t2 = sum_of(s_t2),
+                                             .t1_dx = sum_of(s_t1_dx),
+                                             .t1_dy = sum_of(s_t1_dy),
+                                             .t2_dy = sum_of(s_t2_dy)});
     for (int c = 0; c < 3; ++c) out.color[c] = sum_of(s_color[c]);
     out.ellipse.depth = kWithDepth ? sum_of(s_depth) : T(0);
     if (kWithSize) *size = {sum_of(s_size.u), sum_of(s_size.v)};

@@ -1,6 +1,7 @@
-// Plans in which order, and in how many parts, tiles are blended, and spreads long lists over
-// buckets of depth: a list in its own place if shared memory holds it, else into scratch, so many
-// entries at a time as it holds, and that of a tile in parts into windows.
+// Plans the order in which tiles are blended, and in how many parts each, and spreads long lists
+// over buckets of depth. A list is spread in its own place if shared memory holds it, else into
+// scratch, as many entries at a time as shared memory holds; the list of a tile in parts is spread
+// into windows.
 
 #include "rasterize/spread_lists_cuda.h"
 
@@ -14,10 +15,10 @@ namespace v3dg {
 namespace cuda {
 namespace {
 
-constexpr int kLog2Spread = 11;    // buckets of a list, at most
-constexpr int kPlanThreads = 256;  // a thread a tile
+constexpr int kLog2Spread = 11;    // most buckets of a list
+constexpr int kPlanThreads = 256;  // one thread a tile
 constexpr int kSpreadThreads = 1024;
-constexpr int kMostParts = 4;  // of a tile
+constexpr int kMostParts = 4;  // parts of a tile
 
 static_assert(kPiece % (3 * kMostParts) == 0 && (kPiece / 3 & (kPiece / 3 - 1)) == 0,
               "kPiece and kPiece / kMostParts begin classes of plan_kernel");
@@ -26,11 +27,11 @@ __device__ uint32_t count_of(const FrameLists& lists, uint32_t tile) {
     return static_cast<uint32_t>(lists.tile_first[tile + 1] - lists.tile_first[tile]);
 }
 
-// How tiles are planned, by two kernels with a thread a tile: by falling load, so that no block is
-// left with a long list at the end. Loads of one class, half an octave wide, follow in any order.
-// Where few tiles have most of the entries, as of an asset in the middle of a picture, they are
-// blended in parts, each by a block that drops what does not reach it: there are `num_places` for
-// blocks at a time, and no block is to have much more than its share.
+// The rules by which two kernels with a thread a tile plan the tiles. They are ordered by falling
+// load, so that no block starts a long list at the end. Loads of one class, half an octave wide,
+// are in any order. Where few tiles have most of the entries, as with an asset in the middle of a
+// picture, they are blended in parts, each by a block that drops entries outside of its part.
+// `num_places` blocks run at a time, and no block should have much more than its share.
 struct PlanRules {
     uint32_t share;
     bool has_parts;
@@ -48,7 +49,7 @@ struct PlanRules {
         const int octave = 31 - __clz(static_cast<int>(load));
         return kPlanClasses - 1 - 2 * octave - static_cast<int>(load >> (octave - 1) & 1);
     }
-    // Behind a plan of a lower load there is none of a list longer than kPiece: a part has half a
+    // After a plan of a lower load there is no plan of a list longer than kPiece: a part has half a
     // share or more, and the loads of a class differ by less than half of the least.
     __device__ uint32_t least_of_long() const {
         constexpr uint32_t kLongest = kPiece, kLeastOfPart = kPiece / kMostParts;
@@ -75,7 +76,8 @@ __global__ void __launch_bounds__(kPlanThreads)
         atomicAdd(&lists.plan_counts[threadIdx.x], in_block[threadIdx.x]);
 }
 
-// Writes the plans, those of a class where it begins and behind those of other blocks.
+// Writes the plans. The plans of a class stand together, those of this block after those of other
+// blocks.
 __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, uint32_t num_places) {
     await_kernel_before();
     __shared__ uint32_t place[kPlanClasses], in_block[kPlanClasses], num_planned;
@@ -87,7 +89,7 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, ui
     const int log2_parts = rules.log2_parts_of(count), own_class = rules.class_of(count);
     if (threadIdx.x < kPlanClasses) in_block[threadIdx.x] = 0;
     __syncthreads();
-    uint32_t before = 0;  // of the block's
+    uint32_t before = 0;  // plans of the block's earlier tiles
     if (tile < lists.num_tiles) before = atomicAdd(&in_block[own_class], 1u << log2_parts);
     __syncthreads();
     if (threadIdx.x < 32) {
@@ -106,14 +108,22 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, ui
         TilePlan* plan = lists.plans + place[own_class] + before;
         const uint32_t image = lists.image_of_tile[tile];
         for (int part = 0; part < 1 << log2_parts; ++part)
-            plan[part] = {tile,  image, 0, 0, 0, uint8_t(part), uint8_t(log2_parts),
-                          false, false, 0};
+            plan[part] = {.tile = tile,
+                          .image = image,
+                          .lowest = 0,
+                          .last_bucket = 0,
+                          .shift = 0,
+                          .part = uint8_t(part),
+                          .log2_parts = uint8_t(log2_parts),
+                          .in_windows = false,
+                          .in_scratch = false,
+                          .first_scratch = 0};
     }
     for (uint32_t i = num_planned + tile; i < lists.num_plans; i += gridDim.x * kPlanThreads)
         lists.plans[i].tile = kNoTile;
 }
 
-// Room in the scratch for entries, for the whole block.
+// Allocates room for entries in the scratch; called by the whole block.
 __device__ unsigned long long take_scratch(FrameCounters& counters, uint32_t count) {
     __shared__ unsigned long long first;
     if (threadIdx.x == 0)
@@ -124,14 +134,14 @@ __device__ unsigned long long take_scratch(FrameCounters& counters, uint32_t cou
     return taken;
 }
 
-// Entries of a window of a list in windows; a window has up to a bucket more.
+// The entries of a window of a list in windows; a window has up to a bucket more.
 constexpr uint32_t kWindowEntries = 3 * kWindow / 4;
 
 __device__ uint32_t num_window_ends(uint32_t count) {
     return (count + kWindowEntries - 1) / kWindowEntries;
 }
 
-// Room that a list in windows takes, with the ends of its windows behind it.
+// Returns the room of a list in windows, with the ends of its windows after it.
 __device__ uint32_t room_in_windows(uint32_t count) {
     static_assert(sizeof(TileEntry) == 2 * sizeof(uint32_t), "two ends in the place of an entry");
     return count + num_window_ends(count) / 2 + 1;
@@ -140,10 +150,11 @@ __device__ uint32_t room_in_windows(uint32_t count) {
 struct SpreadSpace {
     SpreadShared<kLog2Spread> even;
     uint32_t finer[1 << kLog2Spread];
-    TileEntry chunk[1];  // as many as there is room for
+    TileEntry chunk[1];  // the size depends on the device
 };
 
-// Whether a bucket has more entries than that; a counter stands where the next one begins.
+// Returns whether a bucket has more entries than `most`. A counter stands at the begin of the next
+// bucket.
 __device__ bool has_longer(const uint32_t (&bucket)[1 << kLog2Spread], uint32_t most) {
     bool is_long = false;
     for (uint32_t b = threadIdx.x; b < 1 << kLog2Spread; b += kSpreadThreads)
@@ -151,12 +162,13 @@ __device__ bool has_longer(const uint32_t (&bucket)[1 << kLog2Spread], uint32_t 
     return __syncthreads_or(is_long);
 }
 
-// Windows end where the buckets do that reach every kWindowEntries entries.
+// Writes the ends of windows, which are the ends of the buckets that reach every kWindowEntries
+// entries.
 __device__ void write_window_ends(const uint32_t (&bucket)[1 << kLog2Spread], uint32_t count,
                                   uint32_t* window_ends) {
     for (uint32_t w = threadIdx.x; w < num_window_ends(count); w += kSpreadThreads) {
         const uint32_t least = min((w + 1) * kWindowEntries, count);
-        uint32_t b = 0;  // the first bucket that ends there or behind it
+        uint32_t b = 0;  // the first bucket that ends there or later
 #pragma unroll
         for (uint32_t step = 1u << (kLog2Spread - 1); step > 0; step /= 2)
             if (bucket[b + step - 1] < least) b += step;
@@ -164,10 +176,10 @@ __device__ void write_window_ends(const uint32_t (&bucket)[1 << kLog2Spread], ui
     }
 }
 
-// Spreads a list into windows of whole buckets, to a place that has room_in_windows() of it; for a
-// whole block. Returns whether there are such windows. Where one step of depth is all of a list,
-// there are none: the order within a step depends on where pieces begin, which parts of a tile do
-// not have in common.
+// Spreads a list into windows of whole buckets, to a place that has room_in_windows() of it; called
+// by the whole block. Returns whether there are such windows. There are none where a list consists
+// of one step of depth: the order within a step depends on the begins of pieces, which parts of a
+// tile do not share.
 __device__ bool spread_into_windows(const TileEntry* from, uint32_t count, TileEntry* to,
                                     SpreadSpace& space) {
     SpreadShared<kLog2Spread>& s = space.even;
@@ -181,11 +193,11 @@ __device__ bool spread_into_windows(const TileEntry* from, uint32_t count, TileE
     spread<kSpreadThreads>(from, to, 0, count, finer, space.finer, s.warp_sum);
     const bool has_windows = !has_longer(space.finer, kWindow - kWindowEntries);
     if (has_windows) write_window_ends(space.finer, count, reinterpret_cast<uint32_t*>(to + count));
-    __syncthreads();  // the next list is held where these counters are
+    __syncthreads();  // the next list overwrites these counters
     return has_windows;
 }
 
-// How many entries of each chunk of a list are in each bucket, two in a word.
+// The number of entries of each chunk of a list in each bucket, two in a word.
 struct ChunkCounts {
     uint32_t* words;
     uint32_t stride;  // words of a chunk
@@ -198,16 +210,17 @@ struct ChunkCounts {
     }
 };
 
-// As spread(), for a list that does not fit into shared memory: chunks of it go through, so that
-// those of a bucket are written side by side. There is room for `most` entries: a chunk, and behind
-// it the counts of all chunks, if these are few enough; else each is counted when it is its turn.
+// As spread(), for a list that does not fit into shared memory. Chunks of it pass through shared
+// memory, so that entries of a bucket are written contiguously. There is room for `most` entries: a
+// chunk, and after it the counts of all chunks, if these are few enough; otherwise each chunk is
+// counted when it is read.
 __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t count,
                                  uint32_t most, const Buckets& buckets, SpreadSpace& space) {
     SpreadShared<kLog2Spread>& s = space.even;
     uint32_t (&of_chunk)[1 << kLog2Spread] = space.finer;
     TileEntry* chunk = space.chunk;
     const uint32_t num_buckets = buckets.last + 1,
-                   counts_room = num_buckets / 4;  // of a chunk, in entries
+                   counts_room = num_buckets / 4;  // counts of a chunk, in entries
     uint32_t num_chunks = 1;
     const auto size_of_chunk = [&] { return (count + num_chunks - 1) / num_chunks; };
     const auto has_room = [&] { return size_of_chunk() + num_chunks * counts_room <= most; };
@@ -235,7 +248,7 @@ __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t 
         place_buckets<kSpreadThreads>(from, 0, count, buckets, s.bucket, s.warp_sum);
     }
 
-    // Where a bucket begins in the chunk, once its counter stands where the next one does.
+    // Returns the begin of a bucket in the chunk, once its counter stands at the begin of the next.
     const auto begin_of = [&](uint32_t b) { return b > 0 ? of_chunk[b - 1] : 0; };
     for (uint32_t k = 0; k < num_chunks; ++k) {
         const uint32_t first = k * size, last = min(first + size, count);
@@ -263,9 +276,9 @@ __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t 
     }
 }
 
-// Spreads the list of a plan's tile if it is long; by a whole block. Where it is, if `most_held`
-// entries in shared memory are enough, else into the scratch. That of a tile in parts is spread
-// into windows, in the scratch, by the block that has the first part.
+// Spreads the list of a plan's tile if it is long: in its own place if `most_held` entries in
+// shared memory suffice, else into the scratch. The list of a tile in parts is spread into windows,
+// in the scratch, by the block that has the first part. Called by the whole block.
 __device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t count,
                             uint32_t most_held, SpreadSpace& space) {
     static_assert(offsetof(SpreadSpace, finer) % sizeof(TileEntry) == 0,
@@ -315,7 +328,7 @@ __device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t co
     }
 }
 
-// Spreads the long lists. A block asks for the next plan as it begins with one.
+// Spreads the long lists. A block requests its next plan when it begins with one.
 __global__ void __launch_bounds__(kSpreadThreads, 2)
     spread_kernel(FrameLists lists, uint32_t most_held, uint32_t num_places) {
     __shared__ uint32_t next_of_block;
@@ -337,7 +350,8 @@ __global__ void __launch_bounds__(kSpreadThreads, 2)
     }
 }
 
-// Entries that a block of spread_kernel holds, two of which share a multiprocessor.
+// Returns the number of entries that a block of spread_kernel holds; two blocks share a
+// multiprocessor.
 uint32_t most_held() {
     const size_t of_two = shared_memory_of_multiprocessor() / 2 - 2048;  // the driver keeps 1024
     return static_cast<uint32_t>((of_two - sizeof(SpreadShared<kLog2Spread>)) / sizeof(TileEntry));
@@ -346,7 +360,8 @@ uint32_t most_held() {
 }  // namespace
 
 uint32_t most_plans(uint32_t num_tiles, uint32_t num_places) {
-    // A tile of one share has one more, of two three more, and there are num_places shares.
+    // A tile of one share has one more plan, a tile of two shares three more, and there are
+    // num_places shares.
     return num_tiles + (kMostParts - 1) * num_places / 2 + 1;
 }
 

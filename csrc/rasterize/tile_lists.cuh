@@ -1,6 +1,6 @@
 #pragma once
 
-// The list of a tile, spread over buckets of depth.
+// Spreads the list of a tile over buckets of depth.
 
 #include "base/scan.cuh"
 #include "frame/tile_list.h"
@@ -8,13 +8,13 @@
 namespace v3dg {
 namespace cuda {
 
-using EntryKey = unsigned long long;  // of a TileEntry
+using EntryKey = unsigned long long;  // the word of a TileEntry
 
-constexpr int kEntriesAtOnce = 4;  // that a thread has in flight
+constexpr int kEntriesAtOnce = 4;  // loads of a thread in flight
 
 // Buckets of entries, of equal width in the bits of their depths, which are logarithmic over
-// octaves and linear within one; or, where all depths are equal, of equal width in what orders
-// those.
+// octaves and linear within one. Where all depths are equal, the width is equal in the bits that
+// order those.
 struct Buckets {
     uint32_t lowest, last;  // `last` is the number of the last bucket
     int shift;
@@ -23,11 +23,12 @@ struct Buckets {
     __device__ uint32_t part_of(EntryKey key) const {
         return by_order ? key_order({key}) : key_depth({key});
     }
-    // Keys outside the range that the buckets were made for belong to the first or the last.
+    // Returns the bucket of a key. Keys outside the range of the buckets belong to the first or the
+    // last.
     __device__ uint32_t of(EntryKey key) const {
         return min((max(part_of(key), lowest) - lowest) >> shift, last);
     }
-    // The part of a key where a bucket begins; nothing lies before the first.
+    // Returns the part of a key at which a bucket begins; nothing lies before the first.
     __device__ uint32_t begin_of(uint32_t bucket) const {
         return bucket == 0 ? 0 : lowest + (bucket << shift);
     }
@@ -36,17 +37,20 @@ struct Buckets {
 __device__ inline Buckets buckets_over(uint32_t lowest, uint32_t highest, int log2_buckets,
                                        bool by_order) {
     const int bits = 32 - __clz(static_cast<int>(highest - lowest));
-    return {lowest, (1u << log2_buckets) - 1, max(bits - log2_buckets, 0), by_order};
+    return {.lowest = lowest,
+            .last = (1u << log2_buckets) - 1,
+            .shift = max(bits - log2_buckets, 0),
+            .by_order = by_order};
 }
 
-// Buckets for entries most of which lie in few buckets of equal width: by the place that an entry
-// would have if those of its bucket lay evenly in it. The buckets of equal width were made for all
-// of them.
+// Buckets for entries most of which lie in few buckets of equal width. An entry's bucket follows
+// from the place that it would have if the entries of its even bucket lay evenly in that. The even
+// buckets were made for all entries.
 struct FinerBuckets {
     Buckets even;
-    const uint32_t* first;  // entry of each of those
-    uint32_t count;         // of entries
-    int shift;              // of places
+    const uint32_t* first;  // first entry of each even bucket
+    uint32_t count;         // number of entries
+    int shift;              // shift of places
 
     __device__ uint32_t of(EntryKey key) const {
         const uint32_t bucket = even.of(key);
@@ -60,10 +64,10 @@ struct FinerBuckets {
 __device__ inline FinerBuckets finer_buckets(const Buckets& even, const uint32_t* first,
                                              uint32_t count, int log2_buckets) {
     const int bits = 32 - __clz(static_cast<int>(count - 1));
-    return {even, first, count, max(bits - log2_buckets, 0)};
+    return {.even = even, .first = first, .count = count, .shift = max(bits - log2_buckets, 0)};
 }
 
-// Shared memory of a block that spreads a list.
+// The shared memory of a block that spreads a list.
 template <int kLog2Buckets>
 struct SpreadShared {
     uint32_t bucket[1 << kLog2Buckets];
@@ -71,7 +75,7 @@ struct SpreadShared {
     uint32_t warp_sum[32];
 };
 
-// Turns counts into the place of each bucket's first.
+// Turns counts into the place of each bucket's first entry.
 template <int kCount, int kBlock>
 __device__ void scan_buckets(uint32_t* bucket, uint32_t* warp_sum) {
     constexpr int kEach = kCount / kBlock;
@@ -96,7 +100,7 @@ __device__ void scan_buckets(uint32_t* bucket, uint32_t* warp_sum) {
     __syncthreads();
 }
 
-// Calls visit(entry) for entries [first, last), a thread's share of them.
+// Calls visit(entry) for a thread's share of entries [first, last).
 template <int kBlock, class Visit>
 __device__ void for_each_entry(const TileEntry* entries, uint32_t first, uint32_t last,
                                const Visit& visit) {
@@ -113,13 +117,13 @@ __device__ void for_each_entry(const TileEntry* entries, uint32_t first, uint32_
     }
 }
 
-// Buckets for entries [first, last): for the range of all of them, or of a sample when `roughly`.
-// As many as there can be when `finely`.
+// Returns buckets for entries [first, last): for the range of all of them, or of a sample when
+// `roughly`; as many as possible when `finely`.
 template <int kBlock, int kLog2Buckets>
 __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32_t last,
                                 bool roughly, bool finely, SpreadShared<kLog2Buckets>& s) {
     if (threadIdx.x < 4) s.range[threadIdx.x] = threadIdx.x % 2 == 0 ? ~0u : 0u;
-    uint32_t low[2] = {~0u, ~0u}, high[2] = {0, 0};  // of depths and orders
+    uint32_t low[2] = {~0u, ~0u}, high[2] = {0, 0};  // ranges of depths and orders
     const auto widen = [&](TileEntry e) {
         const uint32_t part[2] = {key_depth(e), key_order(e)};
         for (int i = 0; i < 2; ++i) {
@@ -128,7 +132,7 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
         }
     };
     if (roughly) {
-        // A list that is spread has an entry for each thread.
+        // A list that is spread has at least as many entries as there are threads.
         widen(entries[first + static_cast<uint32_t>(static_cast<unsigned long long>(last - first) *
                                                     threadIdx.x / kBlock)]);
     } else {
@@ -144,8 +148,8 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
         }
     }
     __syncthreads();
-    // Some 64 entries a bucket; the fewer, the more of what is written together stays together in
-    // the cache.
+    // There are some 64 entries a bucket. With fewer buckets, entries that are written together are
+    // more likely to stay together in the cache.
     const int log2_buckets =
         finely ? kLog2Buckets
                : min(max(31 - __clz(static_cast<int>(last - first)) - 6, 4), kLog2Buckets);
@@ -155,7 +159,7 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
 }
 
 // Counts entries [first, last) into buckets, and turns the counts into the place of each bucket's
-// first.
+// first entry.
 template <int kBlock, int kCount, class SomeBuckets>
 __device__ void place_buckets(const TileEntry* entries, uint32_t first, uint32_t last,
                               const SomeBuckets& buckets, uint32_t (&bucket)[kCount],
@@ -168,8 +172,8 @@ __device__ void place_buckets(const TileEntry* entries, uint32_t first, uint32_t
     scan_buckets<kCount, kBlock>(bucket, warp_sum);
 }
 
-// Spreads entries [first, last) into bucket order, from one place to another. In the end a bucket's
-// counter stands where the next one begins.
+// Spreads entries [first, last) into bucket order, from one place to another. At the end a bucket's
+// counter stands at the begin of the next bucket.
 template <int kBlock, int kCount, class SomeBuckets>
 __device__ void spread(const TileEntry* from, TileEntry* to, uint32_t first, uint32_t last,
                        const SomeBuckets& buckets, uint32_t (&bucket)[kCount], uint32_t* warp_sum) {

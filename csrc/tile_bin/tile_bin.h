@@ -1,14 +1,19 @@
 #pragma once
 
+// Lists of the records that each tile of a picture is blended from: on the CPU sorted tile by tile,
+// on CUDA in any order.
+
 #include <atomic>
 #include <cstddef>
 #include <cstdint>
 #include <vector>
 
 #include "base/buffer.h"
+#include "base/stream.h"
 #include "frame/entry.h"
 #include "frame/image.h"
 #include "frame/record.h"
+#include "frame/tile_list.h"
 
 namespace v3dg {
 
@@ -21,24 +26,23 @@ struct TileGrid {
           columns((w.x1 + kTileSize - 1) / kTileSize - first_column),
           rows((w.y1 + kTileSize - 1) / kTileSize - first_row) {}
     size_t size() const { return static_cast<size_t>(columns) * rows; }
-    // Column and row of a tile in the image.
+    // Return the column and the row of a tile in the image.
     int column(size_t tile) const { return first_column + static_cast<int>(tile % columns); }
     int row(size_t tile) const { return first_row + static_cast<int>(tile / columns); }
 };
 
-// The records that touch each tile t, in the order of the chunks that they came in: entries
-// offset[t] to offset[t + 1].
+// The records that touch each tile t are entries offset[t] to offset[t + 1], in the order of the
+// chunks that they came in.
 struct TileLists {
     EntryFormat format;
     Buffer<uint64_t> offset;
     Buffer<uint64_t> entry;
     uint64_t num_entries = 0;
-    // The same of each chunk alone, whose records are [first, first + count) with depths of these
-    // bits.
+    // The lists of one chunk alone, whose records are [first, first + count).
     struct Chunk {
         uint64_t first, count;
-        uint32_t least_depth, most_depth;
-        Buffer<uint64_t> entry;  // with places in the chunk and all of a depth
+        uint32_t least_depth, most_depth;  // bits of the records' depths
+        Buffer<uint64_t> entry;  // entries with places in the chunk and all bits of a depth
     };
     Buffer<uint32_t> chunk_offset;  // (chunk, tile + 1)
     std::vector<Chunk> chunk;
@@ -49,24 +53,56 @@ struct TileLists {
     }
 };
 
-// A chunk has at most so many records.
+// A chunk has at most this many records.
 constexpr uint64_t kMostChunkRecords = uint64_t(1) << 21;
 
-// Bins the records of one chunk, which are records[first .. first + count). Best done while they
-// are in the cache. Chunks may be binned at the same time.
+// Bins the records of one chunk, which are records[first .. first + count). It is fastest while
+// they are in the cache. Chunks may be binned concurrently.
 template <class T>
 void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const TileGrid& grid,
                size_t chunk, TileLists& out);
 
-// Makes one list a tile of those of the chunks. Once `stop` is true, returns soon and leaves them
-// unfinished.
+// Joins the lists of the chunks into one list a tile. Once `stop` is true, it returns soon and
+// leaves the lists unfinished.
 void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out,
                  const std::atomic<bool>* stop = nullptr);
 
-// Sorts one tile's entries by the depths of their records; equal depths stay in their order.
-// `scratch` has room for as many.
+// Sorts one tile's entries by the depths of their records; equal depths keep their order.
+// `scratch` has room for as many entries.
 template <class T>
 void sort_tile(const Record<T>* records, EntryFormat format, uint64_t* entry, size_t count,
                uint64_t* scratch);
+
+namespace cuda {
+
+// The input of tile_bin(), all of it on the device.
+struct TileBinInput {
+    const ItemTiles* items;
+    const FewTiles* few;  // tiles of each record, or kManyTiles where it is in `large`
+    RecordPlanes records;
+    const FrameImage* images;
+    uint32_t num_images, num_tiles;
+    Capacity capacity;
+    const LargeRecord* large;
+    TileCounts counts;
+    // Their `entries` are set. Where the large records had too little room, these are not counted.
+    FrameCounters* counters;
+};
+
+// The lists: tile t has entries tile_first[t] to tile_first[t + 1].
+struct TileBinOutput {
+    unsigned long long* tile_first;  // [num_tiles + 1]
+    uint32_t* image_of_tile;         // [num_tiles]
+    TileEntry* entries;
+};
+
+// Returns the number of words of TileCounts::state.
+size_t tile_bin_parts(size_t num_tiles);
+
+// Puts a frame's records into the lists of the tiles that they may touch. Work is queued on the
+// stream. Throws std::runtime_error when CUDA reports an error.
+void tile_bin(const TileBinInput& in, const TileBinOutput& out, Stream stream);
+
+}  // namespace cuda
 
 }  // namespace v3dg

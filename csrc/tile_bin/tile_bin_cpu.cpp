@@ -1,3 +1,7 @@
+// Each chunk is counted, scanned and scattered alone, and most reach few tiles. Then each tile
+// collects its entries, chunk by chunk, so the order of the entries does not depend on which thread
+// took which chunk.
+
 #include "tile_bin/tile_bin.h"
 
 #include <algorithm>
@@ -6,16 +10,12 @@
 #include "base/parallel_for.h"
 #include "base/stop.h"
 
-// Each chunk is counted, scanned and scattered alone, and most reach few tiles; then each tile
-// takes what is its own, chunk by chunk, so the order of the entries does not depend on which
-// thread took which chunk.
-
 namespace v3dg {
 
-// All of a depth's bits, and the place in the chunk.
+// Entries of a chunk have all of a depth's bits, and the place in the chunk.
 static constexpr EntryFormat kChunkFormat = EntryFormat::of(kMostChunkRecords, 0, INT32_MAX);
 
-// Calls visit(tile, box in it) for the tiles that a record's box meets; most meet one.
+// Calls visit(tile, box in it) for the tiles that a record's box meets; most boxes meet one.
 template <class T, class Visit>
 static V3DG_INLINE void for_each_tile(const Record<T>& r, const TileGrid& grid,
                                       const Visit& visit) {
@@ -39,8 +39,8 @@ template <class T>
 void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const TileGrid& grid,
                size_t chunk, TileLists& out) {
     const size_t num_tiles = grid.size();
-    // Counts, then where a tile's entries begin, then where the next one goes, which ends where the
-    // next tile's begin.
+    // The offsets are first counts, then the begins of tiles, then the places of the next entries;
+    // the last place of a tile is the begin of the next tile.
     uint32_t* offset = out.chunk_offset.data() + chunk * (num_tiles + 1);
     std::memset(offset, 0, (num_tiles + 1) * sizeof *offset);
     const Record<T>* record = records + first;
@@ -48,9 +48,9 @@ void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const T
         for_each_tile(record[i], grid, [&](size_t t, uint32_t) { ++offset[t + 1]; });
     uint32_t sum = 0;
     for (size_t t = 1; t <= num_tiles; ++t) {
-        const uint32_t here = offset[t];
+        const uint32_t tile_count = offset[t];
         offset[t] = sum;
-        sum += here;
+        sum += tile_count;
     }
     uint64_t* entry = out.chunk[chunk].entry.reserve(sum);
     uint32_t least = UINT32_MAX, most = 0;
@@ -69,7 +69,7 @@ void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const T
     out.chunk[chunk].most_depth = most;
 }
 
-// Of the entries of these chunks, together.
+// Returns the format of the entries of these chunks together.
 static EntryFormat format_of(const TileLists::Chunk* chunk, size_t num_chunks) {
     uint64_t end = 0;
     uint32_t least = UINT32_MAX, most = 0;
@@ -120,7 +120,7 @@ void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out,
     });
 }
 
-// Sorts entries by what they hold of depths; equal ones stay in their order.
+// Sorts entries by the bits of depth that they hold; equal entries keep their order.
 static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_t* scratch) {
     constexpr size_t kSmall = 256;
     if (count <= kSmall) {
@@ -133,10 +133,10 @@ static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_
         for (size_t i = 0; i < count; ++i) entry[i] = (entry[i] & ~low) | scratch[entry[i] & low];
         return;
     }
-    // Least significant digit first over the bits in which depths differ once the least is taken
-    // away; stable.
+    // This is a stable radix sort, least significant digit first, over the bits in which depths
+    // differ after the least is subtracted.
     constexpr int kMostBits = 12;
-    const int most_bits = count < 1024 ? 8 : kMostBits;  // few entries for few counters
+    const int most_bits = count < 1024 ? 8 : kMostBits;  // few counters for few entries
     uint64_t least = ~uint64_t(0), most = 0;
     for (size_t i = 0; i < count; ++i) {
         least = std::min(least, entry[i]);
@@ -156,9 +156,9 @@ static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_
         for (size_t i = 0; i < count; ++i) ++start[(from[i] - least) >> shift & mask];
         uint32_t sum = 0;
         for (uint64_t d = 0; d <= mask; ++d) {
-            const uint32_t here = start[d];
+            const uint32_t digit_count = start[d];
             start[d] = sum;
-            sum += here;
+            sum += digit_count;
         }
         for (size_t i = 0; i < count; ++i) to[start[(from[i] - least) >> shift & mask]++] = from[i];
         std::swap(from, to);
@@ -166,7 +166,7 @@ static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_
     if (from != entry) std::memcpy(entry, from, count * sizeof *entry);
 }
 
-// Sorts entries by their records' depths; equal ones stay in their order.
+// Sorts entries by their records' depths; equal ones keep their order.
 template <class T>
 static void sort_by_records(const Record<T>* records, EntryFormat format, uint64_t* first,
                             uint64_t* last) {
@@ -189,7 +189,7 @@ void sort_tile<float>(const Record<float>* records, EntryFormat format, uint64_t
     }
 }
 
-// What entries hold of depths is less than a double.
+// Entries hold fewer bits of a depth than a double has.
 template <>
 void sort_tile<double>(const Record<double>* records, EntryFormat format, uint64_t* entry,
                        size_t count, uint64_t*) {

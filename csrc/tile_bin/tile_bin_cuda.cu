@@ -1,14 +1,16 @@
-// Count, scan, scatter. Records over few tiles have been counted where they were projected; here
-// those over many are, their rows of tiles spread over a warp. Compiled without contraction, so
-// that the counting and the scattering kernel see the same ellipse.
+// Binning counts, scans and scatters. Records over few tiles have been counted where they were
+// projected; here records over many tiles are counted, their rows of tiles spread over a warp. The
+// file is compiled without contraction, so that the counting and the scattering kernel see the same
+// ellipse.
 
-#include "tile_bin/tile_bin_cuda.h"
+#include "tile_bin/tile_bin.h"
 
 #include <algorithm>
 
 #include "base/scan.cuh"
 #include "frame/count_tile.cuh"
 #include "frame/record.cuh"
+#include "tile_bin/tile_bin_math.h"
 
 namespace v3dg {
 namespace cuda {
@@ -16,36 +18,37 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kThreads = 256, kWarps = kThreads / 32;
-constexpr unsigned kBlocks = 5;  // on a multiprocessor with 164 KiB of shared memory
+constexpr unsigned kBlocks = 5;  // blocks on a multiprocessor with 164 KiB of shared memory
 
-// Of the kernel that counts large records.
+// The shape of the kernel that counts large records.
 constexpr unsigned kCountThreads = 512, kCountBlocks = 3;
-constexpr unsigned kLeastLarge =
-    16;  // large records for each tile, for blocks to count on their own
+// The number of large records a tile from which blocks count in their own memory.
+constexpr unsigned kLeastLarge = 16;
 
-// Large records that a warp takes together; lanes 16 apart have the same one.
+// Large records that a warp takes together; lanes 16 apart have the same record.
 struct LargeBatch {
     uint32_t image;
-    uint32_t record;  // of this lane
-    RecordBox box;    // of that
-    int rows;         // of tiles, of this lane's record; 0 where it has none
-    int rows_after;   // of all records up to this one
+    uint32_t record;  // the record of this lane
+    RecordBox box;    // the box of that record
+    int rows;         // rows of tiles of this lane's record; 0 without a record
+    int rows_after;   // rows of all records up to this one
 };
 
-// A warp's part of the rows of a batch: one of so many.
+// A warp's part of the rows of a batch, which has 2^log2_parts parts.
 struct LargePart {
     int number, log2_parts;
 };
 
 __device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long first) {
     const LargeRecord mine = in.large[first + threadIdx.x % kLargeAtOnce];
-    LargeBatch batch{mine.image, mine.record, mine.box, 0, 0};
+    LargeBatch batch{
+        .image = mine.image, .record = mine.record, .box = mine.box, .rows = 0, .rows_after = 0};
     if (mine.record != kNoRecord) batch.rows = static_cast<int>(tile_rows_of(mine.box));
     batch.rows_after = warp_prefix<kLargeAtOnce>(batch.rows);
     return batch;
 }
 
-// The box of another lane of the warp.
+// Returns the box of another lane of the warp.
 __device__ RecordBox box_of_lane(const RecordBox& box, int lane) {
     const uint32_t columns = __shfl_sync(kAllLanes, box.x0 | uint32_t(box.x1) << 16, lane),
                    rows = __shfl_sync(kAllLanes, box.y0 | uint32_t(box.y1) << 16, lane);
@@ -53,8 +56,8 @@ __device__ RecordBox box_of_lane(const RecordBox& box, int lane) {
             static_cast<uint16_t>(rows), static_cast<uint16_t>(rows >> 16)};
 }
 
-// The first of `kCount` lanes whose number, which does not fall from lane to lane, is above `at`;
-// the last one if none is.
+// Returns the first of `kCount` lanes whose number, which does not decrease from lane to lane, is
+// above `at`; the last lane if none is.
 template <int kCount>
 __device__ int first_lane_above(int number, int at) {
     int lane = 0;
@@ -65,8 +68,8 @@ __device__ int first_lane_above(int number, int at) {
 }
 
 // Calls begin_row(number, record) for 32 rows of a batch's records, a lane a row, and then
-// visit(from, row, column) for each 32 tiles of those rows: a lane a tile, in the row of lane
-// `from`; a column below 0 is of no tile.
+// visit(from, row, column) for each 32 tiles of those rows: each lane has a tile in the row of lane
+// `from`. A column below 0 means no tile.
 template <class BeginRow, class Visit>
 __device__ void for_each_tile(const TileBinInput& in, const LargeBatch& batch,
                               const LargePart& part, const BeginRow& begin_row,
@@ -75,9 +78,10 @@ __device__ void for_each_tile(const TileBinInput& in, const LargeBatch& batch,
               total = __shfl_sync(kAllLanes, batch.rows_after, kLargeAtOnce - 1);
     const int end = total * (part.number + 1) >> part.log2_parts;
     for (int first = total * part.number >> part.log2_parts; first < end; first += 32) {
-        const int at = min(first + lane, end - 1);
-        const int owner = first_lane_above<kLargeAtOnce>(batch.rows_after, at);
-        const int row_of_owner = at - __shfl_sync(kAllLanes, batch.rows_after - batch.rows, owner);
+        const int batch_row = min(first + lane, end - 1);
+        const int owner = first_lane_above<kLargeAtOnce>(batch.rows_after, batch_row);
+        const int row_of_owner =
+            batch_row - __shfl_sync(kAllLanes, batch.rows_after - batch.rows, owner);
         const uint32_t number = __shfl_sync(kAllLanes, batch.record, owner);
         const RecordBox box = box_of_lane(batch.box, owner);
         const Record<float> record = load_record(in.records, number, box);
@@ -94,8 +98,8 @@ __device__ void for_each_tile(const TileBinInput& in, const LargeBatch& batch,
     }
 }
 
-// Calls visit(batch, part) for all large records, batch by batch; for whole warps of the grid.
-// Where there are few batches, several warps take parts of each.
+// Calls visit(batch, part) for all large records, batch by batch, by whole warps of the grid. Where
+// there are few batches, several warps take parts of each.
 template <class Visit>
 __device__ void for_each_part(const TileBinInput& in, const Visit& visit) {
     constexpr int kLog2MostParts = 2;
@@ -103,14 +107,14 @@ __device__ void for_each_part(const TileBinInput& in, const Visit& visit) {
     const unsigned num_batches = static_cast<unsigned>(in.counters->large / kLargeAtOnce);
     const unsigned warps_each = num_batches == 0 ? 0 : 8 * num_warps / num_batches;
     const int log2_parts = min(max(31 - __clz(static_cast<int>(warps_each)), 0), kLog2MostParts);
-    // Neighbours are as much work as each other, so they go to different blocks.
+    // Neighbours cost about the same, so they go to different blocks.
     for (unsigned at = blockIdx.x + threadIdx.x / 32 * gridDim.x; at < num_batches << log2_parts;
          at += num_warps)
         visit(load_batch(in, static_cast<unsigned long long>(at >> log2_parts) * kLargeAtOnce),
               LargePart{static_cast<int>(at & ((1u << log2_parts) - 1)), log2_parts});
 }
 
-// Calls visit(tile) for the tiles of all large records, a lane a tile, kNoTile for none.
+// Calls visit(tile) for the tiles of all large records, a lane a tile; kNoTile means none.
 template <class Visit>
 __device__ void for_each_large_tile(const TileBinInput& in, const Visit& visit) {
     for_each_part(in, [&](const LargeBatch& batch, const LargePart& part) {
@@ -123,8 +127,8 @@ __device__ void for_each_large_tile(const TileBinInput& in, const Visit& visit) 
     });
 }
 
-// Where there are many large records, a block counts in its shared memory first, if the tiles fit
-// into it.
+// Counts large records. Where there are many, a block counts in its shared memory first, if the
+// tiles fit into it.
 __global__ void __launch_bounds__(kCountThreads, kCountBlocks)
     count_large_kernel(TileBinInput in, bool has_room) {
     await_kernel_before();
@@ -140,7 +144,7 @@ __global__ void __launch_bounds__(kCountThreads, kCountBlocks)
         if (tile != kNoTile) atomicAdd(counts + tile, 1u);
     });
     __syncthreads();
-    // Each block begins with another tile, so that they do not all ask for the same at once.
+    // Each block begins with another tile, so that they do not access the same one at once.
     const uint32_t first = static_cast<uint32_t>(size_t(in.num_tiles) * blockIdx.x / gridDim.x);
     for (uint32_t i = threadIdx.x; i < in.num_tiles; i += kCountThreads) {
         const uint32_t tile = first + i < in.num_tiles ? first + i : first + i - in.num_tiles;
@@ -149,7 +153,8 @@ __global__ void __launch_bounds__(kCountThreads, kCountBlocks)
 }
 
 __device__ uint32_t image_of(const TileBinInput& in, uint32_t tile) {
-    uint32_t first = 0, count = in.num_images;  // the last image that begins at the tile or before
+    // Finds the last image that begins at the tile or before.
+    uint32_t first = 0, count = in.num_images;
     while (count > 1) {
         const uint32_t half = count / 2;
         const bool later = in.images[first + half].first_tile <= tile;
@@ -159,7 +164,7 @@ __device__ uint32_t image_of(const TileBinInput& in, uint32_t tile) {
     return first;
 }
 
-// A thread a tile.
+// Scans the counts, a thread a tile.
 __global__ void scan_kernel(TileBinInput in, TileBinOutput out) {
     await_kernel_before();
     __shared__ unsigned long long before_block;
@@ -182,51 +187,54 @@ __global__ void scan_kernel(TileBinInput in, TileBinOutput out) {
     }
 }
 
-// Puts entries into their tiles: from the end of a tile's list on, whose count goes down to 0.
+// The destination of entries. A tile's list is filled from its end on, and its count goes down to
+// 0.
 struct Scatter {
     const unsigned long long* tile_first;
-    uint32_t* left;  // [num_tiles] places
+    uint32_t* left;  // [num_tiles] places that are left
     TileEntry* entries;
 };
 
-// The places of a warp's lanes in the lists of their tiles: lanes of one tile ask together.
+// The places of a warp's lanes in the lists of their tiles. Lanes of one tile share an atomic
+// operation.
 struct Places {
     unsigned peers;
-    uint32_t left;  // of the first of the peers
+    uint32_t left;  // places that are left to the peers
 
-    // For a whole warp; kNoTile has none.
+    // Called by a whole warp; kNoTile gets no place.
     __device__ Places(const Scatter& to, uint32_t tile)
         : peers(__match_any_sync(kAllLanes, tile)), left(0) {
         if (tile != kNoTile && threadIdx.x % 32 + 1 == unsigned(__ffs(peers)))
             left = atomicSub(to.left + tile, unsigned(__popc(peers)));
     }
-    // Of this lane, counted from where its tile's list begins; for a whole warp.
+    // Returns the place of this lane, relative to the begin of its tile's list; called by a whole
+    // warp.
     __device__ uint32_t own() const {
         const uint32_t of_peers = __shfl_sync(kAllLanes, left, __ffs(peers) - 1);
         return of_peers - 1 - __popc(peers & ((1u << threadIdx.x % 32) - 1));
     }
 };
 
-// Entries of records over few tiles that a warp scatters at once: each lane two, as a place takes a
-// while to come.
+// Entries of records over few tiles that a warp scatters at once: two a lane, because the atomic
+// operation for a place has a long latency.
 constexpr unsigned kAtOnce = 2, kFewAtOnce = 32 * kAtOnce;
 
-// A record over few tiles, and which of them.
+// A record over few tiles, and one of its tiles.
 struct FewPlace {
-    FewTiles few;  // kManyTiles where there is none
+    FewTiles few;  // kManyTiles: no record
     uint32_t record;
     unsigned tile;
 };
 
-// Those beyond the first tile of each record, which wait until there are kFewAtOnce.
+// Records for their tiles beyond the first; they are collected until there are kFewAtOnce.
 struct WaitingPlaces {
     static constexpr unsigned kMost = kFewAtOnce - 1 + kFewAtOnce * (kFewTiles - 1);
     FewTiles few[kMost];
-    uint32_t record[kMost];  // and the tile in the highest bits
+    uint32_t record[kMost];  // the highest bits have the tile
 };
 static_assert(kFewTiles <= 1u << (32 - kMostRecordBits), "a tile fits above a record");
 
-// For a whole warp.
+// Writes the entries of these records; called by a whole warp.
 __device__ void scatter_few(const Scatter& to, const ItemTiles& item,
                             const FewPlace (&places)[kAtOnce]) {
     EntryBox box[kAtOnce];
@@ -253,7 +261,7 @@ __device__ void scatter_few(const Scatter& to, const ItemTiles& item,
     }
 }
 
-// An item's records over few tiles, by a whole warp.
+// Scatters an item's records over few tiles; called by a whole warp.
 __device__ void scatter_item(const TileBinInput& in, const Scatter& to, const ItemTiles& item,
                              WaitingPlaces& waiting) {
     const unsigned lane = threadIdx.x % 32;
@@ -300,7 +308,7 @@ __device__ void scatter_item(const TileBinInput& in, const Scatter& to, const It
     __syncwarp();
 }
 
-// A part of a batch of records over many tiles.
+// Scatters a part of a batch of records over many tiles; called by a whole warp.
 __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const LargeBatch& batch,
                               const LargePart& part) {
     const FrameImage& image = in.images[batch.image];
@@ -328,7 +336,8 @@ __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const L
         });
 }
 
-// A warp asks for another item as it begins with one; then come the records over many tiles.
+// Scatters all records. A warp requests its next item when it begins with one; records over many
+// tiles come last.
 __global__ void __launch_bounds__(kThreads, kBlocks)
     scatter_kernel(TileBinInput in, TileBinOutput out) {
     await_kernel_before();

@@ -89,6 +89,23 @@ NOT_OPERATIONS = {
 }
 TESTED_WITH = {"tile_bin": "rasterize"}
 KINDS = {"unit", "files", "system", "browser", "attack", "docs"}
+# Operations whose halves still have a contract each.
+TWO_CONTRACTS = {"project", "select"}
+MOST_LINES_WITHOUT_A_HEAD = 100
+# Folders of csrc/ whose long files open with what they are.
+HEADED = (
+    "base",
+    "math",
+    "frame",
+    "cluster",
+    "simplify",
+    "gather",
+    "quantize",
+    "tile_bin",
+    "rasterize",
+    "fit_group",
+    "levels",
+)
 
 OPERATIONS = sorted(p.name for p in CSRC.iterdir() if p.is_dir() and p.name not in NOT_OPERATIONS)
 SOURCES = sorted(str(p.relative_to(ROOT)) for p in CSRC.rglob("*") if p.suffix in {".cpp", ".cu"})
@@ -116,6 +133,22 @@ def test_operation_has_a_contract_and_both_halves(operation):
     assert f"{operation}.h" in names
     assert any(name.endswith("_cpu.cpp") for name in names)
     assert any(name.endswith("_cuda.cu") for name in names)
+
+
+@pytest.mark.parametrize("operation", sorted(set(OPERATIONS) - TWO_CONTRACTS))
+def test_operation_has_one_contract(operation):
+    assert not (CSRC / operation / f"{operation}_cuda.h").exists()
+
+
+@pytest.mark.parametrize("folder", HEADED)
+def test_long_sources_say_first_what_they_are(folder):
+    untold = []
+    for path in (CSRC / folder).iterdir():
+        lines = path.read_text(encoding="utf-8").splitlines()
+        first = next(line for line in lines if line not in {"", "#pragma once"})
+        if len(lines) > MOST_LINES_WITHOUT_A_HEAD and not first.startswith("//"):
+            untold.append(path.name)
+    assert untold == []
 
 
 @pytest.mark.parametrize("operation", OPERATIONS)
