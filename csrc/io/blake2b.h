@@ -1,5 +1,7 @@
 #pragma once
 
+// The hash of pages, tables and files: BLAKE2b of one message, of several at once, and of pieces.
+
 #include <array>
 #include <cstddef>
 #include <cstdint>
@@ -9,34 +11,37 @@
 
 namespace v3dg {
 
-constexpr size_t kPageHashBytes = 16, kHashBlockBytes = 128, kHashPieceBytes = 16384;
+constexpr size_t kPageHashBytes = 16;
+constexpr size_t kHashBlockBytes = 128;
+constexpr size_t kHashPieceBytes = 16384;
 using PageHash = std::array<uint8_t, kPageHashBytes>;
 
-// BLAKE2b with a digest of 16 bytes and no key, RFC 7693, of several messages: each in a lane of a
-// vector where the processor has wide ones, so that eight of about the same length are quickest.
+// Hashes several messages with BLAKE2b, RFC 7693, with digests of 16 bytes and no key. On
+// processors with wide vectors each message has a lane of a vector, so eight messages of about the
+// same length are fastest.
 void blake2b(Span<const Span<const uint8_t>> messages, PageHash* digests);
 
-// The same of bytes that come one after another.
+// The same hash of one message, which is added in parts.
 class Blake2b {
   public:
     Blake2b();
     void add(const unsigned char* bytes, size_t size);
-    // Of all that was added; nothing is added after it.
+    // Returns the hash of all that was added. Nothing may be added after it.
     PageHash digest();
 
   private:
     uint64_t state_[8];
-    uint64_t num_bytes_ = 0;  // before those that wait
+    uint64_t num_bytes_ = 0;  // in the state, without those that wait
     unsigned char waiting_[kHashBlockBytes] = {};
     size_t num_waiting_ = 0;
 };
 
-// The same of the digests of a message's pieces of kHashPieceBytes, the last of which may be
-// shorter. They are hashed side by side, so it is several times as quick.
+// The hash of the digests of a message's pieces. A piece has kHashPieceBytes, the last one may be
+// shorter. Pieces are hashed in parallel lanes, so this is several times as fast as Blake2b.
 class HashOfPieces {
   public:
     explicit HashOfPieces(Span<const uint8_t> message) : message_(message) {}
-    // So many bytes of the message are there.
+    // Hashes the pieces that end within the first `end` bytes of the message.
     void add_until(size_t end);
     PageHash digest();
 

@@ -1,7 +1,7 @@
-#include "io/blake2b_lanes.h"
+// The formula of BLAKE2b, for a word or for a vector of words. The words of a vector are either
+// those of several messages, one message per lane, or a row of the state of one message.
 
-// A formula of one word, or of as many as a vector has: either the words of several messages, a
-// message a lane, or those of a row of the state of one.
+#include "io/blake2b_lanes.h"
 
 #include <algorithm>
 #include <cstring>
@@ -73,7 +73,7 @@ using Words = Row;
 using Words = uint64_t;
 #endif
 
-// b is ready last, so it is added last.
+// b is available last, so it is added last.
 template <class V>
 V3DG_INLINE void mix(V& a, V& b, V& c, V& d, V x, V y) {
     a = a + x + b;
@@ -99,13 +99,14 @@ V3DG_INLINE void mix_round(V* v, const V* m) {
     mix(v[3], v[4], v[9], v[14], m[s[14]], m[s[15]]);
 }
 
-// One after another without a loop: then the compiler knows which words go where.
+// Unrolled, so that the compiler knows the order of the words in each round.
 template <class V, size_t... kRounds>
 V3DG_INLINE void mix_rounds(V* v, const V* m, std::index_sequence<kRounds...>) {
     (mix_round<kRounds>(v, m), ...);
 }
 
-// `end`: bytes up to the end of this block. `last`: all bits where it is the last one, else none.
+// `end`: number of bytes up to the end of this block. `last`: all bits set for the last block, else
+// none.
 template <class V>
 V3DG_INLINE void compress(V* h, const V* m, V end, V last) {
     V v[16];
@@ -121,12 +122,12 @@ V3DG_INLINE void compress(V* h, const V* m, V end, V last) {
 
 #if defined(__AVX2__)
 
-// A row of four words, moved by so many lanes.
-template <int kBy>
+// Rotates a row of four words by so many lanes.
+template <int kLanes>
 V3DG_INLINE Row turned(Row x) {
-    constexpr auto from = [](int i) { return (i + kBy) & 3; };
-    return (Row)_mm256_permute4x64_epi64((__m256i)x,
-                                         from(0) | from(1) << 2 | from(2) << 4 | from(3) << 6);
+    constexpr auto source = [](int i) { return (i + kLanes) & 3; };
+    constexpr int kOrderOfLanes = source(0) | source(1) << 2 | source(2) << 4 | source(3) << 6;
+    return (Row)_mm256_permute4x64_epi64((__m256i)x, kOrderOfLanes);
 }
 
 V3DG_INLINE uint64_t word(const unsigned char* block, int i) {
@@ -135,7 +136,7 @@ V3DG_INLINE uint64_t word(const unsigned char* block, int i) {
     return word;
 }
 
-// The rows other than b move to the diagonals: b is the one that is ready last.
+// For the diagonals, the rows other than b move, because b is available last.
 template <size_t kRound>
 V3DG_INLINE void mix_rows(Row& a, Row& b, Row& c, Row& d, const unsigned char* block) {
     constexpr const uint8_t* s = kOrder[kRound % 10];
@@ -191,7 +192,8 @@ void add_last_block(uint64_t* state, uint64_t num_bytes, const unsigned char* bl
     compress_one(state, block, num_bytes, ~uint64_t{0});
 }
 
-// Of a message of which so many bytes were added to the state, the rest lies here.
+// Returns the digest of a message of which `num_bytes` were added to the state already. `rest` is
+// what follows them.
 static PageHash digest_of_rest(uint64_t* state, uint64_t num_bytes, const unsigned char* rest,
                                size_t size) {
     const size_t whole = size > 0 ? (size - 1) / kHashBlockBytes : 0,
@@ -212,15 +214,16 @@ namespace {
 constexpr size_t kNumLanes = sizeof(Words) / sizeof(uint64_t);
 constexpr unsigned char kZeros[kHashBlockBytes] = {};
 
-// m[w] gets word w of the block of every lane.
+// Sets m[w] to word w of the blocks of all lanes.
 #if defined(__AVX512F__)
 
-V3DG_INLINE void load_words(const unsigned char* const* at, Words* m) {
+V3DG_INLINE void load_words(const unsigned char* const* blocks, Words* m) {
     for (int half = 0; half < 2; ++half) {
         __m512i rows[8];
-        for (int i = 0; i < 8; ++i) rows[i] = _mm512_loadu_si512(at[i] + 64 * half);
+        for (int i = 0; i < 8; ++i) rows[i] = _mm512_loadu_si512(blocks[i] + 64 * half);
         for (int odd = 0; odd < 2; ++odd) {
-            __m512i pairs[4], fours[4];  // of lanes: words odd, odd + 2, + 4 and + 6; two of those
+            __m512i pairs[4];  // of lanes: words odd, odd + 2, odd + 4 and odd + 6
+            __m512i fours[4];  // of lanes: two of those words
             for (int i = 0; i < 4; ++i)
                 pairs[i] = odd ? _mm512_unpackhi_epi64(rows[2 * i], rows[2 * i + 1])
                                : _mm512_unpacklo_epi64(rows[2 * i], rows[2 * i + 1]);
@@ -230,9 +233,9 @@ V3DG_INLINE void load_words(const unsigned char* const* at, Words* m) {
                     _mm512_shuffle_i64x2(pairs[2 * i], pairs[2 * i + 1], 0xdd);  // + 2, + 6
             }
             for (int i = 0; i < 2; ++i) {
-                Words* of = m + 8 * half + odd + 2 * i;
-                of[0] = (Words)_mm512_shuffle_i64x2(fours[2 * i], fours[2 * i + 1], 0x88);
-                of[4] = (Words)_mm512_shuffle_i64x2(fours[2 * i], fours[2 * i + 1], 0xdd);
+                Words* words = m + 8 * half + odd + 2 * i;
+                words[0] = (Words)_mm512_shuffle_i64x2(fours[2 * i], fours[2 * i + 1], 0x88);
+                words[4] = (Words)_mm512_shuffle_i64x2(fours[2 * i], fours[2 * i + 1], 0xdd);
             }
         }
     }
@@ -240,11 +243,11 @@ V3DG_INLINE void load_words(const unsigned char* const* at, Words* m) {
 
 #else
 
-V3DG_INLINE void load_words(const unsigned char* const* at, Words* m) {
+V3DG_INLINE void load_words(const unsigned char* const* blocks, Words* m) {
     for (int part = 0; part < 4; ++part) {
         __m256i rows[4];
         for (int i = 0; i < 4; ++i)
-            rows[i] = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(at[i] + 32 * part));
+            rows[i] = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(blocks[i] + 32 * part));
         for (int odd = 0; odd < 2; ++odd) {
             __m256i pairs[2];  // of lanes: words odd and odd + 2
             for (int i = 0; i < 2; ++i)
@@ -258,18 +261,18 @@ V3DG_INLINE void load_words(const unsigned char* const* at, Words* m) {
 
 #endif
 
-// Messages that are hashed together. A lane without one hashes zeros.
+// Messages that are hashed together, one per lane. A lane without a message hashes zeros.
 class Lanes {
   public:
     bool is_busy(size_t lane) const { return digest_[lane] != nullptr; }
     void begin(size_t lane, Span<const uint8_t> message, PageHash* digest) {
         digest_[lane] = digest;
-        at_[lane] = message.data;
+        rest_[lane] = message.data;
         left_[lane] = message.size;
         end_[lane] = 0;
         for (int i = 0; i < 8; ++i) state_[i][lane] = kHashStart[i];
     }
-    // Adds blocks to all messages until one is over, and gives the digests of those that are.
+    // Adds blocks to all messages until one ends, and stores the digests of those that have ended.
     void advance() {
         size_t whole = SIZE_MAX;
         for (size_t k = 0; k < kNumLanes; ++k)
@@ -278,47 +281,47 @@ class Lanes {
         add(whole);
         add_where_one_is_last();
     }
-    // What is left of one message.
+    // Hashes the rest of one message alone.
     void finish(size_t lane) {
         uint64_t state[8];
         for (int i = 0; i < 8; ++i) state[i] = state_[i][lane];
-        *digest_[lane] = digest_of_rest(state, end_[lane], at_[lane], left_[lane]);
+        *digest_[lane] = digest_of_rest(state, end_[lane], rest_[lane], left_[lane]);
         digest_[lane] = nullptr;
     }
 
   private:
     void add(size_t num_blocks) {
-        const unsigned char* at[kNumLanes];
+        const unsigned char* blocks[kNumLanes];
         size_t step[kNumLanes];
         for (size_t k = 0; k < kNumLanes; ++k) {
-            at[k] = is_busy(k) ? at_[k] : kZeros;
+            blocks[k] = is_busy(k) ? rest_[k] : kZeros;
             step[k] = is_busy(k) ? kHashBlockBytes : 0;
         }
         for (size_t i = 0; i < num_blocks; ++i) {
             Words m[16];
-            load_words(at, m);
+            load_words(blocks, m);
             compress(state_, m, end_ += Words{} + kHashBlockBytes, Words{});
-            for (size_t k = 0; k < kNumLanes; ++k) at[k] += step[k];
+            for (size_t k = 0; k < kNumLanes; ++k) blocks[k] += step[k];
         }
         for (size_t k = 0; k < kNumLanes; ++k) {
-            at_[k] = at[k];
+            rest_[k] = blocks[k];
             left_[k] -= num_blocks * step[k];
         }
     }
     void add_where_one_is_last() {
         unsigned char filled[kNumLanes][kHashBlockBytes] = {};
-        const unsigned char* at[kNumLanes];
+        const unsigned char* blocks[kNumLanes];
         Words last = {}, m[16];
         for (size_t k = 0; k < kNumLanes; ++k) {
             const size_t size = is_busy(k) ? std::min(left_[k], kHashBlockBytes) : 0;
             last[k] = is_busy(k) && size == left_[k] ? ~uint64_t{0} : 0;
-            if (size > 0) std::memcpy(filled[k], at_[k], size);
-            at[k] = filled[k];
-            at_[k] += size;
+            if (size > 0) std::memcpy(filled[k], rest_[k], size);
+            blocks[k] = filled[k];
+            rest_[k] += size;
             left_[k] -= size;
             end_[k] += size;
         }
-        load_words(at, m);
+        load_words(blocks, m);
         compress(state_, m, end_, last);
         for (size_t k = 0; k < kNumLanes; ++k) {
             if (last[k] == 0) continue;
@@ -328,8 +331,8 @@ class Lanes {
         }
     }
 
-    Words state_[8] = {}, end_ = {};           // end_: bytes that were added
-    const unsigned char* at_[kNumLanes] = {};  // of what is left
+    Words state_[8] = {}, end_ = {};             // end_: bytes that were added
+    const unsigned char* rest_[kNumLanes] = {};  // what is not hashed yet
     size_t left_[kNumLanes] = {};
     PageHash* digest_[kNumLanes] = {};  // null: idle
 };

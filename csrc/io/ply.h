@@ -26,7 +26,7 @@ struct PlyGaussians {
     Span<T> sh;         // [N * K * 3]
 };
 
-// Where the bytes of a gaussian begin. In text and in rows with lists, only reading finds that out.
+// A gaussian, and the offset of its bytes, which only reading finds in text and in rows with lists.
 struct PlyPlace {
     size_t row, offset;
 };
@@ -47,11 +47,11 @@ struct PlyFile {
 // Throws std::system_error when the file cannot be read, PlyError when it is not a 3DGS file.
 PlyFile open_ply(const char* path);
 
-// Reads gaussians `first` and on, as many as `out` holds, and returns where the next one begins.
-// `known` is the place of any gaussian, best of `first` itself. Quaternions are normalised, but
-// those of length zero or not finite stay as stored, as do those of length one up to rounding (so
-// that reading what was written changes nothing). Besides `out` it needs a few megabytes. Throws
-// like open_ply; `out` is then partly written.
+// Reads gaussians from `first` on, as many as `out` holds, and returns the place of the next one.
+// `known` is the place of any gaussian; that of `first` is fastest. Quaternions are normalised,
+// except those of length zero, those that are not finite, and those of length one up to rounding,
+// so that reading what was written changes nothing. Needs a few megabytes beside `out`. Throws like
+// open_ply; `out` is then partly written.
 PlyPlace read_ply(const PlyFile& ply, size_t first, PlyPlace known, const PlyGaussians<float>& out);
 
 // Creates `path`, which must not exist yet. Opacity 1 is written as logit 20, opacity 0 as logit

@@ -61,13 +61,13 @@ std::vector<PlyField> fields_of(const PlyElement& vertex, size_t num_sh) {
     std::vector<PlyField> fields;
     std::vector<std::string> missing;
     for (const std::string& name : slot_names(num_sh)) {
-        const auto found = field_from_name.find(name);
+        const auto field = field_from_name.find(name);
         if (lists.count(name))
             throw PlyError("expected a number as vertex property " + quoted(name) + ", got a list");
-        if (found == field_from_name.end())
+        if (field == field_from_name.end())
             missing.push_back(name);
         else
-            fields.push_back(found->second);
+            fields.push_back(field->second);
     }
     if (!missing.empty()) throw PlyError(missing_text(vertex, missing));
     return fields;

@@ -1,3 +1,6 @@
+// Parses the header of a .ply file. Nothing that it claims about sizes is used here: the callers
+// compare it with the size of the file.
+
 #include "io/ply_header.h"
 
 #include <algorithm>
@@ -8,7 +11,7 @@ namespace v3dg {
 namespace {
 
 constexpr size_t kMaxHeaderBytes = size_t(1) << 20;  // real ones have a few kilobytes
-constexpr size_t kMaxElements = 64;  // real ones have one or two; each is walked over
+constexpr size_t kMaxElements = 64;  // real ones have one or two; each one is skipped in turn
 
 std::vector<std::string> words_of(const std::string& line) {
     const char* kSpace = " \t\r\v\f";
@@ -80,7 +83,7 @@ PlyProperty parse_property(const std::vector<std::string>& words) {
     return property;
 }
 
-// One header at a time: lines go in, a header comes out.
+// Takes the lines of one header in turn, and makes the header.
 struct HeaderParser {
     PlyHeader header;
     bool has_format = false;

@@ -1,5 +1,7 @@
 #pragma once
 
+// The header of a .ply file: its encoding, and its elements with their properties.
+
 #include <cstddef>
 #include <cstdint>
 #include <stdexcept>
@@ -10,8 +12,8 @@
 
 namespace v3dg {
 
-// The content of a file is not what it should be. The message says what was expected and found, in
-// one line of printable ASCII, without the file's name.
+// The content of a file is wrong. The message has what was expected and what was found, in one line
+// of printable ASCII, without the name of the file.
 struct PlyError : std::runtime_error {
     using std::runtime_error::runtime_error;
 };
@@ -27,9 +29,9 @@ inline size_t size_of(PlyType type) {
 
 struct PlyProperty {
     std::string name;
-    PlyType type = PlyType::float32;  // of a list: of its items
+    PlyType type = PlyType::float32;  // of a number, or of the items of a list
     bool is_list = false;
-    PlyType count_type = PlyType::uint8;  // only of a list; an integer type
+    PlyType count_type = PlyType::uint8;  // of the length of a list; an integer type
 };
 
 struct PlyElement {
@@ -38,23 +40,23 @@ struct PlyElement {
     std::vector<PlyProperty> properties;
 
     bool has_lists() const;
-    // Bytes of one row in a binary file; lists count as empty.
+    // Bytes of one row in a binary file if its lists are empty.
     size_t min_row_bytes() const;
 };
 
 struct PlyHeader {
     PlyEncoding encoding = PlyEncoding::ascii;
     std::vector<PlyElement> elements;
-    size_t size = 0;  // bytes, up to and with the line end of end_header
+    size_t size = 0;  // bytes, including the end of the line end_header
 };
 
-// Throws std::system_error, or PlyError for what is no regular file.
+// Throws std::system_error, or PlyError if the path is not a regular file.
 PosixFile open_ply_file(const char* path);
 
-// Reads and checks the header; nothing in it is believed about the size of what follows.
+// Reads and checks the header, but not against the size of the file. Throws PlyError.
 PlyHeader read_ply_header(const PosixFile& file);
 
-// `text` in quotes, cut and made printable for a message.
+// Returns `text` in quotes, shortened and printable, for a message.
 std::string quoted(const std::string& text);
 
 }  // namespace v3dg

@@ -1,7 +1,7 @@
-#include "io/ply.h"
-
 // Opens .ply files and chooses how their rows are read: ply_fields.h has what a row means,
 // ply_rows.h binary rows, ply_text.h lines of text.
+
+#include "io/ply.h"
 
 #include <algorithm>
 #include <cassert>

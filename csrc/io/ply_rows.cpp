@@ -1,3 +1,6 @@
+// Binary rows: RowDecoder converts rows of fixed size. Rows with lists are walked over by a
+// ByteReader and packed to such rows.
+
 #include "io/ply_rows.h"
 
 #include <algorithm>

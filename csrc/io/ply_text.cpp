@@ -1,3 +1,5 @@
+// Text: LineReader cuts lines, NumberReader reads the numbers of one.
+
 #include "io/ply_text.h"
 
 #include <algorithm>
@@ -65,10 +67,10 @@ class LineReader {
     void cut_lines(uint64_t max_lines, bool at_end) {
         while (begin_ < end_ && lines_.size() < max_lines) {
             const char* text = buffer_.data();
-            const void* found = std::memchr(text + begin_, '\n', end_ - begin_);
-            if (!found && !at_end) return;
-            const Line line = {text + begin_,
-                               found ? static_cast<const char*>(found) : text + end_};
+            const void* newline = std::memchr(text + begin_, '\n', end_ - begin_);
+            if (newline == nullptr && !at_end) return;
+            const Line line = {text + begin_, newline != nullptr ? static_cast<const char*>(newline)
+                                                                 : text + end_};
             begin_ = std::min<size_t>(line.end - text + 1, end_);
             if (!std::all_of(line.begin, line.end, is_space)) lines_.push_back(line);
         }
@@ -152,9 +154,9 @@ void parse_row(Line line, uint64_t row, const PlyElement& vertex, double* value_
     numbers.expect_end();
 }
 
-[[noreturn]] void throw_too_few(const PlyElement& element, uint64_t found) {
+[[noreturn]] void throw_too_few(const PlyElement& element, uint64_t num_lines) {
     throw PlyError("expected " + std::to_string(element.count) + " lines for element " +
-                   quoted(element.name) + ", got " + std::to_string(found));
+                   quoted(element.name) + ", got " + std::to_string(num_lines));
 }
 
 }  // namespace

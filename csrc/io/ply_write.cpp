@@ -1,5 +1,5 @@
-// Rows are converted in blocks by all threads. Binary blocks have a known place, so each thread
-// writes its own; text is converted a few blocks at a time and written in order.
+// Writes .ply files. All threads convert blocks of rows. Binary blocks have known offsets, so each
+// thread writes its own; text is converted a few blocks at a time and written in order.
 
 #include <algorithm>
 #include <charconv>
@@ -22,7 +22,7 @@ namespace v3dg {
 namespace {
 
 constexpr size_t kBlockRows = 2048;  // half a megabyte at SH degree 3
-constexpr size_t kTextBlocks = 16;   // that are in memory together
+constexpr size_t kTextBlocks = 16;   // in memory at the same time
 
 // Finite stand-ins for infinities, beyond the logs and logits of all other float32 values (-103.3
 // and 16.6 are the outermost) and far enough that exp and the sigmoid round to exactly 0 and 1,
@@ -77,7 +77,7 @@ void encode_gaussian(const PlyGaussians<const float>& in, size_t num_sh, size_t 
     for (size_t j = 0; j < 4; ++j) *row++ = in.quats[4 * i + j];
 }
 
-// Byte by byte, so that it is right on machines of either order.
+// Byte by byte, so that it does not depend on the byte order of the machine.
 void store_bytes(const float* values, size_t count, PlyEncoding encoding, unsigned char* bytes) {
     for (size_t v = 0; v < count; ++v) {
         uint32_t bits;
@@ -92,8 +92,8 @@ void store_bytes(const float* values, size_t count, PlyEncoding encoding, unsign
 }
 
 void append_text(const float* values, size_t count, std::string& text) {
-    constexpr size_t kMaxDigits =
-        32;  // the shortest text of a float that reads back the same has at most 15
+    // The shortest text that reads back as the same float has at most 15 characters.
+    constexpr size_t kMaxDigits = 32;
     char word[kMaxDigits];
     for (size_t v = 0; v < count; ++v) {
         text.append(word, std::to_chars(word, word + kMaxDigits, values[v]).ptr);
@@ -176,7 +176,12 @@ void write_ply(const char* path, const PlyGaussians<const float>& gaussians, Ply
     PosixFile file = PosixFile::create(path);
     const std::string header = header_text(num_gaussians, num_sh, encoding);
     file.write_at(0, header.data(), header.size());
-    const Writer writer = {file, gaussians, encoding, num_gaussians, num_sh, header.size()};
+    const Writer writer = {.file = file,
+                           .gaussians = gaussians,
+                           .encoding = encoding,
+                           .num_gaussians = num_gaussians,
+                           .num_sh = num_sh,
+                           .offset = header.size()};
     if (encoding == PlyEncoding::ascii)
         writer.write_text();
     else if (num_gaussians > 0)

@@ -1,5 +1,7 @@
 #pragma once
 
+// Files of the system, by descriptor: reads and writes at offsets, with errors as exceptions.
+
 #include <cerrno>
 #include <cstddef>
 #include <system_error>
@@ -24,7 +26,7 @@ class PosixFile {
     static PosixFile create(const char* path) {
         return PosixFile(::open(path, O_WRONLY | O_CLOEXEC | O_CREAT | O_TRUNC, 0666));
     }
-    // Of an open file, which may then be closed.
+    // Duplicates the descriptor of an open file, which may be closed afterwards.
     static PosixFile duplicate(int descriptor) {
         return PosixFile(::fcntl(descriptor, F_DUPFD_CLOEXEC, 0));
     }
@@ -48,8 +50,7 @@ class PosixFile {
         return read_at(offset, Span<iovec>{&piece, 1});
     }
 
-    // The same into several pieces of memory, one behind another, at most 1024. Changes what it is
-    // given.
+    // The same into at most 1024 pieces of memory in turn. Changes the pieces.
     size_t read_at(size_t offset, Span<iovec> pieces) const {
         size_t done = 0;
         while (!pieces.empty()) {
@@ -69,7 +70,7 @@ class PosixFile {
         return done;
     }
 
-    // Has the system begin to read what will be asked for; a hint, where it takes any.
+    // Asks the system to begin to read a part of the file; a hint, on systems that have one.
     void expect(size_t offset, size_t size) const {
 #ifdef POSIX_FADV_WILLNEED
         static_cast<void>(::posix_fadvise(descriptor_, static_cast<off_t>(offset),

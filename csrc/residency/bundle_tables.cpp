@@ -11,10 +11,10 @@ namespace cuda {
 
 namespace {
 
-// Arrays of the host, which go to one piece of memory on the device.
+// Copies arrays of the host into one allocation on the device.
 class Upload {
   public:
-    // `span` is the host's until finish() makes it the device's.
+    // `span` points to memory of the host; finish() makes it point to memory of the device.
     template <class T>
     void add(Span<const T>& span) {
         const size_t first = (num_bytes_ + kAlignment - 1) / kAlignment * kAlignment;
@@ -34,7 +34,7 @@ class Upload {
     }
 
   private:
-    static constexpr size_t kAlignment = 256;  // as of memory from the device's allocator
+    static constexpr size_t kAlignment = 256;  // as in the allocator of the device
 
     size_t num_bytes_ = 0;
     std::vector<std::function<void(unsigned char*, cudaStream_t)>> moves_;
@@ -61,8 +61,12 @@ std::vector<uint8_t> joins_of_clusters(const ClusterTable& table,
 
 BundleTables::BundleTables(const ClusterTable& table, const ClusterAppearance& appearance,
                            cudaStream_t stream)
-    : on_device_{table, appearance, {}, nullptr, runs_of_clusters(table)} {
-    static_assert(kClustersOfBounds <= 8, "a byte says which of them are drawn together");
+    : on_device_{.table = table,
+                 .appearance = appearance,
+                 .bounds = {},
+                 .joins = nullptr,
+                 .runs = runs_of_clusters(table)} {
+    static_assert(kClustersOfBounds <= 8, "a byte has a bit for each of them");
     const std::vector<ClusterBounds> bounds = bounds_of_clusters(table);
     const std::vector<uint8_t> joins = joins_of_clusters(table, appearance);
     on_device_.bounds = {bounds.data(), bounds.size()};

@@ -1,7 +1,7 @@
 #pragma once
 
-// The tables of a bundle on a device. They live as long as a scene that v3dg/residency.py keeps
-// there has them.
+// The tables of a bundle on a device. They live as long as a scene that uses them is resident there
+// (v3dg/residency.py).
 
 #include "base/device.h"
 #include "residency/cluster_bounds.h"
@@ -9,27 +9,27 @@
 namespace v3dg {
 namespace cuda {
 
-// What kernels read of a bundle; all that it points to lies on the device.
+// What kernels read of a bundle; all pointers point to memory of the device.
 struct BundleOnDevice {
     ClusterTable table;
     ClusterAppearance appearance;
     Span<const ClusterBounds> bounds;
-    // A byte for each of the bounds; bit k: its cluster k is drawn together with the one before,
-    // since its rows follow and it looks the same.
+    // A byte for each ClusterBounds. Bit k: its cluster k is drawn together with the cluster before
+    // it, since its rows follow and it has the same appearance.
     const uint8_t* joins;
     ClusterRuns runs;
 };
 
-// A byte for each kClustersOfBounds clusters, as BundleOnDevice::joins has them.
+// Returns BundleOnDevice::joins: a byte for each kClustersOfBounds clusters.
 std::vector<uint8_t> joins_of_clusters(const ClusterTable& table,
                                        const ClusterAppearance& appearance);
 
 // The tables of one bundle on the device that is current when they are made. They never change, so
-// the scenes, threads and streams of that device share them. They have to outlive the work that
+// all scenes, threads and streams of that device share them. They have to outlive the work that
 // reads them.
 class BundleTables {
   public:
-    // Returns when the tables are on the device; the host's memory may then be reused.
+    // Returns when the tables are on the device; the memory of the host may be reused then.
     BundleTables(const ClusterTable& table, const ClusterAppearance& appearance,
                  cudaStream_t stream);
     BundleTables(const BundleTables&) = delete;

@@ -1,3 +1,5 @@
+// Collects the bounds of eight neighbouring clusters each, and of runs of them.
+
 #include "residency/cluster_bounds.h"
 
 #include <algorithm>
@@ -9,10 +11,10 @@ namespace v3dg {
 
 namespace {
 
-// Its square is far above where float32 loses digits.
+// The square of this radius is far above the range where float32 loses digits.
 constexpr float kLeastRunRadius = 1e-15f;
 
-// Contains the centres of the balls. At the origin where there are none.
+// Returns a ball that contains the centres of the balls; at the origin if there are none.
 Ball ball_of_centers(Span<const Ball> balls) {
     double middle[3] = {0, 0, 0}, radius2 = 0;
     for (const Ball& b : balls) {
@@ -24,11 +26,23 @@ Ball ball_of_centers(Span<const Ball> balls) {
         const double d[3] = {double(b.x) - m[0], double(b.y) - m[1], double(b.z) - m[2]};
         radius2 = std::max(radius2, d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
     }
-    return {m[0], m[1], m[2], static_cast<float>(std::sqrt(radius2) * (1 + 1e-6))};
+    return {.x = m[0],
+            .y = m[1],
+            .z = m[2],
+            .radius = static_cast<float>(std::sqrt(radius2) * (1 + 1e-6))};
 }
 
 ClusterBounds bounds_of(const ClusterTable& table, size_t first, size_t last) {
-    ClusterBounds bounds{no_box(), {}, {}, 0, 0, INFINITY, INFINITY, INT32_MAX, false, false};
+    ClusterBounds bounds{.box = no_box(),
+                         .parents = {},
+                         .owns = {},
+                         .most_parent_radius = 0,
+                         .most_parent_weight = 0,
+                         .least_own_radius = INFINITY,
+                         .least_own_weight = INFINITY,
+                         .least_own_level = INT32_MAX,
+                         .has_leaf = false,
+                         .has_root = false};
     Ball parents[kClustersOfBounds], owns[kClustersOfBounds];
     size_t num_parents = 0, num_owns = 0;
     for (size_t c = first; c < last; ++c) {
@@ -69,7 +83,7 @@ std::vector<ClusterBounds> bounds_of_clusters(const ClusterTable& table) {
 ClusterRuns runs_of_clusters(const ClusterTable& table) {
     const size_t count = table.num_clusters();
     ClusterRuns runs{};
-    std::vector<size_t> ends;  // the last first
+    std::vector<size_t> ends;  // of the runs, in bounds, the last run first
     size_t left = (count + kClustersOfBounds - 1) / kClustersOfBounds;
     for (size_t size = 1; left > 0; size *= ends.size() > 1 ? 2 : 1) {
         ends.push_back(left);

@@ -7,8 +7,8 @@
 
 namespace v3dg {
 
-HostTable::HostTable(const ClusterTable& given, const ClusterAppearance& appearance)
-    : table_(given), appearance_(appearance) {
+HostTable::HostTable(const ClusterTable& table, const ClusterAppearance& appearance)
+    : table_(table), appearance_(appearance) {
     find_tops();
     table_.bounds = no_box();
     for (const Box& box : table_.box) grow(table_.bounds, box);

@@ -1,6 +1,6 @@
 #pragma once
 
-// What selection reads of a bundle.
+// The tables of a bundle that selection reads: its groups, its clusters, and where their pages are.
 
 #include <cstdint>
 #include <vector>
@@ -12,20 +12,19 @@
 
 namespace v3dg {
 
-// G groups, C clusters. Group -1 is none.
+// G groups, C clusters. Group -1 means no group.
 struct ClusterTable {
-    Span<const Ball> ball;     // [G] contains the balls of the groups below it
-    Span<const float> weight;  // [G] per px2, never decreasing towards the root
-    Span<const int32_t>
-        level;  // [G] of the clusters that the group makes, ascending towards the root
-    Span<const int32_t> own_group;     // [C] group that made the cluster; -1: always fits
-    Span<const int32_t> parent_group;  // [C] group that replaces the cluster; -1: nothing does
-    Span<const Box> box;               // [C] what the cluster draws, without the filter
-    Span<const int64_t> offset;        // [C + 1] how many gaussians the clusters before each have
+    Span<const Ball> ball;      // [G] contains the balls of the groups below it
+    Span<const float> weight;   // [G] per px2, never decreasing towards the root
+    Span<const int32_t> level;  // [G] of the clusters that the group makes, ascending to the root
+    Span<const int32_t> own_group;     // [C] group that made the cluster; -1: it always fits
+    Span<const int32_t> parent_group;  // [C] group that replaces the cluster; -1: none does
+    Span<const Box> box;               // [C] contains what the cluster draws, without the filter
+    Span<const int64_t> offset;        // [C + 1] number of gaussians in the clusters before each
     Span<const int32_t> top_group;     // groups that no other group replaces
     Span<const int32_t> top_cluster;   // clusters that no group replaces
-    Box bounds;                        // of all boxes
-    float pad_px;                      // how far the filter reaches, and a pixel
+    Box bounds;                        // contains all boxes
+    float pad_px;                      // reach of the filter, plus a pixel
     PageTable pages;                   // where the gaussians are
 
     V3DG_HD size_t num_clusters() const { return own_group.size; }
@@ -34,23 +33,24 @@ struct ClusterTable {
     V3DG_HD size_t page_of(size_t c) const {
         return parent_group[c] < 0 ? ball.size : parent_group[c];
     }
-    // Where the rows of a cluster begin among those that are resident; its page is.
+    // The first row of a cluster among the resident ones. Precondition: its page is resident.
     V3DG_HD int64_t first_row(size_t c) const {
         return pages.is_whole() ? offset[c] : offset[c] + pages.shift[page_of(c)];
     }
-    // Which of the clusters that are resident it is.
+    // The place of a cluster among the resident ones. Precondition: its page is resident.
     V3DG_HD uint32_t place_of(size_t c) const {
         const auto place = static_cast<uint32_t>(c);
         return pages.cluster_shift.empty() ? place : place + pages.cluster_shift[page_of(c)];
     }
-    // Whether they begin where those of the cluster before it end, wherever pages lie.
+    // Whether the rows of a cluster begin where those of the cluster before it end, wherever pages
+    // lie.
     V3DG_HD bool follows(size_t c) const {
         return pages.is_whole() || page_of(c) == page_of(c - 1);
     }
 };
 
-// Low-pass of a level 0 that has none of its own, in a cut that fades: that of coarser levels by
-// default.
+// The filter of a level 0 without one of its own, in a cut with a fade: the default of coarser
+// levels.
 constexpr float kFadeFilterPx2 = 0.05f;
 
 // How the clusters of a bundle are drawn.
@@ -61,20 +61,20 @@ struct ClusterAppearance {
     V3DG_HD Appearance<float> operator[](size_t c) const {
         return {filter_px2[c], antialiased[c] != 0, false};
     }
-    // In a cut that fades, where the gaussians of level 0, too, are not to come and go between the
-    // samples.
+    // The same in a cut with a fade, which filters level 0, too: its gaussians must not appear and
+    // vanish between samples.
     V3DG_HD Appearance<float> faded(const ClusterTable& table, size_t c) const {
         if (table.own_group[c] >= 0 || filter_px2[c] > 0.0f) return (*this)[c];
         return {kFadeFilterPx2, true, true};
     }
 };
 
-// The tables of a bundle on the host. Borrows the arrays that it is given and owns what it derives
-// from them.
+// The tables of a bundle on the host. Borrows the arrays that the constructor gets and owns what it
+// derives from them.
 class HostTable {
   public:
-    // `given` has the arrays from `ball` to `offset`, and the pages.
-    HostTable(const ClusterTable& given, const ClusterAppearance& appearance);
+    // `table` has the arrays from `ball` to `offset`, and the pages.
+    HostTable(const ClusterTable& table, const ClusterAppearance& appearance);
     HostTable(const HostTable&) = delete;
     HostTable& operator=(const HostTable&) = delete;
 

@@ -16,8 +16,8 @@ void HostPages::make_planes(const PagePool& pool) {
     const size_t num_sh = 3 * num_sh_bases(pool.max_sh_degree());
     const float* plane = storage_.reserve((11 + num_sh) * stride_);
     GaussianPlanes<float> planes{};
-    const auto add = [&](size_t width, const float** of) {
-        for (size_t k = 0; k < width; ++k, plane += stride_) of[k] = plane;
+    const auto add = [&](size_t width, const float** pointers) {
+        for (size_t k = 0; k < width; ++k, plane += stride_) pointers[k] = plane;
     };
     add(3, planes.mean);
     add(4, planes.quat);
@@ -34,13 +34,13 @@ void HostPages::make_codes(const PagePool& pool) {
     const SlotPlan& plan = pool.plan();
     const int sh_degree = pool.max_sh_degree();
     offset_ = plan.empty_offsets();
-    slots_ = {records_.reserve(kRecordWords * plan.num_rows()),
-              sh_.reserve(num_sh_words(sh_degree) * plan.num_rows()),
-              ranges_.reserve(range_bytes(sh_degree) * plan.num_clusters()),
-              offset_.data(),
-              range_bytes(sh_degree),
-              static_cast<uint32_t>(sh_degree),
-              plan.num_clusters()};
+    slots_ = {.records = records_.reserve(kRecordWords * plan.num_rows()),
+              .sh = sh_.reserve(num_sh_words(sh_degree) * plan.num_rows()),
+              .ranges = ranges_.reserve(range_bytes(sh_degree) * plan.num_clusters()),
+              .offset = offset_.data(),
+              .range_size = range_bytes(sh_degree),
+              .sh_stride = static_cast<uint32_t>(sh_degree),
+              .num_clusters = plan.num_clusters()};
     for (uint32_t b = 0; b < pool.num_bundles(); ++b)
         codes_.push_back(slots_.codes(pool.source(b).sh_degree()));
 }
@@ -49,9 +49,9 @@ void HostPages::write_rows(const PageSource& source, const PageChange& change) {
     std::vector<float> decoded;
     const GaussianRows<const float> rows = source.rows(change.page, change.bytes, decoded);
     float* plane = storage_.data() + change.row;
-    const auto fill = [&](const float* from, size_t width) {
+    const auto fill = [&](const float* values, size_t width) {
         for (size_t a = 0; a < width; ++a, plane += stride_)
-            for (size_t i = 0; i < rows.size; ++i) plane[i] = from[i * width + a];
+            for (size_t i = 0; i < rows.size; ++i) plane[i] = values[i * width + a];
     };
     fill(rows.means, 3);
     fill(rows.quats, 4);

@@ -1,7 +1,7 @@
 #pragma once
 
-// The slots of a page pool on the host: rows, as planes that the bundles of the pool share, or
-// codes.
+// The slots of a page pool on the host. They hold rows, in planes that the bundles of the pool
+// share, or codes.
 
 #include <memory>
 #include <vector>
@@ -18,7 +18,7 @@ class HostPages {
 
     // Brings pages to their slots.
     void apply(const PagePool& pool, const std::vector<PageChange>& changes);
-    // The gaussians of a bundle: one of the two, the other is null.
+    // The gaussians of a bundle. One of the two is null, depending on PagePool::keeps_codes().
     const GaussianPlanes<float>* planes(size_t bundle) const {
         return planes_.empty() ? nullptr : &planes_[bundle];
     }
@@ -31,13 +31,13 @@ class HostPages {
 
     Buffer<float> storage_;
     size_t stride_ = 0;                          // of a plane
-    std::vector<GaussianPlanes<float>> planes_;  // of each bundle, which differ in the degree
+    std::vector<GaussianPlanes<float>> planes_;  // of each bundle; they differ in the SH degree
 
     Buffer<uint32_t> records_, sh_;
     Buffer<unsigned char> ranges_;
     std::vector<int64_t> offset_;
     CodeSlots slots_{};
-    std::vector<Codes> codes_;  // of each bundle, as planes
+    std::vector<Codes> codes_;  // of each bundle; they differ in the SH degree
 };
 
 // Blocks on the host.

@@ -1,5 +1,7 @@
 #pragma once
 
+// The instances of a scene: which bundle, where, and how important.
+
 #include <cstdint>
 
 #include "base/span.h"
@@ -7,14 +9,14 @@
 
 namespace v3dg {
 
-// Similarity transforms p -> scale * rotation p + position. An instance whose pose is not finite,
-// or has no size, is not drawn.
+// I similarity transforms p -> scale * rotation p + position. An instance is not drawn if its
+// pose is not finite, its scale not positive, or its quaternion zero.
 struct InstanceTable {
-    Span<const int32_t> bundle;     // [I] which of the scene's bundles
+    Span<const int32_t> bundle;     // [I] number among the bundles of the scene
     Span<const double> position;    // [I * 3]
     Span<const double> quaternion;  // [I * 4] w x y z
     Span<const double> scale;       // [I]
-    Span<const float> importance;   // [I] metrics are multiplied by it
+    Span<const float> importance;   // [I] factor of the metrics
 
     V3DG_HD Pose pose(size_t i) const {
         return {position.data + 3 * i, quaternion.data + 4 * i, scale[i]};

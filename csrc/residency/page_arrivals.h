@@ -9,28 +9,29 @@
 
 namespace v3dg {
 
-// How what comes into a pool comes into pictures.
+// Whether pages that become resident are drawn at once, or fade in.
 enum class Arrive { at_once, fading };
 
-// A page, counted through those of all bundles, and the frame after which it begins to fade in.
+// A page, by its number among those of all bundles, and the frame after which it begins to fade in.
 struct Arrival {
     uint32_t page;
     int32_t begins;
 };
 
-// A page waits until the one above it has faded in, so that none is ever farther than those above
-// it, in whichever frame one asks. The state follows from the changes of each frame alone.
+// A page waits until the one above it has faded in, so that in every frame a page has faded in at
+// most as far as the one above it. The state depends only on the changes of each frame.
 class PageArrivals {
   public:
-    // The coarsest pages are there from the start.
+    // The coarsest pages have faded in from the start.
     explicit PageArrivals(const PagePolicy& policy);
 
-    // Begins the next frame, with these changes before it. At once: everything has faded in.
+    // Begins the next frame, with these changes before it. With Arrive::at_once all pages have
+    // faded in.
     void advance(const std::vector<PageChange>& changes, Arrive arrive);
     int32_t frame() const { return frame_; }
-    // Of the last frame: what became of pages, each once.
+    // The pages whose state changed with the last frame, each once.
     const std::vector<Arrival>& changed() const { return changed_; }
-    // [P] of all bundles' pages, as PageTable has them.
+    // [P] of all bundles' pages, as PageTable::begins.
     const std::vector<int32_t>& begins() const { return begins_; }
 
   private:
@@ -39,7 +40,7 @@ class PageArrivals {
     };
     const PagePolicy& policy_;
     std::vector<int32_t> begins_;
-    std::vector<Waiting> waiting_;  // those that came later after those that came before
+    std::vector<Waiting> waiting_;  // in the order in which they became resident
     std::vector<Arrival> changed_;
     int32_t frame_ = 0, last_begin_ = 0;
 };

@@ -1,6 +1,7 @@
 #pragma once
 
-// Blocks of memory for pages on their way, of a few sizes, so that little of them stays empty.
+// Blocks of memory for pages on their way to their slots. There are a few sizes of blocks, so that
+// little of them stays empty.
 
 #include <algorithm>
 #include <cstddef>
@@ -8,16 +9,17 @@
 
 namespace v3dg {
 
-// Where blocks of bytes come from; kinds of memory differ by device.
+// Allocates memory for blocks; its kind depends on the device.
 struct BlockMemory {
     virtual ~BlockMemory() = default;
-    virtual unsigned char* allocate(size_t bytes) = 0;  // lives as long as this
+    // The memory lives as long as this.
+    virtual unsigned char* allocate(size_t bytes) = 0;
 };
 
 class PageBlocks {
   public:
-    // About so many bytes in at most so many blocks, for pages that are as large as these samples,
-    // and four of the most bytes that a page has.
+    // Allocates about `num_bytes` in at most `most_blocks` blocks for pages whose sizes are
+    // distributed like `samples`, and four blocks for the largest page.
     void allocate(const std::vector<size_t>& samples, size_t most_page_bytes, size_t num_bytes,
                   size_t most_blocks, BlockMemory& memory) {
         constexpr size_t kNumSizes = 8, kLeast = 64;
@@ -36,27 +38,30 @@ class PageBlocks {
             const size_t share = samples.empty() ? 0 : count[k] * wanted / samples.size();
             const size_t least =
                 k + 1 == kNumSizes ? std::min<size_t>(4, std::max<size_t>(most_blocks, 1)) : 0;
-            sizes_.push_back({(k + 1) * step, nullptr, std::max(share, least), {}});
+            sizes_.push_back({.size = (k + 1) * step,
+                              .first = nullptr,
+                              .count = std::max(share, least),
+                              .free = {}});
             num_bytes_ += sizes_.back().size * sizes_.back().count;
             num_blocks_ += sizes_.back().count;
         }
         unsigned char* block = memory.allocate(num_bytes_);
-        for (Size& of : sizes_) {
-            of.first = block;
-            of.free.reserve(of.count);
-            for (size_t i = 0; i < of.count; ++i, block += of.size) of.free.push_back(block);
+        for (Size& size : sizes_) {
+            size.first = block;
+            size.free.reserve(size.count);
+            for (size_t i = 0; i < size.count; ++i, block += size.size) size.free.push_back(block);
         }
     }
 
     size_t num_blocks() const { return num_blocks_; }
     size_t num_bytes() const { return num_bytes_; }
 
-    // A block of at least so many bytes; null where none is free.
+    // Returns a block of at least so many bytes, or null if none is free.
     unsigned char* take(size_t bytes) {
-        for (Size& of : sizes_) {
-            if (of.size < bytes || of.free.empty()) continue;
-            unsigned char* block = of.free.back();
-            of.free.pop_back();
+        for (Size& size : sizes_) {
+            if (size.size < bytes || size.free.empty()) continue;
+            unsigned char* block = size.free.back();
+            size.free.pop_back();
             return block;
         }
         return nullptr;

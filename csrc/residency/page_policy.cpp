@@ -1,3 +1,7 @@
+// How a view's needs become decisions. note() marks what is resident as used and collects what is
+// absent, choose() orders that for reading, and bring() assigns slots to what was read, evicting
+// the pages that were unused for longest.
+
 #include "residency/page_policy.h"
 
 #include <algorithm>
@@ -13,28 +17,33 @@ namespace v3dg {
 
 namespace {
 
-// A page above one that is asked for is more urgent by so much, and none below it is as urgent:
-// those around the eye, whose priority has no bound, count as this.
-constexpr float kAbove = 2.0f, kMostPriority = 1073741824.0f;
-constexpr size_t kMostLeaving = 4096;  // slots that make room before they are looked for again
-constexpr size_t kMostChosen = size_t(1) << 14;  // that are read before the next choice
-constexpr int32_t kRootSlot = -2, kNoSlot = -1;
-constexpr size_t kAhead = 16;  // needs whose memory is fetched before their turn
+// The priority of a page is at least this multiple of those of the pages below it.
+constexpr float kAbove = 2.0f;
+// Priorities around the eye have no bound; they are clamped to this, so that a page
+// above one of them is still more urgent.
+constexpr float kMostPriority = 1073741824.0f;
+constexpr size_t kMostLeaving = 4096;            // slots that are found at once to be evicted
+constexpr size_t kMostChosen = size_t(1) << 14;  // pages to be read before the next choice
+constexpr int32_t kRootSlot = -2;
+constexpr int32_t kNoSlot = -1;
+constexpr size_t kAhead = 16;  // needs whose memory is prefetched
 
-// Urgencies are told apart by a sixteenth of a power of two, from 1/2 on: a float has 23 bits
-// within one, of which the upper four are looked at.
-constexpr uint32_t kNumKeys = 1024, kKeyShift = 19, kFirstKey = 0x3f000000u >> kKeyShift;
-constexpr uint32_t kKeyOfMissed =
-    (0x3f800000u >> kKeyShift) - kFirstKey;  // of 1: those below are asked ahead
+// A key is a priority from 1/2 on, rounded down to a sixteenth of a power of two: the exponent of a
+// float and the upper four of its 23 bits of mantissa.
+constexpr uint32_t kNumKeys = 1024;
+constexpr uint32_t kKeyShift = 19;
+constexpr uint32_t kFirstKey = 0x3f000000u >> kKeyShift;
+// The key of priority 1. Pages below it are not missed, but asked for ahead.
+constexpr uint32_t kKeyOfMissed = (0x3f800000u >> kKeyShift) - kFirstKey;
 
-// A disk is quicker the more it reads at once, and neighbours in a file are neighbours in space, of
-// one level: mostly of about the same urgency. So about so many bytes of them are a stretch, which
-// is as urgent as the most urgent page of it that is wanted.
+// A disk is faster the more it reads at once, and neighbours in a file are neighbours in space and
+// of one level: mostly of about the same urgency. So about so many bytes of neighbours form a
+// stretch, which is as urgent as the most urgent wanted page in it.
 constexpr size_t kStretchBytes = size_t(512) << 10;
 constexpr uint32_t kNoStretch = UINT32_MAX;
 
 uint32_t key_of(float priority) {
-    uint32_t bits;  // of a positive float, so they order as it does
+    uint32_t bits;  // those of positive floats have the order of the floats
     std::memcpy(&bits, &priority, sizeof bits);
     return std::clamp(bits >> kKeyShift, kFirstKey, kFirstKey + kNumKeys - 1) - kFirstKey;
 }
@@ -69,7 +78,7 @@ PagePolicy::PagePolicy(const std::vector<PagedBundle>& bundles, const PoolMemory
     states_ = std::make_unique<std::atomic<PageState>[]>(num_pages);
     uint32_t first_page = 0;
     for (const PagedBundle& bundle : bundles) {
-        bundles_.push_back({bundle.source, first_page});
+        bundles_.push_back({.source = bundle.source, .first_page = first_page});
         first_page += static_cast<uint32_t>(bundle.table.num_pages());
     }
     parallel_for(bundles.size(), 1, [&](size_t b) { add_pages(bundles_[b], bundles[b].table); });
@@ -127,9 +136,12 @@ void PagePolicy::plan_memory(const PoolMemory& memory) {
 }
 
 PageChange PagePolicy::root(size_t bundle) const {
-    const Bundle& of = bundles_[bundle];
-    return {static_cast<uint32_t>(bundle), static_cast<uint32_t>(of.source->num_pages() - 1),
-            static_cast<int64_t>(of.root_row), of.root_cluster, nullptr};
+    const Bundle& paged = bundles_[bundle];
+    return {.bundle = static_cast<uint32_t>(bundle),
+            .page = static_cast<uint32_t>(paged.source->num_pages() - 1),
+            .row = static_cast<int64_t>(paged.root_row),
+            .cluster = paged.root_cluster,
+            .bytes = nullptr};
 }
 
 void PagePolicy::forget_failures() {
@@ -139,24 +151,24 @@ void PagePolicy::forget_failures() {
     }
 }
 
-void PagePolicy::touch(uint32_t& last, uint32_t value, Kept& kept) {
-    kept.now -= last == noted_ + 1;
-    kept.before -= last == noted_;
-    kept.now += value == noted_ + 1;
+void PagePolicy::touch(uint32_t& last, uint32_t value, Counts& counts) {
+    counts.now -= last == noted_ + 1;
+    counts.before -= last == noted_;
+    counts.now += value == noted_ + 1;
     last = value;
 }
 
-// Marks a page as used by the noted view, and those above it as needed.
+// Marks the page of a slot as used by the noted view, and the pages above it as needed.
 void PagePolicy::use(int32_t slot, bool is_needed) {
     for (; slot >= 0; slot = uses_[slot].above, is_needed = true) {
-        Use& of = uses_[slot];
-        if (of.last_needed == noted_ + 1) return;
-        touch(of.last_used, noted_ + 1, used_);
-        if (is_needed) touch(of.last_needed, noted_ + 1, needed_);
+        Use& slot_use = uses_[slot];
+        if (slot_use.last_needed == noted_ + 1) return;
+        touch(slot_use.last_used, noted_ + 1, used_);
+        if (is_needed) touch(slot_use.last_needed, noted_ + 1, needed_);
     }
 }
 
-// The topmost page that cannot be had, itself or above a page; -1: none.
+// Returns the topmost page that failed, among a page and those above it; -1 if none did.
 int32_t PagePolicy::block_above(int32_t id) const {
     int32_t blocked = -1;
     for (; id >= 0; id = pages_[id].parent)
@@ -164,8 +176,8 @@ int32_t PagePolicy::block_above(int32_t id) const {
     return blocked;
 }
 
-// Adds an absent page and those above it to what is wanted. Returns how many of them the cut misses
-// that it was not known to miss.
+// Adds an absent page and the absent pages above it to the wanted ones. Returns how many of them
+// the cut misses that were not counted as missing before.
 size_t PagePolicy::ask(const PageRequest& request, bool has_failures) {
     auto id = static_cast<int32_t>(id_of(request.bundle, request.page));
     const int32_t blocked = has_failures ? block_above(id) : -1;
@@ -195,7 +207,7 @@ void PagePolicy::note(Span<const PageRequest> needs, size_t num_left_out, bool h
     needed_ = {0, needed_.now};
     used_ = {0, used_.now};
     missing_ = num_left_out;
-    finds_none_ = false;
+    has_none_leaving_ = false;
     wanted_.clear();
     for (size_t i = 0; i < needs.size; ++i) {
         if (i + kAhead < needs.size) {
@@ -212,16 +224,18 @@ void PagePolicy::note(Span<const PageRequest> needs, size_t num_left_out, bool h
     num_needed_ = needed_.now;
 }
 
-// Has the keys of what is wanted be those of its stretches, and the pages in the order of the
-// files. No stretch has a page and one below it, and that above is the more urgent.
+// Replaces the keys of the wanted pages by those of their stretches, and sorts the pages in the
+// order of their files. No stretch contains both a page and one below it, and the stretch of a page
+// is more urgent than those of the pages below it.
 void PagePolicy::find_stretches() {
     std::sort(wanted_.begin(), wanted_.end(), [](const Wanted& a, const Wanted& b) {
         return a.bundle != b.bundle ? a.bundle < b.bundle : a.page < b.page;
     });
     key_of_stretch_.clear();
     uint32_t bundle = UINT32_MAX;
-    size_t pages_of_stretch = 1, number = 0;  // number: of the stretch, in the bundle
-    int32_t least_above = 0;                  // of its pages
+    size_t pages_of_stretch = 1;
+    size_t number = 0;        // of the stretch, in its bundle
+    int32_t least_above = 0;  // the first of the pages above those of the stretch
     for (const Wanted& w : wanted_) {
         const auto id = static_cast<int32_t>(id_of(w.bundle, w.page));
         if (w.bundle != bundle)
@@ -239,8 +253,8 @@ void PagePolicy::find_stretches() {
         least_above = std::min(least_above, page.parent);
         key_of_stretch_.back() = std::max(key_of_stretch_.back(), w.key);
     }
-    // Pages come after those below them, so what a stretch is raised to is known when its first
-    // page is.
+    // A page lies after those below it, so a stretch has its final key when its first page is
+    // reached.
     for (Wanted& w : wanted_) {
         const Page& page = pages_[id_of(w.bundle, w.page)];
         const Page& above = pages_[page.parent];
@@ -249,7 +263,7 @@ void PagePolicy::find_stretches() {
             uint32_t& key_above = key_of_stretch_[above.stretch];
             key_above = std::min(std::max(key_above, key + 1), kNumKeys - 1);
         }
-        // What is asked for ahead waits until nothing is missed.
+        // Pages that are asked for ahead wait until none is missed.
         w.key = w.key < kKeyOfMissed ? std::min(key, kKeyOfMissed - 1) : key;
     }
 }
@@ -267,7 +281,7 @@ void PagePolicy::choose(size_t under_way, std::vector<PageRequest>& todo) {
     const size_t unneeded = num_old(needed_), unused = num_old(used_);
     const size_t room = num_missed > unused ? std::min(num_missed, unneeded) : unused;
     const size_t most = std::min(room > under_way ? room - under_way : 0, kMostChosen);
-    // The least urgent first; what there is no room for is left out.
+    // The least urgent come first, and of those as many are left out as there is no room for.
     size_t num_left_out = wanted_.size() > most ? wanted_.size() - most : 0;
     todo.resize(wanted_.size() - num_left_out);
     uint32_t end = 0;
@@ -288,17 +302,21 @@ void PagePolicy::choose(size_t under_way, std::vector<PageRequest>& todo) {
 void PagePolicy::evict(uint32_t s, PagesComing& out) {
     const Slot slot = std::exchange(slots_[s], {});
     const uint32_t id = id_of(slot.bundle, slot.page);
-    out.changes.push_back({static_cast<uint32_t>(slot.bundle), slot.page, kAbsentPage, 0, nullptr});
+    out.changes.push_back({.bundle = static_cast<uint32_t>(slot.bundle),
+                           .page = slot.page,
+                           .row = kAbsentPage,
+                           .cluster = 0,
+                           .bytes = nullptr});
     slot_of_page_[id] = kNoSlot;
     states_[id].store(PageState::absent, std::memory_order_release);
-    Use& of = uses_[s];
-    if (of.above >= 0) --uses_[of.above].num_children;
-    touch(of.last_needed, 0, needed_);
-    touch(of.last_used, 0, used_);
+    Use& slot_use = uses_[s];
+    if (slot_use.above >= 0) --uses_[slot_use.above].num_children;
+    touch(slot_use.last_needed, 0, needed_);
+    touch(slot_use.last_used, 0, used_);
     free_slots_.push_back(s);
 }
 
-// Where no slot is free.
+// Collects slots that may be freed, when no slot is free.
 void PagePolicy::find_leaving() {
     for (uint32_t s = 0; s < slots_.size(); ++s)
         if (may_go(s)) leaving_.push_back({uses_[s].last_used, s});
@@ -307,10 +325,11 @@ void PagePolicy::find_leaving() {
         leaving_.resize(kMostLeaving);
     }
     std::make_heap(leaving_.begin(), leaving_.end(), std::greater<>());
-    finds_none_ = leaving_.empty();
+    has_none_leaving_ = leaving_.empty();
 }
 
-// Whether the first of the heap may go; those that were used again are dropped.
+// Drops slots that were used again from the front of the heap. Returns whether one is left that may
+// be freed.
 bool PagePolicy::has_leaving() {
     while (!leaving_.empty()) {
         const Leaving& first = leaving_.front();
@@ -321,10 +340,11 @@ bool PagePolicy::has_leaving() {
     return false;
 }
 
-// Sees to it that there is a free slot, for a page that the cut misses or one that it nearly does.
+// Evicts a page unless a slot is free. `is_missed`: the slot is for a page that the cut misses,
+// else for one that is asked for ahead. Returns whether there is a free slot.
 bool PagePolicy::make_room(bool is_missed, PagesComing& out) {
     if (!free_slots_.empty()) return true;
-    if (!has_leaving() && !finds_none_) find_leaving();
+    if (!has_leaving() && !has_none_leaving_) find_leaving();
     if (leaving_.empty() || (!is_missed && !is_old(leaving_.front().last_used))) return false;
     std::pop_heap(leaving_.begin(), leaving_.end(), std::greater<>());
     const uint32_t s = leaving_.back().slot;
@@ -344,15 +364,19 @@ void PagePolicy::occupy(const LoadedPage& loaded, PagesComing& out) {
     const auto row = static_cast<int64_t>(plan_.first_slot_row + s * plan_.slot_rows);
     const size_t cluster = plan_.first_slot_cluster + s * plan_.slot_clusters;
     slots_[s] = {static_cast<int32_t>(loaded.bundle), loaded.page};
-    Use& of = uses_[s];
-    touch(of.last_needed, noted_ + 1, needed_);
-    touch(of.last_used, noted_ + 1, used_);
-    of.above = slot_of_page_[pages_[id].parent];
-    of.num_children = 0;
-    if (of.above >= 0) ++uses_[of.above].num_children;
+    Use& slot_use = uses_[s];
+    touch(slot_use.last_needed, noted_ + 1, needed_);
+    touch(slot_use.last_used, noted_ + 1, used_);
+    slot_use.above = slot_of_page_[pages_[id].parent];
+    slot_use.num_children = 0;
+    if (slot_use.above >= 0) ++uses_[slot_use.above].num_children;
     slot_of_page_[id] = static_cast<int32_t>(s);
     states_[id].store(PageState::resident, std::memory_order_release);
-    out.changes.push_back({loaded.bundle, loaded.page, row, cluster, loaded.block});
+    out.changes.push_back({.bundle = loaded.bundle,
+                           .page = loaded.page,
+                           .row = row,
+                           .cluster = cluster,
+                           .bytes = loaded.block});
     out.bytes += bundles_[loaded.bundle].source->num_bytes(loaded.page);
 }
 
@@ -360,7 +384,8 @@ void PagePolicy::bring(std::vector<LoadedPage>& loaded, size_t most_bytes, Pages
     for (LoadedPage& next : loaded) next.priority = pages_[id_of(next.bundle, next.page)].priority;
     std::sort(loaded.begin(), loaded.end(), [](const LoadedPage& a, const LoadedPage& b) {
         if (a.priority != b.priority) return a.priority > b.priority;
-        return a.bundle != b.bundle ? a.bundle < b.bundle : a.page > b.page;  // those above first
+        return a.bundle != b.bundle ? a.bundle < b.bundle
+                                    : a.page > b.page;  // pages above come first
     });
     left_.clear();
     for (const LoadedPage& next : loaded) {

@@ -1,12 +1,13 @@
 #pragma once
 
-// What a pool of pages decides: which pages are read, which become resident, which make room, and
-// in what order. It knows no threads and no bytes: whoever asks is one thread at a time, and tells
-// what was read.
+// What a pool of pages decides: which pages are read, which become resident, which are evicted, and
+// in what order. It knows no threads and no bytes: one thread at a time calls it and reports which
+// pages were read.
 //
-// Memory is rows of gaussians, and places of clusters: those of the coarsest pages of all bundles
-// first, which stay, then slots that hold any other page. What is resident is closed towards the
-// root at every moment: a page comes after the page above it, and goes when none below it is there.
+// The memory holds rows of gaussians and places of clusters: first those of the coarsest pages of
+// all bundles, which stay, then slots of one size, each for any other page. At every moment the set
+// of resident pages is closed towards the root: a page becomes resident after the page above it,
+// and is evicted only when no page below it is resident.
 
 #include <atomic>
 #include <cstdint>
@@ -19,8 +20,8 @@
 
 namespace v3dg {
 
-// A bundle of which pages are resident: its tables, of which only those of groups and clusters are
-// read and only at the start, and where its pages come from.
+// A bundle whose pages are resident in part: its tables, of which only those of groups and clusters
+// are read, and only by the constructor, and the source of its pages.
 struct PagedBundle {
     ClusterTable table;
     std::shared_ptr<const PageSource> source;
@@ -29,35 +30,37 @@ struct PagedBundle {
 // Memory for gaussians.
 struct PoolMemory {
     size_t num_bytes;
-    size_t row_bytes, cluster_bytes;  // that a gaussian takes, and a cluster besides
-    size_t most_rows = UINT32_MAX;    // that whoever draws can tell apart
+    size_t row_bytes;               // of a gaussian
+    size_t cluster_bytes;           // of a cluster, beside its gaussians
+    size_t most_rows = UINT32_MAX;  // that the device's indices can address
 
     size_t bytes_of(size_t num_rows, size_t num_clusters) const {
         return num_rows * row_bytes + num_clusters * cluster_bytes;
     }
 };
 
-// What that is divided into: what the coarsest pages take, then slots of one size.
+// How the memory is divided: the coarsest pages first, then slots of one size.
 struct SlotPlan {
     size_t first_slot_row = 0, first_slot_cluster = 0;
     size_t num_slots = 0, slot_rows = 1, slot_clusters = 1;
 
     size_t num_rows() const { return first_slot_row + num_slots * slot_rows; }
     size_t num_clusters() const { return first_slot_cluster + num_slots * slot_clusters; }
-    // What a page of so many clusters that begin there has of them: all in a slot, else its own.
+    // How many places of clusters belong to a page of so many clusters that begins at `cluster`: a
+    // whole slot, or those of a coarsest page.
     size_t num_clusters_at(size_t cluster, size_t num_clusters) const {
         return cluster < first_slot_cluster ? num_clusters : slot_clusters;
     }
-    // [num_clusters() + 1] rows where clusters begin while there is nothing in any slot, ascending.
+    // [num_clusters() + 1] first row of each cluster while all slots are empty, ascending.
     std::vector<int64_t> empty_offsets() const;
 };
 
-// A page that comes to its slot, or leaves it.
+// A page that becomes resident, or is evicted.
 struct PageChange {
     uint32_t bundle, page;
-    int64_t row;                 // where its rows begin; kAbsentPage: it leaves
-    size_t cluster;              // where the places of its clusters begin
-    const unsigned char* bytes;  // of what comes
+    int64_t row;                 // its first row; kAbsentPage: it is evicted
+    size_t cluster;              // the first place of its clusters
+    const unsigned char* bytes;  // of a page that becomes resident, else null
 };
 
 enum class PageState : uint8_t { absent, loading, loaded, resident, failed };
@@ -66,22 +69,24 @@ enum class PageState : uint8_t { absent, loading, loaded, resident, failed };
 struct LoadedPage {
     uint32_t bundle, page;
     unsigned char* block;
-    float priority = 0;  // of the last view that asked for it
+    float priority = 0;  // for the last view that asked for it
 };
 
-// What becomes of pages that were loaded.
+// The result of PagePolicy::bring() for pages that were loaded.
 struct PagesComing {
     std::vector<PageChange> changes;      // in this order
-    std::vector<unsigned char*> dropped;  // blocks of those that nobody wants any more
-    size_t bytes = 0;                     // that come
-    size_t num_left = 0;                  // that wait only for bytes of a later frame
+    std::vector<unsigned char*> dropped;  // blocks of pages that are no longer wanted
+    size_t bytes = 0;                     // of the pages that become resident
+    size_t num_left = 0;                  // pages that wait only for the bytes of a later frame
 
     void clear();
 };
 
+// The constant functions may be called by any thread, except missing() and needed(); those and all
+// others belong to the thread that decides.
 class PagePolicy {
   public:
-    // Throws std::invalid_argument where there is no room for the coarsest pages and one page more
+    // Throws std::invalid_argument if there is no room for the coarsest pages and for one more page
     // of each bundle.
     PagePolicy(const std::vector<PagedBundle>& bundles, const PoolMemory& memory);
 
@@ -92,35 +97,38 @@ class PagePolicy {
     size_t num_pages() const { return slot_of_page_.size; }
     size_t most_page_bytes() const { return most_page_bytes_; }
     const PageSource& source(size_t bundle) const { return *bundles_[bundle].source; }
-    // The place of a page among those of all bundles, and that of the page above it; below 0: none
-    // is.
+    // The number of a page among those of all bundles.
     uint32_t id_of(size_t bundle, size_t page) const {
         return bundles_[bundle].first_page + static_cast<uint32_t>(page);
     }
+    // The number of the page above; negative if there is none.
     int32_t page_above(uint32_t id) const { return pages_[id].parent; }
 
-    // Any thread may ask for the state of a page, and change it from absent to loading and from
-    // that on.
+    // Any thread may read the state of a page. Threads that read pages change it from absent to
+    // loading, and from loading to loaded or failed.
     std::atomic<PageState>& state(size_t bundle, size_t page) const {
         return states_[id_of(bundle, page)];
     }
     void forget_failures();
-    // Takes the memory for as many loaded pages, so that bring() never wants for it.
+    // Allocates memory for so many loaded pages, so that bring() never allocates.
     void reserve(size_t num_loaded) { left_.reserve(num_loaded); }
 
-    // Takes note of what the cut of a frame needed, absent or resident, in any order. So many more
-    // pages are needed as are left out, which is more than there is room for. `has_failures`: some
-    // pages cannot be had.
+    // Notes what the cut of a frame needs, absent or resident, in any order. `num_left_out`:
+    // further needs that are not in the list, which are more than there is room for.
+    // `has_failures`: some pages cannot be read.
     void note(Span<const PageRequest> needs, size_t num_left_out, bool has_failures);
-    // What is read next for that, the most urgent stretch last and each from its end, those above
-    // before those below: no more than there will be room for, beside what is under way.
+    // Sets `todo` to the pages to read next for the noted view, with the most urgent stretch last
+    // and each stretch in descending order, so that pages are taken from the end and those above
+    // come before those below. At most as many as there will be room for, in addition to the
+    // `under_way` pages that are being read or are loaded.
     void choose(size_t under_way, std::vector<PageRequest>& todo);
-    // Of that frame: pages that it misses, and slots that it would take.
+    // Pages that the noted view misses, and slots that it would take.
     size_t missing() const { return missing_; }
     size_t needed() const { return missing_ + num_needed_; }
 
-    // Brings loaded pages to slots, the most urgent first, of about so many bytes; at least one.
-    // What it leaves has to wait: for bytes, or for a page above that is under way.
+    // Assigns slots to loaded pages, the most urgent first, of about `most_bytes`; at least one.
+    // Pages that it leaves in `loaded` wait for a later frame, or for a page above them that is
+    // being read.
     void bring(std::vector<LoadedPage>& loaded, size_t most_bytes, PagesComing& out);
 
   private:
@@ -128,37 +136,43 @@ class PagePolicy {
         std::shared_ptr<const PageSource> source;
         uint32_t first_page = 0;
         size_t root_row = 0, root_cluster = 0;
-        size_t most_rows = 1, most_clusters = 1, most_bytes = 1;  // of its pages but the coarsest
+        // Of a page other than the coarsest.
+        size_t most_rows = 1, most_clusters = 1, most_bytes = 1;
     };
     struct Page {
-        int32_t parent = -1;   // all pages are numbered together; -1: the coarsest has none
-        uint32_t stamp = 0;    // view that asked for it last
-        float priority = 0;    // then
-        uint32_t stretch = 0;  // of that view, where it is wanted
+        int32_t parent = -1;   // number among the pages of all bundles; -1: it is a coarsest page
+        uint32_t stamp = 0;    // the view that asked for it last
+        float priority = 0;    // for that view
+        uint32_t stretch = 0;  // among those of that view, if the page is wanted
     };
     struct Slot {
         int32_t bundle = -1;
         uint32_t page = 0;
     };
-    // Of a slot: one more than the view that needed its page last, and that used it: needed it, or
-    // nearly.
+    // When the page of a slot was used.
     struct Use {
-        uint32_t last_needed = 0, last_used = 0;
-        int32_t above = 0;          // slot of the page above; below 0: that is the coarsest
-        uint32_t num_children = 0;  // that are resident
+        uint32_t last_needed = 0;   // one more than the view that needed it last
+        uint32_t last_used = 0;     // one more than the view that needed it last, or nearly did
+        int32_t above = 0;          // slot of the page above; negative: that is a coarsest page
+        uint32_t num_children = 0;  // resident pages directly below
     };
-    // Slots with a page that this view, or the one before and not this one, needed or used.
-    struct Kept {
-        size_t now = 0, before = 0;
+    // How many slots have a page that this view needed or used, and how many one that only the view
+    // before did.
+    struct Counts {
+        size_t now = 0;
+        size_t before = 0;
     };
     struct Wanted {
-        uint32_t bundle, page, key;  // key: of its urgency
+        uint32_t bundle;
+        uint32_t page;
+        uint32_t key;  // of its urgency
     };
-    // Of what is as urgent: places that are left, and where they end.
+    // The places in `todo` for pages with one key: how many are left, and where they end.
     struct Places {
-        uint32_t count = 0, end = 0;
+        uint32_t count = 0;
+        uint32_t end = 0;
     };
-    // A slot that may go, as long as its page was not used again.
+    // A slot whose page may be evicted, unless it was used again since.
     struct Leaving {
         uint32_t last_used, slot;
 
@@ -175,10 +189,12 @@ class PagePolicy {
     size_t ask(const PageRequest& request, bool has_failures);
     int32_t block_above(int32_t id) const;
     void find_stretches();
-    void touch(uint32_t& last, uint32_t value, Kept& kept);
-    // What this view and the one before did without.
+    void touch(uint32_t& last, uint32_t value, Counts& counts);
+    // Whether neither this view nor the one before needed or used it.
     bool is_old(uint32_t last) const { return last < noted_; }
-    size_t num_old(const Kept& kept) const { return slots_.size() - kept.now - kept.before; }
+    size_t num_old(const Counts& counts) const {
+        return slots_.size() - counts.now - counts.before;
+    }
     bool may_go(uint32_t slot) const {
         return is_old(uses_[slot].last_needed) && uses_[slot].num_children == 0;
     }
@@ -192,7 +208,7 @@ class PagePolicy {
     SlotPlan plan_;
     size_t most_page_bytes_ = 1;
 
-    // Of pages. A page that is in no slot is absent, on its way, or the coarsest of its bundle.
+    // By page. A page without a slot is absent, on its way, or the coarsest of its bundle.
     Buffer<int32_t> slot_storage_;
     Buffer<Page> page_storage_;
     Span<int32_t> slot_of_page_;
@@ -203,16 +219,16 @@ class PagePolicy {
     std::vector<Use> uses_;
     std::vector<uint32_t> free_slots_;
 
-    uint32_t noted_ = 1;  // views, and one more
-    Kept needed_, used_;
+    uint32_t noted_ = 1;  // one more than the number of noted views
+    Counts needed_, used_;
     size_t missing_ = 0, num_needed_ = 0;
     std::vector<Wanted> wanted_;
     std::vector<uint32_t> key_of_stretch_;
     std::vector<Places> places_of_key_;
-    // A heap, those first that were not used for longest. It lasts from frame to frame: what comes
-    // to be old meanwhile is younger than what it has.
+    // A heap with the slot that was unused for longest in front. It is kept from frame to frame:
+    // slots that become old in the meantime were used later than those in it.
     std::vector<Leaving> leaving_;
-    bool finds_none_ = false;  // that may go, until the next view is noted
+    bool has_none_leaving_ = false;  // no slot can be freed until the next view is noted
     std::vector<LoadedPage> left_;
 };
 

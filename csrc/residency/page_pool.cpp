@@ -1,7 +1,7 @@
-#include "residency/page_pool.h"
-
 // The facade of a pool: makes its parts (pool_shared.h has the list), starts and ends its threads,
 // and answers what needs no part of its own.
+
+#include "residency/page_pool.h"
 
 #include <unistd.h>
 

@@ -10,7 +10,7 @@
 
 namespace v3dg {
 
-constexpr size_t kFew = 8;  // pages that a thread reads at once: as many as are hashed side by side
+constexpr size_t kFew = 8;  // pages that a thread reads at once: as many as are hashed in parallel
 
 static std::string name_of(const PageRun& run, size_t page) {
     const Span<const int64_t> clusters = run.clusters(page);
@@ -19,8 +19,8 @@ static std::string name_of(const PageRun& run, size_t page) {
            ")";
 }
 
-// Reads so many pages to memory, one behind another, and calls use(page, bytes) for those up to the
-// first that cannot be had.
+// Reads `count` pages into contiguous memory, and calls use(page, bytes) for each until one cannot
+// be read.
 template <class Use>
 static void read_few(const PosixFile& file, const PageRun& run, size_t first, size_t count,
                      unsigned char* bytes, const Use& use) {
@@ -37,7 +37,7 @@ static void read_few(const PosixFile& file, const PageRun& run, size_t first, si
     }
 }
 
-// Calls read(first page, how many) on all threads.
+// Calls read(first page, number of pages) on all threads.
 template <class Read>
 static void for_few_pages(const PageRun& run, const Read& read) {
     const size_t share = run.size() / static_cast<size_t>(most_threads());
@@ -62,8 +62,8 @@ static void decode(const PageRun& run, size_t page, PageCodec codec, const unsig
         return;
     }
     const GaussianRows<const float> rows = rows_of_page(bytes, count, out.sh_degree);
-    const auto copy = [&](const float* from, float* to, size_t width) {
-        std::copy_n(from, count * width, to + first * width);
+    const auto copy = [&](const float* source, float* destination, size_t width) {
+        std::copy_n(source, count * width, destination + first * width);
     };
     copy(rows.means, out.means, 3);
     copy(rows.quats, out.quats, 4);

@@ -11,27 +11,29 @@
 namespace v3dg {
 
 struct PageRun {
-    size_t first_page;                  // number in the bundle
-    Span<const int64_t> first_cluster;  // [n + 1] of each page, in the run, and the end
-    Span<const int64_t> offset;  // gaussians of each cluster of the run, in the bundle, and the end
+    size_t first_page;                  // its number in the bundle
+    Span<const int64_t> first_cluster;  // [n + 1] of each page, counted in the run, and the end
+    Span<const int64_t> offset;  // first gaussian, in the bundle, of each cluster of the run,
+                                 // and the end
     Span<const int64_t> places;  // [n + 1] first byte of each page in the file, and the end
     Span<const uint8_t> hashes;  // [n][16]
 
     size_t size() const { return places.size - 1; }
     size_t num_bytes(size_t page) const { return places[page + 1] - places[page]; }
-    // Gaussians of the clusters of a page, in the bundle, and the end.
+    // First gaussian, in the bundle, of each cluster of a page, and the end.
     Span<const int64_t> clusters(size_t page) const {
         return {offset.data + first_cluster[page],
                 static_cast<size_t>(first_cluster[page + 1] - first_cluster[page] + 1)};
     }
 };
 
-// The gaussians of all pages, verified. A page has at least the bytes that its codec needs. Throws
-// PageError, which names the first page that cannot be had, without the file.
+// Reads and verifies all pages and decodes their gaussians. Each page has at least the bytes that
+// its codec needs. Throws PageError, which names the first page that cannot be read, without the
+// file.
 void read_pages(const PosixFile& file, const PageRun& run, PageCodec codec,
                 const GaussianRows<float>& out);
 
-// The words of all pages, verified.
+// Reads and verifies the words of all pages. Throws likewise.
 void read_codes(const PosixFile& file, const PageRun& run, Span<int32_t> words);
 
 }  // namespace v3dg

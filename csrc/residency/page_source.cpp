@@ -1,3 +1,6 @@
+// Reads pages in three steps: neighbours in one call of the system, page by page where that fails
+// so that each error names its page, then all hashes together.
+
 #include "residency/page_source.h"
 
 #include <algorithm>
@@ -30,11 +33,16 @@ GaussianRows<const float> PageSource::rows(size_t page, const unsigned char* byt
     decoded.resize(count * (11 + 3 * num_sh_bases(sh_degree_)));
     const GaussianRows<const float> rows =
         rows_of_page(reinterpret_cast<const unsigned char*>(decoded.data()), count, sh_degree_);
-    const auto written = [](const float* to) { return const_cast<float*>(to); };
+    const auto writable = [](const float* values) { return const_cast<float*>(values); };
     cpu::decode_page(
         {{offset.data(), offset.size()}, reinterpret_cast<const uint32_t*>(bytes), sh_degree_},
-        {written(rows.means), written(rows.quats), written(rows.scales), written(rows.opacities),
-         written(rows.sh), count, sh_degree_});
+        {.means = writable(rows.means),
+         .quats = writable(rows.quats),
+         .scales = writable(rows.scales),
+         .opacities = writable(rows.opacities),
+         .sh = writable(rows.sh),
+         .size = count,
+         .sh_degree = sh_degree_});
     return rows;
 }
 
@@ -48,23 +56,24 @@ FilePages::FilePages(const ClusterTable& table, int sh_degree, PageCodec codec, 
       hash_(hash.begin(), hash.end()),
       fetch_(std::move(fetch)) {}
 
-static void read_one(const PosixFile& file, Span<const int64_t> places, PageReading& of,
+static void read_one(const PosixFile& file, Span<const int64_t> places, PageReading& reading,
                      const std::function<std::string(size_t)>& name_of) {
-    const auto size = static_cast<size_t>(places[of.page + 1] - places[of.page]);
+    const size_t page = reading.page;
+    const auto size = static_cast<size_t>(places[page + 1] - places[page]);
     try {
-        if (file.read_at(places[of.page], reinterpret_cast<char*>(of.bytes), size) < size)
-            of.error.emplace(name_of(of.page) + " is not there; the file was truncated", true);
+        if (file.read_at(places[page], reinterpret_cast<char*>(reading.bytes), size) < size)
+            reading.error.emplace(name_of(page) + " is not there; the file was truncated", true);
     } catch (const std::system_error& error) {
-        of.error.emplace(name_of(of.page) + ": " + error.code().message(), false,
-                         error.code().value());
+        reading.error.emplace(name_of(page) + ": " + error.code().message(), false,
+                              error.code().value());
     }
 }
 
-// Bytes between two pages that are read and thrown away rather than asked for twice around: a page
-// or two.
+// A gap between two pages of at most so many bytes, a page or two, is read and discarded: that is
+// faster than a second call.
 constexpr size_t kMostSkippedBytes = size_t(32) << 10;
 
-// Where the pages end that are read at once with the first.
+// Returns the end of the pages that are read in one call with `first`.
 static size_t end_of_run(Span<const int64_t> places, Span<const PageReading> pages, size_t first) {
     size_t end = first + 1;
     while (end < pages.size &&
@@ -79,22 +88,22 @@ static void read_run(const PosixFile& file, Span<const int64_t> places, Span<Pag
     char skipped[kMostSkippedBytes];
     iovec pieces[2 * kMostPagesTogether];
     size_t count = 0;
-    int64_t at = places[run[0].page];
-    const auto add = [&](void* bytes, int64_t end) {
-        if (end > at) pieces[count++] = {bytes, static_cast<size_t>(end - at)};
-        at = end;
-    };
-    for (const PageReading& of : run) {
-        add(skipped, places[of.page]);
-        add(of.bytes, places[of.page + 1]);
-    }
     const int64_t first = places[run[0].page];
-    try {
-        if (file.read_at(first, {pieces, count}) == static_cast<size_t>(at - first)) return;
-    } catch (const std::system_error&) {
-        // Of which page, and whether it lasts, is found out below.
+    int64_t place = first;
+    const auto add = [&](void* bytes, int64_t end) {
+        if (end > place) pieces[count++] = {bytes, static_cast<size_t>(end - place)};
+        place = end;
+    };
+    for (const PageReading& reading : run) {
+        add(skipped, places[reading.page]);
+        add(reading.bytes, places[reading.page + 1]);
     }
-    for (PageReading& of : run) read_one(file, places, of, name_of);
+    try {
+        if (file.read_at(first, {pieces, count}) == static_cast<size_t>(place - first)) return;
+    } catch (const std::system_error&) {
+        // Reading page by page shows which one it was, and whether the error persists.
+    }
+    for (PageReading& reading : run) read_one(file, places, reading, name_of);
 }
 
 void read_verified(const PosixFile& file, Span<const int64_t> places, const uint8_t* hashes,
@@ -106,18 +115,21 @@ void read_verified(const PosixFile& file, Span<const int64_t> places, const uint
     }
     Span<const uint8_t> messages[kMostPagesTogether];
     PageReading* read[kMostPagesTogether];
-    PageHash found[kMostPagesTogether];
+    PageHash digests[kMostPagesTogether];
     size_t count = 0;
-    for (PageReading& of : pages) {
-        if (of.error) continue;
-        messages[count] = {of.bytes, static_cast<size_t>(places[of.page + 1] - places[of.page])};
-        read[count++] = &of;
+    for (PageReading& reading : pages) {
+        if (reading.error) continue;
+        const int64_t begin = places[reading.page];
+        const int64_t end = places[reading.page + 1];
+        messages[count] = {reading.bytes, static_cast<size_t>(end - begin)};
+        read[count++] = &reading;
     }
-    blake2b({messages, count}, found);
-    for (size_t k = 0; k < count; ++k)
-        if (!std::equal(found[k].begin(), found[k].end(), hashes + kPageHashBytes * read[k]->page))
-            read[k]->error.emplace(
-                name_of(read[k]->page) + ": the hash does not match; " + kDamaged, true);
+    blake2b({messages, count}, digests);
+    for (size_t k = 0; k < count; ++k) {
+        const size_t page = read[k]->page;
+        if (!std::equal(digests[k].begin(), digests[k].end(), hashes + kPageHashBytes * page))
+            read[k]->error.emplace(name_of(page) + ": the hash does not match; " + kDamaged, true);
+    }
 }
 
 void PageSource::read(size_t page, unsigned char* bytes) const {
@@ -136,18 +148,19 @@ void FilePages::expect(Span<const PageReading> pages) const {
     }
 }
 
-// Whether the pages are there to be read; else none of them is.
+// Fetches the pages. Returns whether they can be read now; else all of them have an error.
 bool FilePages::fetch(Span<PageReading> pages) const {
     int64_t places[2 * kMostPagesTogether];
     size_t count = 0;
-    for (const PageReading& of : pages) {
-        places[count++] = place_[of.page];
-        places[count++] = place_[of.page + 1];
+    for (const PageReading& reading : pages) {
+        places[count++] = place_[reading.page];
+        places[count++] = place_[reading.page + 1];
     }
     std::string problem = fetch_({places, count});
     if (problem.empty()) return true;
     if (problem.rfind(name_ + ": ", 0) == 0) problem.erase(0, name_.size() + 2);
-    for (PageReading& of : pages) of.error.emplace(name_of(of.page) + ": " + problem, false, EIO);
+    for (PageReading& reading : pages)
+        reading.error.emplace(name_of(reading.page) + ": " + problem, false, EIO);
     return false;
 }
 
@@ -156,17 +169,17 @@ void FilePages::read_pages(Span<PageReading> pages) const {
     read_verified(file_, {place_.data(), place_.size()}, hash_.data(), pages,
                   [this](size_t page) { return name_of(page); });
     if (codec() == PageCodec::float32) return;
-    for (PageReading& of : pages) {
+    for (PageReading& reading : pages) {
         const PageCodes<const uint32_t> codes{
-            clusters(of.page), reinterpret_cast<const uint32_t*>(of.bytes), sh_degree()};
-        for (size_t c = 0; c < codes.num_clusters() && !of.error; ++c) {
+            clusters(reading.page), reinterpret_cast<const uint32_t*>(reading.bytes), sh_degree()};
+        for (size_t c = 0; c < codes.num_clusters() && !reading.error; ++c) {
             const uint32_t* words = codes.ranges(c);
             if (!are_valid(*reinterpret_cast<const ClusterCode*>(words),
                            reinterpret_cast<const uint16_t*>(words + sizeof(ClusterCode) / 4),
                            sh_degree()))
-                of.error.emplace(name_of(of.page) + ": cluster " + std::to_string(c) +
-                                     " has ranges that are not finite; " + kDamaged,
-                                 true);
+                reading.error.emplace(name_of(reading.page) + ": cluster " + std::to_string(c) +
+                                          " has ranges that are not finite; " + kDamaged,
+                                      true);
         }
     }
 }
@@ -178,7 +191,7 @@ size_t MemoryPages::num_bytes(size_t page) const {
 }
 
 void MemoryPages::read_pages(Span<PageReading> pages) const {
-    for (const PageReading& of : pages) copy(of.page, of.bytes);
+    for (const PageReading& reading : pages) copy(reading.page, reading.bytes);
 }
 
 void MemoryPages::copy(size_t page, unsigned char* bytes) const {
@@ -200,7 +213,13 @@ GaussianRows<const float> rows_of_page(const unsigned char* bytes, size_t num_ga
     const float* quats = means + 3 * num_gaussians;
     const float* scales = quats + 4 * num_gaussians;
     const float* opacities = scales + 3 * num_gaussians;
-    return {means, quats, scales, opacities, opacities + num_gaussians, num_gaussians, sh_degree};
+    return {.means = means,
+            .quats = quats,
+            .scales = scales,
+            .opacities = opacities,
+            .sh = opacities + num_gaussians,
+            .size = num_gaussians,
+            .sh_degree = sh_degree};
 }
 
 }  // namespace v3dg

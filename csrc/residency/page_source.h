@@ -1,7 +1,7 @@
 #pragma once
 
-// Where the bytes of a bundle's pages come from: a file, which may have to be fetched first, or
-// memory. Read on any thread.
+// The source of the bytes of a bundle's pages: a file, which may have to be fetched first, or
+// memory. Any thread may read from it.
 
 #include <cstdint>
 #include <functional>
@@ -17,29 +17,29 @@
 
 namespace v3dg {
 
-// A page that cannot be had; what() names the file and the page.
+// A page that cannot be read; what() names the file and the page.
 class PageError : public std::runtime_error {
   public:
     PageError(const std::string& text, bool is_damage, int code = 0)
         : std::runtime_error(text), is_damage(is_damage), code(code) {}
-    const bool is_damage;  // of what is in the file; else the system failed to read it
-    const int code;        // the system's
+    const bool is_damage;  // the content of the file is wrong; else the system failed to read it
+    const int code;        // errno of the system, or 0
 };
 
 constexpr const char* kDamaged = "the file is damaged, copy or build it again";
 
-// A page that is to be read, and what is wrong with it.
+// A page to be read, and the error if that failed.
 struct PageReading {
     size_t page;
-    unsigned char* bytes;  // room for all of it
+    unsigned char* bytes;  // has room for the whole page
     std::optional<PageError> error;
 };
-constexpr size_t kMostPagesTogether =
-    64;  // that are read at once, so that nothing is allocated for it
+// Most pages that are read together; a constant, so that reading allocates nothing.
+constexpr size_t kMostPagesTogether = 64;
 
-// Reads pages of a file, ascending and no more than that: those that lie side by side at once, with
-// what of the file is between them where that is little, and compares their hashes side by side.
-// `places` are the first byte of each page and the end, `hashes` [16] of each. Errors begin with
+// Reads at most kMostPagesTogether pages of a file, in ascending order, and verifies their hashes,
+// several at once. Neighbours are read in one call, including small gaps between them. `places` is
+// [P + 1], the first byte of each page and the end; `hashes` is [P][16]. Errors begin with
 // name_of(page).
 void read_verified(const PosixFile& file, Span<const int64_t> places, const uint8_t* hashes,
                    Span<PageReading> pages, const std::function<std::string(size_t)>& name_of);
@@ -59,23 +59,23 @@ class PageSource {
         return first_cluster_[page + 1] - first_cluster_[page];
     }
     size_t first_cluster(size_t page) const { return first_cluster_[page]; }
-    // [K + 1] where the clusters of a page begin among the rows of the bundle, and the end.
+    // [K + 1] the first row of each cluster of a page, among the rows of the bundle, and the end.
     Span<const int64_t> clusters(size_t page) const;
     int64_t first_row(size_t page) const { return offset_[first_cluster_[page]]; }
     size_t num_rows(size_t page) const {
         return offset_[first_cluster_[page + 1]] - first_row(page);
     }
 
-    // With what it is filled up with.
+    // The bytes of a page, including padding.
     virtual size_t num_bytes(size_t page) const = 0;
-    // Writes all bytes of pages, ascending, at most kMostPagesTogether, verified; it is quickest
-    // for those that lie side by side.
+    // Reads at most kMostPagesTogether pages, in ascending order, and verifies them. Fastest for
+    // neighbours.
     virtual void read_pages(Span<PageReading> pages) const = 0;
-    // The same of one page. Throws PageError.
+    // Reads and verifies one page. Throws PageError.
     void read(size_t page, unsigned char* bytes) const;
-    // Whether they come from so far away that none is to be read before it is missed.
+    // Whether reading is so slow that a page should not be read before it is missed.
     virtual bool is_far() const { return false; }
-    // Such pages will be read soon.
+    // Tells the source that these pages will be read soon.
     virtual void expect(Span<const PageReading> pages) const { static_cast<void>(pages); }
 
     // The rows of a page, given its bytes: borrowed from them, or from `decoded`.
@@ -89,16 +89,16 @@ class PageSource {
     std::vector<int64_t> offset_;        // [C + 1]
 };
 
-// Brings parts of a file to where they are read, before they are: of each two numbers, the bytes
-// from the first to the second. Returns what went wrong, or nothing. Called on any thread.
+// Fetches parts of a file before they are read: for each pair of numbers, the bytes from the first
+// to the second. Returns the problem, or an empty text. Called on any thread.
 using Fetch = std::function<std::string(Span<const int64_t>)>;
 
-// Pages of a file that stays open as long as this lives; one that is renamed or removed meanwhile
-// stays readable, one that is cut or written to is found out.
+// Pages of a file, which stays open as long as this lives. The file may be renamed or removed in
+// the meantime; if it is truncated or written to, the hashes show it.
 class FilePages : public PageSource {
   public:
-    // `place` is [P + 1], `hash` is [P][16], as docs/format.md has them. `fetch` is empty where all
-    // is there.
+    // `place` is [P + 1], `hash` is [P][16], as docs/format.md describes them. `fetch` is empty if
+    // the whole file is there.
     FilePages(const ClusterTable& table, int sh_degree, PageCodec codec, std::string name,
               int descriptor, Span<const int64_t> place, Span<const uint8_t> hash, Fetch fetch);
     size_t num_bytes(size_t page) const override { return place_[page + 1] - place_[page]; }
@@ -117,7 +117,7 @@ class FilePages : public PageSource {
     const Fetch fetch_;
 };
 
-// Pages of gaussians in memory, which outlive this.
+// Pages of gaussians in memory, which have to outlive this.
 class MemoryPages : public PageSource {
   public:
     MemoryPages(const ClusterTable& table, const GaussianRows<const float>& rows)
@@ -131,7 +131,7 @@ class MemoryPages : public PageSource {
     const GaussianRows<const float> rows_;
 };
 
-// The rows of a page of so many gaussians in float32, borrowed from its bytes.
+// The rows of a page of float32 gaussians, borrowed from its bytes.
 GaussianRows<const float> rows_of_page(const unsigned char* bytes, size_t num_gaussians,
                                        int sh_degree);
 

@@ -1,5 +1,7 @@
 #pragma once
 
+// Which pages of a bundle are resident, where they lie, and which of them a cut needs.
+
 #include <cstdint>
 
 #include "base/span.h"
@@ -12,25 +14,25 @@ constexpr int64_t kAbsentPage = INT64_MIN;
 constexpr int32_t kArrivalFrames = 8;
 constexpr int32_t kNeverBegins = INT32_MAX, kBegunLongAgo = -kArrivalFrames;
 
-// Where the pages of a bundle lie in memory, and which of them are there. Page g holds the clusters
-// that group g replaces, the last page those that nothing replaces.
+// Where the pages of a bundle lie in memory, and which of them are resident. Page g holds the
+// clusters that group g replaces, the last page those that no group replaces.
 //
-// The cut refines only what is there. It stays exact as long as a page is resident only together
-// with the pages above it, of which the last one is resident always.
+// A cut refines only groups whose page is resident. It stays exact as long as a page is resident
+// only together with all pages above it; the last page is always resident.
 struct PageTable {
-    // [G + 1] by how many rows a page lies behind its place in the bundle, or kAbsentPage. Empty:
-    // all pages are there, in the order of the bundle.
+    // [G + 1] the first row of a page in memory minus its first row in the bundle, or kAbsentPage.
+    // Empty: all pages are resident, in the order of the bundle.
     Span<const int64_t> shift;
-    // The same of its clusters, modulo 2^32, for who reads ranges by cluster. Empty: they are where
-    // the bundle has them.
+    // The same for its clusters, modulo 2^32, for readers of ranges by cluster. Empty: they have
+    // their places in the bundle.
     Span<const uint32_t> cluster_shift;
-    // [G + 1] the frame after which a page begins to fade in, of cuts with a fade. No page is
-    // farther than the one above it, in whichever frame. Empty: all pages have faded in.
+    // [G + 1] the frame after which a page begins to fade in, for cuts with a fade. In every frame
+    // a page has faded in at most as far as the one above it. Empty: all pages have faded in.
     Span<const int32_t> begins;
 
     V3DG_HD bool is_whole() const { return shift.empty(); }
     V3DG_HD bool is_resident(size_t page) const { return is_whole() || shift[page] != kAbsentPage; }
-    // How many of its frames a page has behind it.
+    // In how many of its kArrivalFrames frames a page has faded in, up to `frame`.
     V3DG_HD int32_t arrived(size_t page, int32_t frame) const {
         const int32_t begin = begins.empty() ? kBegunLongAgo : begins[page];
         if (frame <= begin) return 0;
@@ -38,7 +40,7 @@ struct PageTable {
     }
 };
 
-// A page that a cut needs, and how urgently; select_math.h says what priorities are.
+// A page that a cut needs, and how urgently; select_math.h defines the priorities.
 struct PageRequest {
     uint32_t bundle, page;
     float priority;

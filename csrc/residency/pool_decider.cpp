@@ -1,3 +1,6 @@
+// A round of deciding: takes needs and loaded pages under the mutex, decides without it, and hands
+// the results over under it again.
+
 #include "residency/pool_decider.h"
 
 #include <algorithm>

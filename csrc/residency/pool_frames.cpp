@@ -1,3 +1,5 @@
+// The exchange of a frame with the other threads, and the tables of what is resident.
+
 #include "residency/pool_frames.h"
 
 #include <algorithm>

@@ -1,3 +1,5 @@
+// Batches of the most urgent pages: taken under the mutex, read without it, reported under it.
+
 #include "residency/pool_readers.h"
 
 #include <algorithm>

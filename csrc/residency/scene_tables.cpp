@@ -40,8 +40,8 @@ void SceneTables::set_poses(const PoseSpan& position, const PoseSpan& quaternion
                             const PoseSpan& scale, cudaStream_t stream) {
     const DeviceGuard guard(device_);
     const StreamLock lock(busy_, stream);
-    const auto on_device = [&](const PoseSpan& from, int k) {
-        return from.is_on_device ? from.values.data : uploaded_[k].copy_from(from.values, stream);
+    const auto on_device = [&](const PoseSpan& part, int k) {
+        return part.is_on_device ? part.values.data : uploaded_[k].copy_from(part.values, stream);
     };
     position_ = on_device(position, 0);
     quaternion_ = on_device(quaternion, 1);
@@ -56,12 +56,12 @@ size_t SceneTables::bytes() const {
 
 SceneOnDevice SceneTables::on_device() const {
     const size_t count = num_instances_;
-    return {bundles_on_device_.data(),
-            {{bundle_.data(), count},
-             {position_, 3 * count},
-             {quaternion_, 4 * count},
-             {scale_, count},
-             {importance_.data(), count}}};
+    return {.bundles = bundles_on_device_.data(),
+            .instances = {.bundle = {bundle_.data(), count},
+                          .position = {position_, 3 * count},
+                          .quaternion = {quaternion_, 4 * count},
+                          .scale = {scale_, count},
+                          .importance = {importance_.data(), count}}};
 }
 
 }  // namespace cuda

@@ -1,12 +1,12 @@
 """A model of how a pool settles, of which all interleavings are tried.
 
-The threads of csrc/residency/page_pool.cpp are three here: one that settles a view and
-then draws it, the one that decides, and one that reads. A step is what a thread does
-while it holds the lock, or what it does without it; any thread that can take a step may
-take the next one. The view needs a page and, below it, another one, which its cut asks
-for only once the first is in the page table of its frame. An earlier frame, of another
-view, may have left needs that are not decided about; deciding about them may bring a
-page of its own, and may raise the tolerance.
+The threads of a pool (csrc/residency/pool_shared.h) are three here: one that settles a
+view and then draws it, the one that decides, and one that reads. A step is what a
+thread does while it holds the lock, or what it does without it; any thread that can
+take a step may take the next one. The view needs a page and, below it, another one,
+which its cut asks for only once the first is in the page table of its frame. An earlier
+frame, of another view, may have left needs that are not decided about; deciding about
+them may bring a page of its own, and may raise the tolerance.
 
 `RULES` are what the pool does so that a settled view is drawn complete. Without any one
 of them the model finds an interleaving that draws a picture with a page missing or at a
