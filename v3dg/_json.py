@@ -1,5 +1,4 @@
-"""Strict JSON, and values that know their place in the file, so that errors can name
-it."""
+"""Strict JSON, and values with their place in the file, which errors name."""
 
 from __future__ import annotations
 
@@ -107,8 +106,8 @@ class Node:
         return self.problem(text)
 
     def attempt(self, make: Callable[[], T]) -> T:
-        """What ``make`` makes of the fields; its ValueErrors, which begin with a field,
-        get their place."""
+        """The result of ``make``; its ValueErrors, which begin with a field, get the
+        place of this value."""
         try:
             return make()
         except ValueError as error:

@@ -54,7 +54,7 @@ def floats(values: object, name: str, expected: str = "numbers") -> Floats:
 
 
 def vector(values: object, name: str, shape: tuple[int, ...] = (3,)) -> Floats:
-    """As `floats`, of this shape."""
+    """A new array of finite doubles of this shape; see `floats`."""
     if (
         type(values) is np.ndarray
         and values.shape == shape

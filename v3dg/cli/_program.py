@@ -24,7 +24,7 @@ from v3dg.cli._common import FAILURES, UsageError, check_range, failure_text, te
 
 # Each command has a class of options of its own, with the function that runs on them.
 Options: TypeAlias = Any
-# By the command's name, in the order of the help.
+# Commands by name, in the order of the help.
 Commands: TypeAlias = Mapping[str, tuple[type[Options], Callable[[Options], None]]]
 
 INTERRUPTED = 130  # exit code
@@ -45,12 +45,12 @@ class Program:
     commands: Commands
 
     def parse(self, arguments: Sequence[str]) -> Options:
-        """Parse the command line; tyro's boxed message becomes one line."""
+        """Parse the command line; the boxed message of tyro becomes one line."""
         subcommands: list[Options] = [
             Annotated[options, tyro.conf.subcommand(name)]
             for name, (options, _) in self.commands.items()
         ]
-        if "" in arguments:  # as a path it would be the working folder, and everything in it
+        if "" in arguments:  # as a path it would name the working folder
             number = list(arguments).index("") + 1
             raise UsageError(f"argument {number} is empty; is a shell variable unset?")
         caught = io.StringIO()
@@ -115,7 +115,7 @@ class Program:
             for number in _start.SIGNALS:  # nothing is left to interrupt
                 signal.signal(number, signal.SIG_IGN)
             if code == INTERRUPTED:
-                os._exit(code)  # without waiting for threads that still run
+                os._exit(code)  # does not wait for threads that still run
         return code
 
     def _run(self, arguments: Sequence[str] | None) -> int:
@@ -146,8 +146,8 @@ class Program:
 
 @contextlib.contextmanager
 def _legible_width() -> Iterator[None]:
-    """Have a narrow terminal taken for one with room for a few words: in 5 columns,
-    tyro finds no end."""
+    """Pretend that a very narrow terminal has room for a few words, because tyro does
+    not terminate in 5 columns."""
     if shutil.get_terminal_size().columns >= _LEAST_COLUMNS:
         yield
         return
@@ -171,7 +171,7 @@ def _suggestion(name: str, choices: Sequence[str]) -> str:
 
 
 def _text_of_first_box(boxed: str) -> str:
-    """The text of the first of the boxes that tyro draws, in our words."""
+    """The text of the first box that tyro draws, in our words."""
     lines = [line.strip("│╭╮╰╯─ ").strip() for line in boxed.splitlines()[1:]]
     end = next((i for i, line in enumerate(lines) if not line), len(lines))
     return _plainly(" ".join(lines[:end]).rstrip("."))
@@ -218,7 +218,7 @@ def _flush(code: int) -> int:
     except OSError as error:
         # Python flushes again when it exits, which must not fail.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        # A closed pipe is not reported: its reader has all that it wanted.
+        # A closed pipe is not reported, because its reader needs no more.
         if code == 0 and not isinstance(error, BrokenPipeError):
             return _fail(f"stdout: {error.strerror}", 1)
         return code or 1

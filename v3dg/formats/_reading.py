@@ -1,5 +1,5 @@
-"""Shared by the readers of untrusted files: assets that are read in parts, and bounds
-on memory."""
+"""Shared code of the readers of untrusted files: assets that are read in parts, and
+bounds on memory."""
 
 import contextlib
 import os
@@ -29,14 +29,14 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 @dataclass(frozen=True, eq=False)
 class AssetFile:
-    """What the header of an asset's file says, and its gaussians on demand; open until
-    it is dropped.
+    """The header of an asset's file, and its gaussians on demand; the file is open
+    until this object is dropped.
 
     Attributes:
-        read: Gaussians from a first row up to a last. Runs that follow each other are
-            the quickest. Raises what the format's own `read` raises.
-        whole_bytes: Memory that the first read takes and keeps, where the format can
-            only be read whole.
+        read: Function from a first and a last row to these gaussians; reading in file
+            order is quickest. Its errors are those of `read_asset`.
+        whole_bytes: Memory that the first read takes and keeps, if the format can only
+            be read whole.
     """
 
     path: Path

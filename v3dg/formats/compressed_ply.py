@@ -25,7 +25,7 @@ _CHUNK = 256
 _PLY_TYPES = {"float": "<f4", "uint": "<u4", "uchar": "u1"}
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _RANGES = {"": "xyz", "scale_": "xyz", "color": "rgb"}
-# Where each field of a word begins, and its largest value.
+# The first bit of each field of a word, and its largest value.
 _Fields: TypeAlias = tuple[tuple[int, int], ...]
 _XYZ: _Fields = ((21, 2047), (11, 1023), (0, 2047))
 _THREE: _Fields = ((20, 1023), (10, 1023), (0, 1023))

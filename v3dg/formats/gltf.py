@@ -1,8 +1,8 @@
 """`.glb`: glTF 2.0 with KHR_gaussian_splatting, as float attributes or compressed in
 `.spz`.
 
-Written is one primitive; read are all primitives that are gaussians, of nodes without
-transforms. Coordinates are passed on as they are stored; glTF's have y up.
+The writer writes one primitive; the reader reads all primitives of gaussians, of nodes
+without transforms. Coordinates are passed on as they are stored; glTF's have y up.
 """
 
 import json
@@ -148,7 +148,7 @@ def _buffer_views(parts: list[bytes], *, are_arrays: bool) -> list[JsonObject]:
 
 
 def _chunk(kind: int, content: bytes, padding: bytes) -> bytes:
-    """A chunk of the file, filled up to a multiple of four bytes."""
+    """A chunk of the file, padded to a multiple of four bytes."""
     content += padding * (-len(content) % 4)
     return struct.pack("<II", len(content), kind) + content
 

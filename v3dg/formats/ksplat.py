@@ -50,7 +50,7 @@ class _Section(NamedTuple):
 
 
 class _Buckets(NamedTuple):
-    """What a mean is relative to."""
+    """The buckets that means are relative to."""
 
     centers: NDArray[np.float32]  # (N, 3) of each gaussian's bucket
     step_world: float

@@ -367,6 +367,6 @@ def _webp(values: _packing.Integers, width: int, height: int) -> bytes:
     pixels = np.full((height, width, 4), 255, np.uint8)
     pixels.reshape(-1, 4)[: len(values), : values.shape[1]] = values
     stream = io.BytesIO()
-    # Without exact, pixels whose alpha is 0 lose their colours.
+    # `exact` keeps the colours of pixels whose alpha is 0.
     Image.fromarray(pixels).save(stream, "WEBP", lossless=True, exact=True, quality=50, method=4)
     return stream.getvalue()
