@@ -2,8 +2,10 @@
 an exit code."""
 
 import contextlib
+import dataclasses
 import difflib
 import functools
+import inspect
 import io
 import operator
 import os
@@ -11,11 +13,13 @@ import re
 import shutil
 import signal
 import sys
+import typing
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, TypeAlias, cast
 
+import docstring_parser
 import tyro
 
 from v3dg import _start
@@ -28,6 +32,7 @@ Options: TypeAlias = Any
 Commands: TypeAlias = Mapping[str, tuple[type[Options], Callable[[Options], None]]]
 
 INTERRUPTED = 130  # exit code
+_HELP = ("-h", "--help", "--tyro-write-completion", "--tyro-print-completion")
 
 # More than any machine has cores. If the system refuses a thread, OpenMP ends the
 # process.
@@ -46,6 +51,8 @@ class Program:
 
     def parse(self, arguments: Sequence[str]) -> Options:
         """Parse the command line; the boxed message of tyro becomes one line."""
+        if any(argument in _HELP for argument in arguments):
+            self.join_help()
         subcommands: list[Options] = [
             Annotated[options, tyro.conf.subcommand(name)]
             for name, (options, _) in self.commands.items()
@@ -67,6 +74,13 @@ class Program:
             if not stop.code:
                 raise
             raise UsageError(self._one_line(caught.getvalue(), arguments)) from None
+
+    def join_help(self) -> None:
+        """Make one line of the docstring of each option: tyro keeps line breaks before
+        indented lines."""
+        for options, _ in self.commands.values():
+            for kind in options.__mro__[:-1]:
+                _join_help(kind)
 
     def _one_line(self, boxed: str, arguments: Sequence[str]) -> str:
         """The message for a wrong command line: an unknown name, or else the text of
@@ -142,6 +156,24 @@ class Program:
         except FAILURES as error:
             return _fail(failure_text(error), 1)
         return 0
+
+
+@functools.cache
+def _join_help(kind: type[Options]) -> None:
+    """Put the docstrings of options into the annotations of their class, each as one
+    line."""
+    annotations = inspect.get_annotations(kind)
+    for entry in docstring_parser.parse_from_object(kind).params:
+        annotation = annotations.get(entry.arg_name)
+        if annotation is not None and entry.description:
+            text = " ".join(entry.description.split())
+            annotations[entry.arg_name] = Annotated[annotation, tyro.conf.arg(help=text)]
+    kind.__annotations__ = annotations
+    for annotation in annotations.values():
+        group = typing.get_args(annotation)[:1]
+        if group and dataclasses.is_dataclass(group[0]):
+            for nested in cast(type, group[0]).__mro__[:-1]:
+                _join_help(nested)
 
 
 @contextlib.contextmanager
