@@ -11,15 +11,14 @@ from typing import Literal, TypeVar, get_args
 from v3dg._numbers import check, check_type, one_of
 from v3dg._urls import FileAtUrl, beside, in_parts, reading, shown
 from v3dg.formats import checkpoint, gltf, hier, ksplat, ply, sog, splat, spz, streamed_sog, usd
-from v3dg.formats._reading import AssetFile, bytes_of
+from v3dg.formats._reading import AnyPath, AssetFile, bytes_of
 from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
 
-Path = str | os.PathLike[str]
 Format = TypeVar("Format")
 
 # Readers by the end of a file's name; the first that matches is used.
-_READERS: dict[str, Callable[[Path], AssetFile]] = {
+_READERS: dict[str, Callable[[AnyPath], AssetFile]] = {
     ".ply": ply.open_file,
     ".splat": splat.open_file,
     ".ksplat": ksplat.open_file,
@@ -32,7 +31,7 @@ _READERS: dict[str, Callable[[Path], AssetFile]] = {
     "meta.json": sog.open_file,
     **dict.fromkeys((".ckpt", ".pt"), checkpoint.open_file),
 }
-_WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {
+_WRITERS: dict[str, Callable[[AnyPath, Gaussians], None]] = {
     ".compressed.ply": ply.write_compressed,
     ".ply": ply.write,
     ".spz": spz.write,
@@ -62,7 +61,7 @@ WRITE_SUFFIXES = tuple(_WRITERS)
 """Ends of the names of files that `write_asset` writes."""
 
 
-def read_asset(path: Path) -> Gaussians:
+def read_asset(path: AnyPath) -> Gaussians:
     """Read an asset; the end of the file's name determines the format
     (docs/formats.md):
 
@@ -99,14 +98,14 @@ def read_asset(path: Path) -> Gaussians:
     return file.read(0, file.num_gaussians)
 
 
-def loaded(asset: Gaussians | Path) -> Gaussians:
+def loaded(asset: Gaussians | AnyPath) -> Gaussians:
     """An asset, which is read if it is given by its file."""
     if isinstance(asset, str | os.PathLike):
         return read_asset(asset)
     return asset
 
 
-def open_asset(path: Path) -> AssetFile:
+def open_asset(path: AnyPath) -> AssetFile:
     """Open an asset of any kind that `read_asset` reads, to read it in parts; errors as
     there.
 
@@ -120,7 +119,7 @@ def open_asset(path: Path) -> AssetFile:
     return reader(at_url)
 
 
-def _open_fetched(at_url: FileAtUrl, reader: Callable[[Path], AssetFile]) -> AssetFile:
+def _open_fetched(at_url: FileAtUrl, reader: Callable[[AnyPath], AssetFile]) -> AssetFile:
     """An asset at a URL, whose local copy exists as long as this object; errors name
     the URL."""
     with reading(at_url) as local:
@@ -154,7 +153,7 @@ def run_files(folder: pathlib.Path) -> list[pathlib.Path]:
     return steps[max(steps)]
 
 
-def asset_bytes(path: Path) -> int:
+def asset_bytes(path: AnyPath) -> int:
     """Size on disk of a readable asset, including the existing files that it names."""
     names = _by_name(path, _FILES)
     at_url = in_parts(path)
@@ -164,8 +163,8 @@ def asset_bytes(path: Path) -> int:
 
 
 def write_asset(
-    path: Path,
-    gaussians: Gaussians | Path,
+    path: AnyPath,
+    gaussians: Gaussians | AnyPath,
     *,
     encoding: PlyEncoding = "binary_little_endian",
     version: Literal[2, 3, 4] | None = None,
@@ -219,7 +218,7 @@ def write_asset(
     write(path, gaussians)
 
 
-def _by_name(path: Path, formats: Mapping[str, Format]) -> Format:
+def _by_name(path: AnyPath, formats: Mapping[str, Format]) -> Format:
     name = beside(path).name.lower()
     for ending, function in formats.items():
         if name.endswith(ending):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core, _files, _urls
-from v3dg._json import JsonObject, parse_json, shown
+from v3dg._json import JsonObject, json_text, parse_json
 from v3dg._numbers import check
 from v3dg._urls import FileAtUrl
 from v3dg.bundle import format as file_format
@@ -201,16 +201,18 @@ class BundleFile:
             values = metadata
         kind = values.get("format")
         if kind != file_format.FORMAT:
-            self._fail(f"format: expected '{file_format.FORMAT}', got {shown(kind)}; not a bundle")
+            self._fail(
+                f"format: expected '{file_format.FORMAT}', got {json_text(kind)}; not a bundle"
+            )
         version = values.get("version")
         if not isinstance(version, str) or not re.fullmatch("[1-9][0-9]{0,8}", version):
-            self._fail(f"version: expected a number of 1 or more, got {shown(version)}")
+            self._fail(f"version: expected a number of 1 or more, got {json_text(version)}")
         self.version = int(version)
         if self.version > VERSION:
             self._fail(f"version {self.version}, this build reads up to {VERSION}; update v3dg")
         degree = values.get("sh_degree")
         if not isinstance(degree, str) or degree not in ("0", "1", "2", "3"):
-            self._fail(f"sh_degree: expected '0' to '3', got {shown(degree)}")
+            self._fail(f"sh_degree: expected '0' to '3', got {json_text(degree)}")
         name: object = Codec.name
         if self.version > 1:
             name = values.get("codec")
@@ -219,11 +221,13 @@ class BundleFile:
             or name not in CODECS
             or (self.version, name) == (2, Codec.name)
         ):
-            self._fail(f"codec: expected one that this build reads, got {shown(name)}; update v3dg")
+            self._fail(
+                f"codec: expected one that this build reads, got {json_text(name)}; update v3dg"
+            )
         self.codec = CODECS[name](int(degree))
         config = values.get("config")
         if not isinstance(config, str):
-            self._fail(f"config: expected a string of JSON, got {shown(config)}")
+            self._fail(f"config: expected a string of JSON, got {json_text(config)}")
         self.config = self._object("config", config)
 
     def _object(self, name: str, text: str | bytes) -> JsonObject:
@@ -231,7 +235,7 @@ class BundleFile:
             value = parse_json(text)
         except ValueError as error:
             self._fail(f"{name}: expected JSON, got {error}")
-        self._check(name, isinstance(value, dict), f"a JSON object, got {shown(value)}")
+        self._check(name, isinstance(value, dict), f"a JSON object, got {json_text(value)}")
         return dict(value)
 
     def _check_entries(self, header: JsonObject) -> dict[str, Entry]:
@@ -242,22 +246,24 @@ class BundleFile:
             entry = header.get(name)
             length = _length_of_vector(entry)
             if length is None:
-                self._fail(f"{name}: expected a one-dimensional tensor, got {shown(entry)}")
+                self._fail(f"{name}: expected a one-dimensional tensor, got {json_text(entry)}")
             counts.append(length)
         largest = max(counts)
         text = (
-            f"more than {shown(largest)} bytes for tensors, got {self.num_bytes}; "
+            f"more than {json_text(largest)} bytes for tensors, got {self.num_bytes}; "
             "the file is truncated"
         )
         self._check("size", largest <= self.num_bytes, text)
         expected = entries_of(self.codec, *counts)
         for name, entry in expected.items():
             if header.get(name) != entry:
-                self._fail(f"{name}: expected {entry}, got {shown(header.get(name))}")
+                self._fail(f"{name}: expected {entry}, got {json_text(header.get(name))}")
         self._check_counts(*counts)
         unknown = sorted(set(header) - set(expected))
         if unknown:
-            self._fail(f"{shown(unknown[0])}: expected only the tensors of version {self.version}")
+            self._fail(
+                f"{json_text(unknown[0])}: expected only the tensors of version {self.version}"
+            )
         for name, value in (("header", self._data_start), ("pages", counts[3])):
             is_aligned = value % self.codec.alignment == 0
             self._check(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core
-from v3dg._numbers import check, check_type, refuse, shown, whole_number
+from v3dg._numbers import check, check_type, refuse, value_text, whole_number
 from v3dg.bundle.format import DTYPES, SCHEMA
 from v3dg.gaussians import Gaussians
 
@@ -91,7 +91,7 @@ class Groups:
 
 def check_index(name: str, index: int, count: int) -> None:
     number = whole_number(index, name)
-    check(name, 0 <= number < count, f"0 to {count - 1}, got {shown(number)}")
+    check(name, 0 <= number < count, f"0 to {count - 1}, got {value_text(number)}")
 
 
 def _check_arrays(prefix: str, part: Clusters | Groups) -> None:

@@ -13,7 +13,7 @@ from types import EllipsisType
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypeAlias
 
 from v3dg import _core
-from v3dg._numbers import check, one_of, real, shown, whole
+from v3dg._numbers import check, one_of, real, value_text, whole
 from v3dg.cameras import Camera
 from v3dg.gaussians import Array, Gaussians
 from v3dg.rasterize import (
@@ -204,7 +204,7 @@ def _check_unsupported(options: dict[str, object]) -> None:
             )
         value = options[name]
         if str(value) not in {"None", "False", "pinhole", "RollingShutterType.GLOBAL"}:
-            raise ValueError(f"{name}: {shown(value)} is not supported; {_UNSUPPORTED[name]}")
+            raise ValueError(f"{name}: {value_text(value)} is not supported; {_UNSUPPORTED[name]}")
 
 
 def _cameras(

@@ -26,7 +26,7 @@ from v3dg.export import _common
 from v3dg.export._folder import check_outside, replacing_export
 from v3dg.formats import gltf
 from v3dg.formats._packing import check_writable
-from v3dg.formats._reading import Path as AnyPath
+from v3dg.formats._reading import AnyPath
 from v3dg.gaussians import Gaussians
 from v3dg.opening import File, opened
 from v3dg.scene import Scene
