@@ -1,5 +1,4 @@
-"""Where work runs: on the CPU, with NumPy arrays, or on a CUDA device, with torch
-tensors."""
+"""Devices: the CPU, with NumPy arrays, and CUDA devices, with torch tensors."""
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -20,7 +19,7 @@ _MUCH_MEMORY = 1 << 30
 
 @dataclass(frozen=True)
 class Device:
-    """Where work runs: the CPU, or a CUDA device by its number."""
+    """The CPU, or a CUDA device by its number."""
 
     number: int = -1
 
@@ -54,8 +53,8 @@ def resolve(device: str | Device) -> Device:
 
     Raises:
         ValueError: The name is none of these.
-        RuntimeError: Something is missing for a CUDA device that was asked for; the CPU
-            does not replace it.
+        RuntimeError: A CUDA device was requested and cannot be used; the CPU does not
+            replace it.
     """
     name = str(device)
     kind, _, number = name.partition(":")
@@ -81,7 +80,7 @@ def resolve(device: str | Device) -> Device:
 
 
 def missing_for_cuda() -> str | None:
-    """What is missing for CUDA, and what to do; None if CUDA can be used."""
+    """The reason why CUDA cannot be used, and what to do; None if it can."""
     if not _core.has_cuda:
         return "v3dg was built without CUDA; install it again where nvcc is found"
     if _core.num_cuda_devices() == 0:
@@ -156,7 +155,7 @@ def library_of(array: Array) -> ModuleType:
 
 
 def to_host(array: Array) -> HostArray:
-    """The array as one of NumPy's."""
+    """The array as a NumPy array."""
     if isinstance(array, np.ndarray):
         return array
     return cast(HostArray, array.cpu().numpy())

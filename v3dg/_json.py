@@ -1,5 +1,4 @@
-"""Strict JSON, and values that know their place in the file, so that errors can name
-it."""
+"""Strict JSON, and values with their place in the file, which errors name."""
 
 from __future__ import annotations
 
@@ -37,7 +36,7 @@ def _unique_keys(pairs: list[tuple[str, object]]) -> dict[str, object]:
     fields: dict[str, object] = {}
     for key, value in pairs:
         if key in fields:
-            raise ValueError(f"the key {shown(key)} appears twice")
+            raise ValueError(f"the key {json_text(key)} appears twice")
         fields[key] = value
     return fields
 
@@ -46,7 +45,7 @@ def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is not a JSON number")
 
 
-def shown(value: object) -> str:
+def json_text(value: object) -> str:
     """A JSON value as a short text for a message of one line."""
     if isinstance(value, dict) and len(value) > 8:
         return f"an object of {len(value)} values"
@@ -101,14 +100,14 @@ class Node:
         return ValueError(f"{self.file}: {self.path or 'top level'}: {text}")
 
     def error(self, expected: str, advice: str = "") -> ValueError:
-        text = f"expected {expected}, got {shown(self.value)}"
+        text = f"expected {expected}, got {json_text(self.value)}"
         if advice:
             text = f"{text}; {advice}"
         return self.problem(text)
 
     def attempt(self, make: Callable[[], T]) -> T:
-        """What ``make`` makes of the fields; its ValueErrors, which begin with a field,
-        get their place."""
+        """The result of ``make``; its ValueErrors, which begin with a field, get the
+        place of this value."""
         try:
             return make()
         except ValueError as error:
@@ -125,7 +124,7 @@ class Node:
             raise self.problem(f"expected the field {key}, got an object without it")
         path = key
         if not is_one_line(key) or len(key) > 60:
-            path = shown(key)
+            path = json_text(key)
         if self.path:
             path = f"{self.path}.{path}"
         return Node(self.value[key], self.file, path)

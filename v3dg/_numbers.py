@@ -54,7 +54,7 @@ def floats(values: object, name: str, expected: str = "numbers") -> Floats:
 
 
 def vector(values: object, name: str, shape: tuple[int, ...] = (3,)) -> Floats:
-    """As `floats`, of this shape."""
+    """A new array of finite doubles of this shape; see `floats`."""
     if (
         type(values) is np.ndarray
         and values.shape == shape
@@ -100,7 +100,7 @@ def real(
     except (TypeError, ValueError, RuntimeError):
         number = math.nan
     if not lower_bound <= number <= upper_bound:
-        refuse(name, f"{expected}, got {shown(value)}")
+        refuse(name, f"{expected}, got {value_text(value)}")
     return number
 
 
@@ -116,11 +116,11 @@ def whole(
     try:
         number = operator.index(cast(SupportsIndex, value))
     except TypeError:
-        refuse(name, f"{expected}, got {shown(value)}")
+        refuse(name, f"{expected}, got {value_text(value)}")
     if isinstance(value, bool) or number < lower_bound:
-        refuse(name, f"{expected}, got {shown(value)}")
+        refuse(name, f"{expected}, got {value_text(value)}")
     if number > upper_bound:
-        refuse(name, f"at most {upper_bound}, got {shown(value)}")
+        refuse(name, f"at most {upper_bound}, got {value_text(value)}")
     return number
 
 
@@ -129,7 +129,7 @@ def whole_number(value: object, name: str) -> int:
     try:
         return operator.index(cast(SupportsIndex, value))
     except TypeError:
-        raise TypeError(f"{name}: expected a whole number, got {shown(value)}") from None
+        raise TypeError(f"{name}: expected a whole number, got {value_text(value)}") from None
 
 
 def check(name: str | os.PathLike[str], holds: object, expected: str) -> None:
@@ -174,10 +174,10 @@ def check_all(
 def one_of(value: object, name: str, choices: tuple[str, ...]) -> None:
     """Raise ValueError unless ``value`` is one of the texts ``choices``."""
     if not (isinstance(value, str) and value in choices):
-        refuse(name, f"{' or '.join(map(repr, choices))}, got {shown(value)}")
+        refuse(name, f"{' or '.join(map(repr, choices))}, got {value_text(value)}")
 
 
-def shown(value: object) -> str:
+def value_text(value: object) -> str:
     """A value as text for a message of one line."""
     if isinstance(value, int) and value.bit_length() > 128:
         return f"a whole number of {value.bit_length()} bits"

@@ -59,11 +59,11 @@ def begin() -> None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
         getattr(sys, name).reconfigure(
             errors="backslashreplace"
-        )  # for characters that an encoding lacks
+        )  # escapes characters that an encoding lacks
 
 
 def _end_at_once(number: int, frame: types.FrameType | None) -> None:
-    signal.signal(signal.SIGINT, lambda *_: None)  # another Ctrl-C prints no second line
+    signal.signal(signal.SIGINT, lambda *_: None)  # another Ctrl-C must not print a second line
     try:
         os.write(2, b"v3dg: error: interrupted\n")
     finally:

@@ -1,7 +1,8 @@
 """Camera files: the `transforms.json` of nerfstudio, instant-ngp and NeRF's synthetic
 scenes.
 
-And folders with cameras: nerfstudio's runs, and COLMAP's models, with its own library.
+It also reads folders with cameras: runs of nerfstudio, and models of COLMAP, with
+COLMAP's own library.
 """
 
 import os
@@ -37,7 +38,8 @@ _MODEL = ("images.bin", "images.txt")  # identify a model of COLMAP
 _DATA = re.compile(
     r"^\s*data: (?:&\w+ )?!!python/object/apply:pathlib\.\w+\n((?:\s*- .*\n)+)", re.MULTILINE
 )
-# From a camera with x right, y up, z backward to one with x right, y down, z forward.
+# Rotation from a camera with x right, y up, z backward to one with x right, y down, z
+# forward.
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
@@ -51,9 +53,9 @@ def read_cameras(
     """Read the cameras of a nerfstudio `transforms.json`, in file order
     (docs/scene.md).
 
-    Or those of a folder: of a model of COLMAP, binary or text, by their images' names,
-    with the extra `colmap`; or of a run of nerfstudio (also by its `config.yml`), in
-    the frame that it trained in.
+    ``path`` may also be a folder: a model of COLMAP, binary or text, whose cameras are
+    named after their images, with the extra `colmap`; or a run of nerfstudio (also by
+    its `config.yml`), whose cameras are in the frame of the training.
 
     A camera is named by its `file_path`; if any is missing or repeats, all are named by
     their number, from 0. Pictures, depths, masks and point clouds that the file names
@@ -69,8 +71,8 @@ def read_cameras(
             that the data had before.
 
     Raises:
-        ValueError: The content is not valid, or has other cameras than pinholes; names
-            the place in it.
+        ValueError: The content is not valid, or has cameras that are not pinholes; the
+            message names the place in it.
         OSError: The file cannot be read.
     """
     one_of(distortion, "distortion", ("refuse", "ignore"))

@@ -17,8 +17,8 @@ SMALLEST_OPACITY = float(np.float32(_core.min_alpha))
 """Pixels skip contributions with a smaller alpha, so a gaussian with a smaller opacity
 is never drawn."""
 OUTLIER_DISTANCE = 20.0
-"""Distance from the median position, in median distances, beyond which lie sky,
-floaters and mistakes."""
+"""Distance from the median position, in median distances, beyond which gaussians are
+sky, floaters or mistakes."""
 
 # Kinds of gaussians that cannot be drawn, in the order of the core's bits.
 _TEXT = {
@@ -42,12 +42,13 @@ class AssetWarning(UserWarning):
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """Which of an asset's N gaussians can be drawn, and why the others cannot.
+    """The gaussians of an asset that can be drawn, and the reasons why the others
+    cannot.
 
     Attributes:
         drawable: (N,) bool, on the host.
-        counts: How many there are of each kind that cannot be drawn; kinds without any
-            are left out, and a gaussian can be of several.
+        counts: Number of gaussians of each kind that cannot be drawn; kinds without any
+            are left out, and a gaussian can be of several kinds.
         num_wrong: Gaussians with wrong values; the others that cannot be drawn are
             valid, but transparent.
     """
@@ -92,8 +93,8 @@ def examine(asset: Gaussians) -> Findings:
 
 
 def outliers(means: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
-    """Which of (N, 3) finite positions lie far from all others: more than 20 times the
-    median distance."""
+    """(N,) whether each of the finite positions (N, 3) lies far from all others: at
+    more than 20 times the median distance."""
     if len(means) == 0:
         return np.zeros(0, bool)
     exact = means.astype(np.float64)

@@ -1,9 +1,9 @@
-"""The main job without a download: build a bundle, place it 2,000 times, draw it from
-near to far.
+"""A demonstration without a download: builds a bundle, places it 2,000 times, and draws
+it from near to far.
 
-The result is one picture: the full asset above, the selected cut below, a column a
-distance, each with the gaussians drawn, the time, and the error to the full asset at
-twice the resolution.
+The result is one picture: the full asset above, the selected cut below, with a column
+for each distance. Every picture has the number of gaussians, the time, and the error
+against the full asset at twice the resolution.
 """
 
 import math
@@ -48,13 +48,13 @@ def run_demo(
     picture.
 
     Args:
-        num_gaussians: Of the asset.
+        num_gaussians: Number of gaussians of the asset.
         size: Width and height of one panel in px.
         views: Distance and elevation of every column.
-        device: Where to build and draw: "auto", "cpu" or "cuda".
+        device: The device that builds and draws: "auto", "cpu" or "cuda".
 
     Returns:
-        What was made and measured, as JSON values.
+        Sizes, times and errors, as JSON values.
 
     Raises:
         ValueError: The picture cannot be written to ``output``, or an argument is out
@@ -109,7 +109,7 @@ def _camera(distance: float, elevation: float, size: tuple[int, int]) -> Camera:
 
 
 class _Panel(NamedTuple):
-    """One picture of the result, with what was measured of it."""
+    """One picture of the result, with its measurements."""
 
     numbers: JsonObject
     text: str

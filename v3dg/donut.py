@@ -29,7 +29,7 @@ def make_donut(num_gaussians: int = 50_000, *, seed: int = 0) -> Gaussians:
     """Make a donut of dough, icing that drips over its rim, and sprinkles.
 
     Args:
-        num_gaussians: How many gaussians, exactly.
+        num_gaussians: Exact number of gaussians.
         seed: The same seed gives the same gaussians.
 
     Returns:

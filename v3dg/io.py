@@ -1,4 +1,4 @@
-"""Reading and writing Gaussians by file name; a format is a module of v3dg.formats."""
+"""Reads and writes gaussians by file name; each format is a module of v3dg.formats."""
 
 import os
 import pathlib
@@ -11,15 +11,14 @@ from typing import Literal, TypeVar, get_args
 from v3dg._numbers import check, check_type, one_of
 from v3dg._urls import FileAtUrl, beside, in_parts, reading, shown
 from v3dg.formats import checkpoint, gltf, hier, ksplat, ply, sog, splat, spz, streamed_sog, usd
-from v3dg.formats._reading import AssetFile, bytes_of
+from v3dg.formats._reading import AnyPath, AssetFile, bytes_of
 from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
 
-Path = str | os.PathLike[str]
 Format = TypeVar("Format")
 
-# By the end of a file's name. The first that fits counts.
-_READERS: dict[str, Callable[[Path], AssetFile]] = {
+# Readers by the end of a file's name; the first that matches is used.
+_READERS: dict[str, Callable[[AnyPath], AssetFile]] = {
     ".ply": ply.open_file,
     ".splat": splat.open_file,
     ".ksplat": ksplat.open_file,
@@ -32,7 +31,7 @@ _READERS: dict[str, Callable[[Path], AssetFile]] = {
     "meta.json": sog.open_file,
     **dict.fromkeys((".ckpt", ".pt"), checkpoint.open_file),
 }
-_WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {
+_WRITERS: dict[str, Callable[[AnyPath, Gaussians], None]] = {
     ".compressed.ply": ply.write_compressed,
     ".ply": ply.write,
     ".spz": spz.write,
@@ -40,7 +39,7 @@ _WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {
     **dict.fromkeys(usd.SUFFIXES, usd.write),
     ".sog": sog.write,
 }
-# The files of an asset, where they may be several.
+# Functions that list the files of an asset that may have several.
 _FILES: dict[str, Callable[[pathlib.Path], list[pathlib.Path]]] = {
     "lod-meta.json": streamed_sog.files,
     "meta.json": sog.files,
@@ -56,14 +55,15 @@ _RUNS = (
 )
 
 SUFFIXES = tuple(_READERS)
-"""How the names of files end that `read_asset` reads."""
+"""Ends of the names of files that `read_asset` reads."""
 
 WRITE_SUFFIXES = tuple(_WRITERS)
-"""How the names of files end that `write_asset` writes."""
+"""Ends of the names of files that `write_asset` writes."""
 
 
-def read_asset(path: Path) -> Gaussians:
-    """Read an asset; the end of the file's name tells its kind (docs/formats.md):
+def read_asset(path: AnyPath) -> Gaussians:
+    """Read an asset; the end of the file's name determines the format
+    (docs/formats.md):
 
     - `.ply`, as trainers write it: ascii or binary of either byte order, its properties
       in any order and of any scalar type, among others that are ignored, for SH degree
@@ -71,7 +71,7 @@ def read_asset(path: Path) -> Gaussians:
       computed in double precision and rounded once. Quaternions are normalised, except
       those of length zero, which stay as they are. Values that are not finite are
       passed on. Little more memory is needed than for the result. A compressed `.ply`,
-      of PlayCanvas and SuperSplat, is told by its content.
+      of PlayCanvas and SuperSplat, is recognised by its content.
     - `.glb`, glTF with KHR_gaussian_splatting, also compressed as `.spz`; the leaves of
       `.hier`, of H3DG.
     - `.usd`, `.usda` and `.usdc`, OpenUSD, with the extra `usd`, whose library bounds
@@ -82,15 +82,15 @@ def read_asset(path: Path) -> Gaussians:
     - `.pt` and `.ckpt`, checkpoints of gsplat's trainer and of nerfstudio's splatfacto,
       from which nothing but tensors is taken.
 
-    With the extra `fsspec`, that file may be at a URL, which is fetched once by a
-    process; not if it names others.
+    With the extra `fsspec`, the file may be at a URL, which is fetched once per
+    process, unless it refers to other files.
 
     Coordinates are those of the file: no axes are turned. Memory and time are bounded
     by the size of the file (docs/robustness.md).
 
     Raises:
-        ValueError: Another name, or the content is not of its kind; says what was
-            expected and found.
+        ValueError: The name is unknown, or the content does not match it; the message
+            says what was expected and what was found.
         OSError: The file cannot be opened or read (FileNotFoundError,
             IsADirectoryError, ...).
     """
@@ -98,14 +98,14 @@ def read_asset(path: Path) -> Gaussians:
     return file.read(0, file.num_gaussians)
 
 
-def loaded(asset: Gaussians | Path) -> Gaussians:
-    """An asset, or the one in a file."""
+def loaded(asset: Gaussians | AnyPath) -> Gaussians:
+    """An asset, which is read if it is given by its file."""
     if isinstance(asset, str | os.PathLike):
         return read_asset(asset)
     return asset
 
 
-def open_asset(path: Path) -> AssetFile:
+def open_asset(path: AnyPath) -> AssetFile:
     """Open an asset of any kind that `read_asset` reads, to read it in parts; errors as
     there.
 
@@ -119,9 +119,9 @@ def open_asset(path: Path) -> AssetFile:
     return reader(at_url)
 
 
-def _open_fetched(at_url: FileAtUrl, reader: Callable[[Path], AssetFile]) -> AssetFile:
-    """An asset at a URL, which is whole here as long as this lives; its errors name the
-    URL."""
+def _open_fetched(at_url: FileAtUrl, reader: Callable[[AnyPath], AssetFile]) -> AssetFile:
+    """An asset at a URL, whose local copy exists as long as this object; errors name
+    the URL."""
     with reading(at_url) as local:
         file = reader(local)
         whole = None
@@ -138,8 +138,8 @@ def _open_fetched(at_url: FileAtUrl, reader: Callable[[Path], AssetFile]) -> Ass
 
 
 def run_files(folder: pathlib.Path) -> list[pathlib.Path]:
-    """What a run of gsplat, nerfstudio or the code of the 3DGS paper came to last: one
-    asset together."""
+    """The last checkpoint of a run of gsplat, nerfstudio or the code of the 3DGS paper;
+    its files are one asset."""
     steps: dict[int, list[pathlib.Path]] = {}
     for pattern in _RUNS:
         for file in sorted(folder.glob(pattern)):
@@ -153,9 +153,8 @@ def run_files(folder: pathlib.Path) -> list[pathlib.Path]:
     return steps[max(steps)]
 
 
-def asset_bytes(path: Path) -> int:
-    """Bytes on disk of an asset that can be read: of all files that it names and that
-    are there."""
+def asset_bytes(path: AnyPath) -> int:
+    """Size on disk of a readable asset, including the existing files that it names."""
     names = _by_name(path, _FILES)
     at_url = in_parts(path)
     if isinstance(at_url, FileAtUrl):
@@ -164,15 +163,17 @@ def asset_bytes(path: Path) -> int:
 
 
 def write_asset(
-    path: Path,
-    gaussians: Gaussians | Path,
+    path: AnyPath,
+    gaussians: Gaussians | AnyPath,
     *,
     encoding: PlyEncoding = "binary_little_endian",
     version: Literal[2, 3, 4] | None = None,
 ) -> None:
-    """Write an asset, replacing what is there in one step once all is written.
+    """Write an asset; an existing file is replaced in one step once everything is
+    written.
 
-    The end of the name tells the kind (docs/formats.md has what each loses):
+    The end of the name determines the format (docs/formats.md lists what each one
+    loses):
 
     - `.ply`: the original layout without its normals, which are always zero: x y z,
       f_dc, f_rest (channel by channel), opacity (logit), scale (log), rot. An opacity
@@ -188,14 +189,14 @@ def write_asset(
 
     Args:
         gaussians: The asset, or its file.
-        encoding: Of a `.ply`; the others have one only.
-        version: Of a `.spz`; 3 if None. Version 2 is for viewers from before 2025, 4
-            for those since 2026.
+        encoding: Encoding of a `.ply`; other formats have only one.
+        version: Version of a `.spz`; 3 if None. Version 2 is for viewers from before
+            2025, 4 for those since 2026.
 
     Raises:
-        ValueError: Another name, an unknown encoding, or values that the format cannot
-            hold: a negative scale, an opacity outside [0, 1]; in all but `.ply` also
-            what is not finite, and quaternions of length zero.
+        ValueError: The name or the encoding is unknown, or the format cannot hold a
+            value: a negative scale or an opacity outside [0, 1]; in all formats but
+            `.ply` also values that are not finite, and quaternions of length zero.
         OSError: The file cannot be written.
     """
     gaussians = loaded(gaussians)
@@ -217,7 +218,7 @@ def write_asset(
     write(path, gaussians)
 
 
-def _by_name(path: Path, formats: Mapping[str, Format]) -> Format:
+def _by_name(path: AnyPath, formats: Mapping[str, Format]) -> Format:
     name = beside(path).name.lower()
     for ending, function in formats.items():
         if name.endswith(ending):

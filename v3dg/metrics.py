@@ -1,8 +1,8 @@
-"""How far apart two pictures are: PSNR, SSIM and FLIP; FLIP needs the extra `flip`.
+"""Differences of two pictures: PSNR, SSIM and FLIP; FLIP needs the extra `flip`.
 
-All take a reference and a test picture (H,W,3), display values in [0,1] (sRGB as shown,
-not linear light), as NumPy arrays or torch tensors, and are means over the whole
-picture. Nothing is cropped.
+Every function takes a reference and a test picture (H,W,3) with display values in [0,1]
+(sRGB as shown, not linear light), as NumPy arrays or torch tensors, and returns the
+mean over the whole picture. Nothing is cropped.
 """
 
 import importlib.util
@@ -26,7 +26,8 @@ FLIP_PIXELS_PER_DEGREE = 67.0
 use."""
 
 MIN_TRANSMITTANCE = 1e-4
-"""Where pixels of the truth stop, a tenth of where those of pictures do."""
+"""Transmittance at which pixels of the reference stop, a tenth of that of other
+pictures."""
 
 FLIP_MISSING = _extras.missing("flip_evaluator")
 
@@ -159,7 +160,7 @@ def draw_truth(
     supersampling: int = 2,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Picture:
-    """Draw the picture that others are compared with, in 8 bits, from all gaussians.
+    """Draw the reference picture of comparisons, in 8 bits, from all gaussians.
 
     A pixel has ``supersampling`` × ``supersampling`` samples. Each sample is clipped to
     [0,1] as a screen does, before it is averaged over its pixel.

@@ -15,18 +15,20 @@ from v3dg.scene import Scene, Subject
 from v3dg.scene.file import is_scene, read_scene
 
 File: TypeAlias = str | os.PathLike[str]
-"""A file by its name, which may stand in place of what `open` makes of it."""
+"""The name of a file, which functions accept in place of the subject that `open`
+returns for it."""
 
 
 def open(path: str | os.PathLike[str]) -> Subject:
     """Open a file by its name: a scene (.json), a bundle (.v3dg) or an asset, as
     `read_asset` does.
 
-    `read_scene` gives the cameras of a scene, too. A file of OpenUSD with instances is
-    a scene, as `read_usd_scene` reads it.
+    `read_scene` also returns the cameras of a scene. A file of OpenUSD with instances
+    is a scene, see `read_usd_scene`.
 
     Raises:
-        ValueError: The file is not what its name says, or has another name.
+        ValueError: The content does not match the name of the file, or the name is
+            unknown.
         OSError: It cannot be read.
     """
     return open_with_cameras(Path(path))[0]
@@ -58,22 +60,22 @@ def open_with_cameras(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
 def read_usd_scene(
     path: str | os.PathLike[str], *, config: BuildConfig | None = None, device: str = "auto"
 ) -> Scene:
-    """Read a world of OpenUSD: a bundle is built of each thing in it, and stands where
-    its instances do.
+    """Read a world of OpenUSD: a bundle is built from each asset in it, and placed at
+    the poses of its instances.
 
-    Instances are those of PointInstancers, also of each other, and prims that refer to
-    the same gaussians; a prim alone has one. The finest of their levels is read. Needs
-    the extra `usd`.
+    Instances are those of PointInstancers, which may be nested, and prims that refer to
+    the same gaussians; any other prim is a single instance. The finest of their levels
+    is read. Needs the extra `usd`.
 
     Args:
-        config: How bundles are built; if None, without fitting the levels, which takes
-            seconds.
-        device: Where, as in `build_bundle`.
+        config: Settings of the builds; None builds without fitting the levels, which
+            takes seconds.
+        device: The device that builds, see `build_bundle`.
 
     Raises:
         ImportError: usd-core is not installed.
-        ValueError: The file is not OpenUSD with gaussians, or something is placed
-            otherwise than by rotation, translation and one scale.
+        ValueError: The file is not OpenUSD with gaussians, or a transform is not a
+            rotation, a translation and a uniform scale.
         OSError: It cannot be read.
     """
     with reading(path) as local:

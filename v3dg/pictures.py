@@ -1,5 +1,5 @@
-"""Pictures of 8 bits: from colours, on contact sheets, in files that are written whole
-or not at all."""
+"""Pictures of 8 bits: made from colours, laid out on contact sheets, and written to
+files that appear when they are complete."""
 
 import io
 import os
@@ -20,11 +20,12 @@ Picture: TypeAlias = NDArray[np.uint8]
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 MOST_SIDE = 65_500
-"""Of a picture, in px: that of JPEG."""
+"""Largest side of a picture in px, which is the limit of JPEG."""
 MOST_PIXELS_DRAWN = 1 << 27
-"""Which takes 20 bytes each."""
+"""Largest picture that is drawn; each pixel takes 20 bytes of memory."""
 MOST_PIXELS_COMPARED = 1 << 25
-"""A screen of 8K; measuring takes 200 bytes each."""
+"""Largest picture that is compared, a screen of 8K; each pixel takes 200 bytes of
+memory."""
 
 _GAP_PX = 6
 _TEXT_PX = 18
@@ -33,8 +34,8 @@ _INK = (238, 240, 243)
 
 
 def to_8bit(image: Array) -> Picture:
-    """Round display values in [0,1] to 0..255, where the array is; what lies outside is
-    clipped."""
+    """Round display values in [0,1] to 0..255, on the device of the array; values
+    outside are clipped."""
     if hasattr(image, "detach"):
         import torch
 
@@ -108,19 +109,23 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
     out.
 
     Raises:
-        ValueError: It is none, is damaged or too large, or has more than 8 bits a
-            channel.
+        ValueError: The file is not a PNG or a JPEG, is damaged or too large, or has
+            more than 8 bits a channel.
         OSError: It cannot be read.
     """
     from PIL import Image
 
     name = os.fspath(path)
     with warnings.catch_warnings(), open(_files.open_regular(path), "rb") as file:
-        warnings.simplefilter("ignore")  # about what else the file holds, such as more pictures
+        warnings.simplefilter(
+            "ignore"
+        )  # they concern other content of the file, such as more pictures
         is_known = file.read(8).startswith((b"\x89PNG\r\n\x1a\n", b"\xff\xd8"))
         check(name, is_known, "a PNG or a JPEG, got another file")
         with _files.value_errors(name, "a PNG or a JPEG that is not damaged"):
-            image = Image.open(file, formats=("PNG", "JPEG"))  # of others, Pillow starts programs
+            image = Image.open(
+                file, formats=("PNG", "JPEG")
+            )  # for other formats, Pillow starts programs
         check_size(name, *image.size, MOST_PIXELS_COMPARED)
         check(name, not image.mode.startswith("I"), "8 bits a channel, got 16; convert it first")
         with _files.value_errors(name, "a PNG or a JPEG that is not damaged"):

@@ -1,5 +1,5 @@
-"""Levels of a bundle made better together: as cuts show them, next to what hides parts
-of them."""
+"""Refines all levels of a bundle together, in pictures of cuts, where gaussians hide
+each other."""
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,7 +23,7 @@ from v3dg.opening import File
 from v3dg.residency import residency
 
 _T = TypeVar("_T", covariant=True)
-_RATE = 0.2  # of the step sizes of a fit, from whose result this starts
+_RATE = 0.2  # factor of the step sizes of a fit, because refinement starts from a fitted level
 # The number of pictures that measure how much is seen of each gaussian.
 _NUM_WEIGHING_PICTURES = 2_000
 # A gaussian is measured if it is in the cuts of at least this many of them. Pictures
@@ -41,39 +41,39 @@ def refine_bundle(
     device: str | Device = "auto",
     progress: Progress = True,
 ) -> Bundle:
-    """Make the levels of a bundle look more like its asset, in small pictures and large
-    ones; a copy.
+    """Return a copy of a bundle whose levels look more like its asset, in small and
+    large pictures.
 
     A build fits every group alone, seen from all sides, at the size at which it is
     selected. Pictures of cuts show gaussians next to each other, where they hide each
-    other. By these, this drops the least seen gaussians of all levels but the first,
-    and moves the others until such pictures are those of the asset. Cuts have 0.7 of
-    the asset's gaussians down to those of the last level, and pictures 0.18 to 9.7
-    times the size at which they are at home, 2 px² a gaussian. docs/levels.md has what
-    is gained.
+    other. With such pictures, this function drops the least visible gaussians of all
+    levels but the first, and moves the others until the pictures match those of the
+    asset. Cuts have between 0.7 of the asset's gaussians and the number of the last
+    level. Pictures have 0.18 to 9.7 times the native size of the cut, which is 2 px² a
+    gaussian. docs/levels.md has the gain.
 
     The same bundle, cameras, steps, share and seed give the same bits on the same kind
     of device.
 
     Args:
-        bundle: What `build_bundle` made, or its file. About six times what that takes
-            is in memory meanwhile.
-        cameras: Where the asset is seen from, also by name: for a room those of its
-            photographs. What is seen from elsewhere may get worse. Without any,
-            pictures are taken from all around.
-        steps: Pictures that cuts are compared with, one after another.
-        drop: The least seen gaussians of a level are dropped, up to this share of what
-            is seen of it: 0, which keeps all, to 0.5. A bundle that was refined before
-            loses gaussians again.
-        seed: Of the pictures.
-        device: Where to compute.
-        progress: As for `build_bundle`.
+        bundle: A bundle of `build_bundle`, or its file. The function takes about six
+            times the bundle's memory.
+        cameras: Views of the asset, also by name: for a room, those of its photographs.
+            Views from elsewhere may get worse. Without cameras, pictures are taken from
+            all around.
+        steps: Number of pictures, which are compared one after another.
+        drop: Share of a level's visibility, 0 to 0.5, up to which its least visible
+            gaussians are dropped; 0 keeps all. Refining a bundle again drops gaussians
+            again.
+        seed: Seed of the pictures.
+        device: The device that computes.
+        progress: See `build_bundle`.
 
     Raises:
-        TypeError: The bundle or a camera is none.
+        TypeError: ``bundle`` is not a bundle, or a camera is not a camera.
         ValueError: There are no steps, or the share or the seed is out of range.
-        RuntimeError: The device is "cuda", and something is missing for it.
-        KeyboardInterrupt: Ctrl-C; threads have stopped.
+        RuntimeError: The device is "cuda" and cannot be used.
+        KeyboardInterrupt: Ctrl-C was pressed; threads have stopped.
     """
     if isinstance(bundle, str | os.PathLike):
         bundle = Bundle.open(bundle)

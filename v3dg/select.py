@@ -48,9 +48,9 @@ class Selection:
         instance_ids: (S,) int32, read-only.
         cluster_ids: (S,) int32, within the instance's bundle, read-only.
         num_gaussians: Gaussians in all selected clusters.
-        tolerance: The px² that were used; with a budget, those that meet it.
+        tolerance: The tolerance in px²; with a budget, the one that meets it.
         seconds: Wall time of the selection.
-        revision: Revision of the scene that was selected from; the present one if None.
+        revision: Revision of the scene at the selection; the current one if None.
         given_weights: Like `weights`, read-only; None without a fade, when all are 1.
     """
 
@@ -69,7 +69,7 @@ class Selection:
         if self.given_weights is not None:
             numbers = np.asarray(self.given_weights)
             if numbers.dtype.kind not in "biuf":
-                numbers = np.full(numbers.shape, np.nan)  # which the check below refuses
+                numbers = np.full(numbers.shape, np.nan)  # the check below refuses NaN
             object.__setattr__(self, "given_weights", np.ascontiguousarray(numbers, np.float32))
         weights = self.weights
         expected = f"{len(self)} numbers of 0 to 1"
@@ -154,9 +154,9 @@ class Selection:
     def filters_px2(self) -> npt.NDArray[np.float32]:
         """(N,) variance of the screen-space filter that each gaussian is drawn with.
 
-        With a fade, a level 0 that has none is drawn with 0.05 px², and with
-        `antialiased`. `render` limits that to four times a gaussian's own variance, so
-        that very many tiny ones stay opaque.
+        In a fade, a level 0 without a filter is drawn with 0.05 px² and as
+        `antialiased`. `render` limits it to four times a gaussian's own variance, so
+        that many tiny gaussians stay opaque.
         """
 
         def filter_px2(clusters: Clusters) -> npt.NDArray[np.float32]:
@@ -248,36 +248,35 @@ def select(
     moving it together with the scene changes only what is left out.
 
     Args:
-        subject: What to choose from, or the file of it, which is then opened anew by
-            every call.
-        camera: Pinhole camera. For a stereo camera, what is chosen is detailed enough
-            for the nearer eye, and what either may see is left in; not with the paper's
-            footprint.
+        subject: A scene or a bundle, or its file, which every call opens again.
+        camera: Pinhole camera. For a stereo camera, the cut is detailed enough for the
+            nearer eye and includes everything that either eye may see; it cannot be
+            combined with the paper's footprint.
         tolerance: Screen area in px² that one gaussian of a coarser cluster may stand
             for; 0 chooses the full detail wherever it covers anything, infinity the
             coarsest clusters. `DEFAULT_TOLERANCE` if None; with a budget, 0.
-        budget: Most gaussians that one view may have. The tolerance is raised, alike
-            for all instances, until they fit: to the least of 2,048 values an octave
-            from which on no cut has more.
+        budget: Largest number of gaussians of one view. The tolerance is raised, by the
+            same factor for all instances, to the least of 2,048 values an octave from
+            which on no cut has more.
         min_level: No cluster of a finer level is chosen, except where an asset has no
             coarser one.
         footprint: ``"solid_angle"``, or ``"paper"`` for the published formula, with
             which a path can have more than one cluster.
-        cull: False keeps what lies outside the frustum.
-        fade: What is within this factor of the tolerance is drawn on two levels, or
-            more, with weights that add up to exactly 1 on every path and depend on the
-            view alone: a level comes as the other goes, so that nothing pops while the
-            camera moves. A level 0 without a filter of its own is drawn with a low-pass
-            of 0.05 px², so that it does not flicker. `DEFAULT_FADE` is meant for that,
-            and for nothing else; 1 and None choose one cluster on every path. Not with
-            the paper's footprint.
-        device: Where to choose: ``"cpu"``, ``"cuda"``, or ``"auto"``, which is CUDA
-            where that works; all choose the same.
+        cull: False keeps clusters outside the frustum.
+        fade: Clusters within this factor of the tolerance are drawn on two or more
+            levels, with weights that add up to exactly 1 on every path and depend only
+            on the view: one level fades in as the other fades out, so that nothing pops
+            while the camera moves. A level 0 without a filter of its own is drawn with
+            a low-pass filter of 0.05 px², so that it does not flicker. `DEFAULT_FADE`
+            is meant for sequences of pictures; 1 and None choose one cluster on every
+            path. It cannot be combined with the paper's footprint.
+        device: The device that selects: ``"cpu"``, ``"cuda"``, or ``"auto"``, which is
+            CUDA if it can be used. All give the same cut.
 
     Raises:
         ValueError: The coarsest cut has more gaussians than the budget, ``tolerance``
             is negative or not a number, or another argument is not one of the above.
-        RuntimeError: ``device`` is ``"cuda"`` and something is missing for it.
+        RuntimeError: ``device`` is ``"cuda"`` and cannot be used.
 
     Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the
     budget is ours.

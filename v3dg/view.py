@@ -46,15 +46,16 @@ def view(
     (docs/viewer.md).
 
     The viewer's server runs on threads of this process. Its address is printed, and is
-    the `url` of what is returned; `close()` of that ends it.
+    the `url` of the returned site; the site's `close()` ends the server.
 
     Args:
-        device: As in `v3dg.render`.
-        memory: As in `v3dg.Renderer`.
-        up: What is up at first, an axis or a direction; as `v3dg.upright.up_of` takes
-            it if None.
-        options: As `v3dg.viewer.server.Site` takes them, such as `cameras`, by name,
-            `port`, `tolerance` and `budget`. A scene's file brings its own cameras.
+        device: See `v3dg.render`.
+        memory: See `v3dg.Renderer`.
+        up: The axis or direction that is up at first; None uses the axis of
+            `v3dg.upright.up_of`.
+        options: Options of `v3dg.viewer.server.Site`, such as `cameras` by name,
+            `port`, `tolerance` and `budget`. A scene's file may have cameras of its
+            own.
 
     Raises:
         ImportError: The extra `viewer` is not installed.

@@ -1,10 +1,8 @@
-"""Files at URLs, by fsspec: what is needed of one, or all, comes to files without a
-name.
-
-`names` says what is a URL and how one is shown, `addresses` which hosts may be asked,
-`http` how web servers are asked and what their answers may cost, `others` the same for
-all other places, `failures` what is told of what goes wrong, and `opened` has the
-files.
+"""Files at URLs, which fsspec knows: the parts in use, or all of a file, are fetched
+into a nameless local file. `names` recognises and shows URLs, `addresses` says which
+hosts may be contacted, `http` sends requests to web servers and bounds what their
+answers cost, `others` does the same for other file systems, `failures` words the
+errors, and `opened` has the local files.
 """
 
 from v3dg._urls.names import beside as beside

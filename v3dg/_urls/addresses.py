@@ -1,4 +1,5 @@
-"""How far away an address is: what a server on the internet may not send us on to."""
+"""The reach of network addresses: a server on the internet must not redirect to an
+address of a local network."""
 
 import ipaddress
 from enum import IntEnum
@@ -8,8 +9,8 @@ _Address: TypeAlias = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 class Reach(IntEnum):
-    """From where an address is reached; a redirect may not lead to one that is reached
-    from fewer places."""
+    """The part of the world from which an address can be reached; a redirect must not
+    lead to an address of a smaller reach."""
 
     HOST = 0
     """This machine or its link, also addresses that are no single host's."""
@@ -19,8 +20,8 @@ class Reach(IntEnum):
     """The internet."""
 
 
-# RFC 6890, RFC 1122, RFC 3927, RFC 4291, RFC 5771. Lists of Python differ between its
-# versions.
+# RFC 6890, RFC 1122, RFC 3927, RFC 4291, RFC 5771. The lists in Python differ between
+# its versions.
 _HOST = [
     ipaddress.ip_network(text)
     for text in (
@@ -49,7 +50,7 @@ _PRIVATE = [
         "203.0.113.0/24",
     )
 ]
-# Only these are part of the internet, except what is for documentation and protocols.
+# Only these are part of the internet, except ranges for documentation and protocols.
 _PUBLIC_IPV6 = ipaddress.ip_network("2000::/3")
 _PRIVATE_IPV6 = [ipaddress.ip_network(text) for text in ("2001::/23", "2001:db8::/32", "3fff::/20")]
 # RFC 6052 and RFC 4291: the last 32 bits are an address of IPv4.
@@ -57,13 +58,13 @@ _WITH_IPV4 = [ipaddress.ip_network(text) for text in ("64:ff9b::/96", "::/96")]
 
 
 def reach_of(address: str) -> Reach:
-    """Reach of an IP address; ValueError where the text is none."""
+    """Reach of an IP address; ValueError for any other text."""
     parsed = ipaddress.ip_address(address.partition("%")[0])
     return min(map(_reach_of, _inner(parsed)))
 
 
 def is_address(host: str) -> bool:
-    """Whether this is the number of a host and not its name."""
+    """Whether a host is given by its address and not by a name."""
     try:
         ipaddress.ip_address(host.partition("%")[0])
     except ValueError:
@@ -72,8 +73,8 @@ def is_address(host: str) -> bool:
 
 
 def _inner(address: _Address) -> list[_Address]:
-    """Addresses of IPv4 that a gateway makes of one of IPv6; itself where there are
-    none."""
+    """The IPv4 addresses to which a gateway translates an IPv6 address; the address
+    itself if there are none."""
     if isinstance(address, ipaddress.IPv4Address) or any(address in network for network in _HOST):
         return [address]
     if address.ipv4_mapped is not None:

@@ -1,5 +1,5 @@
-"""What is told of a URL that cannot be read: the right type of error, and one line
-without secrets."""
+"""Errors of URLs that cannot be read: each has the right type, and one line without
+secrets."""
 
 import contextlib
 import errno
@@ -11,12 +11,12 @@ from collections.abc import Iterator
 from v3dg._urls.names import cleaned, shown
 
 _AGAIN = "try again later"
-_LONGEST = 200  # characters that a library may say
+_LONGEST = 200  # characters of a library's message
 
 
 class Problem(Exception):
-    """Says why a file cannot be had, and the type of the error that this is; the URL is
-    not in its text."""
+    """The reason why a file cannot be fetched, and the type of the error; the text does
+    not contain the URL."""
 
     def __init__(self, kind: type[OSError] | type[ValueError], text: str) -> None:
         super().__init__(text)
@@ -24,11 +24,9 @@ class Problem(Exception):
 
 
 def status_problem(status: int) -> Problem:
-    """What an answer with a status that is no success means."""
+    """The problem of an answer whose status is not a success."""
     try:
-        phrase = (
-            f"{status} {http.HTTPStatus(status).phrase}"  # a server's own words may be anything
-        )
+        phrase = f"{status} {http.HTTPStatus(status).phrase}"  # a server's own text may be anything
     except ValueError:
         phrase = str(status)
     kind, advice = _kind_of_status(status)
@@ -52,8 +50,8 @@ def _kind_of_status(status: int) -> tuple[type[OSError], str]:
 
 @contextlib.contextmanager
 def naming_errors(url: str) -> Iterator[None]:
-    """Make one line of whatever a package that knows such URLs raises; the text of its
-    error is cleaned."""
+    """Turn any error of a package for URLs into one line, without the secrets in its
+    text."""
     try:
         yield
     except (ImportError, MemoryError):
@@ -73,8 +71,8 @@ def _failure_of(url: str, error: Exception) -> Exception:
 
 
 def _problem_of(url: str, error: Exception) -> Problem:
-    """Meaning of an error of the system, of fsspec or of aiohttp, whose types are known
-    by their names."""
+    """The problem behind an error of the system, of fsspec or of aiohttp, whose types
+    are recognised by name."""
     names = {kind.__name__ for kind in type(error).__mro__}
     cause = error
     system_error = getattr(
@@ -119,7 +117,7 @@ def _problem_of_connection(error: Exception, text: str) -> Problem:
 
 
 def _problem_of_answer(names: set[str]) -> Problem | None:
-    """The problem of an answer that came, by the names of an error's types; None for
+    """The problem of a received answer, by the names of an error's types; None for
     other errors."""
     if "ClientPayloadError" in names:
         return Problem(ConnectionError, f"the server's answer was not complete; {_AGAIN}")
@@ -144,7 +142,7 @@ def _text_of(url: str, error: Exception) -> str:
 
 
 def no_room(folder: str, error: OSError | None = None) -> Problem:
-    """What a full disk for temporary files means."""
+    """The problem of a full disk for temporary files."""
     reason = "no space left"
     if error is not None:
         reason = error.strerror or reason

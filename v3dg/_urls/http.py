@@ -1,10 +1,10 @@
-"""Files of web servers, which may be hostile: no more is asked for, waited for or kept
-than a request needs.
+"""Files of web servers, which may be hostile: requested bytes, waiting time and memory
+are bounded by what a request needs.
 
-Requests are made with aiohttp on the event loop of fsspec, without compression.
-Redirects are followed here, and each host is checked before it is asked. Addresses are
-checked once more when a connection is made, because a name may resolve to another
-address by then.
+aiohttp makes the requests on the event loop of fsspec, without compression. This module
+follows redirects itself and checks each host before contacting it. It checks the
+address again when a connection is made, because a name may resolve to another address
+by then.
 """
 
 import asyncio
@@ -61,7 +61,7 @@ class _RequestOptions(TypedDict, total=False):
 
 
 class HttpFileSystem(Protocol):
-    """What is used of fsspec's file system of the web, which has no types."""
+    """The used part of fsspec's file system of the web, which has no types."""
 
     client_kwargs: _SessionOptions
     kwargs: _RequestOptions
@@ -79,15 +79,15 @@ class _SessionKey(NamedTuple):
 
 
 class _FileInfo(NamedTuple):
-    """What an answer says of the file: its size, if known, and its tag."""
+    """The file's size, if known, and its tag, from the headers of an answer."""
 
     num_bytes: int | None
     tag: str
 
 
 class _ContentRange(NamedTuple):
-    """What an answer with a part says: first byte, the one behind the last, and the
-    size of the file."""
+    """The first byte of a part, the byte behind its last, and the size of the file,
+    from the headers of an answer."""
 
     first: int | None
     last: int | None
@@ -98,7 +98,7 @@ _sessions: dict[_SessionKey, "ClientSession"] = {}
 
 
 async def resolve(host: str, port: int) -> list[str]:
-    """Addresses of a host; tests put others in place of this function."""
+    """Addresses of a host; tests replace this function."""
     loop = asyncio.get_running_loop()
     entries = await loop.getaddrinfo(
         host, port, type=socket.SOCK_STREAM, flags=socket.AI_ADDRCONFIG
@@ -110,21 +110,21 @@ class WebSource:
     """One file of a web server; methods may be called on any thread.
 
     Attributes:
-        num_bytes: Size; None where the server does not say it.
-        tag: Differs when the content does; empty where the server sends nothing of the
-            kind.
+        num_bytes: Size of the file; None if the server does not send it.
+        tag: Text that changes with the content; empty if the server sends none.
     """
 
     def __init__(self, file_system: HttpFileSystem, address: str) -> None:
         self._aiohttp: ModuleType = _extras.load("aiohttp")
         try:
             url = file_system.encode_url(address)
-        except ValueError:  # whose text may have a part of a password
+        except ValueError:  # its text may contain a part of a password
             raise _wrong_url() from None
         if not url.host:
             raise _wrong_url()
         self._url = url.with_user(None).with_fragment(None)
-        # What users configure for fsspec; only the first host may see the headers.
+        # Options that users configure for fsspec; only the first host may receive the
+        # headers.
         session = file_system.client_kwargs
         request = file_system.kwargs
         self._headers = {**session.get("headers", {}), **request.get("headers", {})}
@@ -134,7 +134,7 @@ class WebSource:
         self._ssl = request.get("ssl", True)
         self._proxy = request.get("proxy")
         self._trust_env = bool(session.get("trust_env", False))
-        self._reach: Reach | None = None  # of the first host, once it is known
+        self._reach: Reach | None = None  # reach of the first host, once it is known
         self._gives_parts = False
         info = _run(self._info())
         self.num_bytes = info.num_bytes
@@ -195,8 +195,8 @@ class WebSource:
             return False
 
     def _check_range(self, content: _ContentRange, first: int, last: int) -> None:
-        """Refuse a part of a file of another size, and another part than the one that
-        was asked for."""
+        """Refuse a part of a file whose size changed, and a part that was not
+        requested."""
         if content.num_bytes is not None and content.num_bytes != self.num_bytes:
             problem = f"one of {content.num_bytes}; it has changed, open it again"
             raise Problem(ValueError, f"expected a file of {self.num_bytes} bytes, got {problem}")
@@ -217,8 +217,8 @@ class WebSource:
 
     @contextlib.asynccontextmanager
     async def _answer(self, method: str, part: str = "") -> "AsyncIterator[ClientResponse]":
-        """The beginning of an answer that is no redirect; the caller reads its body, or
-        leaves it."""
+        """An answer that is not a redirect, after its headers; the caller may read the
+        body."""
         headers: dict[str, str] = {}
         if part:
             headers["Range"] = part
@@ -231,7 +231,7 @@ class WebSource:
                 )
             yield answer
         finally:
-            answer.close()  # also where it would go on, as the text of an error without end
+            answer.close()  # even if its body is endless
 
     async def _follow(self, method: str, headers: Mapping[str, str]) -> "ClientResponse":
         url = self._url
@@ -300,7 +300,7 @@ def _close(process: int, loop: asyncio.AbstractEventLoop, session: "ClientSessio
 
 
 def _resolver(least_reach: Reach) -> "AbstractResolver":
-    """A resolver for aiohttp that knows no address of a shorter reach."""
+    """A resolver for aiohttp that returns no address of a smaller reach."""
     from aiohttp.abc import AbstractResolver
 
     class Resolver(AbstractResolver):
@@ -335,12 +335,12 @@ def _entry(host: str, port: int, address: str) -> "ResolveResult":
 
 
 async def _checked(url: "URL", least_reach: Reach | None) -> Reach:
-    """Reach of a host, which is that of its farthest address; one below `least_reach`
-    is refused."""
+    """Reach of a host, which is the largest of its addresses; a host below
+    `least_reach` is refused."""
     host = url.host
     port = url.port
     assert host is not None
-    assert port is not None  # which URLs of the web always have
+    assert port is not None  # URLs of the web always have one
     addresses = [host]
     if not is_address(host):
         addresses = await resolve(host, port)
@@ -363,8 +363,7 @@ def _refused() -> Problem:
 
 
 def _next_url(url: "URL", location: str) -> "URL":
-    """The address that a redirect leads to; another user or password in it is left
-    out."""
+    """The URL that a redirect leads to, without another user or password."""
     try:
         target = url.join(type(url)(location)).with_user(None).with_fragment(None)
         is_web = bool(location) and target.scheme in ("http", "https") and bool(target.host)
@@ -402,7 +401,7 @@ def _number(text: str | None) -> int | None:
 
 
 async def _read(answer: "ClientResponse", first: int, last: int, write: Write) -> None:
-    """Write a body that must have exactly the bytes from a first to a last."""
+    """Write a body that must have exactly the bytes from the first to the last."""
     length = answer.content_length
     if length is not None and length != last - first:
         raise changed(first, last, length)
@@ -412,8 +411,8 @@ async def _read(answer: "ClientResponse", first: int, last: int, write: Write) -
 
 
 async def _read_to_end(answer: "ClientResponse", first: int, max_bytes: int, write: Write) -> int:
-    """Write a body of at most `max_bytes` and return its size; each step of it must
-    come in time."""
+    """Write a body of at most `max_bytes` and return its size; each piece must arrive
+    in time."""
     num_bytes = 0
 
     async def step() -> bool:

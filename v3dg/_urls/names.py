@@ -1,4 +1,4 @@
-"""Which names are URLs, and how one is shown: without what may be secret."""
+"""Recognises URLs, and shows them without the parts that may be secret."""
 
 import os
 import re
@@ -12,32 +12,31 @@ _SECRET = re.compile(r"[@?#]")
 
 
 def is_url(path: str | os.PathLike[str]) -> bool:
-    """Whether this is the name of a file elsewhere: a local file of that name comes
-    first."""
+    """Whether a name is a URL and not the name of an existing local file."""
     return bool(_URL.match(os.fspath(path))) and not os.path.lexists(path)
 
 
 def full(path: str | os.PathLike[str]) -> str:
-    """The URL with all that belongs to it: as a `Path` it has lost a slash."""
+    """The complete URL: a `Path` of it has lost a slash."""
     return _URL.sub(_with_slashes, os.fspath(path), count=1)
 
 
 def shown(path: str | os.PathLike[str]) -> str:
-    """The name of a file as messages and results show it; of a URL, nothing that may be
-    secret."""
+    """The name of a file in messages and results; for a URL, without the parts that may
+    be secret."""
     if is_url(path):
         return _without_secrets(full(path))
     return os.fspath(path)
 
 
 def cleaned(text: str) -> str:
-    """A text of somebody else in which every URL is shown without what may be
+    """A text from elsewhere, with every URL in it shown without the parts that may be
     secret."""
     return _URL_IN_TEXT.sub(_cleaned_match, text)
 
 
 def beside(path: str | os.PathLike[str]) -> Path:
-    """The file; in place of one at a URL, that of its name in the working folder."""
+    """The path of a local file; for a URL, its file name in the working folder."""
     if not is_url(path):
         return Path(path)
     return Path(os.path.basename(unquote(_place_of(full(path))[1])))

@@ -1,5 +1,5 @@
-"""Files at URLs that this process reads: what is needed of one comes to a file without
-a name, once."""
+"""Files at URLs that this process reads: the parts in use are fetched once, into a
+nameless local file."""
 
 import contextlib
 import os
@@ -21,34 +21,35 @@ from v3dg._urls.others import OtherSource
 
 Source: TypeAlias = WebSource | OtherSource
 
-_BLOCK_BYTES = 1024  # that come together; pages have far more
-_MOST_BLOCKS = 1 << 12  # of a piece
-_MOST_PIECES = 8  # that are asked for at once
-# A file whose size no one says is fetched up to this size.
+_BLOCK_BYTES = 1024  # bytes of a block, the unit that is fetched; pages have far more
+_MOST_BLOCKS = 1 << 12  # blocks of a piece, the largest request
+_MOST_PIECES = 8  # pieces that are requested at once
+# A file of unknown size is fetched up to this size.
 _MOST_UNKNOWN_BYTES = 2 << 30
-# That stay free on the disk of temporary files.
+# Bytes that stay free on the disk of temporary files.
 _SPARE_BYTES = 256 << 20
-# URLs whose files are known again; a file that is in use stays open anyway.
+# Number of URLs whose files are kept open for the next use; a file that is in use stays
+# open anyway.
 _MOST_OPENED = 256
-# USD goes by the end of a name.
+# The USD library depends on the end of a name.
 _NEEDS_NAME = (".usd", ".usda", ".usdc")
 
 _opened: dict[str, "FileAtUrl"] = {}
 
 
 def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUrl":
-    """A local file, or one at a URL, as it is there now, of which nothing is fetched
-    yet.
+    """Open a file at a URL without fetching anything yet; the name of a local file is
+    returned unchanged.
 
-    A file of which its place says that it is the same as before is not fetched again.
+    A file that is unchanged according to its server is not fetched again.
 
     Raises:
-        ImportError: The extra `fsspec` is not installed, or what it needs for such
-            URLs.
-        ValueError: It is a URL of no file, of one that names others, or of one inside
-            of another.
-        FileNotFoundError, PermissionError, TimeoutError, ConnectionError, OSError: It
-            cannot be had.
+        ImportError: The extra `fsspec`, or a package that it needs for such URLs, is
+            not installed.
+        ValueError: The URL is not that of a file, or the file names other files, or
+            lies inside of another file.
+        FileNotFoundError, PermissionError, TimeoutError, ConnectionError, OSError: The
+            file cannot be fetched.
     """
     if not is_url(path):
         return path
@@ -74,7 +75,7 @@ def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUr
 
 @contextlib.contextmanager
 def reading(path: "str | os.PathLike[str] | FileAtUrl") -> Iterator[str | os.PathLike[str]]:
-    """A name under which a file, which is fetched whole from a URL, is read; errors
+    """A name under which a file is read, which for a URL is fetched whole; errors
     inside name the URL."""
     file = path
     if not isinstance(file, FileAtUrl):
@@ -106,17 +107,15 @@ def _source_of(url: str) -> Source:
 
 
 class FileAtUrl(os.PathLike[str]):
-    """A file at a URL, and a file without a name here, to which comes what is needed,
-    once.
-
-    However the process ends, nothing of that file stays.
+    """A file at a URL, and a nameless local file, into which the parts in use are
+    fetched once. Nothing of it remains on disk, however the process ends.
 
     Attributes:
-        file: The file here, in which bytes that are not fetched are 0, or missing at
-            the end.
-        num_bytes: Size of the file there.
-        tag: Differs when the content there does; empty if that cannot be known.
-        needs_name: Whether its reader goes by the end of its name.
+        file: The local file; bytes that are not fetched are 0, or missing at the end.
+        num_bytes: Size of the file at the URL.
+        tag: Text that changes with the content at the URL; empty if the server sends
+            none.
+        needs_name: Whether its reader depends on the end of the name.
     """
 
     def __init__(self, url: str, source: Source) -> None:
@@ -128,9 +127,11 @@ class FileAtUrl(os.PathLike[str]):
         weakref.finalize(self, self.file.close)
         self._lock = threading.Lock()
         self._is_whole = False
-        self._is_fetched: dict[int, NDArray[np.bool_]] = {}  # by piece, for each of its blocks
+        self._is_fetched: dict[
+            int, NDArray[np.bool_]
+        ] = {}  # by piece, whether each block is fetched
         self.num_bytes = -1
-        if source.num_bytes is None:  # there are no parts of what has no size
+        if source.num_bytes is None:  # a file of unknown size has no parts
             self._fetch_whole()
         else:
             self.num_bytes = source.num_bytes
@@ -140,10 +141,11 @@ class FileAtUrl(os.PathLike[str]):
 
     @contextlib.contextmanager
     def named(self) -> Iterator[str]:
-        """The name of a file that has all of it, while it is needed; errors as `fetch`.
+        """The name of a local file with all of the content, valid inside the context;
+        errors as `fetch`.
 
-        The name is of an open file of this process. Where a reader needs the end of a
-        name, it is a link to that, which goes at once afterwards.
+        The name is that of an open file of this process. For a reader that depends on
+        the end of a name, it is a link to that, which is removed afterwards.
         """
         self._fetch_whole()
         name = f"/proc/self/fd/{self.file.fileno()}"
@@ -156,11 +158,11 @@ class FileAtUrl(os.PathLike[str]):
             yield link
 
     def fetch(self, parts: Iterable[tuple[int, int]]) -> None:
-        """Have the bytes from each first to each last here; on any thread.
+        """Fetch the bytes from each first to each last; may be called on any thread.
 
         Raises:
-            OSError: They cannot be had, or there is no room for them.
-            ValueError: They are not in the file, or it has changed.
+            OSError: The bytes cannot be fetched, or the disk is full.
+            ValueError: The bytes are not in the file, or the file has changed.
         """
         if self._is_whole:
             return
@@ -183,8 +185,8 @@ class FileAtUrl(os.PathLike[str]):
                 is_fetched[first - piece * _MOST_BLOCKS : last - piece * _MOST_BLOCKS] = True
 
     def _missing(self, parts: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Runs of blocks that parts need and that are not fetched, none longer than a
-        piece."""
+        """Runs of blocks that the parts need and that are not fetched yet, none longer
+        than a piece."""
         is_needed: dict[int, NDArray[np.bool_]] = {}
         for first, last in parts:
             expected = f"parts of its {self.num_bytes} bytes, got {first} to {last}"

@@ -1,4 +1,4 @@
-"""Files of the file systems that fsspec knows besides the web."""
+"""Files of the other file systems that fsspec knows, apart from the web."""
 
 import contextlib
 import re
@@ -13,14 +13,14 @@ Write: TypeAlias = Callable[[bytes, int], None]
 """Writes bytes at an offset of the file that is read."""
 
 _STEP_BYTES = 1 << 20
-# What says which content a file has, by its name in the answers of fsspec's packages.
+# Fields that change with the content of a file, as fsspec's packages name them.
 _TAG = re.compile(
     r"tag|md5|sha|crc|checksum|digest|modif|mtime|created|updated|generation|version", re.IGNORECASE
 )
 
 
 class FileSystem(Protocol):
-    """What is used of a file system of fsspec, which has no types."""
+    """The used part of a file system of fsspec, which has no types."""
 
     async_impl: bool
 
@@ -37,9 +37,8 @@ class OtherSource:
     """One file of a file system of fsspec.
 
     Attributes:
-        num_bytes: Size; None where that is not known before all is read.
-        tag: Differs when the content does; empty where the file system says nothing of
-            the kind.
+        num_bytes: Size of the file; None if it is not known before everything is read.
+        tag: Text that changes with the content; empty if the file system has none.
     """
 
     def __init__(self, file_system: FileSystem, path: str) -> None:
@@ -50,7 +49,7 @@ class OtherSource:
             self.tag = str(info)
         self._file_system = file_system
         self._path = path
-        # Only file systems of the asynchronous kind are for several threads.
+        # Only asynchronous file systems may be used by several threads.
         self._lock: AbstractContextManager[object] = threading.Lock()
         if file_system.async_impl:
             self._lock = contextlib.nullcontext()
@@ -65,7 +64,7 @@ class OtherSource:
         for (first, last), data in zip(parts, answers, strict=True):
             if isinstance(data, Exception):
                 raise data
-            if len(data) == self.num_bytes:  # this file system gives no parts
+            if len(data) == self.num_bytes:  # this file system cannot read parts
                 write(data, 0)
                 return True
             if len(data) != last - first:
@@ -87,7 +86,7 @@ class OtherSource:
 
 
 def changed(first: int, last: int, num_bytes: int) -> Problem:
-    """The problem of a part that has another number of bytes than was asked for."""
+    """The problem of a part that has another number of bytes than was requested."""
     text = (
         f"expected {last - first} bytes at {first}, got {num_bytes}; it has changed, open it again"
     )

@@ -30,7 +30,7 @@ from v3dg.bundle.tables import Clusters, Groups, check_index, check_tables
 from v3dg.gaussians import Gaussians
 
 _Pages: TypeAlias = MemoryPages | CodePages | FilePages
-_RUN_BYTES = 64 << 20  # of pages that are written together
+_RUN_BYTES = 64 << 20  # bytes of pages that are written together
 
 
 class Bundle:
@@ -38,11 +38,11 @@ class Bundle:
     are read on demand.
 
     Attributes:
-        config: How it was built, as JSON values.
+        config: The settings of the build, as JSON values.
         sh_degree: 0 to 3, the same for all gaussians.
-        codec: How its file keeps gaussians. "float32": every bit. "quantized": in 16
-            (SH degree 0) to 40 bytes (degree 3), to which they are rounded when the
-            bundle is made; docs/format.md has the error.
+        codec: The encoding of gaussians in the file. "float32" keeps every bit.
+            "quantized" takes 16 (SH degree 0) to 40 bytes (degree 3), and gaussians are
+            rounded when the bundle is made; docs/format.md has the error.
 
     Raises:
         ValueError: The tables do not fit each other or the gaussians, do not guarantee
@@ -102,8 +102,8 @@ class Bundle:
         on disk until used.
 
         The file stays open, so a file that is later saved over it does not change this
-        bundle. With the extra `fsspec` it may be at a URL, of which what is used is
-        fetched, once by a process.
+        bundle. With the extra `fsspec` it may be at a URL; only the parts in use are
+        fetched, once per process.
 
         Raises:
             FileNotFoundError: There is no such file.
@@ -118,8 +118,8 @@ class Bundle:
         """Open several bundle files as `open` does, at the same time.
 
         Raises:
-            FileNotFoundError, ValueError: As `open`, for the first file with which
-                something is wrong.
+            FileNotFoundError, ValueError: See `open`; the error is that of the first
+                wrong file.
         """
         reader = _core.HashedReader()
         paths = list(paths)
@@ -159,11 +159,12 @@ class Bundle:
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the bundle to a file; the same bundle gives the same bytes.
 
-        The file appears at ``path`` when it is complete and not before: on an error or
-        an interrupt, a file that existed stays as it was, and no other file remains.
+        The file appears at ``path`` when it is complete and not before: after an error
+        or an interrupt, an existing file is unchanged, and no temporary file remains.
 
         Raises:
-            ValueError: The name does not end in `.v3dg`, or is of a device or a pipe.
+            ValueError: The name does not end in `.v3dg`, or is that of a device or a
+                pipe.
             OSError: The file cannot be written.
         """
         _files.check_bundle_name(path)
@@ -200,8 +201,8 @@ class Bundle:
 
     @property
     def path(self) -> str | None:
-        """Name of the file that the bundle was opened from, if it was; of one at a URL,
-        the whole URL."""
+        """Name or whole URL of the file that the bundle was opened from; None for a
+        bundle in memory."""
         if self._file is None:
             return None
         return self._file.name

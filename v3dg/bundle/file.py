@@ -1,8 +1,8 @@
 """The file of a bundle: a safetensors container with aligned, hashed pages in front of
 the tables.
 
-docs/format.md says what is in the file and why. This module moves bytes and trusts none
-of them; what the tables mean is checked by `v3dg.bundle.tables`.
+docs/format.md says what is in the file and why. This module reads and writes bytes and
+trusts none of them; `v3dg.bundle.tables` checks the values of the tables.
 """
 
 import os
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core, _files, _urls
-from v3dg._json import JsonObject, parse_json, shown
+from v3dg._json import JsonObject, json_text, parse_json
 from v3dg._numbers import check
 from v3dg._urls import FileAtUrl
 from v3dg.bundle import format as file_format
@@ -34,11 +34,11 @@ from v3dg.bundle.pages import PageLayout, PageRun, on_threads
 from v3dg.bundle.tables import Clusters, Column, Groups, check_tables, columns_of
 from v3dg.gaussians import Gaussians
 
-_FIRST_BYTES = 4096  # of the header: what a disk writes at once
-# Of tables at a URL, whose size is a claim until they are here; those of a billion
-# gaussians have less.
+_FIRST_BYTES = 4096  # first bytes of the header, which a disk writes at once
+# Limit for tables at a URL, whose size is only a claim until they are fetched; the
+# tables of a billion gaussians are smaller.
 _MOST_FETCHED_TABLE_BYTES = 1 << 30
-_FREE_CLUSTERS = 1 << 18  # that may all be empty; others have a gaussian each
+_FREE_CLUSTERS = 1 << 18  # clusters that may be empty; every further one has a gaussian
 
 PageSource: TypeAlias = tuple[
     str,
@@ -80,8 +80,8 @@ class BundlePlan:
     def write_tables(
         self, descriptor: int, clusters: Clusters, groups: Groups, hashes: NDArray[np.uint8]
     ) -> None:
-        """Write the tables, which are checked, behind the pages; those have these
-        hashes, (P, 16)."""
+        """Check the tables and write them behind the pages, whose hashes are (P,
+        16)."""
         check_tables(clusters, groups, int(self.layout.first_gaussian[-1]))
         tables = self._page_tables | columns_of(clusters, groups) | {"pages.hash": hashes}
         schema = schema_of(self.codec)
@@ -93,7 +93,8 @@ class BundlePlan:
         _files.write_at(descriptor, end, self._pages_end)
 
     def write_header(self, descriptor: int) -> None:
-        """Write the header; a file that has the first bytes of it has all."""
+        """Write the header; its first bytes are written last, so a file that has them
+        is complete."""
         _files.write_at(descriptor, self.header[_FIRST_BYTES:], _FIRST_BYTES)
         _files.write_at(descriptor, self.header[:_FIRST_BYTES], 0)
 
@@ -134,15 +135,15 @@ def read_pages(
 
 
 class BundleFile:
-    """A bundle file: header and tables are read, pages are not; `verify` tells whether
-    they are damaged.
+    """A bundle file whose header and tables are read, but no pages; `verify` checks
+    them for damage.
 
-    What is allocated follows from the size of the file, which is closed when this is
-    dropped; of one at a URL, from what is fetched.
+    The size of the file bounds what is allocated; for a file at a URL, the number of
+    fetched bytes does. The file is closed when this object is dropped.
 
     Attributes:
-        name: The file's name, or its URL, as it was given.
-        path: As messages show that.
+        name: The file's name, or its URL, as the caller passed it.
+        path: The name in messages.
     """
 
     def __init__(self, path: str | os.PathLike[str], reader: _core.HashedReader) -> None:
@@ -200,16 +201,18 @@ class BundleFile:
             values = metadata
         kind = values.get("format")
         if kind != file_format.FORMAT:
-            self._fail(f"format: expected '{file_format.FORMAT}', got {shown(kind)}; not a bundle")
+            self._fail(
+                f"format: expected '{file_format.FORMAT}', got {json_text(kind)}; not a bundle"
+            )
         version = values.get("version")
         if not isinstance(version, str) or not re.fullmatch("[1-9][0-9]{0,8}", version):
-            self._fail(f"version: expected a number of 1 or more, got {shown(version)}")
+            self._fail(f"version: expected a number of 1 or more, got {json_text(version)}")
         self.version = int(version)
         if self.version > VERSION:
             self._fail(f"version {self.version}, this build reads up to {VERSION}; update v3dg")
         degree = values.get("sh_degree")
         if not isinstance(degree, str) or degree not in ("0", "1", "2", "3"):
-            self._fail(f"sh_degree: expected '0' to '3', got {shown(degree)}")
+            self._fail(f"sh_degree: expected '0' to '3', got {json_text(degree)}")
         name: object = Codec.name
         if self.version > 1:
             name = values.get("codec")
@@ -218,11 +221,13 @@ class BundleFile:
             or name not in CODECS
             or (self.version, name) == (2, Codec.name)
         ):
-            self._fail(f"codec: expected one that this build reads, got {shown(name)}; update v3dg")
+            self._fail(
+                f"codec: expected one that this build reads, got {json_text(name)}; update v3dg"
+            )
         self.codec = CODECS[name](int(degree))
         config = values.get("config")
         if not isinstance(config, str):
-            self._fail(f"config: expected a string of JSON, got {shown(config)}")
+            self._fail(f"config: expected a string of JSON, got {json_text(config)}")
         self.config = self._object("config", config)
 
     def _object(self, name: str, text: str | bytes) -> JsonObject:
@@ -230,33 +235,35 @@ class BundleFile:
             value = parse_json(text)
         except ValueError as error:
             self._fail(f"{name}: expected JSON, got {error}")
-        self._check(name, isinstance(value, dict), f"a JSON object, got {shown(value)}")
+        self._check(name, isinstance(value, dict), f"a JSON object, got {json_text(value)}")
         return dict(value)
 
     def _check_entries(self, header: JsonObject) -> dict[str, Entry]:
-        """Compare the header with the one that its own counts and the file's size call
-        for."""
+        """Compare the header with the one that follows from its own counts and the
+        file's size."""
         counts = []
         for name in ("clusters.level", "groups.parent", "pages.offset", "pages"):
             entry = header.get(name)
             length = _length_of_vector(entry)
             if length is None:
-                self._fail(f"{name}: expected a one-dimensional tensor, got {shown(entry)}")
+                self._fail(f"{name}: expected a one-dimensional tensor, got {json_text(entry)}")
             counts.append(length)
         largest = max(counts)
         text = (
-            f"more than {shown(largest)} bytes for tensors, got {self.num_bytes}; "
+            f"more than {json_text(largest)} bytes for tensors, got {self.num_bytes}; "
             "the file is truncated"
         )
         self._check("size", largest <= self.num_bytes, text)
         expected = entries_of(self.codec, *counts)
         for name, entry in expected.items():
             if header.get(name) != entry:
-                self._fail(f"{name}: expected {entry}, got {shown(header.get(name))}")
+                self._fail(f"{name}: expected {entry}, got {json_text(header.get(name))}")
         self._check_counts(*counts)
         unknown = sorted(set(header) - set(expected))
         if unknown:
-            self._fail(f"{shown(unknown[0])}: expected only the tensors of version {self.version}")
+            self._fail(
+                f"{json_text(unknown[0])}: expected only the tensors of version {self.version}"
+            )
         for name, value in (("header", self._data_start), ("pages", counts[3])):
             is_aligned = value % self.codec.alignment == 0
             self._check(
@@ -301,15 +308,15 @@ class BundleFile:
         self._check("tables", is_small, expected)
         self._fetch(place, self.num_bytes)
         self._reading = reader.read(self.path, self._fd, text, place, num_bytes, self.version > 2)
-        data = self._reading.wait()  # with the hash at the end
+        data = self._reading.wait()  # the tables, followed by the hash
         self.tables: dict[str, Column] = {}  # whose types `schema_of` has
         for name, dtype, _, _ in schema_of(self.codec):
             first, last = (offset - self.pages_bytes for offset in entries[name]["data_offsets"])
             self.tables[name] = data[first:last].view(DTYPES[dtype]).reshape(entries[name]["shape"])
 
     def verify(self) -> None:
-        """Compare header and tables with the file's own hash, once, for which this
-        waits; ValueError."""
+        """Wait for the hash of header and tables, and compare it with that of the file;
+        ValueError if they differ."""
         if not self._reading.is_sound():
             self._fail(f"hash: the header and tables do not match it; {_core.DAMAGED}")
         del self._reading

@@ -49,7 +49,7 @@ SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
 )
 
 
-# With codes, they follow from the other tables.
+# Tables of float32 files only: with codes, they follow from the other tables.
 _ONLY_OF_FLOATS = ("pages.bytes", "pages.num_clusters")
 
 

@@ -164,7 +164,7 @@ class FilePages:
         return gaussians
 
     def in_memory(self) -> MemoryPages | CodePages:
-        """The same pages, all read into memory and verified."""
+        """Read all pages into memory and verify them."""
         if self.codec.name == Codec.name:
             return MemoryPages(self.layout, self.read(0, self.layout.num_pages), self.codec)
         run = self.layout.run(0, self.layout.num_pages, self._file.places)

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core
-from v3dg._numbers import check, check_type, refuse, shown, whole_number
+from v3dg._numbers import check, check_type, refuse, value_text, whole_number
 from v3dg.bundle.format import DTYPES, SCHEMA
 from v3dg.gaussians import Gaussians
 
-Column: TypeAlias = NDArray[Any]  # of the type that `bundle.format.SCHEMA` has for it
+Column: TypeAlias = NDArray[Any]  # its dtype is in `bundle.format.SCHEMA`
 
 NESTING_MARGIN = _core.nesting_margin
 """A group's ball contains the balls of the groups below it with this relative margin;
@@ -53,8 +53,8 @@ class Clusters:
         return len(self.level)
 
     def around(self, gaussians: Gaussians) -> "Clusters":
-        """The same clusters with boxes around other gaussians; those of empty clusters
-        stay."""
+        """Return these clusters with boxes around other gaussians; boxes of empty
+        clusters stay."""
         has_gaussians = np.diff(self.offset)[:, None, None] > 0
         box = np.where(has_gaussians, _core.bound_by_boxes(gaussians.rows, self.offset), self.box)
         return replace(self, box=box)
@@ -72,8 +72,8 @@ class Groups:
             to by the build, at least the largest weight below.
         parent: (G,) int32. Group above, -1 for those that made the last level.
         level: (G,) int32. Level of the clusters that the group makes; 1 or more.
-        error: (G,2) float32. Final residual of the fit in colour and alpha; not a
-            number where not known.
+        error: (G,2) float32. Final residual of the fit in colour and alpha; NaN if it
+            is unknown.
     """
 
     ball: NDArray[np.float32]
@@ -91,7 +91,7 @@ class Groups:
 
 def check_index(name: str, index: int, count: int) -> None:
     number = whole_number(index, name)
-    check(name, 0 <= number < count, f"0 to {count - 1}, got {shown(number)}")
+    check(name, 0 <= number < count, f"0 to {count - 1}, got {value_text(number)}")
 
 
 def _check_arrays(prefix: str, part: Clusters | Groups) -> None:

@@ -1,8 +1,8 @@
-"""Command line: parse, call, print. Each command has a module; its work is in the
-modules that it calls.
+"""The command line: each command has a module, which parses options, calls the library
+and prints the result.
 
-Exit codes: 0 done, 1 failed, 2 wrong usage, 130 interrupted. Errors are one line on
-stderr, results go to stdout.
+Exit codes: 0 success, 1 failure, 2 wrong usage, 130 interrupt. Errors are one line on
+stderr; results go to stdout.
 """
 
 from v3dg.cli import (
@@ -39,7 +39,7 @@ Level of detail for 3D Gaussian Splatting, in four steps:
     v3dg build donut.ply               makes clusters at halving levels of detail
     v3dg render donut.v3dg --views 8   draws those that are just detailed enough
     v3dg view donut.v3dg               shows it in a web browser
-    v3dg compare donut.ply donut.v3dg  says what that costs in quality
+    v3dg compare donut.ply donut.v3dg  measures the loss of quality
 
 No asset at hand? `v3dg demo` makes one. `v3dg doctor` says what is installed and what is missing.
 `v3dg COMMAND --help` has the options, `v3dg --version` prints the version.

@@ -1,4 +1,4 @@
-"""What several commands share: options, checks of paths, and printed results."""
+"""Shared code of the commands: options, checks of paths, and printed results."""
 
 import difflib
 import json
@@ -19,7 +19,7 @@ from v3dg.io import SUFFIXES
 
 
 class UsageError(Exception):
-    """Arguments that cannot be meant; exit code 2."""
+    """Wrong arguments; exit code 2."""
 
 
 # Exceptions that a command reports in one line on stderr; any other is a bug, whose
@@ -43,7 +43,7 @@ def failure_text(error: BaseException) -> str:
 
 def printable(line: str) -> str:
     """A line with its control characters escaped, because file names and texts of files
-    may hold any."""
+    may contain any."""
     return "".join(map(_printable_letter, line))
 
 
@@ -54,13 +54,12 @@ def _printable_letter(letter: str) -> str:
 
 
 def tell(text: str) -> None:
-    """Print one line on stderr, of URLs only what cannot be secret."""
+    """Print one line on stderr, with the secrets of URLs left out."""
     print(printable(" ".join(cleaned(text).split())), file=sys.stderr)
 
 
 def option(metavar: str, *aliases: str) -> object:
-    """Annotation of an option that is None by default; its help says what None
-    means."""
+    """Annotation of an option that is None by default, which its help explains."""
     return tyro.conf.arg(metavar=metavar, aliases=aliases or None, help_behavior_hint="")
 
 
@@ -73,7 +72,7 @@ class Common:
     """Options of every command."""
 
     threads: Threads = None
-    """CPU threads; all if not given."""
+    """Number of CPU threads; all cores by default."""
     json: Flag = False
     """Print the result as JSON."""
     quiet: Flag = False
@@ -83,16 +82,16 @@ class Common:
 @dataclass(kw_only=True)
 class OnDevice(Common):
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to compute; auto is a CUDA device if there is one that torch can use, else
-    the CPU."""
+    """Device that computes; auto is a CUDA device if torch can use one, otherwise the
+    CPU."""
 
 
 @dataclass(kw_only=True)
 class OnPool(OnDevice):
     memory: Annotated[str, option("SIZE")] = "auto"
-    """Draw from so much memory of the device, as 2GB, with pages read from the files as
-    cameras need them. all: from as much as it takes. auto: so if that fits into what is
-    free, else from half of what is free."""
+    """Memory of the device for the pages of bundles, such as 2GB; pages are read from
+    the files as cameras need them. `all` loads everything; `auto` does so if it fits
+    into the free memory, and otherwise uses half of the free memory."""
 
     def pool(self) -> str | None:
         """The memory of the pool as `Renderer` takes it: None draws without a pool."""
@@ -103,14 +102,14 @@ class OnPool(OnDevice):
 
 @dataclass(kw_only=True)
 class Cut:
-    """Which cut of a bundle or a scene is drawn."""
+    """The cut of a bundle or a scene that is drawn."""
 
     tolerance: Annotated[float | None, option("PX2")] = None
-    """Screen area in px² that one gaussian of a coarser cluster may stand for; 3 if not
-    given, 0: all."""
+    """Screen area in px² that one gaussian of a coarser cluster may stand for; 3 by
+    default, 0 draws the full detail."""
     budget: Annotated[int | None, option("N")] = None
-    """Most gaussians to draw in one picture; without a tolerance, the picture is as
-    fine as that allows."""
+    """Largest number of gaussians in one picture; without a tolerance, the picture is
+    as fine as the budget allows."""
 
 
 def check_usage(name: str, holds: object, expected: str) -> None:
@@ -137,7 +136,7 @@ def require_file(path: Path, *suffixes: str) -> None:
 
 
 def _similar(path: Path) -> str:
-    """The advice for a file that does not exist: a file of a similar name, if there is
+    """Advice for a file that does not exist: a file of a similar name, if there is
     one."""
     if path.parent.is_dir():
         similar = difflib.get_close_matches(path.name, os.listdir(path.parent), 1, 0.75)
@@ -147,8 +146,7 @@ def _similar(path: Path) -> str:
 
 
 def check_output(output: Path, *inputs: Path) -> None:
-    """Refuse to overwrite an input, whose content may be more than that of the
-    output."""
+    """Refuse to overwrite an input, which may contain more than the output."""
     for path in inputs:
         is_another = not (output.exists() and path.exists() and output.samefile(path))
         check_usage(

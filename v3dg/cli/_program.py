@@ -2,8 +2,10 @@
 an exit code."""
 
 import contextlib
+import dataclasses
 import difflib
 import functools
+import inspect
 import io
 import operator
 import os
@@ -11,11 +13,13 @@ import re
 import shutil
 import signal
 import sys
+import typing
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, TypeAlias, cast
 
+import docstring_parser
 import tyro
 
 from v3dg import _start
@@ -24,10 +28,11 @@ from v3dg.cli._common import FAILURES, UsageError, check_range, failure_text, te
 
 # Each command has a class of options of its own, with the function that runs on them.
 Options: TypeAlias = Any
-# By the command's name, in the order of the help.
+# Commands by name, in the order of the help.
 Commands: TypeAlias = Mapping[str, tuple[type[Options], Callable[[Options], None]]]
 
 INTERRUPTED = 130  # exit code
+_HELP = ("-h", "--help", "--tyro-write-completion", "--tyro-print-completion")
 
 # More than any machine has cores. If the system refuses a thread, OpenMP ends the
 # process.
@@ -45,12 +50,14 @@ class Program:
     commands: Commands
 
     def parse(self, arguments: Sequence[str]) -> Options:
-        """Parse the command line; tyro's boxed message becomes one line."""
+        """Parse the command line; the boxed message of tyro becomes one line."""
+        if any(argument in _HELP for argument in arguments):
+            self.join_help()
         subcommands: list[Options] = [
             Annotated[options, tyro.conf.subcommand(name)]
             for name, (options, _) in self.commands.items()
         ]
-        if "" in arguments:  # as a path it would be the working folder, and everything in it
+        if "" in arguments:  # as a path it would name the working folder
             number = list(arguments).index("") + 1
             raise UsageError(f"argument {number} is empty; is a shell variable unset?")
         caught = io.StringIO()
@@ -67,6 +74,13 @@ class Program:
             if not stop.code:
                 raise
             raise UsageError(self._one_line(caught.getvalue(), arguments)) from None
+
+    def join_help(self) -> None:
+        """Make one line of the docstring of each option: tyro keeps line breaks before
+        indented lines."""
+        for options, _ in self.commands.values():
+            for kind in options.__mro__[:-1]:
+                _join_help(kind)
 
     def _one_line(self, boxed: str, arguments: Sequence[str]) -> str:
         """The message for a wrong command line: an unknown name, or else the text of
@@ -115,7 +129,7 @@ class Program:
             for number in _start.SIGNALS:  # nothing is left to interrupt
                 signal.signal(number, signal.SIG_IGN)
             if code == INTERRUPTED:
-                os._exit(code)  # without waiting for threads that still run
+                os._exit(code)  # does not wait for threads that still run
         return code
 
     def _run(self, arguments: Sequence[str] | None) -> int:
@@ -144,10 +158,28 @@ class Program:
         return 0
 
 
+@functools.cache
+def _join_help(kind: type[Options]) -> None:
+    """Put the docstrings of options into the annotations of their class, each as one
+    line."""
+    annotations = inspect.get_annotations(kind)
+    for entry in docstring_parser.parse_from_object(kind).params:
+        annotation = annotations.get(entry.arg_name)
+        if annotation is not None and entry.description:
+            text = " ".join(entry.description.split())
+            annotations[entry.arg_name] = Annotated[annotation, tyro.conf.arg(help=text)]
+    kind.__annotations__ = annotations
+    for annotation in annotations.values():
+        group = typing.get_args(annotation)[:1]
+        if group and dataclasses.is_dataclass(group[0]):
+            for nested in cast(type, group[0]).__mro__[:-1]:
+                _join_help(nested)
+
+
 @contextlib.contextmanager
 def _legible_width() -> Iterator[None]:
-    """Have a narrow terminal taken for one with room for a few words: in 5 columns,
-    tyro finds no end."""
+    """Pretend that a very narrow terminal has room for a few words, because tyro does
+    not terminate in 5 columns."""
     if shutil.get_terminal_size().columns >= _LEAST_COLUMNS:
         yield
         return
@@ -171,7 +203,7 @@ def _suggestion(name: str, choices: Sequence[str]) -> str:
 
 
 def _text_of_first_box(boxed: str) -> str:
-    """The text of the first of the boxes that tyro draws, in our words."""
+    """The text of the first box that tyro draws, in our words."""
     lines = [line.strip("│╭╮╰╯─ ").strip() for line in boxed.splitlines()[1:]]
     end = next((i for i, line in enumerate(lines) if not line), len(lines))
     return _plainly(" ".join(lines[:end]).rstrip("."))
@@ -218,7 +250,7 @@ def _flush(code: int) -> int:
     except OSError as error:
         # Python flushes again when it exits, which must not fail.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        # A closed pipe is not reported: its reader has all that it wanted.
+        # A closed pipe is not reported, because its reader needs no more.
         if code == 0 and not isinstance(error, BrokenPipeError):
             return _fail(f"stdout: {error.strerror}", 1)
         return code or 1

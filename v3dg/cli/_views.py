@@ -45,17 +45,17 @@ _MOST_VIEWS = 10_000
 
 @dataclass(kw_only=True)
 class CameraFile:
-    """Cameras of another program to look from."""
+    """Cameras from a file of another program."""
 
     cameras: Annotated[Path | None, option("PATH")] = None
-    """Look from the cameras of this nerfstudio transforms.json, run of nerfstudio, or
-    model of COLMAP; `view` offers them with their photographs."""
+    """Use the cameras of this nerfstudio transforms.json, nerfstudio run or COLMAP
+    model; `view` offers them with their photographs."""
     distortion: Literal["refuse", "ignore"] = "refuse"
     """Whether lens distortion in that file is an error, or left out of the pictures."""
 
     def read(self, size: tuple[int, int] = (800, 800)) -> dict[str, Camera]:
-        """The cameras of --cameras, of this size where their file has none; none if it
-        is not given."""
+        """The cameras of --cameras, with this size if their file has none; empty
+        without the option."""
         if self.cameras is None:
             return {}
         cameras = read_cameras(self.cameras, size=size, distortion=self.distortion)
@@ -65,26 +65,26 @@ class CameraFile:
 
 @dataclass
 class ViewOptions(CameraFile):
-    """From where to look: a scene's own cameras, those of a camera file, or a
+    """The cameras of the pictures: those of a scene, of a camera file, or of a
     turntable."""
 
     camera: Annotated[str | None, option("NAME")] = None
-    """Draw only this camera of a file with cameras: its name, or its place in the file,
-    from 0."""
+    """Draw only this camera of a file with cameras, given by its name or its number in
+    the file, from 0."""
     views: Annotated[int | None, option("N")] = None
-    """Views around the turntable; 1 if not given, and 8 to compare."""
+    """Number of views around the turntable; 1 by default, 8 for `compare`."""
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="W H")] = (800, 800)
-    """Width and height in px of a turntable's pictures, and of cameras whose file gives
-    them no size."""
+    """Width and height in px of a turntable's pictures, and of cameras whose file has
+    no size."""
     elevation: Annotated[float | None, option("DEGREES")] = None
-    """Height of the turntable's cameras above the horizon; 20 if not given."""
+    """Height of the turntable's cameras above the horizon; 20 by default."""
     up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
-    """The turntable's axis; what the file says or what is guessed from it if not given.
+    """The turntable's axis; by default the one in the file, or a guess.
     """
 
     def check(self, *subjects: Path) -> None:
-        """Refuse, before anything is read, wrong subjects, and options that do not
-        apply to them."""
+        """Refuse wrong subjects, and options that do not apply to them, before anything
+        is read."""
         for path in subjects:
             require_subject(path)
         for side in self.size:
@@ -106,8 +106,8 @@ class ViewOptions(CameraFile):
         return {"--views": self.views, "--elevation": self.elevation, "--up": self.up}
 
 
-# Field of a command's options that holds them; on the command line they stand beside
-# the others.
+# A field of a command's options; on the command line its options stand beside the
+# others.
 Views: TypeAlias = Annotated[ViewOptions, tyro.conf.OmitArgPrefixes]
 
 
@@ -134,7 +134,7 @@ def choose_cameras(
 
 
 def _camera_name(text: str, names: Sequence[str]) -> str:
-    """The camera that --camera names, or numbers from 0."""
+    """The name of the camera that --camera selects by name or number."""
     if text in names:
         return text
     if text.isdecimal() and int(text) < len(names):
@@ -191,7 +191,7 @@ def choose_up(
     """The axis that is up: that of --up, or else as `up_of` finds it, with a line that
     says so.
 
-    If nothing tells the axis, a user at a terminal is asked.
+    If the axis is unknown, a user at a terminal is asked.
     """
     if requested:
         return requested, []
@@ -211,8 +211,7 @@ def lines_of_up(path: Path, axis: Axis, reason: str) -> list[str]:
 
 
 def is_at_terminal() -> bool:
-    """Whether a user can answer; a job in the background, which would be stopped,
-    cannot."""
+    """Whether a user can answer questions; a job in the background would be stopped."""
     is_open = sys.stdin and sys.stdin.isatty() and sys.stderr.isatty()
     return bool(is_open and os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp())
 

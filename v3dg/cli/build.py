@@ -44,35 +44,35 @@ class Build(_common.OnDevice):
 
     assets: Annotated[tuple[Path, ...], tyro.conf.Positional, _SEVERAL]
     """Files of trained gaussians, or folders of such files. With an --output that ends
-    in .v3dg they make one asset together."""
+    in .v3dg, all files together are one asset."""
     output: Annotated[Path | None, _common.option("PATH", "-o")] = None
-    """Bundle to write, or the folder for those of many assets; if not given, beside
-    each asset."""
+    """Bundle to write, or folder for the bundles of many assets; by default each bundle
+    is written beside its asset."""
     config: Literal["default", "paper"] = "default"
-    """Settings to start from: ours, or those of the V3DG paper."""
+    """Settings of the build, the default ones or those of the V3DG paper."""
     cluster_size: Annotated[int | None, _common.option("N")] = None
-    """Maximum number of gaussians in a cluster; the config's own if not given."""
+    """Maximum number of gaussians in a cluster; by default that of the config."""
     codec: Literal["float32", "quantized"] = "float32"
-    """How gaussians are kept: every bit, or rounded to 16 to 40 bytes (docs/format.md
-    has the error)."""
+    """Encoding of gaussians, with every bit, or rounded to 16 to 40 bytes
+    (docs/format.md has the error)."""
     up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
-    """The axis that is up in the asset, which the bundle records; asked for at a
-    terminal if unknown."""
+    """The axis that is up in the asset, which the bundle records; if it is unknown, a
+    user at a terminal is asked."""
     seed: int = 0
-    """The same seed gives the same file, byte for byte, on the same kind of device and
-    any threads."""
+    """Seed of random numbers; the same seed gives the same file, byte for byte, on the
+    same kind of device, with any number of threads."""
     strict: _common.Flag = False
-    """Refuse an asset with wrong values, instead of leaving out the gaussians that have
-    them."""
+    """Refuse an asset with wrong values; by default the gaussians that have them are
+    left out."""
     resume: _common.Flag = False
-    """Continue after the last finished level; keep bundles of these gaussians and
-    settings."""
+    """Continue after the last finished level, and keep finished bundles of these
+    gaussians and settings."""
     memory: Annotated[str | None, _common.option("SIZE")] = None
-    """Memory of the host for the build, as 8GiB; half of what is free if not given. An
-    asset that does not fit is brought into order on the disk of the output."""
+    """Memory of the host for the build, such as 8GiB; by default half of the free
+    memory. An asset that does not fit is sorted on the disk of the output."""
     scheduler: Annotated[str | None, _common.option("ADDRESS")] = None
-    """Build on the workers of a dask scheduler, as tcp://host:8786, which reach the
-    output's folder, too; needs the extra `cluster`."""
+    """Build on the workers of a dask scheduler such as tcp://host:8786, which must have
+    access to the output's folder; needs the extra `cluster`."""
 
 
 def run(options: Build) -> None:
@@ -93,8 +93,8 @@ def run(options: Build) -> None:
 
 
 def _asked_up(path: Path) -> Axis | None:
-    """The user's answer which axis is up, asked at a terminal if neither format nor
-    gaussians tell it."""
+    """The axis that is up, which a user at a terminal is asked if neither the format
+    nor the gaussians determine it."""
     if not is_at_terminal():
         return None
     _common.require_file(path, *SUFFIXES)
@@ -136,10 +136,11 @@ def _executor_at(address: str | None) -> Iterator[Executor | None]:
 
 
 def _greet(address: str) -> None:
-    """Say hello to a scheduler; RuntimeError unless something of dask's answers in
+    """Send a greeting to a scheduler; RuntimeError unless a program of dask answers in
     time.
 
-    A client would wait for ever for one that listens and says nothing.
+    A client would wait without end for a server that accepts connections and never
+    answers.
     """
     import asyncio
 
@@ -360,8 +361,8 @@ def _resume_advised(output: Path) -> Iterator[None]:
 
 
 def _resume_advice(output: Path) -> str:
-    """The end of a message about a build that did not finish: where it can continue, if
-    anywhere."""
+    """The end of the message of an unfinished build, which says from which file it can
+    continue."""
     levels = levels_path(output)
     if levels.exists():
         return f"; `--resume` continues from {levels}"

@@ -24,8 +24,8 @@ from v3dg.opening import open_with_cameras
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import render
 
-# From this number of views on, measuring in other processes is quicker, in spite of
-# starting them.
+# From this number of views on, measuring in other processes is faster, in spite of the
+# time to start them.
 _ENOUGH_TO_SHARE = 6
 
 # Smaller pictures are enlarged to about this width, in px, when they are shown side by
@@ -43,26 +43,26 @@ _COLUMNS = (
 
 @dataclass
 class Compare(_common.Cut, _common.OnDevice):
-    """Draw two subjects from the same cameras, or take two pictures, and measure how
-    far apart they look.
+    """Draw two subjects from the same cameras, or take two pictures, and measure their
+    difference.
 
-    By PSNR and SSIM, and by FLIP where the extra `flip` is installed.
+    The measures are PSNR and SSIM, and FLIP if the extra `flip` is installed.
     """
 
     reference: tyro.conf.Positional[Path]
-    """An asset, a bundle (.v3dg) or a scene (.json), to be drawn with all gaussians; or
-    a picture (.png)."""
+    """An asset, a bundle (.v3dg) or a scene (.json), which is drawn with all gaussians;
+    or a picture (.png)."""
     test: tyro.conf.Positional[Path]
-    """The subject to compare with it: any of those, drawn with a tolerance, or a
+    """The subject to compare with the reference, which is drawn with a tolerance; or a
     picture of the same size."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("compare.png")
-    """Picture to write, .png or .jpg: reference, test and, where FLIP is installed, a
-    map of it."""
+    """Picture to write, .png or .jpg, with the reference, the test and, if FLIP is
+    installed, its map."""
     pictures: Literal["worst", "all"] = "worst"
     """Show the view that differs most, or write a picture of every view."""
     supersample: Annotated[int, tyro.conf.arg(metavar="N")] = 1
-    """Draw the reference this many times larger and average it; with 2, aliasing is not
-    taken for detail."""
+    """Draw the reference this many times larger and average it; 2 avoids that aliasing
+    counts as detail."""
     view: Views = field(default_factory=ViewOptions)
 
 
@@ -72,7 +72,7 @@ class _Pair(NamedTuple):
     name: str
     reference: Picture
     test: Picture
-    gaussians: int | None = None  # number that was selected of the test
+    gaussians: int | None = None  # number of selected gaussians of the test
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ def _draw(options: Compare) -> _Pairs:
                 tolerance=options.tolerance,
                 budget=options.budget,
                 device=device,
-                # the truth's, so that only the gaussians differ
+                # as for the reference, so that only the gaussians differ
                 min_transmittance=MIN_TRANSMITTANCE,
             )
             yield _Pair(name, truth, to_8bit(image.color), image.stats.gaussians_selected)

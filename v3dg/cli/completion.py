@@ -21,11 +21,11 @@ _OR_FILES = {
 
 @dataclass
 class Completion(Common):
-    """Print a script that completes commands, options and files (docs/install.md says
-    where to put it)."""
+    """Print a shell script that completes commands, options and files (docs/install.md
+    says where to put it)."""
 
     shell: tyro.conf.Positional[Literal["bash", "zsh", "fish"]]
-    """Shell that will read it."""
+    """Shell that will run the script."""
 
 
 def run(options: Completion) -> None:

@@ -25,25 +25,25 @@ from v3dg.select import select
 @dataclass
 class Convert(_common.Cut, _common.Common):
     """Write an asset, a level of a bundle, or its cut for a camera, in another format;
-    or a bundle anew."""
+    or a bundle with another codec."""
 
     subject: tyro.conf.Positional[Path]
-    """An asset in any format that is read (docs/formats.md), a bundle (.v3dg) or a
-    scene (.json)."""
+    """An asset in any readable format (docs/formats.md), a bundle (.v3dg) or a scene
+    (.json)."""
     output: tyro.conf.Positional[Path]
-    """File to write, .ply, .compressed.ply, .spz, .sog, .glb or .usd; of a bundle also
+    """File to write, .ply, .compressed.ply, .spz, .sog, .glb or .usd; for a bundle also
     .v3dg, with all its levels."""
     codec: Annotated[
         Literal["float32", "quantized"] | None, _common.option("{float32,quantized}")
     ] = None
-    """How a .v3dg that is written keeps gaussians, as for `v3dg build`; as the bundle
-    does if not given."""
+    """Codec of a .v3dg output, as for `v3dg build`; by default that of the bundle."""
     level: Annotated[int | None, _common.option("N")] = None
-    """Write this level of a bundle; 0, the asset itself, if no cut is asked for."""
+    """Write this level of a bundle; by default 0, the asset itself, unless other
+    options choose a cut."""
     outside: Literal["drop", "keep"] = "drop"
-    """Whether the part of the cut that the camera does not see is left out."""
+    """Drop or keep the part of the cut that the camera does not see."""
     spz_version: Annotated[Literal[2, 3, 4] | None, _common.option("{2,3,4}")] = None
-    """Version of a .spz; 3 if not given."""
+    """Version of a .spz; 3 by default."""
     view: Views = field(default_factory=ViewOptions)
 
 
@@ -157,7 +157,7 @@ def _cut(options: Convert, subject: Scene | Bundle, own_cameras: dict[str, Camer
         cull=options.outside == "drop",
         device=CPU,
     )
-    if isinstance(subject, Bundle) and len(selection):  # only the clusters of the cut are read
+    if isinstance(subject, Bundle) and len(selection):  # reads only the clusters of the cut
         gaussians = Gaussians.concatenate(
             [subject.cluster_gaussians(int(c)) for c in selection.cluster_ids]
         )

@@ -13,15 +13,15 @@ from v3dg.select import DEFAULT_TOLERANCE, rule_of
 
 @dataclass
 class Demo(Common):
-    """Build an asset that v3dg makes itself, place it 2,000 times, draw it from near to
-    far, and measure."""
+    """Make an asset, build and place it 2,000 times, draw it from near to far, and
+    measure."""
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("v3dg_demo.png")
     """Picture to write, .png or .jpg."""
     gaussians: int = 50_000
     """Gaussians of the asset."""
     instances: int = 2000
-    """Number of instances of it."""
+    """Number of instances of the asset."""
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="W H")] = (380, 440)
     """Width and height of one panel in px."""
     tolerance: float = DEFAULT_TOLERANCE

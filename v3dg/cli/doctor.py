@@ -22,8 +22,8 @@ _PATIENCE_S = 20  # time for a program to answer
 
 @dataclass
 class Doctor(Common):
-    """List the parts of this machine that v3dg can use, and for missing parts their
-    purpose and source."""
+    """List the software and hardware that v3dg can use, and the purpose and source of
+    missing parts."""
 
 
 def run(options: Doctor) -> None:
@@ -61,7 +61,7 @@ def _findings() -> Iterator[_Finding]:
     yield _Finding("Python", python, "")
     compiler = _answer(os.environ.get("CXX", "c++"), "--version")
     yield _Finding(
-        "compiler", compiler, "to build from source: apt install g++, or as your system has it"
+        "compiler", compiler, "to build from source: apt install g++, or your system's package"
     )
     nvcc = os.environ.get("CUDACXX") or shutil.which("nvcc") or "/usr/local/cuda/bin/nvcc"
     advice = "12.4 or newer, to build with CUDA: https://developer.nvidia.com/cuda-downloads"

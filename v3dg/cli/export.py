@@ -26,26 +26,25 @@ class Export(_common.Common):
     """Write a scene or a bundle as a page for the web, as 3D Tiles, or as OpenUSD
     (docs/formats.md).
 
-    A folder may be new, empty, or have an earlier export in it. Only files that
-    v3dg-export.json there lists, and that are as they were written, are replaced or
-    removed. What is read may not be in it."""
+    The folder may be new, empty, or have an earlier export. Only unchanged files that
+    its v3dg-export.json lists are replaced or removed. The inputs must not be in it."""
 
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg), or a world of OpenUSD."""
     output: Annotated[Path | None, _common.option("FOLDER", "-o")] = None
-    """Folder to write, made with those above it; the subject's name with _web if not
-    given. With a name that ends in .usd, .usda or .usdc, the file to write."""
+    """Folder to write, which is created if needed; by default the subject's name with
+    _web. A name that ends in .usd, .usda or .usdc is a file."""
     to: Literal["sog", "tiles"] = "sog"
     """Streamed SOG, for PlayCanvas and SuperSplat, or 3D Tiles, for CesiumJS."""
     chunk: int = export.DEFAULT_CHUNK
-    """Most gaussians of an asset in a chunk of streamed SOG, for which the viewer
-    chooses a level."""
+    """Largest number of gaussians of an asset in a chunk of streamed SOG; the viewer
+    chooses a level for each chunk."""
     up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
-    """Which way is up; what the file says or what is guessed from it or its cameras if
-    not given."""
+    """The axis that is up; by default the one in the file, or a guess from it or its
+    cameras."""
     overwrite: _common.Flag = False
-    """Write to any folder, and replace files there that have the same names. No other
-    file is removed, and no folder or link is replaced."""
+    """Write to any folder, and replace files of the same names. No other file is
+    removed, and no folder or link is replaced."""
 
 
 def run(options: Export) -> None:
@@ -86,7 +85,7 @@ class _Written:
     """An export to a folder."""
 
     export: export.Site | export.Tiles
-    text: str  # what it consists of
+    text: str  # its content
     needs: Sequence[str]  # commands that bring the missing engine to the folder
 
 

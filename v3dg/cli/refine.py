@@ -16,24 +16,24 @@ from v3dg.refine import refine_bundle
 
 @dataclass(kw_only=True)
 class Refine(CameraFile, _common.OnDevice):
-    """Make the levels of a bundle look more like its asset, small and large, which
-    takes far longer than building it."""
+    """Make the levels of a bundle look more like its asset at all sizes, which takes
+    far longer than building it."""
 
     bundle: tyro.conf.Positional[Path]
     """Bundle that `v3dg build` made (.v3dg)."""
     output: tyro.conf.Positional[Path]
     """Bundle to write (.v3dg)."""
     steps: Annotated[int, tyro.conf.arg(metavar="N")] = 30_000
-    """Pictures of cuts that are compared with the asset's, one after another."""
+    """Number of pictures of cuts that are compared with pictures of the asset."""
     cameras: Annotated[Path | None, _common.option("PATH")] = None
-    """A file or folder of cameras from which the asset is seen, as for `v3dg render`:
-    for a room, which is seen from inside. All around if not given."""
+    """A file or folder of cameras, as for `v3dg render`, for assets such as a room,
+    which is seen from inside. By default the asset is seen from all around."""
     drop: Annotated[float, tyro.conf.arg(metavar="SHARE")] = 0.02
-    """The least seen gaussians of a level are dropped, up to this share of what is seen
-    of it; 0: none."""
+    """Drop the least visible gaussians of each level, up to this share of the level's
+    visibility; 0 keeps all."""
     seed: int = 0
-    """The same seed gives the same file, byte for byte, on the same kind of device and
-    any threads."""
+    """Seed of random numbers; the same seed gives the same file, byte for byte, on the
+    same kind of device, with any number of threads."""
 
 
 def run(options: Refine) -> None:

@@ -32,22 +32,22 @@ from v3dg.select import DEFAULT_FADE, CutOptions
 
 @dataclass
 class Render(Cut, OnPool):
-    """Draw a scene from its cameras, a bundle or an asset from a turntable, or any from
-    a camera file."""
+    """Draw a scene from its cameras, a bundle or an asset from a turntable, or any of
+    them from a camera file."""
 
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg) or an asset (.ply, .spz, ...)."""
     output: Annotated[Path | None, option("PATH", "-o")] = None
-    """Picture to write, .png or .jpg; several get a number or the camera's name.
-    Default: as the subject."""
+    """Picture to write, .png or .jpg; several pictures get a number or the camera's
+    name. By default the name is that of the subject."""
     min_level: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Draw no level finer than this, except where an asset has no coarser one."""
     fade: Annotated[float | None, option("FACTOR")] = None
-    """Draw what is within this factor of the tolerance on two levels, one coming as the
-    other goes, and level 0 with a low-pass, so that a film neither pops nor flickers.
-    Default: 1.02 for several views of a turntable, otherwise 1, which is none."""
+    """Blend two levels within this factor of the tolerance, and draw level 0 with a
+    low-pass filter, so that a film neither pops nor flickers. By default 1.02 for
+    several views of a turntable, otherwise 1, which turns it off."""
     color_by: ColorBy = "appearance"
-    """What a gaussian's colour shows."""
+    """Property that the colours show."""
     background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (
         0.0,
         0.0,
@@ -74,8 +74,8 @@ def run(options: Render) -> None:
     fade = options.fade
     if fade is None and is_turntable and len(cameras) > 1:
         fade = DEFAULT_FADE
-    # With a fade the pictures are a sequence, in which the tolerance of a budget
-    # changes in steps.
+    # The pictures of a fade are a sequence, in which the tolerance of a budget changes
+    # in steps.
     renderer = Renderer(subject, color_by=options.color_by, device=device, memory=options.pool())
     pictures = _draw(options, renderer, cameras, output, fade)
     columns = [

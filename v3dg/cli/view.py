@@ -36,8 +36,8 @@ from v3dg.upright import ASSUMED, direction_of, up_of
 if TYPE_CHECKING:
     from v3dg.viewer.server import Site
 
-# Time between checks for a signal: an endless wait would miss one that comes just
-# before it.
+# Time between checks for a signal: an endless wait would miss a signal that arrives
+# just before it.
 _SECONDS = 0.1
 
 
@@ -48,16 +48,16 @@ class View(CameraFile, Cut, OnPool):
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg) or an asset (.ply)."""
     host: str = "127.0.0.1"
-    """Address to listen at; by default for this machine alone, at 0.0.0.0 for all who
-    have the URL."""
+    """Address of the server; by default only this machine can connect, with 0.0.0.0
+    everybody who has the URL."""
     port: int = 8080
-    """Port to listen at; the next free one where it is taken."""
+    """Port of the server; the next free one if it is taken."""
     no_browser: Flag = False
-    """Open no browser; none is opened over ssh, without a display, or where other
-    machines can connect."""
+    """Do not open a browser. It is also not opened over ssh, without a display, or if
+    other machines can connect."""
     up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
-    """Which way is up at first; what the file says or what is guessed from it or its
-    cameras if not given."""
+    """The axis that is up at first; by default the one in the file, or a guess from it
+    or its cameras."""
 
 
 def run(options: View) -> None:

@@ -1,5 +1,5 @@
-"""`rasterization` with the arguments and the results of gsplat's, for programs that
-train with it.
+"""`rasterization` with the arguments and results of gsplat's function, for programs
+that train with it.
 
 Pictures and gradients are those of `v3dg.rasterize`, on the CPU and on CUDA devices.
 """
@@ -13,7 +13,7 @@ from types import EllipsisType
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypeAlias
 
 from v3dg import _core
-from v3dg._numbers import check, one_of, real, shown, whole
+from v3dg._numbers import check, one_of, real, value_text, whole
 from v3dg.cameras import Camera
 from v3dg.gaussians import Array, Gaussians
 from v3dg.rasterize import (
@@ -195,8 +195,8 @@ class _Look:
 
 
 def _check_unsupported(options: dict[str, object]) -> None:
-    """Raise for arguments that gsplat does not have, and for those that ask for what
-    v3dg cannot do."""
+    """Raise for arguments that gsplat does not have, and for values that v3dg does not
+    support."""
     for name in options.keys() - _IGNORED:
         if name not in _UNSUPPORTED:
             raise TypeError(
@@ -204,7 +204,7 @@ def _check_unsupported(options: dict[str, object]) -> None:
             )
         value = options[name]
         if str(value) not in {"None", "False", "pinhole", "RollingShutterType.GLOBAL"}:
-            raise ValueError(f"{name}: {shown(value)} is not supported; {_UNSUPPORTED[name]}")
+            raise ValueError(f"{name}: {value_text(value)} is not supported; {_UNSUPPORTED[name]}")
 
 
 def _cameras(
@@ -311,7 +311,7 @@ def _picture(
 
 
 class _Context(Protocol):
-    """What torch passes between the two passes of a `torch.autograd.Function`."""
+    """The object that torch passes to both passes of a `torch.autograd.Function`."""
 
     gradient: CenterGradient
 

@@ -1,5 +1,4 @@
-"""What is below a folder, reached by relative names without following a link on the
-way."""
+"""Files below a folder, reached by relative names without following links."""
 
 import errno
 import os
@@ -54,7 +53,8 @@ class Folder(AbstractContextManager["Folder"]):
             os.close(descriptor)
 
     def status(self, name: str) -> os.stat_result | None:
-        """Of what has this name, which may be a link; None where there is nothing."""
+        """The status of a file, a folder or a link of this name; None if there is
+        none."""
         try:
             with self._folder_of(name) as (folder, last):
                 return os.stat(last, dir_fd=folder, follow_symlinks=False)

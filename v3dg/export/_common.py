@@ -1,4 +1,4 @@
-"""What exports share: which way is up, turning gaussians, names of bundles,
+"""Shared code of the exports: the axis that is up, rotations, names of bundles,
 documents."""
 
 import json
@@ -32,7 +32,8 @@ _TO_UPRIGHT: dict[Axis, tuple[float, float, float, float]] = {
     "-y": (1.0, 0.0, 0.0, 0.0),
     "-z": (_HALF, -_HALF, 0.0, 0.0),
 }
-# From there to where y is up, as in WebGL, and z, as on a globe.
+# Rotations from that frame to one with y up, as in WebGL, and to one with z up, as on a
+# globe.
 _FROM_UPRIGHT = {
     "y": np.diag([-1.0, -1.0, 1.0]),
     "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
@@ -80,8 +81,8 @@ def rows_by(numbers: NDArray[np.int32] | NDArray[np.int64], count: int) -> list[
 
 
 def detail_of(bundle: Bundle) -> dict[str, float]:
-    """How far levels reach: `reach` times focal length in px over √tolerance is where
-    level 1 is enough.
+    """The distances of levels: level 1 is enough from `reach` times the focal length in
+    px over √tolerance.
 
     Each further level is enough from `ratio` times the distance of the one before it.
     """

@@ -1,11 +1,11 @@
-"""The folder of an export: what an earlier one wrote there is replaced, and nothing
-else is touched.
+"""The folder of an export: files of an earlier export are replaced, and nothing else is
+changed.
 
 New files are written to `new` in a hidden folder inside, so that all moves stay within
 one file system. Once they are complete, the record of them is written beside `new`,
 what they replace goes to `old`, and they take its place; the move of the record ends
-it. Until then all goes back to where it was: on an error at once, and after the process
-was killed when the next export begins.
+it. Until then everything can be moved back: on an error at once, and after a kill when
+the next export begins.
 """
 
 import contextlib
@@ -39,7 +39,7 @@ _HIDDEN = re.compile(r"\.v3dg-export\.[0-9a-f]{16}\.tmp")
 
 @dataclass(frozen=True)
 class NewFiles:
-    """What a new export is written to.
+    """The place of the files of a new export.
 
     Attributes:
         path: A folder for the new files, which take their place at the end.
@@ -52,8 +52,7 @@ class NewFiles:
 
 
 def check_outside(folder: Path, inputs: Iterable[str | os.PathLike[str] | None]) -> None:
-    """Refuse, with ValueError, to write to a folder that a file lies in that is
-    read."""
+    """Refuse, with ValueError, to write to a folder that contains an input."""
     if not folder.is_dir():
         return
     status = folder.stat()
@@ -78,17 +77,16 @@ def replacing_export(
     where it was not there, it is not there.
 
     Args:
-        folder: Where to; a link to a folder stays one.
-        scene: What is exported, whose files may not be in the folder.
+        folder: The folder to write; a link to a folder stays a link.
+        scene: The exported scene, whose files must not be in the folder.
         certain: Names of files that will be written, so that it is known at once
             whether they may.
         overwrite: Whether files of the same names may be replaced that are not of an
             earlier export. All others stay in any case.
 
     Raises:
-        ValueError: A file that is read is in the folder, there is something else at
-            ``folder``, something may not be replaced, or the record of the earlier
-            export is none.
+        ValueError: An input is in the folder, ``folder`` is not a folder, a file must
+            not be replaced, or the record of the earlier export is invalid.
         RuntimeError: Another export is using the folder.
         OSError: A file cannot be written.
     """
@@ -112,7 +110,7 @@ def replacing_export(
 def _restore_and_remove(root: Folder, hidden: str, folder: Path) -> None:
     """Bring back what an export moved that did not end, and remove its hidden folder,
     which is its alone."""
-    with contextlib.suppress(OSError, ValueError):  # what failed before is told
+    with contextlib.suppress(OSError, ValueError):  # the first error is reported
         if _restore(root, hidden, folder):
             _remove_unused_folders(root, hidden, folder)
             try:
@@ -273,7 +271,7 @@ def _clear_up(root: Folder, hidden: str, folder: Path) -> None:
     """After an export that was killed: bring back what it moved, and remove what
     records say that it wrote.
 
-    What it wrote before there was a record stays.
+    Files that it wrote before its record stay.
     """
     with contextlib.suppress(OSError, ValueError):
         if not _restore(root, hidden, folder):

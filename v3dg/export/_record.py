@@ -23,7 +23,7 @@ from v3dg.export._below import Folder
 RECORD = "v3dg-export.json"
 _FORMAT = "v3dg-export"
 _VERSION = 1
-_MOST_BYTES = 64 << 20  # of a record: that of a million files
+_MOST_BYTES = 64 << 20  # size of a record of a million files
 _PIECE_BYTES = 1 << 20
 _HASH_BYTES = 16
 _FOLDER_NAME = re.compile(r"[A-Za-z0-9_]{1,100}(/[A-Za-z0-9_]{1,100})?")
@@ -45,7 +45,7 @@ class Stamp(NamedTuple):
 
 @dataclass(frozen=True)
 class Content:
-    """What was written to a file."""
+    """The size and the hash of a written file."""
 
     num_bytes: int
     digest: str
@@ -77,7 +77,7 @@ class Record:
         return json.dumps(document, separators=(",", ":")).encode("ascii")
 
     def unchanged(self, root: Folder, prefix: str = "") -> dict[str, Stamp]:
-        """Of the files that are there, below `prefix`, those that are as they were
+        """The files below `prefix` whose content is unchanged since they were
         written."""
         stamps: dict[str, Stamp] = {}
         for name, content in self.files.items():
@@ -92,11 +92,11 @@ def read_record(root: Folder, name: str, display_path: Path) -> Record | None:
 
     Args:
         root: The folder that the record is below.
-        name: Of the record, relative to that.
+        name: The name of the record, relative to `root`.
         display_path: The path that errors begin with.
 
     Raises:
-        ValueError: It is no record, or names what no export writes.
+        ValueError: The file is not a record, or names a file that no export writes.
         OSError: It cannot be read.
     """
     status = root.status(name)
@@ -169,7 +169,7 @@ def stamp_of_status(status: os.stat_result) -> Stamp:
 
 
 def is_file(status: os.stat_result) -> bool:
-    """Whether this is of a regular file, and not of a link to one."""
+    """Whether a status is that of a regular file, and not of a link."""
     return stat.S_ISREG(status.st_mode)
 
 

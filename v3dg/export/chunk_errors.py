@@ -1,4 +1,4 @@
-"""How far the coarser levels of chunks are from the finest, in pictures of them:
+"""Errors of the coarser levels of chunks against the finest, measured in pictures:
 `errors` of streamed SOG."""
 
 from collections import defaultdict
@@ -15,7 +15,7 @@ from v3dg.rasterize import rasterize
 _SIDE_PX = 64
 _FOV = 0.3  # narrow, so that all of a chunk is about as large
 _DIRECTIONS = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
-_FILTER_PX2 = 0.3  # with which viewers of the format draw
+_FILTER_PX2 = 0.3  # the filter of viewers of the format
 
 
 class _Finest(NamedTuple):

@@ -37,15 +37,15 @@ to a folder."""
 
 @dataclass(frozen=True)
 class Site:
-    """What was written.
+    """An export that was written.
 
     Attributes:
         bundles: Bundles, each of them once.
         instances: Instances of them.
-        gaussians: Of the finest level, of all instances.
-        coarsest: Of the coarsest level, of all instances: the least that a viewer can
-            come down to.
-        bytes: Of all files that were written.
+        gaussians: Number of gaussians of the finest level, of all instances.
+        coarsest: Number of gaussians of the coarsest level, of all instances, which is
+            the least that a viewer can draw.
+        bytes: Size of all files that were written.
         has_engine: Whether PlayCanvas's engine is beside the page.
     """
 
@@ -75,19 +75,20 @@ def write_site(
     `node_modules` here or above.
 
     Args:
-        subject: Or its file, of which a scene's brings cameras.
-        folder: Where to; new, empty, or with an earlier export. Folders above it are
-            made. `v3dg-export.json` in it says what was written, and nothing else is
-            replaced or removed.
-        cameras: From where to look, by name; the page begins with the first.
-        chunk: As in `write_streamed_sog`.
-        up: What is up in the world; as `v3dg.upright.up_of` takes it if None.
-        progress: As in `v3dg.build_bundle`.
-        overwrite: As in `write_streamed_sog`.
+        subject: A scene or a bundle, or its file; the file of a scene may also have
+            cameras.
+        folder: The folder to write; it may be new, empty, or have an earlier export.
+            Missing parent folders are created. `v3dg-export.json` in it lists the
+            written files, and only those are replaced or removed by a later export.
+        cameras: Views that the page offers, by name; it begins with the first.
+        chunk: See `write_streamed_sog`.
+        up: The axis that is up in the world; None uses the one of `v3dg.upright.up_of`.
+        progress: See `v3dg.build_bundle`.
+        overwrite: See `write_streamed_sog`.
 
     Raises:
-        TypeError: Cameras are none, or without names.
-        ValueError: As `write_streamed_sog`, or a scene without instances.
+        TypeError: `cameras` is not a mapping from names to cameras.
+        ValueError: See `write_streamed_sog`; or the scene has no instances.
         RuntimeError: Another export is using the folder.
         OSError: A file cannot be written.
     """
@@ -98,7 +99,7 @@ def write_site(
         cameras = cameras or file_cameras
     cameras = cameras or {}
     check_cameras(cameras)
-    scene = Scene.of(cast(Scene | Bundle, content))  # which refuses all else
+    scene = Scene.of(cast(Scene | Bundle, content))  # refuses anything else
     is_scene = isinstance(content, Scene)
     axes = _axes(up or up_of(cast(Subject, content), cameras)[0], is_scene=is_scene)
     turn = _common.turn_upright(axes.asset)
@@ -122,10 +123,10 @@ def write_site(
 
 
 class _Axes(NamedTuple):
-    """What is up."""
+    """The axes that are up."""
 
-    asset: Axis  # in the assets, which are turned so that it is -y
-    files: Axis  # in the world, after that
+    asset: Axis  # up in the assets, which are turned so that it is -y
+    files: Axis  # up in the world, after that turn
     cameras: Axis
 
 
@@ -153,11 +154,12 @@ def _write_bundles(
 def _document(
     scene: Scene, bundles: list[dict[str, object]], axes: _Axes, cameras: Mapping[str, Camera]
 ) -> dict[str, object]:
-    """What the page reads first."""
+    """The document that the page reads first."""
     return {
         "version": 1,
         "tolerance": DEFAULT_TOLERANCE,
-        # By columns: of the files' world, and of the cameras', to one with y up.
+        # Rotations by columns, from the world of the files and of the cameras to one
+        # with y up.
         "rotation": _common.rotation_to(axes.files, "y").T.tolist(),
         "camera_rotation": _common.rotation_to(axes.cameras, "y").T.tolist(),
         "bundles": bundles,

@@ -92,13 +92,13 @@ class _Folders(NamedTuple):
 
 @dataclass(frozen=True)
 class Export:
-    """What was written.
+    """Streamed SOG that was written.
 
     Attributes:
         counts: Gaussians of each level, finest first.
         chunks: Chunks in which a viewer chooses a level.
         files: Folders with SOG.
-        bytes: Of all files.
+        bytes: Size of all files.
     """
 
     counts: list[int]
@@ -119,27 +119,27 @@ def write_streamed_sog(
     """Write a bundle as streamed SOG, replacing the files of an earlier export once all
     is written.
 
-    Besides, `settings.json` tells SuperSplat's viewer where to start. Memory is needed
-    for one folder of SOG, and for 128 KiB of pictures a chunk.
+    `settings.json` has the first view of SuperSplat's viewer. The export takes the
+    memory of one folder of SOG, and 128 KiB of pictures per chunk.
 
     Args:
-        bundle: Or the file of it.
-        folder: Where to; new, empty, or with an earlier export. Folders above it are
-            made. `v3dg-export.json` in it says what was written, and nothing else is
-            replaced or removed.
+        bundle: A bundle, or its file.
+        folder: The folder to write; it may be new, empty, or have an earlier export.
+            Missing parent folders are created. `v3dg-export.json` in it lists the
+            written files, and only those are replaced or removed by a later export.
         chunk: Most gaussians of the asset in a chunk. Smaller chunks follow the view
             more closely, and fewer of their levels go together exactly, whichever each
             of them has.
-        up: What is up in the asset, which is turned to what viewers take to be up.
-            Trained assets mostly have y down, so nothing is turned.
-        progress: As in `v3dg.build_bundle`.
+        up: The axis that is up in the asset, which is turned to the axis that viewers
+            take for up. Most trained assets have y down and are not turned.
+        progress: See `v3dg.build_bundle`.
         overwrite: Write to any folder, and replace files of the same names there; all
             others stay.
 
     Raises:
-        ValueError: There is something else at ``folder``, or the bundle's file is in
-            it; a file of the earlier export was changed; ``chunk`` is too small for the
-            bundle's groups; or a gaussian has values that SOG cannot hold.
+        ValueError: ``folder`` has other files, or the bundle's file; a file of the
+            earlier export was changed; ``chunk`` is too small for the bundle's groups;
+            or a gaussian has values that SOG cannot hold.
         RuntimeError: Another export is using the folder.
         OSError: A file cannot be written.
 
@@ -223,8 +223,8 @@ def _write_sog(folder: Path, gaussians: Gaussians) -> None:
 
 
 def _viewer_settings(gaussians: Gaussians) -> dict[str, object]:
-    """What SuperSplat's viewer reads beside an asset: a camera that shows most of it,
-    and no effects."""
+    """The settings of SuperSplat's viewer: a camera that shows most of the asset, and
+    no effects."""
     # Viewers have y up and turn an asset, whose y is taken to be down, by half a turn
     # about z.
     centre, radius = ball_of_most(gaussians.means.astype(np.float64) * (-1.0, -1.0, 1.0))

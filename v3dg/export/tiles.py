@@ -26,7 +26,7 @@ from v3dg.export import _common
 from v3dg.export._folder import check_outside, replacing_export
 from v3dg.formats import gltf
 from v3dg.formats._packing import check_writable
-from v3dg.formats._reading import Path as AnyPath
+from v3dg.formats._reading import AnyPath
 from v3dg.gaussians import Gaussians
 from v3dg.opening import File, opened
 from v3dg.scene import Scene
@@ -70,13 +70,13 @@ class _Tile(_OptionalFields):
 
 @dataclass(frozen=True)
 class Tiles:
-    """What was written.
+    """3D Tiles that were written.
 
     Attributes:
         bundles: Bundles, each of them once.
         instances: Instances of them.
-        tiles: With gaussians, of all bundles.
-        bytes: Of all files.
+        tiles: Tiles with gaussians, of all bundles.
+        bytes: Size of all files.
     """
 
     bundles: int
@@ -101,19 +101,19 @@ def write_tiles(
     Earth's centre; viewers can put it elsewhere.
 
     Args:
-        subject: Or the file of it.
-        folder: Where to; new, empty, or with an earlier export. Folders above it are
-            made. `v3dg-export.json` in it says what was written, and nothing else is
-            replaced or removed.
-        up: What is up in the world; as `v3dg.upright.up_of` takes it if None.
-        progress: As in `v3dg.build_bundle`.
+        subject: A scene or a bundle, or its file.
+        folder: The folder to write; it may be new, empty, or have an earlier export.
+            Missing parent folders are created. `v3dg-export.json` in it lists the
+            written files, and only those are replaced or removed by a later export.
+        up: The axis that is up in the world; None uses the one of `v3dg.upright.up_of`.
+        progress: See `v3dg.build_bundle`.
         overwrite: Write to any folder, and replace files of the same names there; all
             others stay.
 
     Raises:
-        ValueError: There is something else at ``folder``, or a file that is read is in
-            it; a file of the earlier export was changed; there is nothing to export; or
-            a gaussian has values that SPZ cannot hold.
+        ValueError: ``folder`` has other files, or an input; a file of the earlier
+            export was changed; there is nothing to export; or a gaussian has values
+            that SPZ cannot hold.
         RuntimeError: Another export is using the folder.
         OSError: A file cannot be written.
 
@@ -181,8 +181,8 @@ class _Writer:
         radius = groups.ball[:, 3].astype(np.float64)
         limit = _SCREEN_SPACE_ERROR / math.sqrt(DEFAULT_TOLERANCE)
         self._error = limit * radius * np.sqrt(math.pi * groups.weight.astype(np.float64))
-        # By group: the groups below it, the clusters that it made, and those that it
-        # replaces.
+        # For each group: the groups below it, the clusters that it made, and the
+        # clusters that it replaces.
         self._children = _common.rows_by(groups.parent, len(groups))
         self._clusters = _common.rows_by(clusters.own_group, len(groups))
         self._replaced = _common.rows_by(clusters.parent_group, len(groups))
@@ -264,7 +264,7 @@ def _write_tileset(path: Path, root: _Tile) -> None:
         "extensionsRequired": [_CONTENT],
         "extensions": {
             _CONTENT: extensions
-        },  # of tiles in other tilesets, too: CesiumJS looks at the first
+        },  # also those of tiles in other tilesets: CesiumJS reads the first tileset
         "geometricError": root["geometricError"],
         "root": {"refine": "REPLACE", **root},
     }

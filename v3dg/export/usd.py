@@ -24,8 +24,8 @@ from v3dg.upright import up_of
 if TYPE_CHECKING:
     from pxr import Usd
 
-_PIXELS = 1920 * 1080  # of the picture for which levels have the default tolerance
-_LEAST = 1e-30  # of a distance
+_PIXELS = 1920 * 1080  # pixels of the picture in which levels have the default tolerance
+_LEAST = 1e-30  # smallest distance
 _INSTANCES = "/world/instances"
 
 
@@ -41,15 +41,15 @@ def write_usd(
     PointInstancer of them. Positions are float32, and importance is left out.
 
     Args:
-        subject: Or the file of it.
+        subject: A scene or a bundle, or its file.
         path: File to write, .usd, .usda or .usdc.
-        up: What is up in the world, which is turned to z; as `v3dg.upright.up_of` takes
-            it if None.
+        up: The axis that is up in the world, which is turned to z; None uses the one of
+            `v3dg.upright.up_of`.
 
     Raises:
         ImportError: usd-core is not installed.
-        ValueError: Another name, nothing to export, or a gaussian has values that are
-            none.
+        ValueError: The name has another suffix, there is nothing to export, or a
+            gaussian has invalid values.
         OSError: The file cannot be written.
 
     Source: Pixar, OpenUSD 26.11, UsdVol and UsdLod.

@@ -1,4 +1,4 @@
-"""What the readers and writers of quantised formats share."""
+"""Shared code of the readers and writers of quantised formats."""
 
 import math
 from collections.abc import Callable, Iterator

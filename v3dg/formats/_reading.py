@@ -1,5 +1,5 @@
-"""Shared by the readers of untrusted files: assets that are read in parts, and bounds
-on memory."""
+"""Shared code of the readers of untrusted files: assets that are read in parts, and
+bounds on memory."""
 
 import contextlib
 import os
@@ -23,40 +23,40 @@ _FREE_GAUSSIANS = 1 << 18  # 15 to 62 MB: a file of any size may claim this many
 _FREE_BYTES = 1 << 20  # a member of a zip may have this size, whatever the size of the zip
 
 
-Path: TypeAlias = str | os.PathLike[str]
+AnyPath: TypeAlias = str | os.PathLike[str]
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
 @dataclass(frozen=True, eq=False)
 class AssetFile:
-    """What the header of an asset's file says, and its gaussians on demand; open until
-    it is dropped.
+    """The header of an asset's file, and its gaussians on demand; the file is open
+    until this object is dropped.
 
     Attributes:
-        read: Gaussians from a first row up to a last. Runs that follow each other are
-            the quickest. Raises what the format's own `read` raises.
-        whole_bytes: Memory that the first read takes and keeps, where the format can
-            only be read whole.
+        read: Function from a first and a last row to these gaussians; reading in file
+            order is quickest. Its errors are those of `read_asset`.
+        whole_bytes: Memory that the first read takes and keeps, if the format can only
+            be read whole.
     """
 
-    path: Path
+    path: AnyPath
     num_gaussians: int
     sh_degree: int
     read: Callable[[int, int], Gaussians]
     whole_bytes: int = 0
 
 
-def bytes_of(files: Iterable[Path]) -> int:
+def bytes_of(files: Iterable[AnyPath]) -> int:
     """Size on disk of the files that exist, together."""
     return sum(os.stat(file).st_size for file in set(files) if os.path.exists(file))
 
 
 def whole_file(
-    path: Path,
+    path: AnyPath,
     count: int,
     sh_degree: int,
-    read: Callable[[Path], Gaussians],
-    files: Iterable[Path] = (),
+    read: Callable[[AnyPath], Gaussians],
+    files: Iterable[AnyPath] = (),
 ) -> AssetFile:
     """A file, and others that it names, that can only be read whole: on the first read,
     and then cached."""
@@ -76,7 +76,7 @@ class File:
     """A file with random access, closed when it is dropped; ValueError if it is not a
     regular file."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: AnyPath) -> None:
         self.path = path
         with _files.naming_errors(path):
             self._descriptor = _files.open_regular(path)
@@ -107,17 +107,17 @@ class Claims:
         self._gaussians = 0
 
     @contextlib.contextmanager
-    def open(self, path: Path) -> Iterator[IO[bytes]]:
+    def open(self, path: AnyPath) -> Iterator[IO[bytes]]:
         with _files.naming_errors(path), open(_files.open_regular(path), "rb") as file:
             status = os.fstat(file.fileno())
             self._files[status.st_dev, status.st_ino] = status.st_size
             yield file
 
-    def read(self, path: Path) -> bytes:
+    def read(self, path: AnyPath) -> bytes:
         with self.open(path) as file:
             return file.read()
 
-    def add(self, path: Path, count: int) -> None:
+    def add(self, path: AnyPath, count: int) -> None:
         """Accept that a file has so many gaussians, or raise ValueError; to be called
         before allocation."""
         self._gaussians += count
@@ -131,7 +131,7 @@ class Archive:
     """A zip whose members are no larger than itself, or 1 MiB, and fit their
     checksums."""
 
-    def __init__(self, path: Path, file: IO[bytes]) -> None:
+    def __init__(self, path: AnyPath, file: IO[bytes]) -> None:
         self._path = path
         start = file.read(4)  # zipfile accepts a zip that begins anywhere in the file
         check(path, start == b"PK\3\4", f"a zip, got a file that begins with {start!r}")
@@ -161,7 +161,7 @@ class Archive:
         return content
 
 
-def whole(node: Node, expected: str, low: int, high: int) -> int:
+def integer_of(node: Node, expected: str, low: int, high: int) -> int:
     """A JSON value that must be a whole number of ``low`` to ``high``."""
     if (
         not isinstance(node.value, int)

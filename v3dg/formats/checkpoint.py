@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 
 from v3dg._numbers import refuse
 from v3dg.formats._packing import DEGREES, Floats, assemble
-from v3dg.formats._reading import Archive, AssetFile, Claims, Path, check, value_errors, whole_file
+from v3dg.formats._reading import (
+    AnyPath,
+    Archive,
+    AssetFile,
+    Claims,
+    check,
+    value_errors,
+    whole_file,
+)
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import normalised
 
@@ -78,7 +86,7 @@ class _Tensor(NamedTuple):
     strides: tuple[int, ...]
 
 
-def open_file(path: Path) -> AssetFile:
+def open_file(path: AnyPath) -> AssetFile:
     """Open a checkpoint; the gaussians are all read with the first rows."""
     claims = Claims()
     with claims.open(path) as file:
@@ -87,7 +95,7 @@ def open_file(path: Path) -> AssetFile:
     return whole_file(path, count, DEGREES[num_higher], read)
 
 
-def read(path: Path) -> Gaussians:
+def read(path: AnyPath) -> Gaussians:
     """Read the gaussians of a checkpoint."""
     claims = Claims()
     with claims.open(path) as file:
@@ -116,7 +124,7 @@ def read(path: Path) -> Gaussians:
     return assemble(count, DEGREES[num_higher], decode)
 
 
-def _fields_of(path: Path, archive: Archive) -> tuple[dict[str, _Tensor], str]:
+def _fields_of(path: AnyPath, archive: Archive) -> tuple[dict[str, _Tensor], str]:
     """The tensors of the gaussians, and the folder of the zip that holds their
     numbers."""
     root = next((name[:-8] for name in archive.names if name.endswith("data.pkl")), "")
@@ -135,7 +143,7 @@ def _fields_of(path: Path, archive: Archive) -> tuple[dict[str, _Tensor], str]:
     return _fields(path, content), root
 
 
-def _size(path: Path, fields: dict[str, _Tensor], claims: Claims) -> tuple[int, int]:
+def _size(path: AnyPath, fields: dict[str, _Tensor], claims: Claims) -> tuple[int, int]:
     """Number of gaussians, and of coefficients a channel past the first."""
     count = fields["means"].shape[0]
     claims.add(path, count)
@@ -151,7 +159,7 @@ def _doubles(values: _Numbers) -> Floats:
     return values.astype(np.float64)
 
 
-def _fields(path: Path, content: _Value) -> dict[str, _Tensor]:
+def _fields(path: AnyPath, content: _Value) -> dict[str, _Tensor]:
     """The tensors of the gaussians by the names that gsplat has for them; ValueError if
     one is missing."""
     members: dict[str, _Value] = {}
@@ -177,7 +185,7 @@ def _fields(path: Path, content: _Value) -> dict[str, _Tensor]:
     return tensors
 
 
-def _array(path: Path, name: str, tensor: _Tensor, archive: Archive, root: str) -> _Numbers:
+def _array(path: AnyPath, name: str, tensor: _Tensor, archive: Archive, root: str) -> _Numbers:
     """The numbers of a tensor; ValueError unless each of them is stored in the file."""
     steps = zip(tensor.shape, tensor.strides, strict=True)
     last = tensor.offset + sum((size - 1) * step for size, step in steps)

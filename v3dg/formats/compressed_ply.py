@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from v3dg import _core, _files
 from v3dg.formats import _packing
 from v3dg.formats._packing import SH_C0, SQRT2, Floats, assemble
-from v3dg.formats._reading import AssetFile, File, Path, check
+from v3dg.formats._reading import AnyPath, AssetFile, File, check
 from v3dg.gaussians import Gaussians
 
 _CHUNK = 256
 _PLY_TYPES = {"float": "<f4", "uint": "<u4", "uchar": "u1"}
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _RANGES = {"": "xyz", "scale_": "xyz", "color": "rgb"}
-# Where each field of a word begins, and its largest value.
+# The first bit of each field of a word, and its largest value.
 _Fields: TypeAlias = tuple[tuple[int, int], ...]
 _XYZ: _Fields = ((21, 2047), (11, 1023), (0, 2047))
 _THREE: _Fields = ((20, 1023), (10, 1023), (0, 1023))
@@ -45,7 +45,7 @@ class _Element:
         return file.rows(self.dtype, self.offset + first * self.dtype.itemsize, last - first)
 
 
-def open_file(path: Path) -> AssetFile:
+def open_file(path: AnyPath) -> AssetFile:
     """Open a `.compressed.ply` file."""
     file = File(path)
     elements = _elements(file)
@@ -112,7 +112,7 @@ def _decoded(
     return means, quats, scales, rgba[:, 3], sh
 
 
-def write(path: Path, gaussians: Gaussians) -> None:
+def write(path: AnyPath, gaussians: Gaussians) -> None:
     """Write a `.compressed.ply` file; gaussians are put in an order that keeps
     neighbours together."""
     host = _packing.check_writable(gaussians)
@@ -198,7 +198,7 @@ def _range_names(kind: str) -> list[str]:
     return [f"{end}_{prefix}{axis}" for end in ("min", "max") for axis in _RANGES[kind]]
 
 
-def _range_kinds(path: Path, chunk: _Element) -> list[str]:
+def _range_kinds(path: AnyPath, chunk: _Element) -> list[str]:
     """The kinds of ranges that chunks have; older files have none of colours."""
     kinds = [kind for kind in _RANGES if kind != "color" or chunk.kinds.keys() & _range_names(kind)]
     for kind in kinds:
@@ -220,7 +220,7 @@ def _ranges(chunk: NDArray[np.void], kinds: Sequence[str]) -> dict[str, tuple[Fl
     return ranges
 
 
-def _degree(path: Path, sh: _Element | None, count: int) -> int:
+def _degree(path: AnyPath, sh: _Element | None, count: int) -> int:
     if sh is None:
         return 0
     names = [f"f_rest_{i}" for i in range(len(sh.kinds))]
@@ -234,7 +234,7 @@ def _degree(path: Path, sh: _Element | None, count: int) -> int:
     return _packing.DEGREES[num_coefficients]
 
 
-def _require(path: Path, label: str, element: _Element, names: Sequence[str], kind: str) -> None:
+def _require(path: AnyPath, label: str, element: _Element, names: Sequence[str], kind: str) -> None:
     for name in names:
         check(
             path,

@@ -1,8 +1,8 @@
 """`.glb`: glTF 2.0 with KHR_gaussian_splatting, as float attributes or compressed in
 `.spz`.
 
-Written is one primitive; read are all primitives that are gaussians, of nodes without
-transforms. Coordinates are passed on as they are stored; glTF's have y up.
+The writer writes one primitive; the reader reads all primitives of gaussians, of nodes
+without transforms. Coordinates are passed on as they are stored; glTF's have y up.
 """
 
 import json
@@ -20,8 +20,15 @@ from v3dg._numbers import Floats
 from v3dg._version import __version__
 from v3dg.formats import spz
 from v3dg.formats._packing import SH_C0, assemble, check_writable
-from v3dg.formats._reading import AssetFile, Claims, check, value_errors, whole, whole_file
-from v3dg.formats._reading import Path as AnyPath
+from v3dg.formats._reading import (
+    AnyPath,
+    AssetFile,
+    Claims,
+    check,
+    integer_of,
+    value_errors,
+    whole_file,
+)
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import normalised
 
@@ -148,7 +155,7 @@ def _buffer_views(parts: list[bytes], *, are_arrays: bool) -> list[JsonObject]:
 
 
 def _chunk(kind: int, content: bytes, padding: bytes) -> bytes:
-    """A chunk of the file, filled up to a multiple of four bytes."""
+    """A chunk of the file, padded to a multiple of four bytes."""
     content += padding * (-len(content) % 4)
     return struct.pack("<II", len(content), kind) + content
 
@@ -217,11 +224,11 @@ class _Glb:
         """The item of one of the root's arrays whose number is in a field of the
         node."""
         items = self._arrays[kind]
-        return items[whole(node.field(field), f"0 to {len(items) - 1}", 0, len(items) - 1)]
+        return items[integer_of(node.field(field), f"0 to {len(items) - 1}", 0, len(items) - 1)]
 
     def count_of(self, primitive: Node) -> int:
         accessor = self._item("accessors", primitive.field("attributes"), "POSITION")
-        return whole(accessor.field("count"), "a number of gaussians", 0, _MOST_GAUSSIANS)
+        return integer_of(accessor.field("count"), "a number of gaussians", 0, _MOST_GAUSSIANS)
 
     def gaussians_of(self, primitive: Node) -> Gaussians:
         extension = primitive.field("extensions").field(_NAME)
@@ -268,10 +275,10 @@ class _Glb:
 
     def _view(self, view: Node) -> memoryview:
         """The bytes of a view of the binary chunk."""
-        whole(view.field("buffer"), "0, the file's own buffer", 0, 0)
+        integer_of(view.field("buffer"), "0, the file's own buffer", 0, 0)
         first = _offset(view, len(self._blob))
         limit = len(self._blob) - first
-        num_bytes = whole(view.field("byteLength"), f"at most {limit} bytes", 0, limit)
+        num_bytes = integer_of(view.field("byteLength"), f"at most {limit} bytes", 0, limit)
         return self._blob[first : first + num_bytes]
 
     def _column(self, accessor: Node, count: int, width: int) -> Callable[[slice], Floats]:
@@ -283,13 +290,13 @@ class _Glb:
             raise kind.error(f"one of {', '.join(map(str, _DTYPES))}")
         if accessor.field("type").value != _TYPES[width]:
             raise accessor.field("type").error(_TYPES[width])
-        whole(accessor.field("count"), f"{count}, as POSITION has", count, count)
+        integer_of(accessor.field("count"), f"{count}, as POSITION has", count, count)
         dtype = np.dtype(_DTYPES[kind.value])
         content = self._view(view)
         size = dtype.itemsize * width
         stride = size
         if view.has("byteStride"):
-            stride = whole(view.field("byteStride"), "4 to 252", 4, 252)
+            stride = integer_of(view.field("byteStride"), "4 to 252", 4, 252)
         first = _offset(accessor, len(content))
         if count and first + (count - 1) * stride + size > len(content):
             raise accessor.problem(f"expected {count} values in its view, got {len(content)} bytes")
@@ -313,4 +320,4 @@ def _sh_degree_of(attributes: Node) -> int:
 def _offset(node: Node, limit: int) -> int:
     if not node.has("byteOffset"):
         return 0
-    return whole(node.field("byteOffset"), f"0 to {limit}", 0, limit)
+    return integer_of(node.field("byteOffset"), f"0 to {limit}", 0, limit)

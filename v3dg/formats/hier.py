@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg.formats._packing import Floats, assemble
-from v3dg.formats._reading import AssetFile, File, Path, check
+from v3dg.formats._reading import AnyPath, AssetFile, File, check
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import normalised
 
@@ -26,7 +26,7 @@ _HALF_NODE = np.dtype(
 )
 
 
-def open_file(path: Path) -> AssetFile:
+def open_file(path: AnyPath) -> AssetFile:
     """Open a `.hier` file."""
     file = File(path)
     check(path, file.num_bytes >= 4, f"a number of gaussians, got {file.num_bytes} bytes")
@@ -73,7 +73,7 @@ def open_file(path: Path) -> AssetFile:
     return AssetFile(path, len(leaves), 3, read)
 
 
-def _leaves(path: Path, nodes: NDArray[np.void], count: int) -> NDArray[np.int64]:
+def _leaves(path: AnyPath, nodes: NDArray[np.void], count: int) -> NDArray[np.int64]:
     """The gaussians that are leaves, in ascending order, each once."""
     has_leaves = nodes["leaves"] != 0
     first = nodes["start"][has_leaves].astype(np.int64)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg.formats._packing import SH_C0, Floats, assemble
-from v3dg.formats._reading import AssetFile, Claims, Path, check, whole_file
+from v3dg.formats._reading import AnyPath, AssetFile, Claims, check, whole_file
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import normalised
 
@@ -50,14 +50,14 @@ class _Section(NamedTuple):
 
 
 class _Buckets(NamedTuple):
-    """What a mean is relative to."""
+    """The buckets that means are relative to."""
 
     centers: NDArray[np.float32]  # (N, 3) of each gaussian's bucket
     step_world: float
     num_steps: int  # from a corner to the centre
 
 
-def open_file(path: Path) -> AssetFile:
+def open_file(path: AnyPath) -> AssetFile:
     """Open a `.ksplat` file; all of it is read with its first rows."""
     with Claims().open(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -66,7 +66,7 @@ def open_file(path: Path) -> AssetFile:
     return whole_file(path, sum(section.num_gaussians for section in sections), degree, read)
 
 
-def read(path: Path) -> Gaussians:
+def read(path: AnyPath) -> Gaussians:
     """Read a `.ksplat` file of version 0.1 and later, of SH degree 0 to 2."""
     content = Claims().read(path)
     sections, degree, compression = _headers(path, content)
@@ -86,7 +86,7 @@ def read(path: Path) -> Gaussians:
     return Gaussians.concatenate(parts)
 
 
-def _headers(path: Path, content: bytes) -> tuple[list[_Section], int, int]:
+def _headers(path: AnyPath, content: bytes) -> tuple[list[_Section], int, int]:
     """The headers of all sections, the SH degree and the compression; ``content`` is
     the start of a file."""
     num_bytes = len(content)
@@ -108,7 +108,7 @@ def _headers(path: Path, content: bytes) -> tuple[list[_Section], int, int]:
 
 
 def _section(
-    path: Path, content: bytes, start: int, number: int, section: _Section, compression: int
+    path: AnyPath, content: bytes, start: int, number: int, section: _Section, compression: int
 ) -> tuple[NDArray[np.void], _Buckets | None, int]:
     """The rows of a section, the buckets that their means are relative to, and the end
     of the section."""
@@ -140,7 +140,7 @@ def _section(
     return rows, buckets, end
 
 
-def _buckets(path: Path, content: bytes, start: int, number: int, section: _Section) -> _Buckets:
+def _buckets(path: AnyPath, content: bytes, start: int, number: int, section: _Section) -> _Buckets:
     """The buckets of a section that begins at ``start``."""
     count = section.num_gaussians
     sizes = np.frombuffer(content, "<u4", section.num_partial_buckets, start)

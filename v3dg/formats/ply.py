@@ -5,14 +5,14 @@ from typing import Literal
 
 from v3dg import _core, _files
 from v3dg.formats import compressed_ply
-from v3dg.formats._reading import AssetFile, Path
+from v3dg.formats._reading import AnyPath, AssetFile
 from v3dg.gaussians import Gaussians
 
 write_compressed = compressed_ply.write
 PlyEncoding = Literal["binary_little_endian", "binary_big_endian", "ascii"]
 
 
-def open_file(path: Path) -> AssetFile:
+def open_file(path: AnyPath) -> AssetFile:
     """Open a `.ply` file; one with packed positions is a compressed one, whatever its
     name."""
     name = os.fspath(path)
@@ -27,7 +27,9 @@ def open_file(path: Path) -> AssetFile:
     return AssetFile(path, file.num_gaussians, file.sh_degree, read)
 
 
-def write(path: Path, gaussians: Gaussians, encoding: PlyEncoding = "binary_little_endian") -> None:
+def write(
+    path: AnyPath, gaussians: Gaussians, encoding: PlyEncoding = "binary_little_endian"
+) -> None:
     """Write a `.ply` file."""
     host = gaussians.numpy()
     arrays = (host.means, host.quats, host.scales, host.opacities, host.sh)

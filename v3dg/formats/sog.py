@@ -29,9 +29,9 @@ from v3dg.formats._reading import (
     AssetFile,
     Claims,
     check,
+    integer_of,
     least_bytes,
     value_errors,
-    whole,
     whole_file,
 )
 from v3dg.gaussians import Gaussians
@@ -140,7 +140,7 @@ _NO_HIGHER_SH = _Palette(np.zeros(1), np.zeros((1, 0, 3), np.uint8), 1)
 def _palette(
     path: Path, part: Node, name: str, pictures: dict[str, bytes], degree: int
 ) -> _Palette:
-    num_entries = whole(part.field("count"), "1 to 65536 entries", 1, 65536)
+    num_entries = integer_of(part.field("count"), "1 to 65536 entries", 1, 65536)
     table = _codebook(part)
     num_rows = -(-num_entries // _PALETTE_COLUMNS)
     width = _PALETTE_COLUMNS * ((degree + 1) ** 2 - 1)
@@ -171,10 +171,10 @@ def _meta(path: Path, text: bytes) -> dict[str, Node]:
 
 def _size(meta: dict[str, Node]) -> tuple[int, int]:
     """Number of gaussians, and their SH degree."""
-    count = whole(meta["count"], "a number of gaussians", 0, _MAX_GAUSSIANS)
+    count = integer_of(meta["count"], "a number of gaussians", 0, _MAX_GAUSSIANS)
     if "shN" not in meta:
         return count, 0
-    return count, whole(meta["shN"].field("bands"), "1 to 3", 1, 3)
+    return count, integer_of(meta["shN"].field("bands"), "1 to 3", 1, 3)
 
 
 def _names(meta: dict[str, Node]) -> dict[str, list[str]]:
@@ -367,6 +367,6 @@ def _webp(values: _packing.Integers, width: int, height: int) -> bytes:
     pixels = np.full((height, width, 4), 255, np.uint8)
     pixels.reshape(-1, 4)[: len(values), : values.shape[1]] = values
     stream = io.BytesIO()
-    # Without exact, pixels whose alpha is 0 lose their colours.
+    # `exact` keeps the colours of pixels whose alpha is 0.
     Image.fromarray(pixels).save(stream, "WEBP", lossless=True, exact=True, quality=50, method=4)
     return stream.getvalue()

@@ -9,14 +9,14 @@ header.
 import numpy as np
 
 from v3dg.formats._packing import SH_C0, Floats, assemble
-from v3dg.formats._reading import AssetFile, File, Path, check
+from v3dg.formats._reading import AnyPath, AssetFile, File, check
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import normalised
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
-def open_file(path: Path) -> AssetFile:
+def open_file(path: AnyPath) -> AssetFile:
     """Open a `.splat` file."""
     file = File(path)
     size = _RECORD.itemsize

@@ -21,9 +21,9 @@ from v3dg import _files
 from v3dg.formats import _packing
 from v3dg.formats._packing import SQRT2, Floats, assemble
 from v3dg.formats._reading import (
+    AnyPath,
     AssetFile,
     Claims,
-    Path,
     check,
     least_bytes,
     value_errors,
@@ -64,7 +64,7 @@ class _Header(NamedTuple):
         return [self.num_gaussians * width for width in widths]
 
 
-def open_file(path: Path) -> AssetFile:
+def open_file(path: AnyPath) -> AssetFile:
     """Open a `.spz` file; all of it is read with its first rows."""
     claims = Claims()
     with claims.open(path) as file:
@@ -76,13 +76,13 @@ def open_file(path: Path) -> AssetFile:
     return whole_file(path, checked.num_gaussians, checked.sh_degree, read)
 
 
-def read(path: Path) -> Gaussians:
+def read(path: AnyPath) -> Gaussians:
     """Read a `.spz` file of version 1 to 4."""
     claims = Claims()
     return decode(path, claims.read(path), claims)
 
 
-def decode(path: Path, content: bytes, claims: Claims) -> Gaussians:
+def decode(path: AnyPath, content: bytes, claims: Claims) -> Gaussians:
     """The gaussians of a `.spz` file's content."""
     if content[:2] == b"\x1f\x8b":
         return _decode(*_sections_of_gzip(path, content, claims))
@@ -93,7 +93,7 @@ def decode(path: Path, content: bytes, claims: Claims) -> Gaussians:
     return _decode(*_sections_of_zstd(path, content, claims))
 
 
-def write(path: Path, gaussians: Gaussians, version: int = 3) -> None:
+def write(path: AnyPath, gaussians: Gaussians, version: int = 3) -> None:
     """Write a `.spz` file of version 2, 3 or 4; the order stays."""
     check("version", version in (2, 3, 4), f"2, 3 or 4 for .spz, got {version}")
     host = _packing.check_writable(gaussians)
@@ -222,7 +222,7 @@ def _quats(rotations: NDArray[np.uint8]) -> Floats:
     return np.roll(_packing.quats_from_three(three, words >> 30), 1, axis=1)
 
 
-def _checked_header(path: Path, header: bytes, claims: Claims) -> _Header:
+def _checked_header(path: AnyPath, header: bytes, claims: Claims) -> _Header:
     check(path, len(header) >= _HEADER.size, f"a header of {_HEADER.size} bytes, got {len(header)}")
     magic, version, count, degree, fraction_bits, _, _ = _HEADER.unpack_from(header)
     check(path, magic == _MAGIC, f".spz, which begins with NGSP, got {header[:4].hex(' ')}")
@@ -234,7 +234,7 @@ def _checked_header(path: Path, header: bytes, claims: Claims) -> _Header:
 
 
 def _sections_of_gzip(
-    path: Path, content: bytes, claims: Claims
+    path: AnyPath, content: bytes, claims: Claims
 ) -> tuple[_Header, list[memoryview]]:
     stream = zlib.decompressobj(31)
     with value_errors(path, "a gzip stream that is not damaged"):
@@ -258,7 +258,7 @@ def _sections_of_gzip(
 
 
 def _sections_of_zstd(
-    path: Path, content: bytes, claims: Claims
+    path: AnyPath, content: bytes, claims: Claims
 ) -> tuple[_Header, list[memoryview]]:
     import zstandard
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from v3dg._json import Node, parse_json
 from v3dg.formats import sog
-from v3dg.formats._reading import AssetFile, Claims, check, value_errors, whole, whole_file
+from v3dg.formats._reading import AssetFile, Claims, check, integer_of, value_errors, whole_file
 from v3dg.gaussians import Gaussians
 
 _LEVEL = re.compile(r"[0-9]{1,9}")
@@ -119,9 +119,9 @@ def _finest(tree: Node, names: list[PurePosixPath]) -> dict[PurePosixPath, list[
             raise levels.error("levels by number")
         for level in sorted(levels.value, key=int):
             lod = levels.field(level)
-            file = whole(lod.field("file"), f"0 to {len(names) - 1}", 0, len(names) - 1)
-            offset = whole(lod.field("offset"), "a whole number, 0 or more", 0, 1 << 32)
-            count = whole(lod.field("count"), "a whole number, 0 or more", 0, 1 << 32)
+            file = integer_of(lod.field("file"), f"0 to {len(names) - 1}", 0, len(names) - 1)
+            offset = integer_of(lod.field("offset"), "a whole number, 0 or more", 0, 1 << 32)
+            count = integer_of(lod.field("count"), "a whole number, 0 or more", 0, 1 << 32)
             if count:
                 runs.setdefault(names[file], []).append(range(offset, offset + count))
                 break

@@ -24,8 +24,7 @@ from v3dg import _extras, _files
 from v3dg._numbers import check
 from v3dg.cameras import Axis, Floats, is_rotation
 from v3dg.formats._packing import check_writable
-from v3dg.formats._reading import AssetFile, value_errors
-from v3dg.formats._reading import Path as AnyPath
+from v3dg.formats._reading import AnyPath, AssetFile, value_errors
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import normalised, quaternion_from_rotation
 

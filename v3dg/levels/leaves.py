@@ -14,7 +14,7 @@ import numpy.typing as npt
 from v3dg import _core, _device, cleaning
 from v3dg._device import Device
 from v3dg._json import JsonObject
-from v3dg._numbers import check, one_of, shown, whole_number
+from v3dg._numbers import check, one_of, value_text, whole_number
 from v3dg.bundle.codec import Codec
 from v3dg.cameras import Axis
 from v3dg.gaussians import Gaussians, gaussian_bytes
@@ -91,7 +91,7 @@ def made_with(
 ) -> JsonObject:
     """The config of a bundle: the asset and the settings that it was made with."""
     seed = whole_number(seed, "seed")
-    check("seed", 0 <= seed < 2**58, f"0 to 2^58 - 1, got {shown(seed)}")
+    check("seed", 0 <= seed < 2**58, f"0 to 2^58 - 1, got {value_text(seed)}")
     result: JsonObject = {
         "build": asdict(config),
         "seed": seed,

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from v3dg._numbers import refuse, shown
+from v3dg._numbers import refuse, value_text
 from v3dg.gaussians import gaussian_bytes
 from v3dg.levels.leaves import Leaves
 from v3dg.levels.whole import UNIT_LEAVES
@@ -35,7 +35,7 @@ def in_bytes(memory: int | str | None) -> int:
         text = str(memory)
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?\s*", text, re.IGNORECASE)
     if match is None or not float(match[1]) > 0:
-        refuse("memory", f"bytes, or text like '8GiB', got {shown(memory)}")
+        refuse("memory", f"bytes, or text like '8GiB', got {value_text(memory)}")
     return int(min(float(match[1]) * _UNITS[match[2].upper()], 2.0**62))
 
 

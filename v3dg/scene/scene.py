@@ -36,8 +36,8 @@ class _State(NamedTuple):
 
 
 class Scene:
-    """Instances of bundles: each bundle is stored once, an instance takes p to scale *
-    rotation p + position.
+    """Instances of bundles: each bundle is stored once, and an instance maps p to scale
+    * rotation p + position.
 
     Instances are numbered from 0 in the order in which they were added; `remove` closes
     the gaps. Changes are visible in the next picture. Any thread may change a scene and
@@ -80,7 +80,7 @@ class Scene:
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> "Scene":
-        """Read a scene as `v3dg.read_scene` does, which also has its cameras."""
+        """Read a scene without its cameras; the same as `v3dg.read_scene(path)[0]`."""
         from v3dg.scene.file import read_scene
 
         return read_scene(path)[0]
@@ -88,8 +88,8 @@ class Scene:
     def save(
         self, path: str | os.PathLike[str], cameras: Mapping[str, Camera] | None = None
     ) -> None:
-        """Write the scene as `v3dg.write_scene` does; bundles stay in the files they
-        were opened from."""
+        """Write the scene; the same as `v3dg.write_scene(path, self,
+        cameras=cameras)`."""
         from v3dg.scene.file import write_scene
 
         write_scene(path, self, cameras=cameras)
@@ -173,7 +173,7 @@ class Scene:
         quaternions: Array | npt.ArrayLike | None = None,
         scales: Array | npt.ArrayLike | None = None,
     ) -> None:
-        """Give instances new poses; a part that is None stays.
+        """Give instances new poses; a part that is None does not change.
 
         Args:
             ids: (M,) which instances; all if None.
