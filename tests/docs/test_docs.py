@@ -181,6 +181,7 @@ def folder(files, tmp_path):
     return shutil.copytree(files, tmp_path / "work")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
 @pytest.mark.parametrize("page", [page for page in PAGES if list(blocks_of(page))])
 def test_code_of_page_runs(page, folder, monkeypatch):

@@ -40,6 +40,7 @@ def distance_to_asset(bundle, device):
     return np.array(errors)
 
 
+@pytest.mark.slow
 def test_cuts_come_closer_to_the_asset(bundle, device):
     refined = refine_bundle(bundle, steps=400, drop=0, device=device, progress=False)
     before, after = distance_to_asset(bundle, device), distance_to_asset(refined, device)
@@ -295,6 +296,7 @@ def test_looks_are_counted(bundle, device):
     np.testing.assert_array_equal(num_looks, expected)
 
 
+@pytest.mark.slow
 def test_what_is_not_looked_at_stays(bundle, device):
     """A camera that sees one side alone tells nothing of the other."""
     camera = v3dg.Camera.look_at((0.75, 0, 0.6), (0.75, 0, 0), (0, 1, 0), 0.5, width=64, height=64)

@@ -16,6 +16,8 @@ from benchmarks.worlds.procedural import make_person
 from v3dg._judges import Judges
 from v3dg.metrics import has_flip
 
+pytestmark = pytest.mark.slow  # every test builds and compares levels
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
