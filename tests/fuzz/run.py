@@ -43,6 +43,7 @@ def ply_seeds():
 def compiled(folder):
     sources = [
         HERE / "fuzz_ply.cpp",
+        ROOT / "csrc/base/threads.cpp",
         *(
             ROOT / "csrc/io" / f"ply_{part}.cpp"
             for part in ("fields", "header", "read", "rows", "text")
