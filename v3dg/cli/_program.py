@@ -57,7 +57,7 @@ class Program:
             Annotated[options, tyro.conf.subcommand(name)]
             for name, (options, _) in self.commands.items()
         ]
-        if "" in arguments:  # as a path it would name the working folder
+        if "" in arguments:  # an empty path would name the working folder
             number = list(arguments).index("") + 1
             raise UsageError(f"argument {number} is empty; is a shell variable unset?")
         caught = io.StringIO()
