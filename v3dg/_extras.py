@@ -8,7 +8,7 @@ from typing import NamedTuple
 class Extra(NamedTuple):
     """An optional package."""
 
-    requirement: str  # as pip takes it
+    requirement: str  # in the syntax of pip
     purpose: str
 
 

@@ -20,8 +20,8 @@ _SPRINKLE_COLORS = np.array(
     [[0.95, 0.95, 0.9], [0.9, 0.6, 0.03], [0.05, 0.3, 0.8], [0.02, 0.5, 0.3], [0.8, 0.05, 0.04]]
 )
 _TO_SUN = np.array([0.42, -0.50, 0.76])
-_SH_C0 = _core.sh_base0  # of the constant basis function
-_SH_C1 = 0.4886025119029199  # of the linear basis functions
+_SH_C0 = _core.sh_base0  # factor of the constant basis function
+_SH_C1 = 0.4886025119029199  # factor of the linear basis functions
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 

@@ -1,5 +1,5 @@
-"""The axis that is up: from a file, or guessed from cameras, from a ground plane, or by
-convention."""
+"""The axis that is up: read from a file, or guessed from cameras, from a ground plane,
+or by convention."""
 
 import os
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""Videos: pictures in a row in one file, written whole or not at all. Needs the extra
+"""Videos: files of pictures, which appear when they are complete. They need the extra
 `video`."""
 
 import os
@@ -13,8 +13,8 @@ from v3dg.pictures import to_8bit
 def write_video(
     path: str | os.PathLike[str], pictures: Iterable[Array], *, fps: int = 30, quality: int = 18
 ) -> int:
-    """Encode pictures as H.264 in an .mp4 file, each as it comes; the file appears when
-    all are in it.
+    """Encode pictures one after another as H.264 in an .mp4 file, which appears when it
+    is complete.
 
     Args:
         pictures: (H, W, 3) floats in [0, 1], NumPy arrays or torch tensors, all of one
@@ -24,7 +24,7 @@ def write_video(
             no difference.
 
     Returns:
-        How many pictures the video has.
+        Number of pictures in the video.
 
     Raises:
         ImportError: The extra is not installed.

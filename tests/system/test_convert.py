@@ -205,7 +205,16 @@ def test_what_cannot_be_meant_is_refused(folder):
         cwd=folder,
     )
     fails(2, "expected a bundle as the input", "convert", "tuft.ply", "x.v3dg", cwd=folder)
-    fails(2, "and no level or cut", "convert", "tuft.v3dg", "x.v3dg", "--level", "1", cwd=folder)
+    fails(
+        2,
+        "without options that choose a part",
+        "convert",
+        "tuft.v3dg",
+        "x.v3dg",
+        "--level",
+        "1",
+        cwd=folder,
+    )
     fails(
         2,
         "--codec: expected an output",

@@ -309,7 +309,7 @@ class BundleFile:
         self._fetch(place, self.num_bytes)
         self._reading = reader.read(self.path, self._fd, text, place, num_bytes, self.version > 2)
         data = self._reading.wait()  # the tables, followed by the hash
-        self.tables: dict[str, Column] = {}  # whose types `schema_of` has
+        self.tables: dict[str, Column] = {}  # `schema_of` has their types
         for name, dtype, _, _ in schema_of(self.codec):
             first, last = (offset - self.pages_bytes for offset in entries[name]["data_offsets"])
             self.tables[name] = data[first:last].view(DTYPES[dtype]).reshape(entries[name]["shape"])

@@ -1,25 +1,27 @@
 """A program of several commands: parses, runs one, and turns failures into one line and
 an exit code."""
 
+import ast
 import contextlib
 import dataclasses
 import difflib
 import functools
 import inspect
 import io
+import itertools
 import operator
 import os
 import re
 import shutil
 import signal
 import sys
+import textwrap
 import typing
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias, cast
 
-import docstring_parser
 import tyro
 
 from v3dg import _start
@@ -57,7 +59,7 @@ class Program:
             Annotated[options, tyro.conf.subcommand(name)]
             for name, (options, _) in self.commands.items()
         ]
-        if "" in arguments:  # as a path it would name the working folder
+        if "" in arguments:  # an empty path would name the working folder
             number = list(arguments).index("") + 1
             raise UsageError(f"argument {number} is empty; is a shell variable unset?")
         caught = io.StringIO()
@@ -163,11 +165,15 @@ def _join_help(kind: type[Options]) -> None:
     """Put the docstrings of options into the annotations of their class, each as one
     line."""
     annotations = inspect.get_annotations(kind)
-    for entry in docstring_parser.parse_from_object(kind).params:
-        annotation = annotations.get(entry.arg_name)
-        if annotation is not None and entry.description:
-            text = " ".join(entry.description.split())
-            annotations[entry.arg_name] = Annotated[annotation, tyro.conf.arg(help=text)]
+    (source,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    for field, docstring in itertools.pairwise(cast(ast.ClassDef, source).body):
+        match field, docstring:
+            case (
+                ast.AnnAssign(target=ast.Name(id=name)),
+                ast.Expr(value=ast.Constant(value=str(text))),
+            ):
+                joined = tyro.conf.arg(help=" ".join(text.split()))
+                annotations[name] = Annotated[annotations[name], joined]
     kind.__annotations__ = annotations
     for annotation in annotations.values():
         group = typing.get_args(annotation)[:1]

@@ -78,7 +78,7 @@ class _Named(NamedTuple):
 
 
 class _Tensor(NamedTuple):
-    kind: str  # of its storage
+    kind: str  # kind of its storage
     key: str
     num_stored: int
     offset: int

@@ -43,7 +43,7 @@ class _Section(NamedTuple):
     num_buckets: int
     bucket_side: float  # world units
     bucket_bytes: int
-    num_steps: int  # from a corner of a bucket to its centre; 0: the default
+    num_steps: int  # steps from a corner of a bucket to its centre; 0 is the default
     num_full_buckets: int
     num_partial_buckets: int
     sh_degree: int
@@ -54,7 +54,7 @@ class _Buckets(NamedTuple):
 
     centers: NDArray[np.float32]  # (N, 3) of each gaussian's bucket
     step_world: float
-    num_steps: int  # from a corner to the centre
+    num_steps: int  # steps from a corner to the centre
 
 
 def open_file(path: AnyPath) -> AssetFile:

@@ -47,7 +47,7 @@ _LARGEST_FIXED = (1 << 23) - 1
 class _Header(NamedTuple):
     version: int
     sh_degree: int
-    fraction_bits: int  # of the fixed-point positions
+    fraction_bits: int  # fraction bits of the fixed-point positions
     num_gaussians: int
 
     @property

@@ -56,7 +56,7 @@ class DiskLeaves(Leaves):
 
     path: Path
     bucket_offset: npt.NDArray[np.int64]
-    bucket_depth: int  # of the median split inside each bucket
+    bucket_depth: int  # depth of the median split inside each bucket
 
     def read(self, first: int, last: int) -> Gaussians:
         result = Codec(self.sh_degree).empty(last - first)

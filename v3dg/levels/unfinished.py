@@ -116,7 +116,7 @@ class Unfinished:
         self.pages = PageFile(Path(os.path.abspath(path)), _MAGIC + digest, plan.codec)
         self.levels: dict[tuple[int, int], FinishedLevel] = {}
         self.is_whole = False
-        self._end = plan.num_bytes  # of the journal
+        self._end = plan.num_bytes  # end of the journal
         self._lock = threading.Lock()
 
     def __enter__(self) -> "Unfinished":

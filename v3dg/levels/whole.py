@@ -158,7 +158,7 @@ class _Build:
         if runs:
             first = self.config.target_of(self.num_low)
         lower_levels: dict[int, Level] = {}
-        for n in range(first, self.num_low):  # what the levels above begin with
+        for n in range(first, self.num_low):  # targets and starts of the levels above
             gaussians = _device.place(self._level(n).gaussians, devices[0])
             lower_levels[n] = Level(gaussians, finished[n].tables)
         builder = LevelBuilder(self.plan, self.config, self.seed, self.file.codec)
@@ -324,7 +324,7 @@ class WorkerDevice(NamedTuple):
 
     kind: str  # "cpu" or "cuda"
     description: str
-    version: str  # of v3dg
+    version: str  # version of v3dg
 
     def __str__(self) -> str:
         return f"{self.description} with v3dg {self.version}"
