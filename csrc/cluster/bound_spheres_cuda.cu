@@ -177,7 +177,7 @@ void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double 
         Span<const uint32_t>{segment_of_chunk.data(), segment_of_chunk.size()}, stream);
     DeviceBuffer<Search> searches(num_segments, stream);
     DeviceBuffer<Ball> cores(num_segments * kCoreSize, stream);
-    DeviceBuffer<Farthest> found(segment_of_chunk.size(), stream);
+    DeviceBuffer<Farthest> farthest_of_chunk(segment_of_chunk.size(), stream);
     launch("bound_spheres: start", start_kernel, blocks_for(num_segments, kBlockSize), kBlockSize,
            0, stream, spheres.data, offsets.data(), num_segments, searches.data(), ball.data);
     // The core set grows from two spheres by one a pass. Two more passes measure it and find the

@@ -216,7 +216,6 @@ struct FitStep {
 V3DG_HD inline FitStep fit_step(const FitConfig& config, int index) {
     const double progress = config.steps > 1 ? static_cast<double>(index) / (config.steps - 1) : 0;
     const float decay = static_cast<float>(::pow(static_cast<double>(config.final_step), progress));
-    const double beta2 = static_cast<double>(config.beta2);
     return {.position = decay * config.step_position,
             .quat = decay * config.step_quat,
             .log_scale = decay * config.step_log_scale,
@@ -224,7 +223,8 @@ V3DG_HD inline FitStep fit_step(const FitConfig& config, int index) {
             .sh0 = decay * config.step_sh0,
             .sh_rest = decay * config.step_sh_rest,
             .correction1 = static_cast<float>(1 / (1 - ::pow(kAdamBeta1, index + 1.0))),
-            .correction2 = static_cast<float>(1 / (1 - ::pow(beta2, index + 1.0)))};
+            .correction2 = static_cast<float>(
+                1 / (1 - ::pow(static_cast<double>(config.beta2), index + 1.0)))};
 }
 
 V3DG_HD inline float position_step(const FitConfig& config, const FitGroup& group,
