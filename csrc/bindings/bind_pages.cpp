@@ -1,3 +1,5 @@
+// Pages of files: read, verified and hashed, for Python.
+
 #include <algorithm>
 #include <cerrno>
 #include <memory>
@@ -56,7 +58,7 @@ void read_rows(const py::object& path, int descriptor, const PageRun& run, PageC
                const Rows& out) {
     const GaussianRows<float> rows = out.write();
     const auto count = static_cast<size_t>(run.offset[run.offset.size - 1] - run.offset[0]);
-    if (!out.device().is_host() || rows.size != count)
+    if (out.device() != kHost || rows.size != count)
         throw py::value_error("out: expected " + std::to_string(count) +
                               " gaussians on the host, got others");
     const bool is_quantized = codec == PageCodec::quantized;
