@@ -194,7 +194,9 @@ def test_bindings_ask_for_the_backend_in_one_place():
     ]
     assert flags == ["backend.cpp"]
     ladders = [
-        path.name for path, text in sources.items() if re.search(r"is_host\(|if constexpr.*CUDA", text)
+        path.name
+        for path, text in sources.items()
+        if re.search(r"is_host\(|if constexpr.*CUDA", text)
     ]
     assert ladders == []
     assert "Add a backend" in sources[CSRC / "bindings" / "backend.h"].partition("#include")[0]
@@ -202,7 +204,9 @@ def test_bindings_ask_for_the_backend_in_one_place():
 
 def test_only_the_backend_of_cuda_sees_cuda():
     """Bindings that are compiled without CUDA include no header of its half."""
-    halves = re.compile(r'#include "(?:base/(?:device|device_guard|stream)\.h|.*_cuda\w*\.h|.*\.cuh)"')
+    halves = re.compile(
+        r'#include "(?:base/(?:device|device_guard|stream)\.h|.*_cuda\w*\.h|.*\.cuh)"'
+    )
     allowed = {*cmake_list("V3DG_CUDA_BINDINGS"), "csrc/bindings/cuda_frame.h"}
     users = [
         str(path.relative_to(ROOT))

@@ -1,7 +1,7 @@
 #pragma once
 
-// Arrays that users hold: NumPy's on the host, and what a backend takes on a device, such as torch's
-// tensors. They are borrowed after checks of kind, dtype, shape and layout, never copied.
+// Arrays that users hold: NumPy's on the host, and what a backend takes on a device, such as
+// torch's tensors. They are borrowed after checks of kind, dtype, shape and layout, never copied.
 
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
@@ -97,9 +97,8 @@ Span<T> span_of(const py::handle& array, const char* name, Shape shape) {
 // Borrows an array that has to be where others are.
 template <class T>
 Span<T> span_on(Device device, const py::handle& array, const char* name, Shape shape) {
-    const Borrowed borrowed =
-        borrow(device, array, name, element_of<std::remove_const_t<T>>(), shape,
-               !std::is_const_v<T>);
+    const Borrowed borrowed = borrow(device, array, name, element_of<std::remove_const_t<T>>(),
+                                     shape, !std::is_const_v<T>);
     return {static_cast<T*>(borrowed.data), borrowed.size};
 }
 

@@ -53,7 +53,7 @@ py::tuple median_split(const py::object& means, const py::array& offset, int dep
 py::object findings_of(const Rows& gaussians) {
     const GaussianRows<const float> rows = gaussians.read<float>();
     check_is_on_host(gaussians.device(), "gaussians",
-                  "expected arrays on the host, got others; bring them there");
+                     "expected arrays on the host, got others; bring them there");
     const NewArray<uint16_t> findings({}, {static_cast<py::ssize_t>(rows.size)});
     {
         const Unlocked unlocked;

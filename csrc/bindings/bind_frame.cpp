@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <memory>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -35,19 +36,65 @@ FrameLook look_of(const std::string& shows) {
     return FrameLook::appearance;
 }
 
-// Colours of the clusters of each bundle: (C, 3) each.
-std::vector<const float*> colors_of(const py::list& arrays, const SceneState& scene) {
-    std::vector<const float*> colors;
-    if (arrays.empty()) return colors;
-    for (size_t b = 0; b < scene.tables.size(); ++b) {
-        if (b >= arrays.size())
-            throw py::value_error("colors: expected none, or of each bundle");
-        const auto clusters = static_cast<py::ssize_t>(scene.tables[b].num_clusters());
-        colors.push_back(
-            span_of<const float>(arrays[b].cast<py::array>(), "colors", {clusters, 3}).data);
-    }
-    return colors;
+Eyes eyes_of(const py::object& camera) {
+    if (py::isinstance<BoundCamera>(camera)) return camera.cast<const BoundCamera&>().camera;
+    if (!py::isinstance<BoundEyes>(camera)) refuse_kind("camera", "a Camera or Eyes", camera);
+    return camera.cast<const BoundEyes&>().eyes;
 }
+
+// A cut that was selected before. The arrays are where the frame is, which looks when it draws.
+struct BoundGivenCut {
+    py::object instance_ids, cluster_ids, weights;
+
+    // Borrows from the arrays. Weights are of 0 to 1, or None where all are 1.
+    GivenCut read(Device device) const {
+        GivenCut given{span_on<const int32_t>(device, instance_ids, "instance_ids", {-1}), {}, {}};
+        const auto size = static_cast<py::ssize_t>(given.instance.size);
+        given.cluster = span_on<const int32_t>(device, cluster_ids, "cluster_ids", {size});
+        if (!weights.is_none())
+            given.weight = span_on<const float>(device, weights, "weights", {size});
+        return given;
+    }
+};
+
+// A request, without what only the frame can read: the given cut, and colours of clusters.
+struct BoundRequest {
+    FrameRequest plain;
+    std::optional<BoundGivenCut> cut;
+    py::list cluster_colors;  // (C, 3) of each bundle, or none
+
+    // Of a Camera or of Eyes. It looks itself which of the two it is: overloads, or a conversion,
+    // would take longer than all else here.
+    BoundRequest(const py::object& camera, const SelectRule* rule, const Shade* shade,
+                 const BoundGivenCut* given, const std::string& shows, const py::list& colors,
+                 const BoundEyes* chooser, bool is_aside)
+        : plain{.eyes = eyes_of(camera),
+                .rule = rule == nullptr ? SelectRule{} : *rule,
+                .shade = shade == nullptr ? Shade{} : *shade,
+                .look = look_of(shows),
+                .is_aside = is_aside},
+          cluster_colors(colors) {
+        if (given != nullptr && plain.eyes.are_two)
+            throw py::value_error("cut: expected one camera, got two eyes; draw each of them");
+        if (given != nullptr) cut = *given;
+        if (chooser != nullptr) plain.chooser = chooser->eyes;
+    }
+
+    bool is_complete() const { return !cut && cluster_colors.empty(); }
+    FrameRequest completed(Device device, const SceneState& scene) const {
+        FrameRequest request = plain;
+        if (cut) request.cut = cut->read(device);
+        for (size_t b = 0; !cluster_colors.empty() && b < scene.tables.size(); ++b) {
+            if (b >= cluster_colors.size())
+                throw py::value_error("colors: expected none, or of each bundle");
+            const auto clusters = static_cast<py::ssize_t>(scene.tables[b].num_clusters());
+            const auto colors = cluster_colors[b].cast<py::array>();
+            request.cluster_colors.push_back(
+                span_of<const float>(colors, "colors", {clusters, 3}).data);
+        }
+        return request;
+    }
+};
 
 // Draws scenes of the same bundles, or of the first of them, on one device.
 class BoundSceneFrame {
@@ -80,82 +127,36 @@ class BoundSceneFrame {
         num_gaussians_ = std::move(num_gaussians);
     }
 
-    std::unique_ptr<BoundDrawing> draw(const py::object& scene_object, const BoundEyes& camera,
-                                       const SelectRule& rule, const Shade& shade, const Stop* stop,
-                                       BudgetSteps* steps) {
-        const auto& scene = checked(scene_object);
-        const FrameRequest request{.eyes = camera.eyes, .rule = rule, .shade = shade};
-        return kept(frame_->draw({.request = request,
-                                  .scene = scene.handle(),
-                                  .state = scene.state(),
-                                  .pool = nullptr,
-                                  .steps = steps,
-                                  .stop = flag_of(stop)}),
-                    scene_object, py::none());
+    // Of the gaussians that were set, or of what is resident in a pool, after bringing in pages
+    // that are ready. With `steps`, one of several pictures that follow each other.
+    std::unique_ptr<BoundDrawing> draw(const py::object& scene_object,
+                                       const py::object& request_object,
+                                       const py::object& pool_object, BudgetSteps* steps,
+                                       const Stop* stop) {
+        std::unique_ptr<BoundDrawing> drawing;
+        with_input(scene_object, request_object, pool_object, [&](backend::FrameInput input) {
+            input.steps = steps;
+            input.stop = flag_of(stop);
+            drawing = frame_->draw(input);
+        });
+        // A drawing that is not done has what it is drawn from.
+        if (drawing->is_under_way())
+            drawing->keep(
+                py::make_tuple(py::cast(this), scene_object, request_object, pool_object));
+        return drawing;
     }
 
-    std::unique_ptr<BoundDrawing> draw_resident(
-        const py::object& scene_object, const py::object& pool_object, const BoundEyes& camera,
-        const SelectRule& rule, const Shade& shade, const Stop* stop, BudgetSteps* steps,
-        const std::string& shows, const py::list& cluster_colors, const BoundEyes* chooser,
-        bool is_aside) {
-        auto& pool = checked_pool(scene_object, pool_object);
-        const auto& scene = held<BoundScene>(scene_object, "scene");
-        FrameRequest request{.eyes = camera.eyes, .rule = rule, .shade = shade};
-        request.look = look_of(shows);
-        request.is_aside = is_aside;
-        if (chooser != nullptr) request.chooser = chooser->eyes;
-        request.cluster_colors = colors_of(cluster_colors, *scene.state());
-        if (backend_of(device_).traits.draws_only_plainly && !request.is_plain())
-            throw py::value_error("shows, colors, chooser, aside: expected none on a CUDA device");
-        return kept(frame_->draw({.request = request,
-                                  .scene = scene.handle(),
-                                  .state = scene.state(),
-                                  .pool = &pool.handle(),
-                                  .steps = steps,
-                                  .stop = flag_of(stop)}),
-                    scene_object, pool_object);
-    }
-
-    // (instance, cluster, weight, depth) of what is resident, or None.
-    py::object pick_resident(const py::object& scene_object, const py::object& pool_object,
-                             const BoundCamera& camera, const SelectRule& rule) {
-        require_host("pick_resident");
-        auto& pool = checked_pool(scene_object, pool_object);
-        const FrameRequest request{.eyes = camera.camera, .rule = rule, .shade = {}};
-        return picked_by(request, held<BoundScene>(scene_object, "scene"), &pool.handle());
-    }
-
-    std::unique_ptr<BoundDrawing> draw_cut(const py::object& scene_object,
-                                           const BoundCamera& camera,
-                                           const py::object& instance_ids,
-                                           const py::object& cluster_ids, const Shade& shade,
-                                           const Stop* stop, const py::object& weights) {
-        return draw_given(scene_object, camera, {}, instance_ids, cluster_ids, shade, stop, weights,
-                          FrameLook::appearance);
-    }
-
-    // As draw_cut(), with the number of gaussians that each pixel is blended of in place of depth.
-    std::unique_ptr<BoundDrawing> count_cut(const py::object& scene_object,
-                                            const BoundCamera& camera,
-                                            const py::array& instance_ids,
-                                            const py::array& cluster_ids, const Shade& shade,
-                                            const Stop* stop, const py::object& weights) {
-        require_host("count_cut");
-        return draw_given(scene_object, camera, {}, instance_ids, cluster_ids, shade, stop, weights,
-                          FrameLook::count);
-    }
-
-    // As draw_cut(), with the share of the rule's tolerance that each pair's metric takes as its
-    // colour.
-    std::unique_ptr<BoundDrawing> draw_metrics(const py::object& scene_object,
-                                               const BoundCamera& camera, const SelectRule& rule,
-                                               const py::array& instance_ids,
-                                               const py::array& cluster_ids, const Shade& shade,
-                                               const Stop* stop, const py::object& weights) {
-        require_host("draw_metrics");
-        return draw_given(scene_object, camera, rule, instance_ids, cluster_ids, shade, stop,
-                          weights, FrameLook::metrics);
+    // What the first pixel of the window shows most of, or nothing.
+    std::optional<ScenePick> pick(const py::object& scene_object, const py::object& request_object,
+                                  const py::object& pool_object) {
+        check_is_on_host(device_, "pick", "expected a frame on the CPU, got one on a CUDA device");
+        ScenePick picked{};
+        bool shows_any = false;
+        with_input(
+            scene_object, request_object, pool_object,
+            [&](const backend::FrameInput& input) { shows_any = frame_->pick(input, picked); });
+        if (!shows_any) return {};
+        return picked;
     }
 
     // Bytes of what it keeps on its device by part, and of the pool that those are of.
@@ -166,54 +167,30 @@ class BoundSceneFrame {
         return parts;
     }
 
-    // (instance, cluster, weight, depth), or None.
-    py::object pick_cut(const py::object& scene_object, const BoundCamera& camera,
-                        const py::array& instance_ids, const py::array& cluster_ids) {
-        require_host("pick_cut");
-        const auto& scene = checked(scene_object);
-        FrameRequest request{.eyes = camera.camera, .rule = {}, .shade = {}};
-        request.cut = given_cut(instance_ids, cluster_ids, py::none());
-        return picked_by(request, scene, nullptr);
-    }
-
   private:
-    std::unique_ptr<BoundDrawing> draw_given(const py::object& scene_object,
-                                             const BoundCamera& camera, const SelectRule& rule,
-                                             const py::object& instance_ids,
-                                             const py::object& cluster_ids, const Shade& shade,
-                                             const Stop* stop, const py::object& weights,
-                                             FrameLook look) {
-        const auto& scene = checked(scene_object);
-        FrameRequest request{.eyes = camera.camera, .rule = rule, .shade = shade, .look = look};
-        request.cut = given_cut(instance_ids, cluster_ids, weights);
-        return kept(frame_->draw({.request = request,
-                                  .scene = scene.handle(),
-                                  .state = scene.state(),
-                                  .pool = nullptr,
-                                  .steps = nullptr,
-                                  .stop = flag_of(stop)}),
-                    scene_object, py::make_tuple(instance_ids, cluster_ids, weights));
-    }
-
-    py::object picked_by(const FrameRequest& request, const BoundScene& scene,
-                         backend::Pool* pool) {
-        ScenePick picked{};
-        const bool shows_any = frame_->pick({.request = request,
-                                             .scene = scene.handle(),
-                                             .state = scene.state(),
-                                             .pool = pool,
-                                             .steps = nullptr,
-                                             .stop = nullptr},
-                                            picked);
-        if (!shows_any) return py::none();
-        return py::make_tuple(picked.instance, picked.cluster, picked.weight, picked.depth);
-    }
-
-    // A drawing that is not done has what it is drawn from.
-    std::unique_ptr<BoundDrawing> kept(std::unique_ptr<BoundDrawing> drawing,
-                                       const py::object& scene, const py::object& others) const {
-        if (drawing->is_under_way()) drawing->keep(py::make_tuple(py::cast(this), scene, others));
-        return drawing;
+    // Calls body() with a request after checks that all belong together.
+    template <class Body>
+    void with_input(const py::object& scene_object, const py::object& request_object,
+                    const py::object& pool_object, const Body& body) const {
+        const bool has_pool = !pool_object.is_none();
+        BoundPool* const pool = has_pool ? &checked_pool(scene_object, pool_object) : nullptr;
+        const BoundScene& scene =
+            has_pool ? held<BoundScene>(scene_object, "scene") : checked(scene_object);
+        const auto& bound = held<BoundRequest>(request_object, "request");
+        const std::shared_ptr<const SceneState> state = scene.state();
+        std::optional<FrameRequest> completed;
+        if (!bound.is_complete()) completed = bound.completed(device_, *state);
+        const FrameRequest& request = completed ? *completed : bound.plain;
+        if (has_pool && request.cut)
+            throw py::value_error("cut: expected none for a pool, which has its own, got one");
+        if (backend_of(device_).traits.draws_only_plainly && !request.is_plain())
+            throw py::value_error("shows, colors, chooser, aside: expected none on a CUDA device");
+        body(backend::FrameInput{.request = request,
+                                 .scene = scene.handle(),
+                                 .state = state,
+                                 .pool = has_pool ? &pool->handle() : nullptr,
+                                 .steps = nullptr,
+                                 .stop = nullptr});
     }
 
     BoundPool& checked_pool(const py::object& scene_object, const py::object& pool_object) const {
@@ -223,17 +200,6 @@ class BoundSceneFrame {
             throw py::value_error("scene, pool: expected them on the frame's device");
         pool.check_scene(*scene.state());
         return pool;
-    }
-
-    // Weights are of 0 to 1, or None where all are 1.
-    GivenCut given_cut(const py::handle& instance_ids, const py::handle& cluster_ids,
-                       const py::handle& weights) const {
-        GivenCut given{span_on<const int32_t>(device_, instance_ids, "instance_ids", {-1}), {}, {}};
-        const auto size = static_cast<py::ssize_t>(given.instance.size);
-        given.cluster = span_on<const int32_t>(device_, cluster_ids, "cluster_ids", {size});
-        if (!weights.is_none())
-            given.weight = span_on<const float>(device_, weights, "weights", {size});
-        return given;
     }
 
     const BoundScene& checked(const py::object& scene_object) const {
@@ -252,10 +218,6 @@ class BoundSceneFrame {
         if (device != device_)
             throw py::value_error(std::string(name) +
                                   ": expected what is on the frame's device, got others");
-    }
-
-    void require_host(const char* name) const {
-        check_is_on_host(device_, name, "expected a frame on the CPU, got one on a CUDA device");
     }
 
     Device device_;
@@ -323,29 +285,33 @@ void bind_frame(py::module_& m) {
                                "Of two eyes: what the right one sees.")
         .def("finish", &BoundDrawing::finish, py::return_value_policy::copy,
              "Waits for the picture.");
+    py::class_<BoundGivenCut>(m, "GivenCut", "A cut that was selected before; borrows the arrays.")
+        .def(py::init([](const py::object& instance_ids, const py::object& cluster_ids,
+                         const py::object& weights) {
+                 return BoundGivenCut{
+                     .instance_ids = instance_ids, .cluster_ids = cluster_ids, .weights = weights};
+             }),
+             "instance_ids"_a, "cluster_ids"_a, "weights"_a = py::none());
+    py::class_<BoundRequest>(m, "FrameRequest", "One picture that is asked of a frame.")
+        .def(py::init<const py::object&, const SelectRule*, const Shade*, const BoundGivenCut*,
+                      const std::string&, const py::list&, const BoundEyes*, bool>(),
+             "camera"_a, "rule"_a = nullptr, "shade"_a = nullptr, "cut"_a = nullptr,
+             "shows"_a = "appearance", "colors"_a = py::list(), "chooser"_a = nullptr,
+             "aside"_a = false);
+    py::class_<ScenePick>(m, "Pick", "The gaussian that a pixel shows most of.")
+        .def_readonly("instance", &ScenePick::instance)
+        .def_readonly("cluster", &ScenePick::cluster)
+        .def_readonly("weight", &ScenePick::weight)
+        .def_readonly("depth", &ScenePick::depth);
     py::class_<BoundSceneFrame>(m, "SceneFrame", "Draws scenes of the same bundles on one device.")
         .def(py::init<int>(), "device"_a)
         .def("set_models", &BoundSceneFrame::set_models, "models"_a, "palettes"_a)
-        .def("draw", &BoundSceneFrame::draw, "scene"_a, "camera"_a, "rule"_a, "shade"_a,
-             "stop"_a = nullptr, "steps"_a = nullptr)
-        .def("draw_resident", &BoundSceneFrame::draw_resident, "scene"_a, "pool"_a, "camera"_a,
-             "rule"_a, "shade"_a, "stop"_a = nullptr, "steps"_a = nullptr, py::kw_only(),
-             "shows"_a = "appearance", "colors"_a = py::list(), "chooser"_a = nullptr,
-             "aside"_a = false)
-        .def("pick_resident", &BoundSceneFrame::pick_resident, "scene"_a, "pool"_a, "camera"_a,
-             "rule"_a)
-        .def("draw_cut", &BoundSceneFrame::draw_cut, "scene"_a, "camera"_a, "instance_ids"_a,
-             "cluster_ids"_a, "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
-        .def("count_cut", &BoundSceneFrame::count_cut, "scene"_a, "camera"_a, "instance_ids"_a,
-             "cluster_ids"_a, "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
-        .def("draw_metrics", &BoundSceneFrame::draw_metrics, "scene"_a, "camera"_a, "rule"_a,
-             "instance_ids"_a, "cluster_ids"_a, "shade"_a, "stop"_a = nullptr,
-             "weights"_a = py::none())
+        .def("draw", &BoundSceneFrame::draw, "scene"_a, "request"_a, "pool"_a = py::none(),
+             "steps"_a = nullptr, "stop"_a = nullptr)
+        .def("pick", &BoundSceneFrame::pick, "scene"_a, "request"_a, "pool"_a = py::none())
         .def("memory", &BoundSceneFrame::memory,
              "Bytes that it keeps on a CUDA device, by part; and those of the pool of all frames "
-             "there.")
-        .def("pick_cut", &BoundSceneFrame::pick_cut, "scene"_a, "camera"_a, "instance_ids"_a,
-             "cluster_ids"_a);
+             "there.");
     py::class_<BoundAssetFrame>(m, "AssetFrame",
                                 "Draws gaussians without levels on the device that they are on.")
         .def(py::init<py::object>(), "model"_a)

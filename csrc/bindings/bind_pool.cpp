@@ -20,15 +20,29 @@ constexpr unsigned kMostThreads = 16;
     throw py::error_already_set();
 }
 
+// The file of a bundle as Python has it, with the arrays that pages are found by.
+struct BoundFileSource {
+    std::string name;
+    int descriptor;
+    PageCodec codec;
+    int sh_degree;
+    py::array places, hashes;
+    py::object fetch;  // what fetches parts of the file, or None
+};
+
+PageCodec codec_of(const std::string& name) {
+    if (name == "float32") return PageCodec::float32;
+    if (name == "quantized") return PageCodec::quantized;
+    throw py::value_error("codec: expected float32 or quantized, got " + name);
+}
+
 // What a source is made of, borrowed from objects of Python.
 struct GivenSource {
-    const Rows* rows = nullptr;  // in memory; else a file:
-    std::string name;
-    int descriptor = -1, sh_degree = 0;
-    Fetch fetch;
-    PageCodec codec = PageCodec::float32;
-    Span<const int64_t> places;
-    Span<const uint8_t> hashes;
+    const Rows* rows = nullptr;             // in memory; or
+    const BoundFileSource* file = nullptr;  // in a file:
+    Fetch fetch = {};
+    Span<const int64_t> places = {};
+    Span<const uint8_t> hashes = {};
 };
 
 // The text of what was raised, which is raised no longer; with Python's lock.
@@ -73,33 +87,22 @@ Fetch fetch_by(const py::object& function) {
 }
 
 GivenSource given_source(const py::handle& source, const ClusterTable& table) {
-    GivenSource given;
-    if (py::isinstance<Rows>(source)) {
-        given.rows = &source.cast<const Rows&>();
-        return given;
-    }
-    const auto file = source.cast<py::tuple>();
-    const auto codec = file[2].cast<std::string>();
-    if (codec != "float32" && codec != "quantized")
-        throw py::value_error("codec: expected float32 or quantized, got " + codec);
-    if (codec == "quantized") given.codec = PageCodec::quantized;
-    given.name = file[0].cast<std::string>();
-    given.descriptor = file[1].cast<int>();
-    given.sh_degree = file[3].cast<int>();
-    const py::array places = file[4], hashes = file[5];
+    if (py::isinstance<Rows>(source)) return {.rows = &source.cast<const Rows&>()};
+    const auto& file = held<BoundFileSource>(source, "sources");
     const auto num_pages =
         static_cast<py::ssize_t>(table.num_clusters() > 0 ? table.num_pages() : 0);
-    given.places = span_of<const int64_t>(places, "places", {num_pages + 1});
-    given.hashes = span_of<const uint8_t>(hashes, "hashes", {num_pages, 16});
-    given.fetch = fetch_by(file[6]);
-    return given;
+    return {.file = &file,
+            .fetch = fetch_by(file.fetch),
+            .places = span_of<const int64_t>(file.places, "places", {num_pages + 1}),
+            .hashes = span_of<const uint8_t>(file.hashes, "hashes", {num_pages, 16})};
 }
 
 std::shared_ptr<const PageSource> source_of(const GivenSource& given, const ClusterTable& table) {
     if (given.rows != nullptr)
         return std::make_shared<MemoryPages>(table, given.rows->read<float>());
-    return std::make_shared<FilePages>(table, given.sh_degree, given.codec, given.name,
-                                       given.descriptor, given.places, given.hashes, given.fetch);
+    const BoundFileSource& file = *given.file;
+    return std::make_shared<FilePages>(table, file.sh_degree, file.codec, file.name,
+                                       file.descriptor, given.places, given.hashes, given.fetch);
 }
 
 py::array_t<bool> resident_pages(BoundPool& pool, size_t bundle) {
@@ -210,6 +213,20 @@ void bind_pool(py::module_& m) {
                                [](const SettlingStep& step) { return step.noted.is_decided; })
         .def_property_readonly("num_absent",
                                [](const SettlingStep& step) { return step.noted.num_absent; });
+    py::class_<BoundFileSource>(m, "FileSource", "The file that pages of a bundle are in.")
+        .def(py::init([](const std::string& name, int descriptor, const std::string& codec,
+                         int sh_degree, const py::array& places, const py::array& hashes,
+                         const py::object& fetch) {
+                 return BoundFileSource{.name = name,
+                                        .descriptor = descriptor,
+                                        .codec = codec_of(codec),
+                                        .sh_degree = sh_degree,
+                                        .places = places,
+                                        .hashes = hashes,
+                                        .fetch = fetch};
+             }),
+             py::kw_only(), "name"_a, "descriptor"_a, "codec"_a, "sh_degree"_a, "places"_a,
+             "hashes"_a, "fetch"_a = py::none());
     py::class_<BoundPool>(m, "PagePool",
                           "Pages of bundles in a fixed amount of memory of one device.")
         .def(py::init<py::list, py::list, int, size_t, unsigned>(), "tables"_a, "sources"_a,

@@ -7,38 +7,51 @@ namespace v3dg {
 
 namespace {
 
-py::object counts_of(const std::optional<RenderCounts>& counts) {
-    if (!counts) return py::none();
-    return py::dict("in_frustum"_a = counts->in_frustum, "records"_a = counts->records,
-                    "entries"_a = counts->entries, "project_seconds"_a = counts->project_seconds,
-                    "bin_seconds"_a = counts->bin_seconds,
-                    "rasterize_seconds"_a = counts->rasterize_seconds);
-}
+// A picture as Python has it: the tape is an object of its own.
+struct BoundRasterized {
+    py::object color, alpha, depth;
+    std::optional<RenderCounts> counts;
+    py::object tape;
+};
+
+// Where gaussians lie on the image.
+struct BoundEllipses {
+    py::object centers, depths, conics, opacities, radii;
+};
 
 template <class T>
-py::tuple ellipses_of(const Rows& gaussians, const Camera& camera, double filter_px2,
-                      bool antialiased, double far_depth, double min_radius_px) {
+BoundEllipses ellipses_of(const Rows& gaussians, const Camera& camera, double filter_px2,
+                          bool antialiased, double far_depth, double min_radius_px) {
     const Work work(gaussians.device());
     const auto n = static_cast<py::ssize_t>(gaussians.size());
     const NewArray<T> centers(work.device(), {n, 2}), depths(work.device(), {n}),
         conics(work.device(), {n, 3}), opacities(work.device(), {n});
     const NewArray<int32_t> radii(work.device(), {n, 2});
-    const Ellipses<T> out{centers.span.data, depths.span.data, conics.span.data,
-                          opacities.span.data, radii.span.data};
-    const EllipsesInput<T> in{gaussians.read<T>(),   view_of_world<T>(camera),
-                              pinhole_of<T>(camera), T(filter_px2),
-                              antialiased,           T(far_depth),
-                              T(min_radius_px)};
+    const Ellipses<T> out{.centers = centers.span.data,
+                          .depths = depths.span.data,
+                          .conics = conics.span.data,
+                          .opacities = opacities.span.data,
+                          .radii = radii.span.data};
+    const EllipsesInput<T> in{.rows = gaussians.read<T>(),
+                              .view = view_of_world<T>(camera),
+                              .camera = pinhole_of<T>(camera),
+                              .filter_px2 = T(filter_px2),
+                              .antialiased = antialiased,
+                              .far_depth = T(far_depth),
+                              .min_radius_px = T(min_radius_px)};
     {
         const Unlocked unlocked;
         work.backend().ellipses(in, out, work);
     }
-    return py::make_tuple(centers.object, depths.object, conics.object, opacities.object,
-                          radii.object);
+    return {.centers = centers.object,
+            .depths = depths.object,
+            .conics = conics.object,
+            .opacities = opacities.object,
+            .radii = radii.object};
 }
 
-py::tuple ellipses(const Rows& gaussians, const BoundCamera& camera, double filter_px2,
-                   bool antialiased, double far_depth, double min_radius_px) {
+BoundEllipses ellipses(const Rows& gaussians, const BoundCamera& camera, double filter_px2,
+                       bool antialiased, double far_depth, double min_radius_px) {
     return gaussians.is_double() ? ellipses_of<double>(gaussians, camera.camera, filter_px2,
                                                        antialiased, far_depth, min_radius_px)
                                  : ellipses_of<float>(gaussians, camera.camera, filter_px2,
@@ -52,13 +65,43 @@ Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const Dra
     if (look.plain_colors && gaussians.sh_degree() != 0)
         throw py::value_error("sh: expected shape (N, 1, 3) for plain colours, got degree " +
                               std::to_string(gaussians.sh_degree()));
-    return backend_of(gaussians.device())
-        .rasterize(gaussians, camera, look, with_depth, keep_tape);
+    return backend_of(gaussians.device()).rasterize(gaussians, camera, look, with_depth, keep_tape);
 }
 
 void bind_rasterize(py::module_& m) {
     py::class_<Tape>(m, "Tape",
                      "What rasterize leaves for rasterize_backward; it keeps the gaussians.");
+    py::class_<RenderCounts>(m, "RenderCounts", "What a picture came to on the host.")
+        .def_readonly("in_frustum", &RenderCounts::in_frustum)
+        .def_readonly("records", &RenderCounts::records)
+        .def_readonly("entries", &RenderCounts::entries)
+        .def_readonly("project_seconds", &RenderCounts::project_seconds)
+        .def_readonly("bin_seconds", &RenderCounts::bin_seconds)
+        .def_readonly("rasterize_seconds", &RenderCounts::rasterize_seconds);
+    py::class_<BoundRasterized>(m, "Rasterized", "A picture of gaussians without levels.")
+        .def_readonly("color", &BoundRasterized::color, "(H, W, 3).")
+        .def_readonly("alpha", &BoundRasterized::alpha, "(H, W).")
+        .def_readonly("depth", &BoundRasterized::depth, "(H, W), or None.")
+        .def_readonly("counts", &BoundRasterized::counts, "None where a device drew it.")
+        .def_readonly("tape", &BoundRasterized::tape, "None where it is not kept.");
+    py::class_<Gradients>(m, "Gradients", "Gradients of a picture, by what it was drawn of.")
+        .def_readonly("means", &Gradients::means)
+        .def_readonly("quats", &Gradients::quats)
+        .def_readonly("scales", &Gradients::scales)
+        .def_readonly("opacities", &Gradients::opacities)
+        .def_readonly("sh", &Gradients::sh)
+        .def_readonly("background", &Gradients::background)
+        .def_readonly("centers", &Gradients::centers,
+                      "(N, 2), by the centres on the image, or None.")
+        .def_readonly("center_sizes", &Gradients::center_sizes,
+                      "(N, 2), the sum of absolute values of each pixel's share, or None.");
+    py::class_<BoundEllipses>(m, "Ellipses",
+                              "Gaussians on an image; zeros for those that are not in sight.")
+        .def_readonly("centers", &BoundEllipses::centers, "(N, 2), px.")
+        .def_readonly("depths", &BoundEllipses::depths, "(N,).")
+        .def_readonly("conics", &BoundEllipses::conics, "(N, 3).")
+        .def_readonly("opacities", &BoundEllipses::opacities, "(N,).")
+        .def_readonly("radii", &BoundEllipses::radii, "(N, 2) int32, px.");
     m.def(
         "rasterize",
         [](const Rows& gaussians, const BoundCamera& camera, double filter_px2, bool antialiased,
@@ -69,34 +112,27 @@ void bind_rasterize(py::module_& m) {
                                 .background = background,
                                 .plain_colors = plain_colors};
             Rasterized made = rasterize(gaussians, camera, look, with_depth, keep_tape);
-            return py::make_tuple(made.color, made.alpha, made.depth, counts_of(made.counts),
-                                  py::cast(std::move(made.tape)));
+            return BoundRasterized{.color = made.color,
+                                   .alpha = made.alpha,
+                                   .depth = made.depth,
+                                   .counts = made.counts,
+                                   .tape = py::cast(std::move(made.tape))};
         },
         "gaussians"_a, "camera"_a, py::kw_only(), "filter_px2"_a, "antialiased"_a, "background"_a,
         "with_depth"_a, "keep_tape"_a, "plain_colors"_a = false,
-        "Draws gaussians where they are and in the precision that they have: (color, alpha, depth "
-        "or None, "
-        "on "
-        "the host counts and times, the tape or None).");
+        "Draws gaussians where they are and in the precision that they have.");
     m.def(
         "rasterize_backward",
         [](Tape& tape, const py::object& d_color, const py::object& d_alpha,
            const py::object& d_depth, bool with_centers, bool with_sizes) {
-            const Gradients made =
-                tape.backward(d_color, d_alpha, d_depth, {with_centers, with_sizes});
-            return py::make_tuple(made.means, made.quats, made.scales, made.opacities, made.sh,
-                                  made.background, made.centers, made.center_sizes);
+            return tape.backward(d_color, d_alpha, d_depth,
+                                 {.sum = with_centers, .size = with_sizes});
         },
         "tape"_a, "d_color"_a, "d_alpha"_a, "d_depth"_a, "with_centers"_a = false,
         "with_sizes"_a = false,
-        "Gradients of means, quats, scales, opacities, sh and background; by the gaussians' "
-        "centres on the "
-        "image their sum and the sum of their sizes, where they are wanted.");
+        "Goes back from the gradients of a picture to those of what it was drawn of.");
     m.def("ellipses", &ellipses, "gaussians"_a, "camera"_a, py::kw_only(), "filter_px2"_a,
-          "antialiased"_a, "far_depth"_a, "min_radius_px"_a,
-          "Where gaussians lie on the image: centres, depths, conics, opacities, radii; zeros for "
-          "those that "
-          "are not in sight.");
+          "antialiased"_a, "far_depth"_a, "min_radius_px"_a, "Where gaussians lie on the image.");
 }
 
 }  // namespace v3dg

@@ -78,9 +78,9 @@ void check_is_on(Device device, const void* memory, const char* name) {
     if (cudaPointerGetAttributes(&attributes, memory) != cudaSuccess)
         cudaGetLastError();
     else if (attributes.type == cudaMemoryTypeDevice && attributes.device != device.number)
-        refuse_value(name, "expected an array on cuda:" + std::to_string(device.number) +
-                               " like the others, got one on cuda:" +
-                               std::to_string(attributes.device));
+        refuse_value(name,
+                     "expected an array on cuda:" + std::to_string(device.number) +
+                         " like the others, got one on cuda:" + std::to_string(attributes.device));
 }
 
 class BackendTarget final : public backend::Target {
@@ -158,8 +158,7 @@ class CudaBackend final : public Backend {
         } catch (py::error_already_set& error) {
             const py::str kind(error.type().attr("__name__"));
             if (kind.cast<std::string>() != "OutOfMemoryError") throw;
-            PyErr_SetString(PyExc_MemoryError,
-                            py::str(error.value()).cast<std::string>().c_str());
+            PyErr_SetString(PyExc_MemoryError, py::str(error.value()).cast<std::string>().c_str());
             throw py::error_already_set();
         }
     }
@@ -223,8 +222,8 @@ class CudaBackend final : public Backend {
         throw std::invalid_argument("gaussians: float64 is computed on the CPU only");
     }
     void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& gaussians,
-                    const CutPictures& pictures, const SeenOfGaussians& seen,
-                    FitProgress& progress, const Work& work) const override {
+                    const CutPictures& pictures, const SeenOfGaussians& seen, FitProgress& progress,
+                    const Work& work) const override {
         cuda::weigh_cuts(config, gaussians, pictures, seen, progress, stream_of(work));
     }
 

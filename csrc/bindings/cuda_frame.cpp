@@ -15,8 +15,7 @@ namespace {
 class BackendModel final : public backend::Model {
   public:
     BackendModel(const Rows& rows, const Work& work) : rows_(rows) {
-        on_device_.packed =
-            std::make_shared<PackedModel>(rows.read<float>(), stream_of(work));
+        on_device_.packed = std::make_shared<PackedModel>(rows.read<float>(), stream_of(work));
     }
     BackendModel(const CodedPages& pages, const Work& work) {
         const Unlocked unlocked;
@@ -143,7 +142,8 @@ class EnqueuedDrawing final : public BoundDrawing {
         if (pages_ != nullptr) pages_->note_frames(stream_of(work));
         const FrameTimes times = drawing_->times();
         const bool exceeds = counters.choice.exceeds_budget;
-        const auto selected = exceeds ? counters.choice.least : counters.gaussians / pictures_.size();
+        const auto selected =
+            exceeds ? counters.choice.least : counters.gaussians / pictures_.size();
         stats_ = {.gaussians = static_cast<int64_t>(selected),
                   .in_frustum = counters.in_frustum,
                   .records = counters.records,
@@ -221,9 +221,8 @@ class BackendFrame final : public backend::Frame {
         const Turn turn(*turns_);
         const FrameRequest& request = input.request;
         if (request.cut) return enqueue(input, request.rule);
-        return in_steps(
-            input.steps, request.rule, request.choosing_eyes(), input.state,
-            [&](const SelectRule& paced, uint32_t*) { return enqueue(input, paced); });
+        return in_steps(input.steps, request.rule, request.choosing_eyes(), input.state,
+                        [&](const SelectRule& paced, uint32_t*) { return enqueue(input, paced); });
     }
 
     bool pick(const backend::FrameInput&, ScenePick&) override {
@@ -397,21 +396,19 @@ Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const Dra
     const Device device = gaussians.device();
     const Work work(device);
     NewPicture made({0, 0, camera.width(), camera.height()}, with_depth);
-    const ModelPicture in{
-        .rows = look.read<float>(gaussians),
-        .view = view_of_world<float>(camera.camera),
-        .filter_px2 = static_cast<float>(look.filter_px2),
-        .antialiased = look.antialiased,
-        .image = image_of(camera.camera, Shade{.background = look.background},
-                          planes_of(made, device))};
+    const ModelPicture in{.rows = look.read<float>(gaussians),
+                          .view = view_of_world<float>(camera.camera),
+                          .filter_px2 = static_cast<float>(look.filter_px2),
+                          .antialiased = look.antialiased,
+                          .image = image_of(camera.camera, Shade{.background = look.background},
+                                            planes_of(made, device))};
     std::unique_ptr<DifferentiableFrame> frame;
     {
         const Unlocked unlocked;
         frame = take_frame();
         frame->draw(in, stream_of(work));
     }
-    auto tape =
-        std::make_unique<DeviceTape>(gaussians, std::move(frame), made.height, made.width);
+    auto tape = std::make_unique<DeviceTape>(gaussians, std::move(frame), made.height, made.width);
     return {.color = made.color,
             .alpha = made.alpha,
             .depth = made.depth,

@@ -195,10 +195,10 @@ class HostFrame final : public backend::Frame {
         const FrameRequest& request = input.request;
         bool shows_any = false;
         with_scene(input, request.rule, PoolFrame::aside, nullptr,
-                       [&](const HostScene& scene, const SelectRule& rule) {
-                           shows_any = cpu::pick_scene(scene, request, rule, picked);
-                           return rule.tolerance_px2;
-                       });
+                   [&](const HostScene& scene, const SelectRule& rule) {
+                       shows_any = cpu::pick_scene(scene, request, rule, picked);
+                       return rule.tolerance_px2;
+                   });
         return shows_any;
     }
 
@@ -229,15 +229,14 @@ class HostFrame final : public backend::Frame {
             auto& pool = static_cast<HostPool&>(*input.pool);
             const std::vector<SceneModel> models = pool.models(state, input.request);
             const Unlocked unlocked;
-            pool.frame(state, rule, kind,
-                       [&](auto tables, const SelectRule& raised, auto needs) {
-                           return body(HostScene{.tables = tables,
-                                                 .models = {models.data(), models.size()},
-                                                 .instances = state.instances,
-                                                 .needs = needs,
-                                                 .last_bin = last_bin},
-                                       raised);
-                       });
+            pool.frame(state, rule, kind, [&](auto tables, const SelectRule& raised, auto needs) {
+                return body(HostScene{.tables = tables,
+                                      .models = {models.data(), models.size()},
+                                      .instances = state.instances,
+                                      .needs = needs,
+                                      .last_bin = last_bin},
+                            raised);
+            });
             return;
         }
         const std::shared_ptr<const HostModels> kept = models_;
@@ -265,8 +264,7 @@ class HostAssetFrame final : public backend::AssetFrame {
         SceneFrameCounts counts;
         {
             const Unlocked unlocked;
-            counts =
-                cpu::draw_model(*model.planes(), model.size(), camera, out.pictures[0], stop);
+            counts = cpu::draw_model(*model.planes(), model.size(), camera, out.pictures[0], stop);
         }
         return std::make_unique<BoundDrawing>(std::move(out.made), stats_of(counts));
     }

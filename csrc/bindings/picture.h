@@ -17,7 +17,9 @@ struct NewPicture {
     bool with_depth;
 
     NewPicture(const Window& window, bool with_depth)
-        : height(window.height()), width(window.width()), depth(py::none()),
+        : height(window.height()),
+          width(window.width()),
+          depth(py::none()),
           with_depth(with_depth) {}
 
     // Gives the planes their memory.
@@ -28,9 +30,8 @@ struct NewPicture {
         color = color_plane.object;
         alpha = alpha_plane.object;
         if (!with_depth)
-            return {.color = color_plane.span.data,
-                    .alpha = alpha_plane.span.data,
-                    .depth = nullptr};
+            return {
+                .color = color_plane.span.data, .alpha = alpha_plane.span.data, .depth = nullptr};
         const NewArray<T> depth_plane(device, {height, width});
         depth = depth_plane.object;
         return {.color = color_plane.span.data,

@@ -11,9 +11,8 @@ namespace v3dg {
 
 class BoundPool {
   public:
-    // `sources` has for each table either the arrays of gaussians in memory, or the file of the
-    // bundle: its name, descriptor, codec, SH degree, places (P+1,), hashes (P, 16), and what
-    // fetches parts of it, or None.
+    // `sources` has for each table either the arrays of gaussians in memory (Rows), or the file of
+    // the bundle (FileSource).
     BoundPool(const py::list& tables, const py::list& sources, int device, size_t num_bytes,
               unsigned num_threads);
     ~BoundPool();

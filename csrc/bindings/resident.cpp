@@ -113,7 +113,8 @@ BoundCut BoundScene::select(const BoundEyes& camera, const SelectRule& rule, Bud
 }
 
 py::list BoundScene::page_needs(const BoundCamera& camera, const SelectRule& rule) const {
-    check_is_on_host(device_, "page_needs", "expected a scene on the CPU, got one on a CUDA device");
+    check_is_on_host(device_, "page_needs",
+                     "expected a scene on the CPU, got one on a CUDA device");
     const std::shared_ptr<const SceneState> state = state_;
     py::list priorities;
     std::vector<Span<uint32_t>> needs;

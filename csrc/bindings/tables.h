@@ -11,9 +11,7 @@
 
 namespace v3dg {
 
-namespace backend {
-class Tables;
-}
+namespace backend { class Tables; }
 
 // The tables of one bundle with the arrays that they borrow from.
 class BoundTable {

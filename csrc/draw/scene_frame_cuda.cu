@@ -1,3 +1,5 @@
+// Frames of a scene on a CUDA device: which cut writes the items, and of which models the batch is.
+
 #include "draw/scene_frame_cuda.h"
 
 #include <algorithm>
@@ -151,7 +153,7 @@ std::unique_ptr<Drawing> SceneFrame::draw_selected(const SceneTables& scene, con
                                                    const Frame::Place& place) {
     return frame_.draw(
         batch(scene, pictures, rule, stream),
-        [=, &scene, next = rule](const ItemList& items, cudaStream_t on) mutable {
+        [=, this, &scene, next = rule](const ItemList& items, cudaStream_t on) mutable {
             cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items,
                            on);
             next = drawn_again(next);
@@ -173,7 +175,7 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
     of_pages.guards_models = &pages.mutex();
     return frame_.draw(
         of_pages,
-        [=, &scene, &pages](const ItemList& items, cudaStream_t on) mutable {
+        [=, this, &scene, &pages](const ItemList& items, cudaStream_t on) mutable {
             cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items,
                            on, &resident);
             next = drawn_again(next);
@@ -191,7 +193,7 @@ std::unique_ptr<Drawing> SceneFrame::draw_given(const SceneTables& scene, const 
     of_cut.has_faded_items = given.weight.size > 0;
     return frame_.draw(
         of_cut,
-        [=, &scene](const ItemList& items, cudaStream_t on) {
+        [=, this, &scene](const ItemList& items, cudaStream_t on) {
             cut_.given_items(scene, camera, given, pictures.image[0], images_.data(),
                              placements_.data(), items, on);
         },

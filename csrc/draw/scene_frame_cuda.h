@@ -1,7 +1,7 @@
 #pragma once
 
-// Frames of a scene on a CUDA device: a request in, an enqueued drawing out; and the models that they
-// draw.
+// Frames of a scene on a CUDA device: a request in, an enqueued drawing out; and the models that
+// they draw.
 
 #include "draw/device_pages.h"
 #include "draw/frame_cuda.h"
@@ -80,12 +80,12 @@ class SceneFrame {
                     std::vector<std::shared_ptr<const DevicePalette>> palettes,
                     cudaStream_t stream);
 
-    // Draws what is asked for, plainly (FrameRequest::is_plain), into `pictures`; `place` says where
-    // they are. With `pages`, what is resident of the bundles of a pool, with what comes in before.
-    // `rule` is the one of the request, as the pacing of a budget has changed it, and becomes the
-    // one that is used. What is drawn stays until the drawing is finished: the scene, the pool, and
-    // a given cut, which is on the device and has one picture. A frame that is drawn again has the
-    // pages that are there by then.
+    // Draws what is asked for, plainly (FrameRequest::is_plain), into `pictures`; `place` says
+    // where they are. With `pages`, what is resident of the bundles of a pool, with what comes in
+    // before. `rule` is the one of the request, as the pacing of a budget has changed it, and
+    // becomes the one that is used. What is drawn stays until the drawing is finished: the scene,
+    // the pool, and a given cut, which is on the device and has one picture. A frame that is drawn
+    // again has the pages that are there by then.
     std::unique_ptr<Drawing> draw(const SceneTables& scene, DevicePages* pages,
                                   const FrameRequest& request, SelectRule& rule,
                                   const EyeImages& pictures, cudaStream_t stream,

@@ -287,7 +287,7 @@ class Bundle:
         return not isinstance(self._pages, FilePages)
 
     @property
-    def page_source(self) -> Any:
+    def page_source(self) -> _core.Rows | _core.FileSource:
         """The source of single pages for the core: the file, or all gaussians if they
         are in memory."""
         if self._file is None or isinstance(self._pages, MemoryPages):

@@ -8,8 +8,7 @@ of them; what the tables mean is checked by `v3dg.bundle.tables`.
 import os
 import re
 import weakref
-from collections.abc import Callable, Iterable
-from typing import Any, NoReturn, TypeAlias
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,18 +37,6 @@ _FIRST_BYTES = 4096  # of the header: what a disk writes at once
 # gaussians have less.
 _MOST_FETCHED_TABLE_BYTES = 1 << 30
 _FREE_CLUSTERS = 1 << 18  # that may all be empty; others have a gaussian each
-
-_PageSource: TypeAlias = tuple[
-    str,
-    int,
-    str,
-    int,
-    NDArray[np.int64],
-    NDArray[np.generic],
-    Callable[[Iterable[tuple[int, int]]], None] | None,
-]
-"""The tuple that the core reads pages with: name, descriptor, codec, SH degree, places,
-hashes, fetch."""
 
 
 class BundlePlan:
@@ -127,7 +114,7 @@ def read_pages(
     hashes."""
     result = codec.empty(run.rows.stop - run.rows.start)
     _core.read_pages(
-        os.fspath(path), descriptor, result.rows, codec.name, hashes[: len(run)], **vars(run)
+        os.fspath(path), descriptor, result.rows, codec.name, hashes[: len(run)], run.core
     )
     return result
 
@@ -328,19 +315,19 @@ class BundleFile:
         return self._data_start + np.append(self.tables["pages.offset"], self.pages_bytes)
 
     @property
-    def source(self) -> _PageSource:
+    def source(self) -> _core.FileSource:
         """The source of pages for the core."""
         fetch = None
         if self._at_url is not None:
             fetch = self._at_url.fetch
-        return (
-            self.path,
-            self._fd,
-            self.codec.name,
-            self.codec.sh_degree,
-            self.places,
-            self.tables["pages.hash"],
-            fetch,
+        return _core.FileSource(
+            name=self.path,
+            descriptor=self._fd,
+            codec=self.codec.name,
+            sh_degree=self.codec.sh_degree,
+            places=self.places,
+            hashes=self.tables["pages.hash"],
+            fetch=fetch,
         )
 
     def read(self, run: PageRun, out: _core.Rows | NDArray[np.int32]) -> None:
@@ -348,7 +335,7 @@ class BundleFile:
         pages; verified."""
         self._fetch(*run.places[[0, -1]])
         hashes = self.tables["pages.hash"][run.first_page :][: len(run)]
-        _core.read_pages(self.path, self._fd, out, self.codec.name, hashes, **vars(run))
+        _core.read_pages(self.path, self._fd, out, self.codec.name, hashes, run.core)
 
 
 def _only_side(entry: object) -> int | None:
