@@ -1,6 +1,6 @@
 """Types of the compiled module."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from os import PathLike
 from typing import Any, Literal, TypeAlias, overload
 
@@ -163,17 +163,15 @@ def decode_page(page: Int32, offset: Int64, out: Rows) -> None: ...
 DAMAGED: str
 HASH_PIECE_BYTES: int
 
+class PageRun:
+    """Neighbouring pages of a file; borrows the arrays."""
+
+    def __init__(
+        self, *, first_page: int, first_cluster: Int64, offset: Int64, places: Int64
+    ) -> None: ...
+
 def read_pages(
-    path: str,
-    descriptor: int,
-    out: Rows | Int32,
-    codec: str,
-    hashes: Uint8,
-    *,
-    first_page: int,
-    first_cluster: Int64,
-    offset: Int64,
-    places: Int64,
+    path: str, descriptor: int, out: Rows | Int32, codec: str, hashes: Uint8, run: PageRun
 ) -> None: ...
 def blake2b(messages: Sequence[Uint8]) -> list[bytes]: ...
 
@@ -261,8 +259,91 @@ def group_metrics(
 class Tape:
     """What rasterize leaves for rasterize_backward; it keeps the gaussians."""
 
-# Colour, alpha, depth where it is wanted, counts and times where it was the host that
-# drew, the tape where it is to be kept.
+class RenderCounts:
+    """What a picture came to on the host."""
+
+    @property
+    def in_frustum(self) -> int: ...
+    @property
+    def records(self) -> int: ...
+    @property
+    def entries(self) -> int: ...
+    @property
+    def project_seconds(self) -> float: ...
+    @property
+    def bin_seconds(self) -> float: ...
+    @property
+    def rasterize_seconds(self) -> float: ...
+
+class Rasterized:
+    """A picture of gaussians without levels.
+
+    Attributes:
+        color: (H, W, 3).
+        alpha: (H, W).
+        depth: (H, W), or None.
+        counts: None where a device drew it.
+        tape: None where it is not kept.
+    """
+
+    @property
+    def color(self) -> Array: ...
+    @property
+    def alpha(self) -> Array: ...
+    @property
+    def depth(self) -> Array | None: ...
+    @property
+    def counts(self) -> RenderCounts | None: ...
+    @property
+    def tape(self) -> Tape | None: ...
+
+class Gradients:
+    """Gradients of a picture, by what it was drawn of.
+
+    Attributes:
+        centers: (N, 2), by the centres on the image, or None.
+        center_sizes: (N, 2), the sum of absolute values of each pixel's share, or None.
+    """
+
+    @property
+    def means(self) -> Array: ...
+    @property
+    def quats(self) -> Array: ...
+    @property
+    def scales(self) -> Array: ...
+    @property
+    def opacities(self) -> Array: ...
+    @property
+    def sh(self) -> Array: ...
+    @property
+    def background(self) -> Array: ...
+    @property
+    def centers(self) -> Array | None: ...
+    @property
+    def center_sizes(self) -> Array | None: ...
+
+class Ellipses:
+    """Gaussians on an image; zeros for those that are not in sight.
+
+    Attributes:
+        centers: (N, 2), px.
+        depths: (N,).
+        conics: (N, 3).
+        opacities: (N,).
+        radii: (N, 2) int32, px.
+    """
+
+    @property
+    def centers(self) -> Array: ...
+    @property
+    def depths(self) -> Array: ...
+    @property
+    def conics(self) -> Array: ...
+    @property
+    def opacities(self) -> Array: ...
+    @property
+    def radii(self) -> Array: ...
+
 def rasterize(
     gaussians: Rows,
     camera: Camera,
@@ -273,10 +354,7 @@ def rasterize(
     with_depth: bool,
     keep_tape: bool,
     plain_colors: bool = ...,
-) -> tuple[Array, Array, Array | None, dict[str, float] | None, Tape | None]: ...
-
-# Gradients of the columns and of the background; of those by centres on the image the
-# sum and the sizes.
+) -> Rasterized: ...
 def rasterize_backward(
     tape: Tape,
     d_color: Array | None,
@@ -284,7 +362,7 @@ def rasterize_backward(
     d_depth: Array | None,
     with_centers: bool = ...,
     with_sizes: bool = ...,
-) -> tuple[Array, Array, Array, Array, Array, Array, Array | None, Array | None]: ...
+) -> Gradients: ...
 
 # How many times larger balls of level 1 are to be, (G, 4); and balls of each level
 # after they have grown.
@@ -299,9 +377,6 @@ def first_selected(
     level_filter_px2: float,
 ) -> Float32: ...
 def grown_balls(balls: list[Float32], growth: Float32) -> list[Float32]: ...
-
-# Centres, depths, conics, opacities and radii; zeros for gaussians that are not in
-# sight.
 def ellipses(
     gaussians: Rows,
     camera: Camera,
@@ -310,7 +385,7 @@ def ellipses(
     antialiased: bool,
     far_depth: float,
     min_radius_px: float,
-) -> tuple[Array, Array, Array, Array, Array]: ...
+) -> Ellipses: ...
 
 # scene
 class Stop:
@@ -443,13 +518,34 @@ class SettlingStep:
     @property
     def num_absent(self) -> int: ...
 
+class FileSource:
+    """The file that pages of a bundle are in.
+
+    Args:
+        places: (P+1,) first byte of each page, and the end.
+        hashes: (P, 16).
+        fetch: Called with ranges of bytes before they are read; None: all are there.
+    """
+
+    def __init__(
+        self,
+        *,
+        name: str,
+        descriptor: int,
+        codec: str,
+        sh_degree: int,
+        places: Int64,
+        hashes: Uint8,
+        fetch: Callable[[list[tuple[int, int]]], None] | None = None,
+    ) -> None: ...
+
 class PagePool:
     """Pages of bundles in a fixed amount of memory of one device."""
 
     def __init__(
         self,
         tables: list[ClusterTable],
-        sources: list[Any],
+        sources: Sequence[Rows | FileSource],
         device: int,
         num_bytes: int,
         num_threads: int,
@@ -477,73 +573,74 @@ class Shade:
         self, *, background: Sequence[float], min_transmittance: float, with_depth: bool
     ) -> None: ...
 
+class GivenCut:
+    """A cut that was selected before; borrows the arrays.
+
+    Args:
+        weights: 0 to 1; None where all are 1.
+    """
+
+    def __init__(
+        self, instance_ids: Array, cluster_ids: Array, weights: Array | None = None
+    ) -> None: ...
+
+class FrameRequest:
+    """One picture that is asked of a frame.
+
+    Args:
+        rule: What is selected; with a cut, the tolerance that metrics are compared
+            with.
+        cut: A cut that is drawn in place of what the rule selects.
+        shows: "error" shows the share of the tolerance that metrics take, "count" how
+            many gaussians a pixel is blended of, in place of depth, "residency" where
+            pages are missing; anything else, the gaussians' or palettes' own colours.
+        colors: (C, 3) of each bundle, of a pool: colours of its clusters.
+        chooser: Whom the cut is selected for.
+        aside: From a pool: what was resident for the last picture.
+    """
+
+    def __init__(
+        self,
+        camera: Camera | Eyes,
+        rule: Rule | None = None,
+        shade: Shade | None = None,
+        cut: GivenCut | None = None,
+        shows: str = "appearance",
+        colors: list[Float32] = ...,
+        chooser: Camera | Eyes | None = None,
+        aside: bool = False,
+    ) -> None: ...
+
+class Pick:
+    """The gaussian that a pixel shows most of."""
+
+    @property
+    def instance(self) -> int: ...
+    @property
+    def cluster(self) -> int: ...
+    @property
+    def weight(self) -> float: ...
+    @property
+    def depth(self) -> float: ...
+
 class SceneFrame:
-    """Draws scenes of the same bundles on one device."""
+    """Draws scenes of the same bundles on one device: the models that were set, or what
+    is resident in a pool."""
 
     def __init__(self, device: int) -> None: ...
     def set_models(self, models: list[Model], palettes: list[Palette]) -> None: ...
     def draw(
         self,
         scene: ResidentScene,
-        camera: Camera | Eyes,
-        rule: Rule,
-        shade: Shade,
-        stop: Stop | None = None,
+        request: FrameRequest,
+        pool: PagePool | None = None,
         steps: BudgetSteps | None = None,
+        stop: Stop | None = None,
     ) -> Drawing: ...
+    def pick(
+        self, scene: ResidentScene, request: FrameRequest, pool: PagePool | None = None
+    ) -> Pick | None: ...
     def memory(self) -> dict[str, int]: ...
-    def draw_resident(
-        self,
-        scene: ResidentScene,
-        pool: PagePool,
-        camera: Camera | Eyes,
-        rule: Rule,
-        shade: Shade,
-        stop: Stop | None = None,
-        steps: BudgetSteps | None = None,
-        *,
-        shows: str = "appearance",
-        colors: list[Float32] = ...,
-        chooser: Camera | Eyes | None = None,
-        aside: bool = False,
-    ) -> Drawing: ...
-    def pick_resident(
-        self, scene: ResidentScene, pool: PagePool, camera: Camera, rule: Rule
-    ) -> tuple[int, int, float, float] | None: ...
-    def draw_cut(
-        self,
-        scene: ResidentScene,
-        camera: Camera,
-        instance_ids: Array,
-        cluster_ids: Array,
-        shade: Shade,
-        stop: Stop | None = None,
-        weights: Array | None = None,
-    ) -> Drawing: ...
-    def count_cut(
-        self,
-        scene: ResidentScene,
-        camera: Camera,
-        instance_ids: Int32,
-        cluster_ids: Int32,
-        shade: Shade,
-        stop: Stop | None = None,
-        weights: Float32 | None = None,
-    ) -> Drawing: ...
-    def draw_metrics(
-        self,
-        scene: ResidentScene,
-        camera: Camera,
-        rule: Rule,
-        instance_ids: Int32,
-        cluster_ids: Int32,
-        shade: Shade,
-        stop: Stop | None = None,
-        weights: Float32 | None = None,
-    ) -> Drawing: ...
-    def pick_cut(
-        self, scene: ResidentScene, camera: Camera, instance_ids: Int32, cluster_ids: Int32
-    ) -> tuple[int, int, float, float] | None: ...
 
 class AssetFrame:
     """Draws gaussians without levels on the device that they are on."""

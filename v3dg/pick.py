@@ -87,28 +87,24 @@ def pick(
         hit = _pick_from_scene(scene, pixel, rule)
     if hit is None:
         return None
-    instance, cluster, weight, depth = hit
-    level = int(scene.bundles[scene.instance_bundle[instance]].clusters.level[cluster])
+    bundle = scene.bundles[scene.instance_bundle[hit.instance]]
+    level = int(bundle.clusters.level[hit.cluster])
     ray = np.array([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1.0])
-    position = camera.position + depth * ray @ camera.viewmat[:3, :3]
-    return Pick(instance, cluster, level, weight, depth, position)
+    position = camera.position + hit.depth * ray @ camera.viewmat[:3, :3]
+    return Pick(hit.instance, hit.cluster, level, hit.weight, hit.depth, position)
 
 
-def _pick_from_scene(
-    scene: Scene, pixel: _core.Camera, rule: _core.Rule
-) -> tuple[int, int, float, float] | None:
-    """Instance, cluster, weight and depth of what a pixel shows most of, from all
-    gaussians."""
+def _pick_from_scene(scene: Scene, pixel: _core.Camera, rule: _core.Rule) -> _core.Pick | None:
+    """What a pixel shows most of, from all gaussians."""
     resident = residency.scene(scene, CPU)
-    pairs = resident.core.select(pixel, rule)
     frame = _core.SceneFrame(CPU.number)
     residency.set_models(frame, resident.bundles, CPU, "appearance")
-    return frame.pick_cut(resident.core, pixel, pairs.instance_ids, pairs.cluster_ids)
+    return frame.pick(resident.core, _core.FrameRequest(pixel, rule))
 
 
 def _pick_from_pool(
     renderer: Renderer, scene: Scene, pixel: _core.Camera, rule: _core.Rule
-) -> tuple[int, int, float, float] | None:
+) -> _core.Pick | None:
     """As `_pick_from_scene`, from what is resident in the renderer's pool.
 
     Raises:

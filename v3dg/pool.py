@@ -3,17 +3,10 @@
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
-
-import numpy as np
-from numpy.typing import NDArray
 
 from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg.bundle import Bundle
-from v3dg.cameras import Camera
-from v3dg.false_color import ColorBy
 from v3dg.levels.memory import free_bytes
 from v3dg.residency import ResidentScene, residency
 
@@ -40,44 +33,6 @@ def chosen_bytes(bundles: Sequence[Bundle], device: Device) -> int | None:
         if num_bytes > free - min(free // 4, _RESERVE_BYTES):
             return free_on(device) // 2
     return None
-
-
-@dataclass(frozen=True)
-class PoolLook:
-    """What a picture of a pool shows, and of which cut; anything but "appearance" is
-    for the CPU alone.
-
-    Attributes:
-        shows: Colours as in `v3dg.render`; "error" shows the share of the tolerance
-            that metrics take, as grey, and "count" the number of gaussians that a pixel
-            is blended of, in place of depth.
-        chooser: The camera whose cut is drawn; None for the camera of the picture.
-        aside: Draw what was resident for the last picture, and neither bring pages in
-            nor ask for any.
-    """
-
-    shows: ColorBy | Literal["error", "count"] = "appearance"
-    chooser: Camera | None = None
-    aside: bool = False
-
-    @property
-    def core_chooser(self) -> _core.Camera | None:
-        """The chooser for the compiled operations."""
-        if self.chooser is None:
-            return None
-        return self.chooser.core
-
-    def palettes(self, bundles: Sequence[Bundle]) -> list[NDArray[np.float32]]:
-        """The colours of each bundle's clusters; none where the bundles have no colours
-        of their own."""
-        if self.shows not in ("level", "cluster"):
-            return []
-        palettes = []
-        for bundle in bundles:
-            palette = residency.palette(bundle, self.shows)
-            assert palette is not None
-            palettes.append(palette)
-        return palettes
 
 
 class Pool:

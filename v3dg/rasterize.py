@@ -66,7 +66,7 @@ def rasterize(
     background_color = color(background, "background")
     means = gaussians.means
     if isinstance(means, np.ndarray):
-        color_plane, alpha, depth, _, _ = _core.rasterize(
+        drawn = _core.rasterize(
             gaussians.rows,
             camera.core,
             filter_px2=filter_px2,
@@ -75,7 +75,7 @@ def rasterize(
             with_depth=True,
             keep_tape=False,
         )
-        return Image(color_plane, alpha, depth)
+        return Image(drawn.color, drawn.alpha, drawn.depth)
     import torch
 
     check_device(means)
@@ -193,7 +193,7 @@ def _draw_view(
     import torch
 
     *arrays, background = (tensor.detach() for tensor in inputs)
-    color_plane, alpha, depth, _, tape = _core.rasterize(
+    drawn = _core.rasterize(
         Gaussians(*arrays).rows,
         camera,
         filter_px2=settings.filter_px2,
@@ -204,12 +204,12 @@ def _draw_view(
         plain_colors=settings.plain_colors,
     )
     planes: list[torch.Tensor | None] = []
-    for plane in (color_plane, alpha, depth):
+    for plane in (drawn.color, drawn.alpha, drawn.depth):
         if plane is None:
             planes.append(None)
         else:
             planes.append(torch.as_tensor(plane))
-    return planes, tape
+    return planes, drawn.tape
 
 
 def _add_to(sums: list[torch.Tensor | None], slot: int, gradient: torch.Tensor) -> None:
@@ -228,6 +228,27 @@ def _set_probe(probe: CenterProbe, gradients: list[list[torch.Tensor]]) -> torch
     if probe.with_sizes:
         cast(Any, probe.centers).absgrad = sizes[0]
     return d_centers
+
+
+def _input_parts(gradients: _core.Gradients) -> list[Array]:
+    """The gradients with respect to the inputs of `draw_views`, in their order."""
+    return [
+        gradients.means,
+        gradients.quats,
+        gradients.scales,
+        gradients.opacities,
+        gradients.sh,
+        gradients.background,
+    ]
+
+
+def _center_parts(gradients: _core.Gradients) -> list[torch.Tensor]:
+    """The gradients with respect to the centres, and their sizes, where they are
+    wanted."""
+    import torch
+
+    parts = (gradients.centers, gradients.center_sizes)
+    return [torch.as_tensor(part) for part in parts if part is not None]
 
 
 @functools.cache
@@ -279,10 +300,9 @@ def _function() -> Callable[..., tuple[torch.Tensor, ...]]:
                 parts = _core.rasterize_backward(
                     tape, d_color, d_alpha, d_depth, wants_centers, with_sizes
                 )
-                center_gradients.append(
-                    [torch.as_tensor(part) for part in parts[6:] if part is not None]
-                )
-                for slot, part in zip(_slots_of_view(ctx.counts, view), parts, strict=False):
+                center_gradients.append(_center_parts(parts))
+                slots = _slots_of_view(ctx.counts, view)
+                for slot, part in zip(slots, _input_parts(parts), strict=True):
                     if wants_input[slot]:
                         _add_to(sums, slot, torch.as_tensor(part).to(ctx.devices[slot]))
             d_centers = None

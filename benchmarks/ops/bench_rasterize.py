@@ -47,28 +47,28 @@ def main(config: Config) -> None:
     times, stages = [], []
     for _ in range(config.repeats + 3):
         start = time.perf_counter()
-        color, alpha, _, counts, _ = _core.rasterize(rows, camera.core, **options)
+        drawn = _core.rasterize(rows, camera.core, **options)
         times.append(time.perf_counter() - start)
-        stages.append(counts)
-    exact = _core.rasterize(in_double, camera.core, **options)[0]
+        stages.append(drawn.counts)
+    exact = _core.rasterize(in_double, camera.core, **options).color
     median = statistics.median(times[3:])
     result = {
         "gaussians": len(gaussians),
         "size": config.size,
-        "covered": round(float((alpha > 0.5).mean()), 3),
+        "covered": round(float((drawn.alpha > 0.5).mean()), 3),
         "frame_ms": round(1e3 * median, 2),
         "frame_ms_fastest": round(1e3 * min(times), 2),
         "frames_per_second": round(1 / median, 1),
         **{
             f"{stage}_ms": round(
-                1e3 * statistics.median(s[f"{stage}_seconds"] for s in stages[3:]), 2
+                1e3 * statistics.median(getattr(s, f"{stage}_seconds") for s in stages[3:]), 2
             )
             for stage in ("project", "bin", "rasterize")
         },
-        "records": counts["records"],
-        "entries": counts["entries"],
-        "largest_error": float(np.abs(color - exact).max()),
-        "mean_error": float(np.abs(color - exact).mean()),
+        "records": drawn.counts.records,
+        "entries": drawn.counts.entries,
+        "largest_error": float(np.abs(drawn.color - exact).max()),
+        "mean_error": float(np.abs(drawn.color - exact).mean()),
     }
     print(result)
     record.write(config.output, result)

@@ -1,11 +1,11 @@
+// Clusters: splits, bounds, and checks of a bundle's tables.
+
 #include <cmath>
 #include <map>
 
+#include "bindings/backend.h"
 #include "bindings/operations.h"
-#include "bindings/types.h"
-#include "cluster/box.h"
 #include "cluster/check_tables.h"
-#include "cluster/cluster.h"
 #include "cluster/examine.h"
 #include "cluster/morton.h"
 
@@ -38,23 +38,22 @@ py::tuple median_split(const py::object& means, const py::array& offset, int dep
     const Span<const int64_t> offsets = offsets_of(offset, points.size);
     if (depth < 0 || depth > kDeepest)
         throw py::value_error("depth: expected 0 to 32, got " + std::to_string(depth));
-    if (device.is_host()) check_finite(values);
     const Work work(device);
+    if (work.backend().traits.host_reads_arrays) check_finite(values);
     const NewArray<int64_t> order(device, {static_cast<py::ssize_t>(points.size)});
     const NewArray<int64_t> leaf_offset(
         {}, {static_cast<py::ssize_t>(((offsets.size - 1) << depth) + 1)});
     {
         const Unlocked unlocked;
-        V3DG_DISPATCH(work, median_split, points, offsets, depth, order.span, leaf_offset.span);
+        work.backend().median_split(points, offsets, depth, order.span, leaf_offset.span, work);
     }
     return py::make_tuple(order.object, leaf_offset.object);
 }
 
 py::object findings_of(const Rows& gaussians) {
     const GaussianRows<const float> rows = gaussians.read<float>();
-    if (!gaussians.device().is_host())
-        throw py::value_error(
-            "gaussians: expected arrays on the host, got others; bring them there");
+    check_is_on_host(gaussians.device(), "gaussians",
+                     "expected arrays on the host, got others; bring them there");
     const NewArray<uint16_t> findings({}, {static_cast<py::ssize_t>(rows.size)});
     {
         const Unlocked unlocked;
@@ -85,7 +84,7 @@ py::object bound_spheres(const py::object& spheres, const py::array& offset) {
     const Span<Ball> out{reinterpret_cast<Ball*>(ball.span.data), offsets.size - 1};
     {
         const Unlocked unlocked;
-        V3DG_DISPATCH(work, bound_spheres, in, offsets, kNestingMargin, out);
+        work.backend().bound_spheres(in, offsets, kNestingMargin, out, work);
     }
     return ball.object;
 }
@@ -99,7 +98,7 @@ py::object bound_by_boxes(const Rows& gaussians, const py::array& offset) {
     const Span<Box> out{reinterpret_cast<Box*>(box.span.data), in.offset.size - 1};
     {
         const Unlocked unlocked;
-        V3DG_DISPATCH(work, bound_by_boxes, in, out);
+        work.backend().bound_by_boxes(in, out, work);
     }
     return box.object;
 }

@@ -1,8 +1,9 @@
+// How much larger the balls of level 1 are to be: pictures of both levels are drawn and compared.
+
 #include <algorithm>
 
+#include "bindings/backend.h"
 #include "bindings/operations.h"
-#include "bindings/tape.h"
-#include "cluster/cluster.h"
 #include "levels/first_selected.h"
 #include "levels/refine_cuts_math.h"
 
@@ -12,25 +13,14 @@ namespace {
 
 constexpr std::array<double, 3> kWhite{1, 1, 1}, kBlack{0, 0, 0};
 
-// An array that lies where the gaussians are, as one of NumPy's.
-py::object on_host(const py::object& array, Device device) {
-    return device.is_host() ? array : array.attr("detach")().attr("cpu")().attr("numpy")();
-}
-
-// An array of NumPy's where the gaussians are.
-py::object on_device(const py::object& array, Device device) {
-    if (device.is_host()) return array;
-    return py::module_::import("torch").attr("as_tensor")(array, "device"_a = device.number);
-}
-
 // The colours of a picture over white.
 struct Colors {
     py::object object;
     Span<const float> span;
 
-    Colors(const Rows& gaussians, const Camera& camera, Look look)
-        : object(on_host(py::object(rasterize(gaussians, {{}, camera}, look, false, false)[0]),
-                         gaussians.device())),
+    Colors(const Rows& gaussians, const Camera& camera, const DrawLook& look)
+        : object(backend_of(gaussians.device())
+                     .to_host(rasterize(gaussians, {{}, camera}, look, false, false).color)),
           span(span_of<const float>(object, "color",
                                     {py::ssize_t(camera.height), py::ssize_t(camera.width), 3})) {}
 };
@@ -40,13 +30,16 @@ Rows blackened(const Rows& gaussians) {
     const NewArray<float> sh({}, {py::ssize_t(gaussians.size()), 1, 3});
     std::fill(sh.span.begin(), sh.span.end(), 0.0f);
     const std::array<py::object, 5>& arrays = gaussians.arrays();
-    return {arrays[0], arrays[1], arrays[2], arrays[3], on_device(sh.object, gaussians.device())};
+    const Backend& backend = backend_of(gaussians.device());
+    return {arrays[0], arrays[1], arrays[2], arrays[3],
+            backend.from_host(sh.object, gaussians.device())};
 }
 
 py::array first_selected(const Rows& leaves, const Rows& level, const py::array& leaf_offset,
                          const py::array& group_offset, const py::array& ball,
                          double leaf_filter_px2, bool leaf_antialiased, double level_filter_px2) {
     const Device device = leaves.device();
+    const Backend& backend = backend_of(device);
     const auto num_leaves = static_cast<py::ssize_t>(leaves.size());
     const Span<const int64_t> of_leaves = offsets_of(leaf_offset, leaves.size()),
                               of_level = offsets_of(group_offset, level.size());
@@ -54,14 +47,20 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
     if (num_groups < 1 || of_leaves.size != of_level.size)
         throw py::value_error("leaf_offset, group_offset: expected those of the same groups");
     const Span<const float> balls = span_of<const float>(ball, "ball", {num_groups, 4});
-    const py::object means = on_host(leaves.arrays()[0], device);
+    const py::object means = backend.to_host(leaves.arrays()[0]);
     FirstSelected measured(span_of<const float>(means, "means", {num_leaves, 3}),
                            {reinterpret_cast<const Ball*>(balls.data), size_t(num_groups)},
                            of_level);
     const Rows black = blackened(leaves);
-    const Look own{leaf_filter_px2, leaf_antialiased, kWhite, false},
-        coarse{level_filter_px2, true, kWhite, false};
-    Look in_black = own;
+    const DrawLook own{.filter_px2 = leaf_filter_px2,
+                       .antialiased = leaf_antialiased,
+                       .background = kWhite,
+                       .plain_colors = false};
+    const DrawLook coarse{.filter_px2 = level_filter_px2,
+                          .antialiased = true,
+                          .background = kWhite,
+                          .plain_colors = false};
+    DrawLook in_black = own;
     in_black.background = kBlack;
     in_black.plain_colors = true;
     for (size_t picture = 0; picture < FirstSelected::num_pictures(); ++picture) {
@@ -79,10 +78,11 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
         }
         // The gradient of the sum of what the leaves show of the losses, by their colours, is their
         // share.
-        const py::object tape = rasterize(black, {{}, camera}, in_black, false, true)[4];
-        const py::tuple gradients = tape.cast<Tape&>().backward(
-            on_device(losses.object, device), py::none(), py::none(), {false, false});
-        const py::object shares = on_host(py::object(gradients[4]), device);
+        const Rasterized seen = rasterize(black, {{}, camera}, in_black, false, true);
+        const Gradients gradients =
+            seen.tape->backward(backend.from_host(losses.object, device), py::none(), py::none(),
+                                {.sum = false, .size = false});
+        const py::object shares = backend.to_host(gradients.sh);
         measured.add(picture, span_of<const float>(shares, "sh", {num_leaves, 1, 3}), of_leaves);
     }
     const std::vector<float> growth = measured.growth();

@@ -1,16 +1,13 @@
+// Fits: of the groups of one level, and of all levels together to pictures of their cuts.
+
 #include <algorithm>
 #include <memory>
 
+#include "bindings/backend.h"
 #include "bindings/operations.h"
 #include "bindings/tables.h"
-#include "bindings/types.h"
-#include "draw/model.h"
 #include "fit_group/dssim.h"
 #include "fit_group/ssim.h"
-#include "levels/fit_level.h"
-#include "levels/fit_level_cuda.h"
-#include "levels/refine_cuts.h"
-#include "levels/refine_cuts_cuda.h"
 
 namespace v3dg {
 
@@ -20,31 +17,25 @@ namespace {
 class BoundTarget {
   public:
     BoundTarget(const Rows& rows, float filter_px2, bool antialiased)
-        : rows_(rows), filter_px2_(filter_px2), antialiased_(antialiased) {
-        const GaussianRows<const float> read = rows.read<float>();
-        if (!rows.device().is_host()) return;
-        const Unlocked unlocked;
-        model_ = std::make_unique<Model<float>>(read);
+        : device_(rows.device()), size_(rows.size()), sh_degree_(rows.sh_degree()) {
+        static_cast<void>(rows.read<float>());  // which checks the precision
+        target_ = backend_of(device_).make_target(rows, filter_px2, antialiased);
     }
 
-    Device device() const { return rows_.device(); }
-    size_t size() const { return rows_.size(); }
+    size_t size() const { return size_; }
+    const backend::Target& handle() const { return *target_; }
     // Throws unless the gaussians can be fitted to it.
     void check_alike(const Rows& gaussians) const {
-        if (gaussians.device() != device() || gaussians.sh_degree() != rows_.sh_degree())
+        if (gaussians.device() != device_ || gaussians.sh_degree() != sh_degree_)
             throw py::value_error(
                 "gaussians: expected the device and the SH degree of the target, got others");
     }
-    FitTarget on_host() const { return {&model_->planes(), filter_px2_, antialiased_}; }
-    cuda::DeviceFitTarget on_device() const {
-        return {rows_.read<float>(), filter_px2_, antialiased_};
-    }
 
   private:
-    Rows rows_;
-    float filter_px2_;
-    bool antialiased_;
-    std::unique_ptr<Model<float>> model_;  // on the host
+    Device device_;
+    size_t size_;
+    int sh_degree_;
+    std::unique_ptr<backend::Target> target_;
 };
 
 // The groups that index `num_targets` and `num_rows` gaussians.
@@ -65,13 +56,13 @@ std::vector<FitGroup> groups_of(const py::array& target_range, const py::array& 
             bounds[3] < bounds[2] || bounds[3] > static_cast<int64_t>(num_rows))
             throw py::value_error("range: expected [first, last) within the gaussians, group " +
                                   std::to_string(g) + " is not");
-        FitGroup group{static_cast<uint64_t>(bounds[0]),
-                       static_cast<uint64_t>(bounds[1] - bounds[0]),
-                       static_cast<uint64_t>(bounds[2]),
-                       static_cast<uint64_t>(bounds[3] - bounds[2]),
-                       {balls[4 * g], balls[4 * g + 1], balls[4 * g + 2]},
-                       balls[4 * g + 3],
-                       static_cast<uint64_t>(streams[g])};
+        FitGroup group{.target_first = static_cast<uint64_t>(bounds[0]),
+                       .target_count = static_cast<uint64_t>(bounds[1] - bounds[0]),
+                       .first = static_cast<uint64_t>(bounds[2]),
+                       .count = static_cast<uint64_t>(bounds[3] - bounds[2]),
+                       .center = {balls[4 * g], balls[4 * g + 1], balls[4 * g + 2]},
+                       .radius = balls[4 * g + 3],
+                       .stream = static_cast<uint64_t>(streams[g])};
         if (!(group.radius > 0))
             throw py::value_error("ball: expected a positive radius, group " + std::to_string(g) +
                                   " has none");
@@ -91,21 +82,11 @@ py::object fit_level_arrays(const FitConfig& config, const BoundTarget& target,
     const GaussianRows<float> rows = gaussians.write();
     const NewArray<float> error({}, {static_cast<py::ssize_t>(groups.size()), 2});
     std::fill(error.span.begin(), error.span.end(), 0.0f);
-    const Span<const FitGroup> all{groups.data(), groups.size()};
     const Work work(gaussians.device());
-    if constexpr (V3DG_WITH_CUDA != 0)
-        if (!work.device().is_host()) {
-            const cuda::DeviceFitTarget on_device = target.on_device();
-            {
-                const Unlocked unlocked;
-                cuda::fit_level(config, all, on_device, rows, error.span.data, progress,
-                                work.stream());
-            }
-            return error.object;
-        }
     {
         const Unlocked unlocked;
-        fit_level(config, all, target.on_host(), rows, error.span.data, progress);
+        target.handle().fit_level(config, {groups.data(), groups.size()}, rows, error.span.data,
+                                  progress, work);
     }
     return error.object;
 }
@@ -146,9 +127,8 @@ class BoundPictures {
         return cameras;
     }
     static GaussianRows<const float> on_host(const Rows& asset) {
-        if (!asset.device().is_host() || asset.size() == 0)
-            throw py::value_error("asset: expected gaussians on the host, got " +
-                                  std::string(asset.size() == 0 ? "none" : "others"));
+        if (asset.size() == 0) refuse_value("asset", "expected gaussians on the host, got none");
+        check_is_on_host(asset.device(), "asset", "expected gaussians on the host, got others");
         return asset.read<float>();
     }
 
@@ -169,16 +149,8 @@ void refine_cuts_arrays(const FitConfig& config, const BoundTarget& target, cons
             throw py::value_error("radius: expected positive numbers, got " +
                                   std::to_string(radius_of_one));
     const Work work(gaussians.device());
-    if constexpr (V3DG_WITH_CUDA != 0)
-        if (!work.device().is_host()) {
-            const cuda::DeviceFitTarget on_device = target.on_device();
-            const Unlocked unlocked;
-            cuda::refine_cuts(config, on_device, levels, pictures.pictures(), progress,
-                              work.stream());
-            return;
-        }
     const Unlocked unlocked;
-    refine_cuts(config, target.on_host(), target.size(), levels, pictures.pictures(), progress);
+    target.handle().refine_cuts(config, levels, pictures.pictures(), progress, work);
 }
 
 py::tuple weigh_cuts_arrays(const FitConfig& config, const Rows& gaussians,
@@ -193,17 +165,9 @@ py::tuple weigh_cuts_arrays(const FitConfig& config, const Rows& gaussians,
     const SeenOfGaussians seen{weight.span, num_looks.span};
     const py::tuple answer = py::make_tuple(weight.object, num_looks.object);
     const Work work(gaussians.device());
-    if constexpr (V3DG_WITH_CUDA != 0)
-        if (!work.device().is_host()) {
-            {
-                const Unlocked unlocked;
-                cuda::weigh_cuts(config, rows, pictures.pictures(), seen, progress, work.stream());
-            }
-            return answer;
-        }
     {
         const Unlocked unlocked;
-        weigh_cuts(config, rows, pictures.pictures(), seen, progress);
+        work.backend().weigh_cuts(config, rows, pictures.pictures(), seen, progress, work);
     }
     return answer;
 }
@@ -214,28 +178,26 @@ FitConfig make_config(int steps, int views_per_step, int num_views, int supersam
                       float step_log_scale, float step_quat, float step_logit, float step_sh0,
                       float step_sh_rest, bool position_in_world, float final_step, float beta2,
                       uint64_t seed) {
-    FitConfig config{};
-    config.steps = steps;
-    config.views_per_step = views_per_step;
-    config.num_views = num_views;
-    config.supersample = supersample;
-    config.image_size = image_size;
-    config.px2_per_gaussian = px2_per_gaussian;
-    config.distance = distance;
-    config.filter_px2 = filter_px2;
-    config.antialiased = antialiased;
-    config.loss = {loss_l1, loss_dssim, loss_alpha};
-    config.step_position = step_position;
-    config.step_log_scale = step_log_scale;
-    config.step_quat = step_quat;
-    config.step_logit = step_logit;
-    config.step_sh0 = step_sh0;
-    config.step_sh_rest = step_sh_rest;
-    config.position_in_world = position_in_world;
-    config.final_step = final_step;
-    config.beta2 = beta2;
-    config.seed = seed;
-    return config;
+    return {.steps = steps,
+            .views_per_step = views_per_step,
+            .num_views = num_views,
+            .supersample = supersample,
+            .image_size = image_size,
+            .px2_per_gaussian = px2_per_gaussian,
+            .distance = distance,
+            .filter_px2 = filter_px2,
+            .antialiased = antialiased,
+            .loss = {loss_l1, loss_dssim, loss_alpha},
+            .step_position = step_position,
+            .step_log_scale = step_log_scale,
+            .step_quat = step_quat,
+            .step_logit = step_logit,
+            .step_sh0 = step_sh0,
+            .step_sh_rest = step_sh_rest,
+            .position_in_world = position_in_world,
+            .final_step = final_step,
+            .beta2 = beta2,
+            .seed = seed};
 }
 
 py::tuple dssim_of(const py::array& picture, const py::array& target) {

@@ -1,305 +1,198 @@
+// Frames as Python has them: checks of what they draw, and calls of their backend.
+
 #include <algorithm>
 #include <memory>
-#include <mutex>
 #include <optional>
 #include <string>
 #include <vector>
 
-#include "bindings/drawing.h"
 #include "bindings/operations.h"
 #include "bindings/pool.h"
 #include "bindings/resident.h"
-#include "draw/scene_frame.h"
 
 namespace v3dg {
 
 namespace {
 
-// What a picture from a pool shows: colours, and where clusters have their own, those; or how many
-// gaussians each pixel is blended of, in place of depth.
-struct PoolLook {
-    SceneColors colors = SceneColors::own;
-    bool counts = false;
-    bool is_aside = false;
-    std::optional<Eyes> chooser;
-    py::list cluster_colors;
+// Asks, from any thread, for work under way to end early.
+class Stop {
+  public:
+    void request() { requested_.store(true, std::memory_order_relaxed); }
+    bool is_requested() const { return requested_.load(std::memory_order_relaxed); }
+    const std::atomic<bool>* flag() const { return &requested_; }
 
-    bool is_plain() const {
-        return colors == SceneColors::own && !counts && !is_aside && !chooser &&
-               cluster_colors.empty();
+  private:
+    std::atomic<bool> requested_{false};
+};
+
+const std::atomic<bool>* flag_of(const Stop* stop) {
+    return stop == nullptr ? nullptr : stop->flag();
+}
+
+FrameLook look_of(const std::string& shows) {
+    if (shows == "residency") return FrameLook::missing;
+    if (shows == "error") return FrameLook::metrics;
+    if (shows == "count") return FrameLook::count;
+    return FrameLook::appearance;
+}
+
+Eyes eyes_of(const py::object& camera) {
+    if (py::isinstance<BoundCamera>(camera)) return camera.cast<const BoundCamera&>().camera;
+    if (!py::isinstance<BoundEyes>(camera)) refuse_kind("camera", "a Camera or Eyes", camera);
+    return camera.cast<const BoundEyes&>().eyes;
+}
+
+// A cut that was selected before. The arrays are where the frame is, which looks when it draws.
+struct BoundGivenCut {
+    py::object instance_ids, cluster_ids, weights;
+
+    // Borrows from the arrays. Weights are of 0 to 1, or None where all are 1.
+    GivenCut read(Device device) const {
+        GivenCut given{span_on<const int32_t>(device, instance_ids, "instance_ids", {-1}), {}, {}};
+        const auto size = static_cast<py::ssize_t>(given.instance.size);
+        given.cluster = span_on<const int32_t>(device, cluster_ids, "cluster_ids", {size});
+        if (!weights.is_none())
+            given.weight = span_on<const float>(device, weights, "weights", {size});
+        return given;
     }
 };
 
-PoolLook pool_look(const std::string& shows, const py::list& cluster_colors,
-                   const BoundEyes* chooser, bool is_aside) {
-    PoolLook look;
-    if (shows == "residency") look.colors = SceneColors::missing;
-    if (shows == "error") look.colors = SceneColors::metrics;
-    look.counts = shows == "count";
-    look.is_aside = is_aside;
-    if (chooser != nullptr) look.chooser = chooser->eyes;
-    look.cluster_colors = cluster_colors;
-    return look;
-}
+// A request, without what only the frame can read: the given cut, and colours of clusters.
+struct BoundRequest {
+    FrameRequest plain;
+    std::optional<BoundGivenCut> cut;
+    py::list cluster_colors;  // (C, 3) of each bundle, or none
 
-#if V3DG_WITH_CUDA
-// Pictures of the eyes on the device, which have no memory yet.
-cuda::EyeImages new_images(const Eyes& eyes, const Shade& shade, NewPictures& pictures) {
-    cuda::FrameImage image[2]{};
-    for (int k = 0; k < eyes.count(); ++k) {
-        const Camera& eye = eyes.camera[k];
-        const Window whole{0, 0, static_cast<int>(eye.width), static_cast<int>(eye.height)};
-        pictures.push_back(picture_of(whole, shade.with_depth));
-        image[k] = pictures.back().frame_image(eye, shade);
+    // Of a Camera or of Eyes. It looks itself which of the two it is: overloads, or a conversion,
+    // would take longer than all else here.
+    BoundRequest(const py::object& camera, const SelectRule* rule, const Shade* shade,
+                 const BoundGivenCut* given, const std::string& shows, const py::list& colors,
+                 const BoundEyes* chooser, bool is_aside)
+        : plain{.eyes = eyes_of(camera),
+                .rule = rule == nullptr ? SelectRule{} : *rule,
+                .shade = shade == nullptr ? Shade{} : *shade,
+                .look = look_of(shows),
+                .is_aside = is_aside},
+          cluster_colors(colors) {
+        if (given != nullptr && plain.eyes.are_two)
+            throw py::value_error("cut: expected one camera, got two eyes; draw each of them");
+        if (given != nullptr) cut = *given;
+        if (chooser != nullptr) plain.chooser = chooser->eyes;
     }
-    const float stop = shade.min_transmittance;
-    return eyes.are_two ? cuda::images_of_eyes(image[0], image[1], stop)
-                        : cuda::EyeImages{{image[0], {}}, 1, stop};
-}
 
-// Gives them their memory, for which torch takes a while.
-cuda::Frame::Place place_of(NewPictures& pictures, Device device) {
-    return [&pictures, device](cuda::PicturePlanes planes[2]) {
-        for (size_t k = 0; k < pictures.size(); ++k) planes[k] = pictures[k].on_device(device);
-    };
-}
-#endif
+    bool is_complete() const { return !cut && cluster_colors.empty(); }
+    FrameRequest completed(Device device, const SceneState& scene) const {
+        FrameRequest request = plain;
+        if (cut) request.cut = cut->read(device);
+        for (size_t b = 0; !cluster_colors.empty() && b < scene.tables.size(); ++b) {
+            if (b >= cluster_colors.size())
+                throw py::value_error("colors: expected none, or of each bundle");
+            const auto clusters = static_cast<py::ssize_t>(scene.tables[b].num_clusters());
+            const auto colors = cluster_colors[b].cast<py::array>();
+            request.cluster_colors.push_back(
+                span_of<const float>(colors, "colors", {clusters, 3}).data);
+        }
+        return request;
+    }
+};
 
 // Draws scenes of the same bundles, or of the first of them, on one device.
 class BoundSceneFrame {
   public:
     explicit BoundSceneFrame(int device) : device_{device} {
         const Work work(device_);
-#if V3DG_WITH_CUDA
-        if (device_.is_host()) return;
-        frame_ = std::make_unique<cuda::SceneFrame>();
-        turns_ = std::make_shared<std::mutex>();
-#endif
+        frame_ = work.backend().make_frame(work);
     }
 
     // The gaussians of each bundle and, unless there are none, the colours of their clusters.
     void set_models(const py::list& models, const py::list& palettes) {
         if (!palettes.empty() && palettes.size() != models.size())
             throw py::value_error("palettes: expected none, or one for each model");
-        std::vector<SceneModel> host;
+        std::vector<std::shared_ptr<const backend::Model>> model_handles;
+        std::vector<std::shared_ptr<const backend::Palette>> palette_handles;
         std::vector<size_t> num_gaussians;
         for (const py::handle& item : models) {
             const auto& model = held<BoundModel>(item, "models");
             check_device(model.device(), "models");
             num_gaussians.push_back(model.size());
-            if (device_.is_host()) host.push_back(model.on_host());
+            model_handles.push_back(model.handle());
         }
-        for (size_t b = 0; b < palettes.size(); ++b) {
-            const auto& palette = held<BoundPalette>(palettes[b], "palettes");
+        for (const py::handle& item : palettes) {
+            const auto& palette = held<BoundPalette>(item, "palettes");
             check_device(palette.device(), "palettes");
-            if (device_.is_host()) host[b].palette = palette.host();
+            palette_handles.push_back(palette.handle());
         }
-#if V3DG_WITH_CUDA
-        if (!device_.is_host()) set_models_on_device(models, palettes);
-#endif
-        host_ = std::move(host);
+        const Work work(device_);
+        frame_->set_models(std::move(model_handles), std::move(palette_handles), work);
         num_gaussians_ = std::move(num_gaussians);
-        models_ = models;
-        palettes_ = palettes;
     }
 
-    // With `steps`, of pictures that follow each other.
-    std::unique_ptr<BoundDrawing> draw(const py::object& scene_object, const BoundEyes& camera,
-                                       const SelectRule& rule, const Shade& shade, const Stop* stop,
-                                       BudgetSteps* steps) {
-        const Turn turn(turns_.get());
-        auto& scene = checked(scene_object);
-        const Eyes& eyes = camera.eyes;
-        const auto draw_paced = [&](const SelectRule& paced,
-                                    uint32_t* last_bin) -> std::unique_ptr<BoundDrawing> {
-            if (device_.is_host())
-                return on_host(scene, eyes, shade,
-                               [&](HostScene host, Span<const Picture<float>> out) {
-                                   host.last_bin = last_bin;
-                                   return cpu::draw_scene(host, eyes, paced, out, flag_of(stop));
-                               });
-#if V3DG_WITH_CUDA
-            const Work work(device_);
-            NewPictures pictures;
-            const cuda::EyeImages images = new_images(eyes, shade, pictures);
-            auto drawing = frame_->draw(scene.on_device(), eyes, paced, images, work.stream(),
-                                        place_of(pictures, device_));
-            return std::make_unique<BoundDrawing>(std::move(pictures),
-                                                  py::make_tuple(py::cast(this), scene_object),
-                                                  device_, turns_, std::move(drawing), rule);
-#else
-            return nullptr;
-#endif
-        };
-        return in_steps(steps, rule, eyes, scene.state(), draw_paced);
+    // Of the gaussians that were set, or of what is resident in a pool, after bringing in pages
+    // that are ready. With `steps`, one of several pictures that follow each other.
+    std::unique_ptr<BoundDrawing> draw(const py::object& scene_object,
+                                       const py::object& request_object,
+                                       const py::object& pool_object, BudgetSteps* steps,
+                                       const Stop* stop) {
+        std::unique_ptr<BoundDrawing> drawing;
+        with_input(scene_object, request_object, pool_object, [&](backend::FrameInput input) {
+            input.steps = steps;
+            input.stop = flag_of(stop);
+            drawing = frame_->draw(input);
+        });
+        // A drawing that is not done has what it is drawn from.
+        if (drawing->is_under_way())
+            drawing->keep(
+                py::make_tuple(py::cast(this), scene_object, request_object, pool_object));
+        return drawing;
     }
 
-    // What is resident of the bundles of a pool, with what comes in before.
-    std::unique_ptr<BoundDrawing> draw_resident(const py::object& scene_object,
-                                                const py::object& pool_object,
-                                                const BoundEyes& camera, const SelectRule& rule,
-                                                const Shade& shade, const Stop* stop,
-                                                BudgetSteps* steps, const std::string& shows,
-                                                const py::list& cluster_colors,
-                                                const BoundEyes* chooser, bool is_aside) {
-        const PoolLook look = pool_look(shows, cluster_colors, chooser, is_aside);
-        auto& pool = checked_pool(scene_object, pool_object);
-        const auto& scene = held<BoundScene>(scene_object, "scene");
-        const std::shared_ptr<const SceneState> state = scene.state();
-        const Turn turn(turns_.get());
-        const Eyes& eyes = camera.eyes;
-        if (!device_.is_host() && !look.is_plain())
-            throw py::value_error("shows, colors, chooser, aside: expected none on a CUDA device");
-        const auto draw_paced = [&](const SelectRule& paced,
-                                    uint32_t* last_bin) -> std::unique_ptr<BoundDrawing> {
-            if (device_.is_host()) {
-                const float wanted = rule.tolerance_px2;
-                return resident_on_host(*state, pool, eyes, paced, wanted, shade, stop, look,
-                                        last_bin);
-            }
-#if V3DG_WITH_CUDA
-            const Work work(device_);
-            NewPictures pictures;
-            const cuda::EyeImages images = new_images(eyes, shade, pictures);
-            SelectRule used = paced;
-            auto drawing =
-                frame_->draw_resident(scene.on_device(), pool.on_device(), eyes, used, images,
-                                      work.stream(), place_of(pictures, device_));
-            return std::make_unique<BoundDrawing>(
-                std::move(pictures), py::make_tuple(py::cast(this), scene_object, pool_object),
-                device_, turns_, std::move(drawing), used, &pool.on_device());
-#else
-            return nullptr;
-#endif
-        };
-        return in_steps(steps, rule, look.chooser ? *look.chooser : eyes, state, draw_paced);
-    }
-
-    // (instance, cluster, weight, depth) of what is resident, or None.
-    py::object pick_resident(const py::object& scene_object, const py::object& pool_object,
-                             const BoundCamera& camera, const SelectRule& rule) {
-        require_host("pick_resident");
-        auto& pool = checked_pool(scene_object, pool_object);
-        const auto state = held<BoundScene>(scene_object, "scene").state();
-        const std::vector<SceneModel> models = models_in(pool, *state, py::list());
-        const Eyes eyes = camera.camera;
-        SelectOutput cut;
+    // What the first pixel of the window shows most of, or nothing.
+    std::optional<ScenePick> pick(const py::object& scene_object, const py::object& request_object,
+                                  const py::object& pool_object) {
+        check_is_on_host(device_, "pick", "expected a frame on the CPU, got one on a CUDA device");
         ScenePick picked{};
         bool shows_any = false;
-        {
-            const Unlocked unlocked;
-            pool.frame_on_host(
-                *state, rule, PoolFrame::aside,
-                [&](auto tables, const SelectRule& raised, auto needs) {
-                    const HostScene host{tables, {models.data(), models.size()}, state->instances};
-                    cpu::select({tables, state->instances, eyes, raised, needs}, cut);
-                    const GivenCut given{{cut.instance.data(), cut.instance.size()},
-                                         {cut.cluster.data(), cut.cluster.size()},
-                                         {cut.weight.data(), cut.weight.size()}};
-                    shows_any = cpu::pick_cut(host, camera.camera, given, picked);
-                    return raised.tolerance_px2;
-                });
-        }
-        if (!shows_any) return py::none();
-        return py::make_tuple(cut.instance[picked.pair], cut.cluster[picked.pair], picked.weight,
-                              picked.depth);
-    }
-
-    std::unique_ptr<BoundDrawing> draw_cut(const py::object& scene_object,
-                                           const BoundCamera& camera,
-                                           const py::object& instance_ids,
-                                           const py::object& cluster_ids, const Shade& shade,
-                                           const Stop* stop, const py::object& weights) {
-        auto& scene = checked(scene_object);
-        const GivenCut given = given_cut(instance_ids, cluster_ids, weights);
-        if (device_.is_host())
-            return on_host(scene, camera.camera, shade,
-                           [&](const HostScene& host, Span<const Picture<float>> out) {
-                               return cpu::draw_cut(host, camera.camera, given, out[0],
-                                                    flag_of(stop));
-                           });
-#if V3DG_WITH_CUDA
-        const Turn turn(turns_.get());
-        const Work work(device_);
-        NewPictures pictures;
-        const cuda::EyeImages images = new_images(camera.camera, shade, pictures);
-        auto drawing = frame_->draw_cut(scene.on_device(), camera.camera, given, images,
-                                        work.stream(), place_of(pictures, device_));
-        return std::make_unique<BoundDrawing>(
-            std::move(pictures),
-            py::make_tuple(py::cast(this), scene_object, instance_ids, cluster_ids, weights),
-            device_, turns_, std::move(drawing), SelectRule{});
-#else
-        return nullptr;
-#endif
-    }
-
-    // As draw_cut(), with the number of gaussians that each pixel is blended of in place of depth.
-    std::unique_ptr<BoundDrawing> count_cut(const py::object& scene_object,
-                                            const BoundCamera& camera,
-                                            const py::array& instance_ids,
-                                            const py::array& cluster_ids, Shade shade,
-                                            const Stop* stop, const py::object& weights) {
-        require_host("count_cut");
-        const GivenCut given = given_cut(instance_ids, cluster_ids, weights);
-        shade.with_depth = true;
-        return on_host(checked(scene_object), camera.camera, shade,
-                       [&](const HostScene& host, Span<const Picture<float>> out) {
-                           Picture<float> picture = out[0];
-                           std::swap(picture.depth, picture.count);
-                           return cpu::draw_cut(host, camera.camera, given, picture, flag_of(stop));
-                       });
-    }
-
-    // As draw_cut(), with the share of the rule's tolerance that each pair's metric takes as its
-    // colour.
-    std::unique_ptr<BoundDrawing> draw_metrics(const py::object& scene_object,
-                                               const BoundCamera& camera, const SelectRule& rule,
-                                               const py::array& instance_ids,
-                                               const py::array& cluster_ids, const Shade& shade,
-                                               const Stop* stop, const py::object& weights) {
-        require_host("draw_metrics");
-        const GivenCut given = given_cut(instance_ids, cluster_ids, weights);
-        return on_host(checked(scene_object), camera.camera, shade,
-                       [&](const HostScene& host, Span<const Picture<float>> out) {
-                           return cpu::draw_metrics(host, camera.camera, rule, given, out[0],
-                                                    flag_of(stop));
-                       });
+        with_input(
+            scene_object, request_object, pool_object,
+            [&](const backend::FrameInput& input) { shows_any = frame_->pick(input, picked); });
+        if (!shows_any) return {};
+        return picked;
     }
 
     // Bytes of what it keeps on its device by part, and of the pool that those are of.
     py::dict memory() const {
         py::dict parts;
-#if V3DG_WITH_CUDA
-        if (device_.is_host()) return parts;
         const Work work(device_);
-        for (const auto& [name, bytes] : frame_->bytes()) parts[name] = bytes;
-        const cuda::PoolBytes pool = cuda::pool_bytes();
-        parts["pool, reserved"] = pool.reserved;
-        parts["pool, used"] = pool.used;
-#endif
+        for (const auto& [name, bytes] : frame_->memory()) parts[name] = bytes;
         return parts;
     }
 
-    // (instance, cluster, weight, depth), or None.
-    py::object pick_cut(const py::object& scene_object, const BoundCamera& camera,
-                        const py::array& instance_ids, const py::array& cluster_ids) {
-        require_host("pick_cut");
-        const std::shared_ptr<const SceneState> state = checked(scene_object).state();
-        const GivenCut given = given_cut(instance_ids, cluster_ids, py::none());
-        const std::vector<SceneModel> models = models_of(*state);
-        ScenePick picked{};
-        bool shows_any = false;
-        {
-            const Unlocked unlocked;
-            shows_any = cpu::pick_cut(host_scene(*state, models), camera.camera, given, picked);
-        }
-        if (!shows_any) return py::none();
-        return py::make_tuple(given.instance[picked.pair], given.cluster[picked.pair],
-                              picked.weight, picked.depth);
+  private:
+    // Calls body() with a request after checks that all belong together.
+    template <class Body>
+    void with_input(const py::object& scene_object, const py::object& request_object,
+                    const py::object& pool_object, const Body& body) const {
+        const bool has_pool = !pool_object.is_none();
+        BoundPool* const pool = has_pool ? &checked_pool(scene_object, pool_object) : nullptr;
+        const BoundScene& scene =
+            has_pool ? held<BoundScene>(scene_object, "scene") : checked(scene_object);
+        const auto& bound = held<BoundRequest>(request_object, "request");
+        const std::shared_ptr<const SceneState> state = scene.state();
+        std::optional<FrameRequest> completed;
+        if (!bound.is_complete()) completed = bound.completed(device_, *state);
+        const FrameRequest& request = completed ? *completed : bound.plain;
+        if (has_pool && request.cut)
+            throw py::value_error("cut: expected none for a pool, which has its own, got one");
+        if (backend_of(device_).traits.draws_only_plainly && !request.is_plain())
+            throw py::value_error("shows, colors, chooser, aside: expected none on a CUDA device");
+        body(backend::FrameInput{.request = request,
+                                 .scene = scene.handle(),
+                                 .state = state,
+                                 .pool = has_pool ? &pool->handle() : nullptr,
+                                 .steps = nullptr,
+                                 .stop = nullptr});
     }
 
-  private:
     BoundPool& checked_pool(const py::object& scene_object, const py::object& pool_object) const {
         const auto& scene = held<BoundScene>(scene_object, "scene");
         auto& pool = held<BoundPool>(pool_object, "pool");
@@ -309,65 +202,8 @@ class BoundSceneFrame {
         return pool;
     }
 
-    static std::vector<SceneModel> models_in(const BoundPool& pool, const SceneState& scene,
-                                             const py::list& colors) {
-        std::vector<SceneModel> models;
-        for (size_t b = 0; b < scene.tables.size(); ++b) {
-            models.push_back({pool.on_host().planes(b),
-                              scene.bundle(b).appearance(),
-                              {},
-                              pool.on_host().codes(b)});
-            const auto clusters = static_cast<py::ssize_t>(scene.tables[b].num_clusters());
-            if (colors.empty()) continue;
-            if (b >= colors.size())
-                throw py::value_error("colors: expected none, or of each bundle");
-            models.back().cluster_sh =
-                span_of<const float>(colors[b].cast<py::array>(), "colors", {clusters, 3}).data;
-        }
-        return models;
-    }
-
-    static std::unique_ptr<BoundDrawing> resident_on_host(const SceneState& scene, BoundPool& pool,
-                                                          const Eyes& eyes, const SelectRule& rule,
-                                                          float wanted_px2, Shade shade,
-                                                          const Stop* stop, const PoolLook& look,
-                                                          uint32_t* last_bin) {
-        shade.with_depth |= look.counts;
-        HostPictures out(eyes, shade);
-        if (look.counts)
-            for (Picture<float>& picture : out.pictures) std::swap(picture.depth, picture.count);
-        const std::vector<SceneModel> models = models_in(pool, scene, look.cluster_colors);
-        SceneFrameCounts counts{};
-        const auto cut = [&](auto tables, const SelectRule& raised, auto needs) {
-            HostScene host{
-                tables, {models.data(), models.size()}, scene.instances, needs, last_bin};
-            host.colors = look.colors;
-            host.wanted_px2 = wanted_px2;
-            if (look.chooser) host.chooser = &*look.chooser;
-            counts = cpu::draw_scene(host, eyes, raised, out.span(), flag_of(stop));
-            return counts.exceeds_budget ? raised.tolerance_px2 : counts.tolerance_px2;
-        };
-        {
-            const Unlocked unlocked;
-            pool.frame_on_host(scene, rule, look.is_aside ? PoolFrame::aside : PoolFrame::flight,
-                               cut);
-        }
-        return std::make_unique<BoundDrawing>(std::move(out.out), stats_of(counts));
-    }
-
-    // Weights are of 0 to 1, or None where all are 1.
-    GivenCut given_cut(const py::handle& instance_ids, const py::handle& cluster_ids,
-                       const py::handle& weights) const {
-        GivenCut given{span_on<const int32_t>(device_, instance_ids, "instance_ids", {-1}), {}, {}};
-        const auto size = static_cast<py::ssize_t>(given.instance.size);
-        given.cluster = span_on<const int32_t>(device_, cluster_ids, "cluster_ids", {size});
-        if (!weights.is_none())
-            given.weight = span_on<const float>(device_, weights, "weights", {size});
-        return given;
-    }
-
-    BoundScene& checked(const py::object& scene_object) const {
-        auto& scene = held<BoundScene>(scene_object, "scene");
+    const BoundScene& checked(const py::object& scene_object) const {
+        const auto& scene = held<BoundScene>(scene_object, "scene");
         if (scene.device() != device_)
             throw py::value_error("scene: expected one on the frame's device");
         const std::vector<size_t>& of_scene = scene.state()->num_gaussians;
@@ -384,118 +220,31 @@ class BoundSceneFrame {
                                   ": expected what is on the frame's device, got others");
     }
 
-#if V3DG_WITH_CUDA
-    void set_models_on_device(const py::list& models, const py::list& palettes) {
-        std::vector<cuda::DeviceModel> on_device;
-        for (const py::handle& model : models)
-            on_device.push_back(model.cast<const BoundModel&>().on_device());
-        std::vector<std::shared_ptr<const cuda::DevicePalette>> colors;
-        for (const py::handle& palette : palettes)
-            colors.push_back(palette.cast<const BoundPalette&>().on_device());
-        const Work work(device_);
-        frame_->set_models(std::move(on_device), std::move(colors), work.stream());
-    }
-#endif
-
-    void require_host(const char* name) const {
-        if (!device_.is_host())
-            throw py::value_error(std::string(name) +
-                                  ": expected a frame on the CPU, got one on a CUDA device");
-    }
-
-    std::vector<SceneModel> models_of(const SceneState& scene) const {
-        std::vector<SceneModel> models(host_.begin(), host_.begin() + scene.tables.size());
-        for (size_t b = 0; b < models.size(); ++b)
-            models[b].appearance = scene.bundle(b).appearance();
-        return models;
-    }
-
-    static HostScene host_scene(const SceneState& scene, const std::vector<SceneModel>& models) {
-        return {{scene.tables.data(), scene.tables.size()},
-                {models.data(), models.size()},
-                scene.instances};
-    }
-
-    // The windows of the eyes, drawn by draw(host scene, pictures) without Python's lock.
-    template <class DrawPictures>
-    std::unique_ptr<BoundDrawing> on_host(const BoundScene& scene, const Eyes& eyes,
-                                          const Shade& shade, const DrawPictures& draw) const {
-        HostPictures out(eyes, shade);
-        const std::shared_ptr<const SceneState> state = scene.state();
-        const std::vector<SceneModel> models = models_of(*state);
-        const py::list gaussians = models_,
-                       colors = palettes_;  // which another thread may replace meanwhile
-        SceneFrameCounts counts;
-        {
-            const Unlocked unlocked;
-            counts = draw(host_scene(*state, models), out.span());
-        }
-        return std::make_unique<BoundDrawing>(std::move(out.out), stats_of(counts));
-    }
-
     Device device_;
-    py::list models_, palettes_;
     std::vector<size_t> num_gaussians_;  // of each bundle
-    std::vector<SceneModel> host_;       // without what the scene knows of the clusters
-    std::shared_ptr<std::mutex> turns_;  // on a device
-#if V3DG_WITH_CUDA
-    std::unique_ptr<cuda::SceneFrame> frame_;  // on a device
-#endif
+    std::unique_ptr<backend::Frame> frame_;
 };
 
 // Draws the gaussians of one asset, which have no levels.
 class BoundAssetFrame {
   public:
-    explicit BoundAssetFrame(const py::object& model) : model_(model) {
-        if (held<BoundModel>(model, "model").has_codes())
+    explicit BoundAssetFrame(const py::object& model_object) {
+        const auto& model = held<BoundModel>(model_object, "model");
+        if (model.has_codes())
             throw py::value_error("model: expected one of rows, got one of codes");
-        const Work work(held<BoundModel>(model, "model").device());
-#if V3DG_WITH_CUDA
-        if (work.device().is_host()) return;
-        frame_ = std::make_unique<cuda::ModelFrame>();
-        turns_ = std::make_shared<std::mutex>();
-#endif
+        const Work work(model.device());
+        frame_ = work.backend().make_asset_frame(model.handle(), work);
     }
 
     std::unique_ptr<BoundDrawing> draw(const BoundCamera& camera, const Shade& shade,
                                        const Stop* stop) {
-        const auto& model = held<BoundModel>(model_, "model");
-        if (model.device().is_host()) return on_host(model, camera, shade, stop);
-#if V3DG_WITH_CUDA
-        const Device device = model.device();
-        const Turn turn(turns_.get());
-        const Work work(device);
-        NewPictures pictures;
-        const cuda::EyeImages images = new_images(camera.camera, shade, pictures);
-        const cuda::PackedModel& packed = *model.on_device().packed;
-        auto drawing = frame_->draw(packed.rows(), view_of_world<float>(camera.camera), 0.0f, false,
-                                    images.image[0], work.stream(), &packed.packed(),
-                                    images.min_transmittance, place_of(pictures, device));
-        return std::make_unique<BoundDrawing>(std::move(pictures), py::cast(this), device, turns_,
-                                              std::move(drawing), SelectRule{});
-#else
-        return nullptr;
-#endif
+        std::unique_ptr<BoundDrawing> drawing = frame_->draw(camera.camera, shade, flag_of(stop));
+        if (drawing->is_under_way()) drawing->keep(py::cast(this));
+        return drawing;
     }
 
   private:
-    static std::unique_ptr<BoundDrawing> on_host(const BoundModel& model, const BoundCamera& camera,
-                                                 const Shade& shade, const Stop* stop) {
-        HostPictures out(camera.camera, shade);
-        SceneFrameCounts counts;
-        {
-            const Unlocked unlocked;
-            counts = cpu::draw_model(*model.on_host().planes, model.size(), camera.camera,
-                                     out.pictures[0], flag_of(stop));
-        }
-        return std::make_unique<BoundDrawing>(std::move(out.out), stats_of(counts));
-    }
-
-    py::object model_;
-    std::shared_ptr<std::mutex> turns_;  // on a device
-#if V3DG_WITH_CUDA
-    std::unique_ptr<cuda::ModelFrame> frame_;  // on a device
-#endif
+    std::unique_ptr<backend::AssetFrame> frame_;
 };
 
 }  // namespace
@@ -536,29 +285,33 @@ void bind_frame(py::module_& m) {
                                "Of two eyes: what the right one sees.")
         .def("finish", &BoundDrawing::finish, py::return_value_policy::copy,
              "Waits for the picture.");
+    py::class_<BoundGivenCut>(m, "GivenCut", "A cut that was selected before; borrows the arrays.")
+        .def(py::init([](const py::object& instance_ids, const py::object& cluster_ids,
+                         const py::object& weights) {
+                 return BoundGivenCut{
+                     .instance_ids = instance_ids, .cluster_ids = cluster_ids, .weights = weights};
+             }),
+             "instance_ids"_a, "cluster_ids"_a, "weights"_a = py::none());
+    py::class_<BoundRequest>(m, "FrameRequest", "One picture that is asked of a frame.")
+        .def(py::init<const py::object&, const SelectRule*, const Shade*, const BoundGivenCut*,
+                      const std::string&, const py::list&, const BoundEyes*, bool>(),
+             "camera"_a, "rule"_a = nullptr, "shade"_a = nullptr, "cut"_a = nullptr,
+             "shows"_a = "appearance", "colors"_a = py::list(), "chooser"_a = nullptr,
+             "aside"_a = false);
+    py::class_<ScenePick>(m, "Pick", "The gaussian that a pixel shows most of.")
+        .def_readonly("instance", &ScenePick::instance)
+        .def_readonly("cluster", &ScenePick::cluster)
+        .def_readonly("weight", &ScenePick::weight)
+        .def_readonly("depth", &ScenePick::depth);
     py::class_<BoundSceneFrame>(m, "SceneFrame", "Draws scenes of the same bundles on one device.")
         .def(py::init<int>(), "device"_a)
         .def("set_models", &BoundSceneFrame::set_models, "models"_a, "palettes"_a)
-        .def("draw", &BoundSceneFrame::draw, "scene"_a, "camera"_a, "rule"_a, "shade"_a,
-             "stop"_a = nullptr, "steps"_a = nullptr)
-        .def("draw_resident", &BoundSceneFrame::draw_resident, "scene"_a, "pool"_a, "camera"_a,
-             "rule"_a, "shade"_a, "stop"_a = nullptr, "steps"_a = nullptr, py::kw_only(),
-             "shows"_a = "appearance", "colors"_a = py::list(), "chooser"_a = nullptr,
-             "aside"_a = false)
-        .def("pick_resident", &BoundSceneFrame::pick_resident, "scene"_a, "pool"_a, "camera"_a,
-             "rule"_a)
-        .def("draw_cut", &BoundSceneFrame::draw_cut, "scene"_a, "camera"_a, "instance_ids"_a,
-             "cluster_ids"_a, "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
-        .def("count_cut", &BoundSceneFrame::count_cut, "scene"_a, "camera"_a, "instance_ids"_a,
-             "cluster_ids"_a, "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
-        .def("draw_metrics", &BoundSceneFrame::draw_metrics, "scene"_a, "camera"_a, "rule"_a,
-             "instance_ids"_a, "cluster_ids"_a, "shade"_a, "stop"_a = nullptr,
-             "weights"_a = py::none())
+        .def("draw", &BoundSceneFrame::draw, "scene"_a, "request"_a, "pool"_a = py::none(),
+             "steps"_a = nullptr, "stop"_a = nullptr)
+        .def("pick", &BoundSceneFrame::pick, "scene"_a, "request"_a, "pool"_a = py::none())
         .def("memory", &BoundSceneFrame::memory,
              "Bytes that it keeps on a CUDA device, by part; and those of the pool of all frames "
-             "there.")
-        .def("pick_cut", &BoundSceneFrame::pick_cut, "scene"_a, "camera"_a, "instance_ids"_a,
-             "cluster_ids"_a);
+             "there.");
     py::class_<BoundAssetFrame>(m, "AssetFrame",
                                 "Draws gaussians without levels on the device that they are on.")
         .def(py::init<py::object>(), "model"_a)

@@ -2,9 +2,8 @@
 #include <functional>
 #include <vector>
 
+#include "bindings/backend.h"
 #include "bindings/operations.h"
-#include "bindings/types.h"
-#include "gather/gather.h"
 
 namespace v3dg {
 
@@ -31,7 +30,7 @@ py::tuple gathered(const GatherInput& in, Device device, int sh_degree) {
     const NewRows out(device, static_cast<size_t>(in.offset[in.instance.size]), sh_degree);
     {
         const Unlocked unlocked;
-        V3DG_DISPATCH(work, gather, in, out.rows());
+        work.backend().gather(in, out.rows(), work);
     }
     return out.arrays();
 }

@@ -1,3 +1,5 @@
+// Pages of files: read, verified and hashed, for Python.
+
 #include <algorithm>
 #include <cerrno>
 #include <memory>
@@ -15,22 +17,28 @@ namespace v3dg {
 
 namespace {
 
-PageRun run_of(const py::array& hashes, size_t first_page, const py::array& first_cluster,
-               const py::array& offset, const py::array& places) {
-    constexpr size_t kMost = size_t(1) << 62;
-    PageRun run{first_page,
-                {},
-                boundaries_of(offset, "offset", kMost),
-                boundaries_of(places, "places", kMost),
-                {}};
-    run.first_cluster = boundaries_of(first_cluster, "first_cluster", run.offset.size - 1);
-    if (run.first_cluster.size != run.places.size)
-        throw py::value_error("places: expected " + std::to_string(run.first_cluster.size) +
-                              ", got " + std::to_string(run.places.size));
-    run.hashes =
-        span_of<const uint8_t>(hashes, "hashes", {static_cast<py::ssize_t>(run.size()), 16});
-    return run;
-}
+// Neighbouring pages of a file, with the arrays that they are found by.
+struct BoundPageRun {
+    size_t first_page;
+    py::array first_cluster, offset, places;
+
+    // Borrows from the arrays; `hashes` are those of these pages.
+    PageRun read(const py::array& hashes) const {
+        constexpr size_t kMost = size_t(1) << 62;
+        PageRun run{.first_page = first_page,
+                    .first_cluster = {},
+                    .offset = boundaries_of(offset, "offset", kMost),
+                    .places = boundaries_of(places, "places", kMost),
+                    .hashes = {}};
+        run.first_cluster = boundaries_of(first_cluster, "first_cluster", run.offset.size - 1);
+        if (run.first_cluster.size != run.places.size)
+            throw py::value_error("places: expected " + std::to_string(run.first_cluster.size) +
+                                  ", got " + std::to_string(run.places.size));
+        run.hashes =
+            span_of<const uint8_t>(hashes, "hashes", {static_cast<py::ssize_t>(run.size()), 16});
+        return run;
+    }
+};
 
 // Calls body() without the interpreter lock; what goes wrong with a page gets the file's name,
 // which need not be text that can be encoded.
@@ -56,7 +64,7 @@ void read_rows(const py::object& path, int descriptor, const PageRun& run, PageC
                const Rows& out) {
     const GaussianRows<float> rows = out.write();
     const auto count = static_cast<size_t>(run.offset[run.offset.size - 1] - run.offset[0]);
-    if (!out.device().is_host() || rows.size != count)
+    if (out.device() != kHost || rows.size != count)
         throw py::value_error("out: expected " + std::to_string(count) +
                               " gaussians on the host, got others");
     const bool is_quantized = codec == PageCodec::quantized;
@@ -87,9 +95,8 @@ void read_words(const py::object& path, int descriptor, const PageRun& run, cons
 
 // `out` is rows, which are decoded, or an array of words, which are not.
 void read_run(const py::object& path, int descriptor, const py::object& out,
-              const std::string& codec, const py::array& hashes, size_t first_page,
-              const py::array& first_cluster, const py::array& offset, const py::array& places) {
-    const PageRun run = run_of(hashes, first_page, first_cluster, offset, places);
+              const std::string& codec, const py::array& hashes, const BoundPageRun& bound) {
+    const PageRun run = bound.read(hashes);
     if (py::isinstance<py::array>(out))
         return read_words(path, descriptor, run, out.cast<py::array>());
     const PageCodec of = codec == "quantized" ? PageCodec::quantized : PageCodec::float32;
@@ -208,11 +215,19 @@ void bind_pages(py::module_& m) {
           "BLAKE2b-128 of several messages, side by side.");
     m.attr("DAMAGED") = kDamaged;
     m.attr("HASH_PIECE_BYTES") = kHashPieceBytes;
+    py::class_<BoundPageRun>(m, "PageRun", "Neighbouring pages of a file; borrows the arrays.")
+        .def(py::init([](size_t first_page, const py::array& first_cluster, const py::array& offset,
+                         const py::array& places) {
+                 return BoundPageRun{.first_page = first_page,
+                                     .first_cluster = first_cluster,
+                                     .offset = offset,
+                                     .places = places};
+             }),
+             py::kw_only(), "first_page"_a, "first_cluster"_a, "offset"_a, "places"_a);
     m.def("read_pages", &read_run, "path"_a, "descriptor"_a, "out"_a, "codec"_a, "hashes"_a,
-          py::kw_only(), "first_page"_a, "first_cluster"_a, "offset"_a, "places"_a,
-          "Fills rows with the gaussians of neighbouring pages of a file, which have these hashes "
-          "(n, 16), or "
-          "an array of words (W,) int32 with what the pages are as they are.");
+          "run"_a,
+          "Fills rows with the gaussians of a run of pages, which have these hashes (n, 16), or an "
+          "array of words (W,) int32 with the pages as they are.");
 }
 
 }  // namespace v3dg

@@ -1,5 +1,4 @@
 #include <algorithm>
-#include <cstring>
 #include <thread>
 
 #include "base/parallel_for.h"
@@ -10,9 +9,7 @@ namespace v3dg {
 
 namespace {
 
-// At most so much of a pool's memory is for pages on their way: what comes in while a few frames
-// are drawn.
-constexpr size_t kMostBlockBytes = size_t(64) << 20, kMostBlockBytesOnDevice = size_t(128) << 20;
+// At most this part of a pool's memory is for pages on their way.
 constexpr size_t kBlockShare = 8;
 // Threads that read do more than wait for the disk: they hash. There are more of them where there
 // are cores.
@@ -23,15 +20,29 @@ constexpr unsigned kMostThreads = 16;
     throw py::error_already_set();
 }
 
+// The file of a bundle as Python has it, with the arrays that pages are found by.
+struct BoundFileSource {
+    std::string name;
+    int descriptor;
+    PageCodec codec;
+    int sh_degree;
+    py::array places, hashes;
+    py::object fetch;  // what fetches parts of the file, or None
+};
+
+PageCodec codec_of(const std::string& name) {
+    if (name == "float32") return PageCodec::float32;
+    if (name == "quantized") return PageCodec::quantized;
+    throw py::value_error("codec: expected float32 or quantized, got " + name);
+}
+
 // What a source is made of, borrowed from objects of Python.
 struct GivenSource {
-    const Rows* rows = nullptr;  // in memory; else a file:
-    std::string name;
-    int descriptor = -1, sh_degree = 0;
-    Fetch fetch;
-    PageCodec codec = PageCodec::float32;
-    Span<const int64_t> places;
-    Span<const uint8_t> hashes;
+    const Rows* rows = nullptr;             // in memory; or
+    const BoundFileSource* file = nullptr;  // in a file:
+    Fetch fetch = {};
+    Span<const int64_t> places = {};
+    Span<const uint8_t> hashes = {};
 };
 
 // The text of what was raised, which is raised no longer; with Python's lock.
@@ -76,33 +87,22 @@ Fetch fetch_by(const py::object& function) {
 }
 
 GivenSource given_source(const py::handle& source, const ClusterTable& table) {
-    GivenSource given;
-    if (py::isinstance<Rows>(source)) {
-        given.rows = &source.cast<const Rows&>();
-        return given;
-    }
-    const auto file = source.cast<py::tuple>();
-    const auto codec = file[2].cast<std::string>();
-    if (codec != "float32" && codec != "quantized")
-        throw py::value_error("codec: expected float32 or quantized, got " + codec);
-    if (codec == "quantized") given.codec = PageCodec::quantized;
-    given.name = file[0].cast<std::string>();
-    given.descriptor = file[1].cast<int>();
-    given.sh_degree = file[3].cast<int>();
-    const py::array places = file[4], hashes = file[5];
+    if (py::isinstance<Rows>(source)) return {.rows = &source.cast<const Rows&>()};
+    const auto& file = held<BoundFileSource>(source, "sources");
     const auto num_pages =
         static_cast<py::ssize_t>(table.num_clusters() > 0 ? table.num_pages() : 0);
-    given.places = span_of<const int64_t>(places, "places", {num_pages + 1});
-    given.hashes = span_of<const uint8_t>(hashes, "hashes", {num_pages, 16});
-    given.fetch = fetch_by(file[6]);
-    return given;
+    return {.file = &file,
+            .fetch = fetch_by(file.fetch),
+            .places = span_of<const int64_t>(file.places, "places", {num_pages + 1}),
+            .hashes = span_of<const uint8_t>(file.hashes, "hashes", {num_pages, 16})};
 }
 
 std::shared_ptr<const PageSource> source_of(const GivenSource& given, const ClusterTable& table) {
     if (given.rows != nullptr)
         return std::make_shared<MemoryPages>(table, given.rows->read<float>());
-    return std::make_shared<FilePages>(table, given.sh_degree, given.codec, given.name,
-                                       given.descriptor, given.places, given.hashes, given.fetch);
+    const BoundFileSource& file = *given.file;
+    return std::make_shared<FilePages>(table, file.sh_degree, file.codec, file.name,
+                                       file.descriptor, given.places, given.hashes, given.fetch);
 }
 
 py::array_t<bool> resident_pages(BoundPool& pool, size_t bundle) {
@@ -150,66 +150,34 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
         max_degree = std::max(max_degree, bundle.source->sh_degree());
         limits.keeps_codes &= bundle.source->codec() == PageCodec::quantized;
     }
-    needs_.resize(bundles.size());
     limits.num_threads = num_threads;
     if (num_threads > 0)
         limits.num_threads =
             std::max(num_threads, std::min(kMostThreads, std::thread::hardware_concurrency()));
-    const size_t most_block_bytes = device_.is_host() ? kMostBlockBytes : kMostBlockBytesOnDevice;
-    limits.block_bytes = std::min(most_block_bytes, num_bytes / kBlockShare);
-    size_t row_bytes = sizeof(float) * (11 + 3 * num_sh_bases(max_degree));
-    std::shared_ptr<BlockMemory> blocks = std::make_shared<HostBlocks>();
     const Work work(device_);
-#if V3DG_WITH_CUDA
-    if (!device_.is_host()) {
-        row_bytes = cuda::packed_row_bytes(max_degree);
-        blocks = std::make_shared<cuda::PinnedBlocks>();
-        limits.most_frames = cuda::kMostFlights;
-    }
-#endif
-    limits.memory = {num_bytes - limits.block_bytes, row_bytes, 0};
+    PoolDemands demands = work.backend().pool_demands(max_degree);
+    limits.most_frames = demands.most_frames;
+    limits.block_bytes = std::min(demands.most_block_bytes, num_bytes / kBlockShare);
+    limits.memory = {num_bytes - limits.block_bytes, demands.row_bytes, 0};
     if (limits.keeps_codes) {
         limits.memory.row_bytes = slot_row_bytes(max_degree);
         limits.memory.cluster_bytes = slot_cluster_bytes(max_degree);
-        // The host has places of 32 bits for coefficients, which devices have for rows alone.
-        if (device_.is_host()) limits.memory.most_rows /= std::max(1, max_degree);
+        if (demands.most_coded_rows > 0) limits.memory.most_rows = demands.most_coded_rows;
     }
     try {
         const Unlocked unlocked;
-        pool_ = std::make_unique<PagePool>(bundles, limits, std::move(blocks));
+        pool_ = std::make_unique<PagePool>(bundles, limits, std::move(demands.blocks));
     } catch (const PageError& error) {
         raise(error);
     }
-    if (device_.is_host()) host_ = std::make_unique<HostPages>(*pool_);
-#if V3DG_WITH_CUDA
-    if (!device_.is_host()) make_on_device(work);
-#endif
+    on_device_ = work.backend().make_pool(*pool_, tables_, work);
 }
 
 BoundPool::~BoundPool() {
-#if V3DG_WITH_CUDA
     on_device_.reset();
-#endif
-    host_.reset();
     const Unlocked unlocked;  // threads that end may be on their way to ask Python for a page
     pool_.reset();
 }
-
-#if V3DG_WITH_CUDA
-void BoundPool::make_on_device(const Work& work) {
-    std::vector<std::shared_ptr<const cuda::BundleTables>> tables;
-    std::vector<ClusterTable> host;
-    std::vector<ClusterAppearance> appearance;
-    for (const py::handle& table : tables_) {
-        const auto& bound = held<BoundTable>(table, "tables");
-        tables.push_back(bound.on_device(work));
-        host.push_back(bound.table());
-        appearance.push_back(bound.appearance());
-    }
-    on_device_ = std::make_unique<cuda::DevicePages>(*pool_, std::move(tables), host, appearance,
-                                                     work.stream());
-}
-#endif
 
 void BoundPool::check_scene(const SceneState& scene) const {
     bool fits = scene.bundles.size() == tables_.size();
@@ -217,46 +185,14 @@ void BoundPool::check_scene(const SceneState& scene) const {
     if (!fits) throw py::value_error("scene: expected one of the bundles that the pool is of");
 }
 
-NotedView BoundPool::note_needs(float tolerance_px2, bool is_bounded) {
-    FrameNeeds* needs = pool_->lend_needs();
-    size_t count = 0;
-    for (uint32_t b = 0; b < needs_.size(); ++b)
-        for (uint32_t p = 0; p < needs_[b].size(); ++p) {
-            if (needs_[b][p] == 0 || count++ >= pool_->most_needs()) continue;
-            PageRequest& need = needs->list[count - 1] = {b, p, 0};
-            std::memcpy(&need.priority, &needs_[b][p], sizeof(float));
-        }
-    needs->count = std::min(count, pool_->most_needs());
-    needs->num_left_out = count - needs->count;
-    needs->tolerance_px2 = tolerance_px2;
-    needs->adapts = is_bounded;
-    return pool_->note_needs(needs, !is_bounded);
-}
-
 SettlingStep BoundPool::settle_step(const py::object& scene_object, const BoundEyes& camera,
                                     const SelectRule& rule, bool begins) {
-    const Eyes& eyes = camera.eyes;
-    const auto& held_scene = held<BoundScene>(scene_object, "scene");
-    const std::shared_ptr<const SceneState> state = held_scene.state();
+    const auto& scene = held<BoundScene>(scene_object, "scene");
+    const std::shared_ptr<const SceneState> state = scene.state();
     check_scene(*state);
-    SettlingStep step;
-#if V3DG_WITH_CUDA
-    if (!device_.is_host()) {
-        const Work work(device_);
-        const Unlocked unlocked;
-        return on_device_->settle_step(held_scene.on_device(), eyes, rule, begins, work.stream());
-    }
-#endif
+    const Work work(device_);
     const Unlocked unlocked;
-    const PoolFrame kind = begins ? PoolFrame::first_look : PoolFrame::look;
-    step.noted =
-        frame_on_host(*state, rule, kind, [&](auto tables, const SelectRule& raised, auto needs) {
-            SelectOutput out;
-            cpu::select({tables, state->instances, eyes, raised, needs}, out);
-            step.tolerance_px2 = out.fits_budget ? out.tolerance_px2 : raised.tolerance_px2;
-            return step.tolerance_px2;
-        });
-    return step;
+    return on_device_->settle_step(scene.handle(), *state, camera.eyes, rule, begins, work);
 }
 
 void bind_pool(py::module_& m) {
@@ -277,6 +213,20 @@ void bind_pool(py::module_& m) {
                                [](const SettlingStep& step) { return step.noted.is_decided; })
         .def_property_readonly("num_absent",
                                [](const SettlingStep& step) { return step.noted.num_absent; });
+    py::class_<BoundFileSource>(m, "FileSource", "The file that pages of a bundle are in.")
+        .def(py::init([](const std::string& name, int descriptor, const std::string& codec,
+                         int sh_degree, const py::array& places, const py::array& hashes,
+                         const py::object& fetch) {
+                 return BoundFileSource{.name = name,
+                                        .descriptor = descriptor,
+                                        .codec = codec_of(codec),
+                                        .sh_degree = sh_degree,
+                                        .places = places,
+                                        .hashes = hashes,
+                                        .fetch = fetch};
+             }),
+             py::kw_only(), "name"_a, "descriptor"_a, "codec"_a, "sh_degree"_a, "places"_a,
+             "hashes"_a, "fetch"_a = py::none());
     py::class_<BoundPool>(m, "PagePool",
                           "Pages of bundles in a fixed amount of memory of one device.")
         .def(py::init<py::list, py::list, int, size_t, unsigned>(), "tables"_a, "sources"_a,

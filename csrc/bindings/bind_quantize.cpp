@@ -1,4 +1,4 @@
-#include "bindings/codes.h"
+#include "bindings/backend.h"
 #include "bindings/operations.h"
 #include "quantize/codebook.h"
 
@@ -19,9 +19,8 @@ py::ssize_t num_words(Span<const int64_t> offset, int sh_degree) {
 
 py::object encode_rows(const Rows& gaussians, const py::array& offset) {
     const GaussianRows<const float> in = gaussians.read<float>();
-    if (!gaussians.device().is_host())
-        throw py::value_error(
-            "gaussians: expected arrays on the host, got others; bring them there");
+    check_is_on_host(gaussians.device(), "gaussians",
+                     "expected arrays on the host, got others; bring them there");
     const Span<const int64_t> clusters = boundaries_of(offset, "offset", in.size);
     const NewArray<int32_t> page({}, {num_words(clusters, in.sh_degree)});
     {
@@ -33,8 +32,8 @@ py::object encode_rows(const Rows& gaussians, const py::array& offset) {
 
 void decode_rows(const py::array& page, const py::array& offset, const Rows& out) {
     const GaussianRows<float> rows = out.write();
-    if (!out.device().is_host())
-        throw py::value_error("out: expected arrays on the host, got others; bring them there");
+    check_is_on_host(out.device(), "out",
+                     "expected arrays on the host, got others; bring them there");
     const Span<const int64_t> clusters = boundaries_of(offset, "offset", rows.size);
     const auto words = span_of<const int32_t>(page, "page", {num_words(clusters, rows.sh_degree)});
     const Unlocked unlocked;

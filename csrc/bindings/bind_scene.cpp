@@ -1,3 +1,5 @@
+// What is resident, and false colours.
+
 #include "bindings/operations.h"
 #include "bindings/resident.h"
 #include "draw/false_color.h"

@@ -1,5 +1,8 @@
+// Tables of bundles, and selections on the host that no resident scene is made for.
+
 #include <functional>
 
+#include "bindings/backend.h"
 #include "bindings/operations.h"
 #include "bindings/tables.h"
 
@@ -112,26 +115,21 @@ BoundTable::BoundTable(py::array ball, py::array weight, py::array level, py::ar
     host_ = std::make_unique<HostTable>(given, appearance);
 }
 
-#if V3DG_WITH_CUDA
-std::shared_ptr<const cuda::BundleTables> BoundTable::on_device(const Work& work) const {
-    std::weak_ptr<const cuda::BundleTables>& known = on_device_[work.device().number];
-    std::shared_ptr<const cuda::BundleTables> tables = known.lock();
+std::shared_ptr<const backend::Tables> BoundTable::on(const Work& work) const {
+    std::weak_ptr<const backend::Tables>& known = on_device_[work.device().number];
+    std::shared_ptr<const backend::Tables> tables = known.lock();
     if (tables == nullptr) {
-        tables = std::make_shared<cuda::BundleTables>(table(), appearance(), work.stream());
+        tables = work.backend().make_tables(*this, work);
         known = tables;
     }
     return tables;
 }
-#endif
 
 size_t BoundTable::bytes_on(int device) const {
-#if V3DG_WITH_CUDA
     const auto found = on_device_.find(device);
-    const auto tables = found == on_device_.end() ? nullptr : found->second.lock();
-    if (tables != nullptr) return tables->bytes();
-#endif
-    static_cast<void>(device);
-    return 0;
+    if (found == on_device_.end()) return 0;
+    const std::shared_ptr<const backend::Tables> tables = found->second.lock();
+    return tables == nullptr ? 0 : tables->bytes();
 }
 
 BoundCut::BoundCut(const SelectOutput& out)

@@ -1,6 +1,5 @@
+#include "bindings/backend.h"
 #include "bindings/operations.h"
-#include "bindings/types.h"
-#include "simplify/simplify.h"
 
 namespace v3dg {
 
@@ -44,7 +43,7 @@ py::object prune(const Rows& gaussians, const py::array& in_offset, const py::ar
                                  {static_cast<py::ssize_t>(segments.num_out())});
     {
         const Unlocked unlocked;
-        V3DG_DISPATCH(work, prune, in, segments.in, segments.out, kept.span);
+        work.backend().prune(in, segments.in, segments.out, kept.span, work);
     }
     return kept.object;
 }
@@ -56,7 +55,7 @@ py::tuple merge(const Rows& gaussians, const py::array& in_offset, const py::arr
     const NewRows merged(gaussians.device(), segments.num_out(), in.sh_degree);
     {
         const Unlocked unlocked;
-        V3DG_DISPATCH(work, merge, in, segments.in, segments.out, merged.rows());
+        work.backend().merge(in, segments.in, segments.out, merged.rows(), work);
     }
     return merged.arrays();
 }

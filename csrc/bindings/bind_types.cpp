@@ -1,8 +1,10 @@
+// Values that cross between Python and the core: cameras, rules, instances and rows.
+
 #include <algorithm>
 #include <cmath>
 
+#include "bindings/backend.h"
 #include "bindings/operations.h"
-#include "bindings/types.h"
 
 namespace v3dg {
 
@@ -113,18 +115,18 @@ Rows::Rows(py::object means, py::object quats, py::object scales, py::object opa
     if (centers.size() != 2)
         throw py::value_error("means: expected shape (N, 3), got " + shape_text(arrays_[0]));
     size_ = static_cast<size_t>(centers[0]);
-    is_double_ = device_.is_host() && py::isinstance<py::array_t<double>>(arrays_[0]);
+    const BackendTraits& traits = backend_of(device_).traits;
+    is_double_ = traits.computes_doubles && py::isinstance<py::array_t<double>>(arrays_[0]);
     if (is_double_) {
         remember(spans<const double>());
         return;
     }
     const GaussianRows<const float> rows = spans<const float>();
     remember(rows);
-    if (device_.is_host()) return;
     for (const float* start : {rows.quats, rows.sh})
-        if (reinterpret_cast<uintptr_t>(start) % 16 != 0)
-            throw py::value_error(
-                "quats, sh: expected memory that begins at a multiple of 16 bytes");
+        if (reinterpret_cast<uintptr_t>(start) % traits.row_alignment != 0)
+            throw py::value_error("quats, sh: expected memory that begins at a multiple of " +
+                                  std::to_string(traits.row_alignment) + " bytes");
 }
 
 void Rows::check_precision(bool wants_double) const {

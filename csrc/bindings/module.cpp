@@ -1,3 +1,5 @@
+// The compiled module: what it needs of the process, and its parts in order.
+
 #include <dlfcn.h>
 #include <omp.h>
 #include <pthread.h>
@@ -6,15 +8,11 @@
 #include <new>
 
 #include "base/isa.h"
-#include "bindings/array.h"
+#include "bindings/backend.h"
 #include "bindings/operations.h"
 #include "bindings/python_lock.h"
 #include "math/gaussian.h"
 #include "residency/cluster_table.h"
-
-#if V3DG_WITH_CUDA
-#include "base/device.h"
-#endif
 
 // A child of fork() has none of the threads that GNU's OpenMP keeps for the next loop, but would
 // wait for them without end. So the thread that forks lets its own go first; they come back, on
@@ -28,11 +26,8 @@ static bool must_let_threads_go() {
 }
 
 static int num_cuda_devices() {
-#if V3DG_WITH_CUDA
-    return v3dg::cuda::num_devices();
-#else
-    return 0;
-#endif
+    const v3dg::Backend* const backend = v3dg::device_backend();
+    return backend == nullptr ? 0 : backend->num_devices();
 }
 
 // An object that only `__new__` has made holds nothing. When a function is given one, pybind11 asks
@@ -59,7 +54,7 @@ PYBIND11_MODULE(_core, m) {
     m.attr("min_alpha") = v3dg::kMinAlpha;
     m.attr("fade_filter_px2") = v3dg::kFadeFilterPx2;
     m.attr("sh_base0") = v3dg::kShBase0;
-    m.attr("has_cuda") = V3DG_WITH_CUDA != 0;
+    m.attr("has_cuda") = v3dg::device_backend() != nullptr;
     m.def(
         "isa", [] { return v3dg::isa_name(v3dg::active_isa()); },
         "Instruction set that the CPU half runs on.");

@@ -1,5 +1,7 @@
 #pragma once
 
+// Tables of bundles, and cuts of them.
+
 #include <map>
 #include <memory>
 #include <vector>
@@ -7,11 +9,9 @@
 #include "bindings/types.h"
 #include "residency/cluster_table.h"
 
-#if V3DG_WITH_CUDA
-#include "residency/bundle_tables.h"
-#endif
-
 namespace v3dg {
+
+namespace backend { class Tables; }
 
 // The tables of one bundle with the arrays that they borrow from.
 class BoundTable {
@@ -30,17 +30,13 @@ class BoundTable {
     // Memory that the tables take on a device.
     size_t bytes_on(int device) const;
 
-#if V3DG_WITH_CUDA
-    // The tables on a device, which all scenes there share; uploaded if no scene has them.
-    std::shared_ptr<const cuda::BundleTables> on_device(const Work& work) const;
-#endif
+    // The tables on a device, which all scenes there share; made if no scene has them.
+    std::shared_ptr<const backend::Tables> on(const Work& work) const;
 
   private:
     std::vector<py::array> arrays_;
     std::unique_ptr<HostTable> host_;
-#if V3DG_WITH_CUDA
-    mutable std::map<int, std::weak_ptr<const cuda::BundleTables>> on_device_;
-#endif
+    mutable std::map<int, std::weak_ptr<const backend::Tables>> on_device_;
 };
 
 // The pairs (instance, cluster) of a selection, and what it came to.

@@ -1,3 +1,6 @@
+// The slots of a page pool on a CUDA device: bytes of pages go there in a flight before a cut, and
+// kernels unpack or place them; what the cut needed comes back with the flight.
+
 #include "draw/device_pages.h"
 
 #include <algorithm>

@@ -1,3 +1,6 @@
+// A frame on a CUDA device: its buffers, the stages in their order, and drawing again where a
+// buffer was too small. draw/frame_cuda.h says what it promises.
+
 #include "draw/frame_cuda.h"
 
 #include <algorithm>
@@ -151,10 +154,15 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     State* state = reinterpret_cast<State*>(cleared);
     auto* scan_state = reinterpret_cast<unsigned long long*>(cleared + sizeof(State));
     unsigned long long* zeros = scan_state + parts;
-    const TileCounts tiles{reinterpret_cast<uint32_t*>(zeros + batch.num_zeros),
-                           &state->scan_ticket, &state->scattered, scan_state};
-    const ItemList items{room(items_, capacity.items, drawing), &state->counters, capacity.items,
-                         capacity.records, zeros};
+    const TileCounts tiles{.count = reinterpret_cast<uint32_t*>(zeros + batch.num_zeros),
+                           .scan_ticket = &state->scan_ticket,
+                           .taken = &state->scattered,
+                           .state = scan_state};
+    const ItemList items{.items = room(items_, capacity.items, drawing),
+                         .counters = &state->counters,
+                         .item_capacity = capacity.items,
+                         .record_capacity = capacity.records,
+                         .zeros = zeros};
     room(records_, kRecordFloats * capacity.records, drawing);
     uint32_t* item_records = room(item_records_, capacity.items, drawing);
     ItemTiles* item_tiles = room(item_tiles_, capacity.items, drawing);
@@ -167,8 +175,9 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     uint32_t* source = keeps_tape ? room(source_, capacity.records, drawing) : nullptr;
     if (keeps_tape) room(boxes_, capacity.records, drawing);
     const RecordPlanes planes = records();
-    const TileBinOutput bins{room(tile_first_, batch.num_tiles + 1, drawing),
-                             room(image_of_tile_, batch.num_tiles, drawing), entries};
+    const TileBinOutput bins{.tile_first = room(tile_first_, batch.num_tiles + 1, drawing),
+                             .image_of_tile = room(image_of_tile_, batch.num_tiles, drawing),
+                             .entries = entries};
 
     if (!capturing) check(cudaEventRecord(slot.begun, stream), "cudaEventRecord");
     if (capturing || num_zero_bytes_ < cleared_bytes)
@@ -176,13 +185,34 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     const size_t num_zero_bytes = std::max(std::exchange(num_zero_bytes_, 0), cleared_bytes);
     drawing.prepare_(items, stream);
     if (!capturing) check(cudaEventRecord(slot.prepared, stream), "cudaEventRecord");
-    project({batch.models, batch.packed, batch.coded, batch.placements, batch.images, items,
-             batch.has_shared_items, batch.has_faded_items},
-            {planes, few, item_records, item_tiles, source, tiles, large, capacity.large,
-             state->projected},
+    project({.models = batch.models,
+             .packed = batch.packed,
+             .coded = batch.coded,
+             .placements = batch.placements,
+             .images = batch.images,
+             .items = items,
+             .has_shared_items = batch.has_shared_items,
+             .has_faded_items = batch.has_faded_items},
+            {.records = planes,
+             .few = few,
+             .item_records = item_records,
+             .item_tiles = item_tiles,
+             .source = source,
+             .tiles = tiles,
+             .large = large,
+             .large_capacity = capacity.large,
+             .taken = state->projected},
             stream);
-    tile_bin({item_tiles, few, planes, batch.images, batch.num_images, batch.num_tiles, capacity,
-              large, tiles, &state->counters},
+    tile_bin({.items = item_tiles,
+              .few = few,
+              .records = planes,
+              .images = batch.images,
+              .num_images = batch.num_images,
+              .num_tiles = batch.num_tiles,
+              .capacity = capacity,
+              .large = large,
+              .counts = tiles,
+              .counters = &state->counters},
              bins, stream);
     num_plans_ = keeps_tape ? batch.num_tiles : most_plans(batch.num_tiles);
     room(plans_, num_plans_, drawing);

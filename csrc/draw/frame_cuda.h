@@ -1,5 +1,7 @@
 #pragma once
 
+// Frames on a CUDA device, from items to pixels, and drawings that are under way.
+
 #include <deque>
 #include <functional>
 #include <memory>

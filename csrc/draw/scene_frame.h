@@ -1,10 +1,12 @@
 #pragma once
 
+// Frames of a scene on the host: a request in, pictures and what they came to out.
+
 #include <atomic>
 #include <vector>
 
 #include "draw/render.h"
-#include "select/select.h"
+#include "draw/request.h"
 
 namespace v3dg {
 
@@ -19,11 +21,6 @@ struct SceneModel {
     const float* cluster_sh = nullptr;
 };
 
-// What colours of a cut's clusters say: nothing, where finer pages are missing (see
-// missing_color()), or the share of the cut's tolerance that metrics take, as draw_metrics() has
-// it.
-enum class SceneColors { own, missing, metrics };
-
 // A scene on the host: what selection reads of its bundles, their gaussians, and its instances.
 struct HostScene {
     Span<const ClusterTable> tables;
@@ -32,9 +29,6 @@ struct HostScene {
     // As SelectInput has them.
     Span<const Span<uint32_t>> needs = {};
     uint32_t* last_bin = nullptr;
-    SceneColors colors = SceneColors::own;
-    float wanted_px2 = 0.0f;        // what is missing, where it is not of this tolerance
-    const Eyes* chooser = nullptr;  // which the cut is for; null: those that look
 };
 
 // What one frame came to.
@@ -56,39 +50,34 @@ struct SceneFrameCounts {
     }
 };
 
-// Where a pixel's gaussian comes from.
+// The gaussian that a pixel shows most of, and the pair that it belongs to.
 struct ScenePick {
-    size_t pair;  // place in the cut
-    float weight, depth;
+    int32_t instance, cluster;
+    float weight;  // its share of the pixel
+    float depth;
 };
 
 namespace cpu {
 
-// Selects what the windows of the eyes need, which share a cut, and draws a picture for each. Once
-// `stop` is true, returns soon and leaves the pictures unfinished.
-SceneFrameCounts draw_scene(const HostScene& scene, const Eyes& eyes, const SelectRule& rule,
-                            Span<const Picture<float>> pictures,
-                            const std::atomic<bool>* stop = nullptr);
-
-// Draws pairs that were selected before. Throws std::out_of_range where one is not of the scene.
-SceneFrameCounts draw_cut(const HostScene& scene, const Camera& camera, const GivenCut& given,
-                          const Picture<float>& picture, const std::atomic<bool>* stop = nullptr);
-
-// The same in shades of grey: the metric of each pair (see pair_metrics) over the rule's tolerance,
-// at most kMostShare.
+// Metrics are shown up to so many times the tolerance.
 constexpr float kMostShare = 2.0f;
-SceneFrameCounts draw_metrics(const HostScene& scene, const Camera& camera, const SelectRule& rule,
-                              const GivenCut& given, const Picture<float>& picture,
-                              const std::atomic<bool>* stop = nullptr);
+
+// Draws what is asked for, a picture for each eye. `rule` is the one of the request, as a pool or
+// the pacing of a budget has changed it. A given cut has a picture for the first eye alone; throws
+// std::out_of_range where one of its pairs is not of the scene. Once `stop` is true, returns soon
+// and leaves the pictures unfinished.
+SceneFrameCounts draw_scene(const HostScene& scene, const FrameRequest& request,
+                            const SelectRule& rule, Span<const Picture<float>> pictures,
+                            const std::atomic<bool>* stop = nullptr);
 
 // Draws all gaussians of one model, in the world, without a filter.
 SceneFrameCounts draw_model(const GaussianPlanes<float>& model, size_t count, const Camera& camera,
                             const Picture<float>& picture, const std::atomic<bool>* stop = nullptr);
 
-// The gaussian that the first pixel of the camera's window shows most of. Returns whether there is
-// any.
-bool pick_cut(const HostScene& scene, const Camera& camera, const GivenCut& given,
-              ScenePick& picked);
+// Finds the gaussian that the first pixel of the first eye's window shows most of, of the cut that
+// draw_scene() would draw. Returns whether there is any.
+bool pick_scene(const HostScene& scene, const FrameRequest& request, const SelectRule& rule,
+                ScenePick& picked);
 
 }  // namespace cpu
 }  // namespace v3dg

@@ -1,3 +1,6 @@
+// Frames of a scene on the host: the clusters of a cut as draws, their false colours, and what
+// draw/scene_frame.h promises.
+
 #include "draw/scene_frame.h"
 
 #include <algorithm>
@@ -159,21 +162,26 @@ std::vector<int64_t> levels_of(const HostScene& scene, const GivenCut& given) {
     return levels;
 }
 
-// [S][3]: what pairs are drawn with in place of their colours; empty: nothing.
-std::vector<float> tint_of(const HostScene& scene, const Camera& camera, const SelectRule& rule,
-                           const GivenCut& given, float tolerance_px2) {
-    if (scene.colors == SceneColors::own) return {};
-    const bool is_metric = scene.colors == SceneColors::metrics;
-    // Of a budget, the tolerance that it comes to is wanted; a little more, for metrics are
-    // rounded.
-    const float wanted = is_metric || rule.budget != kNoBudget ? tolerance_px2 : scene.wanted_px2;
+// [S][3]: what pairs are drawn with in place of their colours; empty: nothing. `tolerance_px2` is
+// the one of the cut.
+std::vector<float> tint_of(const HostScene& scene, const FrameRequest& request,
+                           const SelectRule& rule, const GivenCut& given, float tolerance_px2) {
+    const bool is_metric = request.look == FrameLook::metrics;
+    if (!is_metric && request.look != FrameLook::missing) return {};
+    // Metrics are those for who looks. What is missing is so for whom the cut was chosen.
+    const Camera& judge = is_metric ? request.eyes.camera[0] : request.choosing_eyes().camera[0];
+    // Without a budget, the tolerance that was asked for is wanted, not the one that a pool raised
+    // it to. With a budget, the one that the budget comes to is.
+    const bool wants_used = is_metric || rule.budget != kNoBudget;
+    const float wanted = wants_used ? tolerance_px2 : request.rule.tolerance_px2;
     std::vector<float> tint(3 * given.instance.size);
     const std::vector<float> share =
-        shares_of(scene, camera, rule, given, is_metric ? wanted : std::max(wanted, 1e-6f));
+        shares_of(scene, judge, rule, given, is_metric ? wanted : std::max(wanted, 1e-6f));
     for (size_t s = 0; s < share.size(); ++s) {
         const ClusterTable& table = scene.tables[scene.instances.bundle[given.instance[s]]];
         const bool is_finest = level_of(table, given.cluster[s]) <= rule.min_level;
         const float grey = std::min(share[s], cpu::kMostShare);
+        // A little more than the fade's factor, for metrics are rounded.
         const Rgb rgb =
             is_metric ? Rgb{grey, grey, grey}
                       : missing_color(is_finest ? 0.0f : share[s], 1.0001f * rule.fade.factor);
@@ -182,27 +190,49 @@ std::vector<float> tint_of(const HostScene& scene, const Camera& camera, const S
     return tint;
 }
 
-}  // namespace
+GivenCut pairs_of(const SelectOutput& cut) {
+    return {.instance = {cut.instance.data(), cut.instance.size()},
+            .cluster = {cut.cluster.data(), cut.cluster.size()},
+            .weight = {cut.weight.data(), cut.weight.size()}};
+}
 
-SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Eyes& eyes, const SelectRule& rule,
-                                 Span<const Picture<float>> pictures,
-                                 const std::atomic<bool>* stop) {
+void select_for(const HostScene& scene, const FrameRequest& request, const SelectRule& rule,
+                SelectOutput& out) {
+    cpu::select({.bundles = scene.tables,
+                 .instances = scene.instances,
+                 .eyes = request.choosing_eyes(),
+                 .rule = rule,
+                 .needs = scene.needs,
+                 .last_bin = scene.last_bin},
+                out);
+}
+
+SceneFrameCounts draw_given(const HostScene& scene, const FrameRequest& request,
+                            const SelectRule& rule, const Picture<float>& picture,
+                            const std::atomic<bool>* stop) {
+    const Camera& camera = request.eyes.camera[0];
+    const GivenCut& given = *request.cut;
+    std::vector<float> tint;
+    if (request.look == FrameLook::metrics) {
+        static_cast<void>(CutDraws(scene, camera, given));  // which checks the pairs
+        tint = tint_of(scene, request, rule, given, rule.tolerance_px2);
+    }
+    return draw_pairs(scene, camera, given, tint.empty() ? nullptr : tint.data(), picture, stop);
+}
+
+SceneFrameCounts draw_selected(const HostScene& scene, const FrameRequest& request,
+                               const SelectRule& rule, Span<const Picture<float>> pictures,
+                               const std::atomic<bool>* stop) {
     const double start = now();
     SelectOutput cut;
-    const Eyes& chooser = scene.chooser == nullptr ? eyes : *scene.chooser;
-    select({scene.tables, scene.instances, chooser, rule, scene.needs, scene.last_bin}, cut);
+    select_for(scene, request, rule, cut);
     const double select_seconds = now() - start;
-    const GivenCut given{{cut.instance.data(), cut.instance.size()},
-                         {cut.cluster.data(), cut.cluster.size()},
-                         {cut.weight.data(), cut.weight.size()}};
-    // Metrics are those from here, whatever was missing was so for whom it was chosen for.
-    const Camera& judge = scene.colors == SceneColors::missing ? chooser.camera[0] : eyes.camera[0];
-    const std::vector<float> tint = cut.fits_budget
-                                        ? tint_of(scene, judge, rule, given, cut.tolerance_px2)
-                                        : std::vector<float>{};
+    const GivenCut given = pairs_of(cut);
+    std::vector<float> tint;
+    if (cut.fits_budget) tint = tint_of(scene, request, rule, given, cut.tolerance_px2);
     SceneFrameCounts counts{};
     for (size_t k = 0; k < pictures.size && cut.fits_budget; ++k)
-        counts.add_picture(draw_pairs(scene, eyes.camera[k], given,
+        counts.add_picture(draw_pairs(scene, request.eyes.camera[k], given,
                                       tint.empty() ? nullptr : tint.data(), pictures[k], stop));
     counts.gaussians = cut.num_gaussians;
     counts.tolerance_px2 = cut.tolerance_px2;
@@ -212,19 +242,13 @@ SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Eyes& eyes, const
     return counts;
 }
 
-SceneFrameCounts cpu::draw_cut(const HostScene& scene, const Camera& camera, const GivenCut& given,
-                               const Picture<float>& picture, const std::atomic<bool>* stop) {
-    return draw_pairs(scene, camera, given, nullptr, picture, stop);
-}
+}  // namespace
 
-SceneFrameCounts cpu::draw_metrics(const HostScene& scene, const Camera& camera,
-                                   const SelectRule& rule, const GivenCut& given,
-                                   const Picture<float>& picture, const std::atomic<bool>* stop) {
-    static_cast<void>(CutDraws(scene, camera, given));  // which checks the pairs
-    HostScene shown = scene;
-    shown.colors = SceneColors::metrics;
-    const std::vector<float> tint = tint_of(shown, camera, rule, given, rule.tolerance_px2);
-    return draw_pairs(scene, camera, given, tint.data(), picture, stop);
+SceneFrameCounts cpu::draw_scene(const HostScene& scene, const FrameRequest& request,
+                                 const SelectRule& rule, Span<const Picture<float>> pictures,
+                                 const std::atomic<bool>* stop) {
+    if (request.cut) return draw_given(scene, request, rule, pictures[0], stop);
+    return draw_selected(scene, request, rule, pictures, stop);
 }
 
 SceneFrameCounts cpu::draw_model(const GaussianPlanes<float>& model, size_t count,
@@ -239,14 +263,22 @@ SceneFrameCounts cpu::draw_model(const GaussianPlanes<float>& model, size_t coun
     return counts;
 }
 
-bool cpu::pick_cut(const HostScene& scene, const Camera& camera, const GivenCut& given,
-                   ScenePick& picked) {
+bool cpu::pick_scene(const HostScene& scene, const FrameRequest& request, const SelectRule& rule,
+                     ScenePick& picked) {
+    SelectOutput selected;
+    if (!request.cut) select_for(scene, request, rule, selected);
+    const GivenCut given = request.cut ? *request.cut : pairs_of(selected);
+    const Camera& camera = request.eyes.camera[0];
     const CutDraws cut(scene, camera, given);
     Pick found{};
     if (!pick(cut.draws(), camera.intrinsics<float>(), static_cast<int>(camera.x0),
               static_cast<int>(camera.y0), found))
         return false;
-    picked = {cut.pair_of(found.gaussian), found.weight, found.depth};
+    const size_t pair = cut.pair_of(found.gaussian);
+    picked = {.instance = given.instance[pair],
+              .cluster = given.cluster[pair],
+              .weight = found.weight,
+              .depth = found.depth};
     return true;
 }
 

@@ -1,3 +1,5 @@
+// Frames of a scene on a CUDA device: which cut writes the items, and of which models the batch is.
+
 #include "draw/scene_frame_cuda.h"
 
 #include <algorithm>
@@ -10,14 +12,14 @@ namespace cuda {
 
 FrameImage frame_image(const Intrinsics<float>& camera, int width, int height,
                        const float background[3], const PicturePlanes& planes) {
-    return {camera,
-            width,
-            height,
-            (width + kFrameTileWidth - 1) / kFrameTileWidth,
-            (height + kFrameTileHeight - 1) / kFrameTileHeight,
-            0,
-            {background[0], background[1], background[2]},
-            planes};
+    return {.camera = camera,
+            .width = width,
+            .height = height,
+            .tile_columns = (width + kFrameTileWidth - 1) / kFrameTileWidth,
+            .tile_rows = (height + kFrameTileHeight - 1) / kFrameTileHeight,
+            .first_tile = 0,
+            .background = {background[0], background[1], background[2]},
+            .planes = planes};
 }
 
 static uint32_t num_tiles(const FrameImage& image) {
@@ -113,33 +115,45 @@ EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_tra
 FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures,
                              const SelectRule& rule, cudaStream_t stream) {
     const FrameImage& last = pictures.image[pictures.count - 1];
-    return {rows_.data(),
-            placements_.reserve(pictures.count * scene.num_instances(), stream),
-            images_.reserve(pictures.count, stream),
-            pictures.count,
-            last.first_tile + num_tiles(last),
-            has_packed_ ? packed_.data() : nullptr,
-            has_coded_ ? coded_.data() : nullptr,
-            scene.num_instances() > 1,
-            pictures.min_transmittance,
-            rule.fade.is_on(),
-            nullptr,
-            Cut::num_zeros(scene, rule),
-            false};
+    return {.models = rows_.data(),
+            .placements = placements_.reserve(pictures.count * scene.num_instances(), stream),
+            .images = images_.reserve(pictures.count, stream),
+            .num_images = pictures.count,
+            .num_tiles = last.first_tile + num_tiles(last),
+            .packed = has_packed_ ? packed_.data() : nullptr,
+            .coded = has_coded_ ? coded_.data() : nullptr,
+            .has_shared_items = scene.num_instances() > 1,
+            .min_transmittance = pictures.min_transmittance,
+            .has_faded_items = rule.fade.is_on(),
+            .guards_models = nullptr,
+            .num_zeros = Cut::num_zeros(scene, rule),
+            .has_depth = false};
 }
 
-// What a frame that was drawn once is drawn again with.
+// The rule for drawing a frame again whose buffers were too small.
 static SelectRule drawn_again(SelectRule rule) {
     if (rule.pace == BudgetPace::in_steps) rule.pace = BudgetPace::again;
     return rule;
 }
 
-std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const Eyes& eyes,
-                                          const SelectRule& rule, const EyeImages& pictures,
-                                          cudaStream_t stream, const Frame::Place& place) {
+std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, DevicePages* pages,
+                                          const FrameRequest& request, SelectRule& rule,
+                                          const EyeImages& pictures, cudaStream_t stream,
+                                          const Frame::Place& place) {
+    const Eyes& eyes = request.eyes;
+    if (request.cut)
+        return draw_given(scene, eyes.camera[0], *request.cut, pictures, stream, place);
+    if (pages != nullptr) return draw_resident(scene, *pages, eyes, rule, pictures, stream, place);
+    return draw_selected(scene, eyes, rule, pictures, stream, place);
+}
+
+std::unique_ptr<Drawing> SceneFrame::draw_selected(const SceneTables& scene, const Eyes& eyes,
+                                                   const SelectRule& rule,
+                                                   const EyeImages& pictures, cudaStream_t stream,
+                                                   const Frame::Place& place) {
     return frame_.draw(
         batch(scene, pictures, rule, stream),
-        [=, &scene, next = rule](const ItemList& items, cudaStream_t on) mutable {
+        [=, this, &scene, next = rule](const ItemList& items, cudaStream_t on) mutable {
             cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items,
                            on);
             next = drawn_again(next);
@@ -161,7 +175,7 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
     of_pages.guards_models = &pages.mutex();
     return frame_.draw(
         of_pages,
-        [=, &scene, &pages](const ItemList& items, cudaStream_t on) mutable {
+        [=, this, &scene, &pages](const ItemList& items, cudaStream_t on) mutable {
             cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items,
                            on, &resident);
             next = drawn_again(next);
@@ -172,14 +186,14 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
         stream, place);
 }
 
-std::unique_ptr<Drawing> SceneFrame::draw_cut(const SceneTables& scene, const Camera& camera,
-                                              const GivenCut& given, const EyeImages& pictures,
-                                              cudaStream_t stream, const Frame::Place& place) {
+std::unique_ptr<Drawing> SceneFrame::draw_given(const SceneTables& scene, const Camera& camera,
+                                                const GivenCut& given, const EyeImages& pictures,
+                                                cudaStream_t stream, const Frame::Place& place) {
     FrameBatch of_cut = batch(scene, pictures, SelectRule{}, stream);
     of_cut.has_faded_items = given.weight.size > 0;
     return frame_.draw(
         of_cut,
-        [=, &scene](const ItemList& items, cudaStream_t on) {
+        [=, this, &scene](const ItemList& items, cudaStream_t on) {
             cut_.given_items(scene, camera, given, pictures.image[0], images_.data(),
                              placements_.data(), items, on);
         },
@@ -223,12 +237,14 @@ std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows,
     ModelTables* on_device = tables_.data();
     const ModelTables tables{
         rows, packed == nullptr ? PackedPlanes{} : *packed, {view, 0, 0}, image};
-    FrameBatch batch{&on_device->rows,  &on_device->placement,
-                     &on_device->image, 1,
-                     num_tiles(image),  packed == nullptr ? nullptr : &on_device->packed,
-                     nullptr,           false,
-                     min_transmittance};
-    batch.has_depth = image.planes.depth != nullptr;
+    const FrameBatch batch{.models = &on_device->rows,
+                           .placements = &on_device->placement,
+                           .images = &on_device->image,
+                           .num_images = 1,
+                           .num_tiles = num_tiles(image),
+                           .packed = packed == nullptr ? nullptr : &on_device->packed,
+                           .min_transmittance = min_transmittance,
+                           .has_depth = image.planes.depth != nullptr};
     const unsigned blocks =
         std::max(1u, blocks_for(blocks_for(rows.size, kItemSize), kModelThreads));
     return frame_.draw(

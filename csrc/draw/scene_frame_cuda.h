@@ -1,7 +1,11 @@
 #pragma once
 
+// Frames of a scene on a CUDA device: a request in, an enqueued drawing out; and the models that
+// they draw.
+
 #include "draw/device_pages.h"
 #include "draw/frame_cuda.h"
+#include "draw/request.h"
 #include "quantize/quantize.h"
 #include "select/select_cuda.h"
 
@@ -76,27 +80,31 @@ class SceneFrame {
                     std::vector<std::shared_ptr<const DevicePalette>> palettes,
                     cudaStream_t stream);
 
-    // The scene stays as it is until the drawing is finished. `place` says where the pictures are.
-    std::unique_ptr<Drawing> draw(const SceneTables& scene, const Eyes& eyes,
-                                  const SelectRule& rule, const EyeImages& pictures,
-                                  cudaStream_t stream, const Frame::Place& place);
-    // Draws what is resident of the bundles of a pool, with what comes in before; the pool stays,
-    // too. The rule becomes the one that is used. A frame that is drawn again has the pages that
-    // are there by then.
-    std::unique_ptr<Drawing> draw_resident(const SceneTables& scene, DevicePages& pages,
-                                           const Eyes& eyes, SelectRule& rule,
-                                           const EyeImages& pictures, cudaStream_t stream,
-                                           const Frame::Place& place);
-    // Draws pairs that were selected before; they are on the device and stay, too. There is one
-    // picture.
-    std::unique_ptr<Drawing> draw_cut(const SceneTables& scene, const Camera& camera,
-                                      const GivenCut& given, const EyeImages& pictures,
-                                      cudaStream_t stream, const Frame::Place& place);
+    // Draws what is asked for, plainly (FrameRequest::is_plain), into `pictures`; `place` says
+    // where they are. With `pages`, what is resident of the bundles of a pool, with what comes in
+    // before. `rule` is the one of the request, as the pacing of a budget has changed it, and
+    // becomes the one that is used. What is drawn stays until the drawing is finished: the scene,
+    // the pool, and a given cut, which is on the device and has one picture. A frame that is drawn
+    // again has the pages that are there by then.
+    std::unique_ptr<Drawing> draw(const SceneTables& scene, DevicePages* pages,
+                                  const FrameRequest& request, SelectRule& rule,
+                                  const EyeImages& pictures, cudaStream_t stream,
+                                  const Frame::Place& place);
 
     // Bytes of what it keeps on the device, by part, without the models.
     std::vector<std::pair<const char*, size_t>> bytes() const;
 
   private:
+    std::unique_ptr<Drawing> draw_selected(const SceneTables& scene, const Eyes& eyes,
+                                           const SelectRule& rule, const EyeImages& pictures,
+                                           cudaStream_t stream, const Frame::Place& place);
+    std::unique_ptr<Drawing> draw_resident(const SceneTables& scene, DevicePages& pages,
+                                           const Eyes& eyes, SelectRule& rule,
+                                           const EyeImages& pictures, cudaStream_t stream,
+                                           const Frame::Place& place);
+    std::unique_ptr<Drawing> draw_given(const SceneTables& scene, const Camera& camera,
+                                        const GivenCut& given, const EyeImages& pictures,
+                                        cudaStream_t stream, const Frame::Place& place);
     // Of the models that were set.
     FrameBatch batch(const SceneTables& scene, const EyeImages& pictures, const SelectRule& rule,
                      cudaStream_t stream);

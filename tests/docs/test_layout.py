@@ -123,7 +123,14 @@ def module_name(path):
 
 
 def test_cmake_lists_every_source_once():
-    lists = ("SIMD_SOURCES", "SOURCES", "BINDINGS", "CUDA_DECISION_SOURCES", "CUDA_SOURCES")
+    lists = (
+        "SIMD_SOURCES",
+        "SOURCES",
+        "BINDINGS",
+        "CUDA_BINDINGS",
+        "CUDA_DECISION_SOURCES",
+        "CUDA_SOURCES",
+    )
     assert sorted(source for name in lists for source in cmake_list(f"V3DG_{name}")) == SOURCES
 
 
@@ -225,6 +232,42 @@ def test_host_sources_know_nothing_of_the_cuda_runtime():
         text = behind_the_flag.sub("", path.read_text(encoding="utf-8"))
         assert path.name == "host_device.h" or not re.search(r"__CUDACC__|cuda_runtime", text), path
         todo |= {CSRC / name for name in re.findall(r'^#include "(.+)"', text, re.MULTILINE)} - seen
+
+
+def test_bindings_ask_for_the_backend_in_one_place():
+    """Everything else goes through the seam, whose head says how to add a backend."""
+    sources = {
+        path: path.read_text(encoding="utf-8")
+        for path in (CSRC / "bindings").iterdir()
+        if path.suffix in {".h", ".cpp"}
+    }
+    flags = [
+        path.name
+        for path, text in sources.items()
+        for _ in re.findall(r"^#\s*(?:el)?if.*V3DG_WITH_CUDA", text, re.MULTILINE)
+    ]
+    assert flags == ["backend.cpp"]
+    ladders = [
+        path.name
+        for path, text in sources.items()
+        if re.search(r"is_host\(|if constexpr.*CUDA", text)
+    ]
+    assert ladders == []
+    assert "Add a backend" in sources[CSRC / "bindings" / "backend.h"].partition("#include")[0]
+
+
+def test_only_the_backend_of_cuda_sees_cuda():
+    """Bindings that are compiled without CUDA include no header of its half."""
+    halves = re.compile(
+        r'#include "(?:base/(?:device|device_guard|stream)\.h|.*_cuda\w*\.h|.*\.cuh)"'
+    )
+    allowed = {*cmake_list("V3DG_CUDA_BINDINGS"), "csrc/bindings/cuda_frame.h"}
+    users = [
+        str(path.relative_to(ROOT))
+        for path in (CSRC / "bindings").iterdir()
+        if path.suffix in {".h", ".cpp"} and halves.search(path.read_text(encoding="utf-8"))
+    ]
+    assert sorted(users) == sorted(allowed)
 
 
 def test_kernels_are_started_by_launch_alone():

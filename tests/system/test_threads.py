@@ -252,7 +252,7 @@ def test_threads_that_change_a_scene_lose_nothing(device, hasty):
 READING = {"PlyFile.read", "ply_write"}
 DRAWING = {
     *("rasterize", "rasterize_backward", "gather"),
-    *("ResidentScene.select", "SceneFrame.draw", "SceneFrame.draw_cut", "AssetFrame.draw"),
+    *("ResidentScene.select", "SceneFrame.draw", "AssetFrame.draw"),
 }
 BUILDING = {"median_split", "bound_spheres", "merge", "bound_by_boxes", "fit_level"}
 LONG = READING | DRAWING | BUILDING

@@ -16,7 +16,7 @@ from v3dg._json import JsonObject, parse_json
 from v3dg._numbers import check, check_all, check_type
 from v3dg._urls import in_parts, is_url, shown
 from v3dg.bundle.codec import Codec, codec_of
-from v3dg.bundle.file import BundleFile, BundlePlan, PageSource, write_pages
+from v3dg.bundle.file import BundleFile, BundlePlan, write_pages
 from v3dg.bundle.format import HASH_BYTES, VERSION, config_to_json, page_tables
 from v3dg.bundle.pages import (
     CodePages,
@@ -291,7 +291,7 @@ class Bundle:
         return not isinstance(self._pages, FilePages)
 
     @property
-    def page_source(self) -> _core.Rows | PageSource:
+    def page_source(self) -> _core.Rows | _core.FileSource:
         """The source of single pages for the core: the file, or all gaussians if they
         are in memory."""
         if self._file is None or isinstance(self._pages, MemoryPages):

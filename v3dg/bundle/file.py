@@ -8,8 +8,7 @@ trusts none of them; `v3dg.bundle.tables` checks the values of the tables.
 import os
 import re
 import weakref
-from collections.abc import Callable, Iterable
-from typing import NoReturn, TypeAlias
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,18 +38,6 @@ _FIRST_BYTES = 4096  # first bytes of the header, which a disk writes at once
 # tables of a billion gaussians are smaller.
 _MOST_FETCHED_TABLE_BYTES = 1 << 30
 _FREE_CLUSTERS = 1 << 18  # clusters that may be empty; every further one has a gaussian
-
-PageSource: TypeAlias = tuple[
-    str,
-    int,
-    str,
-    int,
-    NDArray[np.int64],
-    NDArray[np.generic],
-    Callable[[Iterable[tuple[int, int]]], None] | None,
-]
-"""The tuple that the core reads pages with: name, descriptor, codec, SH degree, places,
-hashes, fetch."""
 
 
 class BundlePlan:
@@ -129,7 +116,7 @@ def read_pages(
     hashes."""
     result = codec.empty(run.rows.stop - run.rows.start)
     _core.read_pages(
-        os.fspath(path), descriptor, result.rows, codec.name, hashes[: len(run)], **vars(run)
+        os.fspath(path), descriptor, result.rows, codec.name, hashes[: len(run)], run.core
     )
     return result
 
@@ -336,19 +323,19 @@ class BundleFile:
         return self._data_start + np.append(self.tables["pages.offset"], self.pages_bytes)
 
     @property
-    def source(self) -> PageSource:
+    def source(self) -> _core.FileSource:
         """The source of pages for the core."""
         fetch = None
         if self._at_url is not None:
             fetch = self._at_url.fetch
-        return (
-            self.path,
-            self._fd,
-            self.codec.name,
-            self.codec.sh_degree,
-            self.places,
-            self.tables["pages.hash"],
-            fetch,
+        return _core.FileSource(
+            name=self.path,
+            descriptor=self._fd,
+            codec=self.codec.name,
+            sh_degree=self.codec.sh_degree,
+            places=self.places,
+            hashes=self.tables["pages.hash"],
+            fetch=fetch,
         )
 
     def read(self, run: PageRun, out: _core.Rows | NDArray[np.int32]) -> None:
@@ -356,7 +343,7 @@ class BundleFile:
         pages; verified."""
         self._fetch(*run.places[[0, -1]])
         hashes = self.tables["pages.hash"][run.first_page :][: len(run)]
-        _core.read_pages(self.path, self._fd, out, self.codec.name, hashes, **vars(run))
+        _core.read_pages(self.path, self._fd, out, self.codec.name, hashes, run.core)
 
 
 def _length_of_vector(entry: object) -> int | None:

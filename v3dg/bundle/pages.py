@@ -88,6 +88,16 @@ class PageRun:
         return len(self.places) - 1
 
     @property
+    def core(self) -> _core.PageRun:
+        """The run for the compiled operations."""
+        return _core.PageRun(
+            first_page=self.first_page,
+            first_cluster=self.first_cluster,
+            offset=self.offset,
+            places=self.places,
+        )
+
+    @property
     def rows(self) -> slice:
         """Their gaussians in the bundle."""
         return slice(int(self.offset[0]), int(self.offset[-1]))

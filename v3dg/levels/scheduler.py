@@ -77,7 +77,7 @@ def watch_over(executor: Executor) -> Watch | None:
     module = sys.modules.get("distributed.cfexecutor")
     if module is None or not isinstance(executor, module.ClientExecutor):
         return None
-    client = executor._client  # noqa: SLF001  # dask gives the client no public name
+    client = executor._client  # dask gives the client no public name
     if client.scheduler is None:
         return None
     return Watch(client)

@@ -7,15 +7,24 @@ and chooses one. `request.py` has what is asked for.
 """
 
 from v3dg.render.api import render
-from v3dg.render.frame import Frame, frame_of
+from v3dg.render.frame import Frame, FrameSource, frame_of
 from v3dg.render.pool_frame import PoolFrame
 from v3dg.render.renderer import Renderer
-from v3dg.render.request import DEFAULT_MIN_TRANSMITTANCE, CutRequest, shade_of
+from v3dg.render.request import (
+    DEFAULT_MIN_TRANSMITTANCE,
+    CutRequest,
+    FrameRequest,
+    Look,
+    shade_of,
+)
 
 __all__ = [
     "DEFAULT_MIN_TRANSMITTANCE",
     "CutRequest",
     "Frame",
+    "FrameRequest",
+    "FrameSource",
+    "Look",
     "PoolFrame",
     "Renderer",
     "frame_of",

@@ -14,9 +14,9 @@ from v3dg.image import RenderedImage
 from v3dg.levels.memory import pool_bytes
 from v3dg.opening import File, opened
 from v3dg.pool import PoolSlot
-from v3dg.render.frame import Frame, frame_of
+from v3dg.render.frame import FrameSource, frame_of
 from v3dg.render.picture import Picture
-from v3dg.render.request import BLACK, CutRequest, shade_of
+from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.residency import residency
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
@@ -109,12 +109,13 @@ def render(
     opened_subject = opened(subject)
     one_of(color_by, "color_by", get_args(ColorBy))
     frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
-    request = CutRequest(tolerance, budget, min_level, fade)
+    chosen = CutRequest(tolerance, budget, min_level, fade)
     shade = shade_of(background, min_transmittance, isinstance(opened_subject, Gaussians), depth)
 
     def picture(view: Camera | StereoCamera) -> Picture:
         check_camera(view)
-        return frame.draw_settled(opened_subject, view, request, shade, cut)
+        request = FrameRequest(view, chosen, shade, cut)
+        return frame.chosen(opened_subject).draw_settled(opened_subject, request)
 
     pictures: Picture | list[Picture] = for_each(camera, picture)
     return cast(
@@ -124,7 +125,7 @@ def render(
 
 def _still_frame(
     subject: Subject, color_by: ColorBy, device: Device, memory: int | Literal["auto"] | None
-) -> Frame:
+) -> FrameSource:
     """The frame that stills of a subject are drawn with, which is kept with a scene or
     a bundle.
 
@@ -135,7 +136,7 @@ def _still_frame(
     is_sized = isinstance(memory, int)
     slot = residency.once(subject, ("pool", device, is_sized), PoolSlot)
 
-    def make() -> Frame:
+    def make() -> FrameSource:
         return frame_of(subject, color_by, device, memory, slot)
 
     if is_sized:

@@ -13,12 +13,11 @@ from v3dg.cameras import Camera, StereoCamera
 from v3dg.false_color import ColorBy
 from v3dg.image import RenderedImage, Stats
 from v3dg.render.picture import Picture, stats_of
-from v3dg.render.request import CutRequest
+from v3dg.render.request import CutRequest, FrameRequest
 
 if TYPE_CHECKING:
     from v3dg.gaussians import Gaussians
     from v3dg.scene import Subject
-    from v3dg.select import Selection
 
 
 class AssetFrame:
@@ -36,33 +35,39 @@ class AssetFrame:
         self.memory: int | None = None
         self._core = _core.AssetFrame(_core.Model(_device.place(asset, device).rows))
 
+    def chosen(self, subject: Subject) -> AssetFrame:
+        """This frame."""
+        return self
+
     def draw(
         self,
         subject: Subject,
-        camera: Camera | StereoCamera,
-        request: CutRequest,
-        shade: _core.Shade,
-        cut: Selection | None = None,
+        request: FrameRequest,
         steps: _core.BudgetSteps | None = None,
+        stop: _core.Stop | None = None,
     ) -> Picture:
         """Draw the asset; ValueError where something is asked for that only levels
         have."""
-        check("cut", cut is None, "a scene or a bundle to choose from, got an asset")
-        check_request(request)
+        is_selected = request.given is None
+        check("cut", is_selected, "a scene or a bundle to choose from, got an asset")
+        check_request(request.cut)
+        camera = request.camera
         if isinstance(camera, StereoCamera):
-            left, right = (self._draw_eye(eye, shade) for eye in camera.eyes)
+            left, right = (self._draw_eye(eye, request.shade, stop) for eye in camera.eyes)
             return left, right
-        return self._draw_eye(camera, shade)
+        return self._draw_eye(camera, request.shade, stop)
 
     draw_settled = draw
 
     def settle(
-        self, subject: Subject, camera: Camera | StereoCamera, request: CutRequest, timeout: float
+        self, subject: Subject, camera: Camera | StereoCamera, cut: CutRequest, timeout: float
     ) -> None:
         """Return at once, for all of an asset is resident."""
 
-    def _draw_eye(self, camera: Camera, shade: _core.Shade) -> RenderedImage:
-        drawing = self._core.draw(camera.core, shade)
+    def _draw_eye(
+        self, camera: Camera, shade: _core.Shade, stop: _core.Stop | None
+    ) -> RenderedImage:
+        drawing = self._core.draw(camera.core, shade, stop)
 
         def finish() -> Stats:
             return stats_of(drawing.finish(), 0.0)

@@ -15,7 +15,7 @@ from v3dg.pool import PoolSlot, chosen_bytes
 from v3dg.render.asset_frame import AssetFrame
 from v3dg.render.picture import Picture
 from v3dg.render.pool_frame import PoolFrame
-from v3dg.render.request import CutRequest
+from v3dg.render.request import CutRequest, FrameRequest
 from v3dg.render.scene_frame import SceneFrame
 from v3dg.residency import ResidentScene, residency
 
@@ -24,12 +24,38 @@ if TYPE_CHECKING:
 
     from v3dg.bundle import Bundle
     from v3dg.scene import Subject
-    from v3dg.select import Selection
 
 
 class Frame(Protocol):
     """Buffers that pictures of one subject are drawn with; it does not keep a scene or
     a bundle alive."""
+
+    def draw(
+        self,
+        subject: Subject,
+        request: FrameRequest,
+        steps: _core.BudgetSteps | None = None,
+        stop: _core.Stop | None = None,
+    ) -> Picture:
+        """Draw what is resident; of a stereo camera, a picture for each eye.
+
+        Args:
+            steps: The pacing of pictures that follow each other; None for a single one.
+            stop: Ends a picture early on the CPU.
+        """
+
+    def draw_settled(self, subject: Subject, request: FrameRequest) -> Picture:
+        """Draw a picture that misses nothing, whatever other threads draw."""
+
+    def settle(
+        self, subject: Subject, camera: Camera | StereoCamera, cut: CutRequest, timeout: float
+    ) -> None:
+        """Wait until what a view needs is resident."""
+
+
+class FrameSource(Protocol):
+    """Has the frame of a subject on one device, which may become another one when the
+    subject grows."""
 
     device: Device
 
@@ -37,31 +63,8 @@ class Frame(Protocol):
     def memory(self) -> int | None:
         """Bytes of the pool that it draws from; None where all is resident."""
 
-    def draw(
-        self,
-        subject: Subject,
-        camera: Camera | StereoCamera,
-        request: CutRequest,
-        shade: _core.Shade,
-        cut: Selection | None = None,
-        steps: _core.BudgetSteps | None = None,
-    ) -> Picture:
-        """Draw what is resident; of a stereo camera, a picture for each eye."""
-
-    def draw_settled(
-        self,
-        subject: Subject,
-        camera: Camera | StereoCamera,
-        request: CutRequest,
-        shade: _core.Shade,
-        cut: Selection | None = None,
-    ) -> Picture:
-        """Draw a picture that misses nothing, whatever other threads draw."""
-
-    def settle(
-        self, subject: Subject, camera: Camera | StereoCamera, request: CutRequest, timeout: float
-    ) -> None:
-        """Wait until what a view needs is resident."""
+    def chosen(self, subject: Subject) -> Frame:
+        """The frame that the subject is drawn with now."""
 
 
 class AutoFrame:
@@ -106,32 +109,6 @@ class AutoFrame:
             self._frame.take(resident)
             self._references = resident.references
 
-    def draw(
-        self,
-        subject: Subject,
-        camera: Camera | StereoCamera,
-        request: CutRequest,
-        shade: _core.Shade,
-        cut: Selection | None = None,
-        steps: _core.BudgetSteps | None = None,
-    ) -> Picture:
-        return self.chosen(subject).draw(subject, camera, request, shade, cut, steps)
-
-    def draw_settled(
-        self,
-        subject: Subject,
-        camera: Camera | StereoCamera,
-        request: CutRequest,
-        shade: _core.Shade,
-        cut: Selection | None = None,
-    ) -> Picture:
-        return self.chosen(subject).draw_settled(subject, camera, request, shade, cut)
-
-    def settle(
-        self, subject: Subject, camera: Camera | StereoCamera, request: CutRequest, timeout: float
-    ) -> None:
-        self.chosen(subject).settle(subject, camera, request, timeout)
-
 
 def frame_of(
     subject: Subject,
@@ -139,7 +116,7 @@ def frame_of(
     device: Device,
     memory: int | Literal["auto"] | None,
     slot: PoolSlot,
-) -> Frame:
+) -> FrameSource:
     """A new frame for pictures of a subject.
 
     Args:

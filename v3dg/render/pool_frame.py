@@ -11,9 +11,9 @@ from v3dg._device import Device
 from v3dg._numbers import check, real
 from v3dg.cameras import Camera, StereoCamera
 from v3dg.image import Stats
-from v3dg.pool import Pool, PoolLook, PoolSlot
+from v3dg.pool import Pool, PoolSlot
 from v3dg.render.picture import Picture, picture_of, stats_of
-from v3dg.render.request import CutRequest
+from v3dg.render.request import CutRequest, FrameRequest, Look
 from v3dg.residency import ResidentScene, residency
 from v3dg.select import over_budget
 
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from v3dg.bundle import Bundle
     from v3dg.false_color import ColorBy
     from v3dg.scene import Subject
-    from v3dg.select import Selection
 
 _STILL_TIMEOUT_SECONDS = 30.0
 
@@ -44,7 +43,7 @@ class PoolFrame:
         self.device = device
         self.memory: int | None = memory
         self._num_bytes = memory
-        self._look = PoolLook(color_by)
+        self._look = Look(color_by)
         self._slot = slot
         self._core = _core.SceneFrame(device.number)
         self._pool: Pool | None = None
@@ -73,65 +72,48 @@ class PoolFrame:
             self._references = resident.references
             return pool
 
+    def chosen(self, subject: Subject) -> PoolFrame:
+        """This frame."""
+        return self
+
     def draw(
         self,
         subject: Subject,
-        camera: Camera | StereoCamera,
-        request: CutRequest,
-        shade: _core.Shade,
-        cut: Selection | None = None,
+        request: FrameRequest,
         steps: _core.BudgetSteps | None = None,
         stop: _core.Stop | None = None,
-        look: PoolLook | None = None,
     ) -> Picture:
-        """Draw what is resident of a cut, after bringing in pages that are ready.
-
-        Args:
-            steps: The pacing of pictures that follow each other; None for a single one.
-            stop: Ends a picture early on the CPU.
-            look: What to show in place of the frame's own colours, on the CPU.
-        """
-        _refuse_cut(cut)
+        """Draw what is resident of a cut, after bringing in pages that are ready."""
+        _refuse_given_cut(request)
         with residency.turn(self.device):
             resident = residency.scene(subject, self.device, self._resident)
             self._resident = resident
             pool = self.take(resident)
-            picture = self._enqueue(resident, pool, camera, request, shade, steps, stop, look)
+            picture = self._enqueue(resident, pool, request, steps, stop)
         if not self.device.is_cuda:
             _finish(picture)
         elif self._has_settled:
-            _finish(
-                picture
-            )  # which may draw again, from pages that other views put in place of its own
+            # This may draw again, from pages that other views put in place of its own.
+            _finish(picture)
         self._has_settled = False
         return picture
 
-    def draw_settled(
-        self,
-        subject: Subject,
-        camera: Camera | StereoCamera,
-        request: CutRequest,
-        shade: _core.Shade,
-        cut: Selection | None = None,
-    ) -> Picture:
+    def draw_settled(self, subject: Subject, request: FrameRequest) -> Picture:
         """Settle and draw in one step, between which no other thread's view gets at the
         pool."""
-        _refuse_cut(cut)
+        _refuse_given_cut(request)
+        camera = request.camera.core
         while True:
             with residency.turn(self.device):
                 resident = residency.scene(subject, self.device)
                 revision = resident.revision
                 pool = self.take(resident)
             with pool.lease:
-                pool.settle(resident, camera.core, request.rule, _STILL_TIMEOUT_SECONDS, math.inf)
+                pool.settle(resident, camera, request.cut.rule, _STILL_TIMEOUT_SECONDS, math.inf)
                 with residency.turn(self.device):
-                    if (
-                        resident.revision != revision
-                    ):  # Another thread has changed the scene meanwhile.
+                    if resident.revision != revision:  # another thread has changed the scene
                         continue
-                    picture = self._enqueue(
-                        resident, pool, camera, request, shade, None, None, None
-                    )
+                    picture = self._enqueue(resident, pool, request, None, None)
                 _finish(picture)
                 return picture
 
@@ -139,14 +121,14 @@ class PoolFrame:
         self,
         subject: Subject,
         camera: Camera | StereoCamera,
-        request: CutRequest,
+        cut: CutRequest,
         timeout: float = _STILL_TIMEOUT_SECONDS,
         seconds: float = math.inf,
     ) -> None:
         """Bring in what a view needs, or what of it comes in within `seconds`; errors
         as of `Pool.settle`."""
         real(timeout, "timeout", "seconds, at least 0", 0)
-        rule = request.rule
+        rule = cut.rule
         with residency.turn(self.device):
             resident = residency.scene(subject, self.device)
             pool = self.take(resident)
@@ -154,49 +136,43 @@ class PoolFrame:
             pool.settle(resident, camera.core, rule, timeout, seconds)
         self._has_settled = True
 
-    def pick(
-        self, subject: Subject, pixel: _core.Camera, rule: _core.Rule
-    ) -> tuple[int, int, float, float] | None:
-        """Instance, cluster, weight and depth of what a pixel shows most of; only on
-        the CPU."""
+    def pick(self, subject: Subject, pixel: _core.Camera, rule: _core.Rule) -> _core.Pick | None:
+        """What a pixel shows most of; only on the CPU."""
         resident = residency.scene(subject, self.device)
         pool = self.take(resident)
-        return self._core.pick_resident(resident.core, pool.core, pixel, rule)
+        request = _core.FrameRequest(pixel, rule, aside=True)
+        return self._core.pick(resident.core, request, pool.core)
 
     def _enqueue(
         self,
         resident: ResidentScene,
         pool: Pool,
-        camera: Camera | StereoCamera,
-        request: CutRequest,
-        shade: _core.Shade,
+        request: FrameRequest,
         steps: _core.BudgetSteps | None,
         stop: _core.Stop | None,
-        look: PoolLook | None,
     ) -> Picture:
         bytes_in_at_start = pool.core.status().bytes_in
-        look = look or self._look
-        drawing = self._core.draw_resident(
-            resident.core,
-            pool.core,
-            camera.core,
-            request.rule,
-            shade,
-            stop,
-            steps,
-            shows=look.shows,
-            colors=look.palettes(resident.bundles),
-            chooser=look.core_chooser,
-            aside=look.aside,
+        look = request.look or self._look
+        asked = _core.FrameRequest(
+            request.camera.core,
+            request.cut.rule,
+            request.shade,
+            None,
+            look.shows,
+            look.palettes(resident.bundles),
+            look.core_chooser,
+            look.aside,
         )
+        drawing = self._core.draw(resident.core, asked, pool.core, steps, stop)
         status = pool.core.status()
         resident.add_drawing(drawing)
+        budget = request.cut.budget
 
         def finish() -> Stats:
             stats = drawing.finish()
             if stats.exceeds_budget:
-                assert request.budget is not None
-                raise over_budget(request.budget, stats.gaussians)
+                assert budget is not None
+                raise over_budget(budget, stats.gaussians)
             return stats_of(stats, stats.tolerance_px2)._replace(
                 missing=status.missing,
                 failed=status.failed,
@@ -204,7 +180,7 @@ class PoolFrame:
                 memory=pool.num_bytes,
             )
 
-        return picture_of(drawing, camera, finish)
+        return picture_of(drawing, request.camera, finish)
 
 
 def _finish(picture: Picture) -> None:
@@ -214,5 +190,6 @@ def _finish(picture: Picture) -> None:
     picture.stats  # noqa: B018
 
 
-def _refuse_cut(cut: Selection | None) -> None:
-    check("cut", cut is None, "none for a pool, which has its own, got one; give memory=None")
+def _refuse_given_cut(request: FrameRequest) -> None:
+    is_selected = request.given is None
+    check("cut", is_selected, "none for a pool, which has its own, got one; give memory=None")

@@ -14,9 +14,9 @@ from v3dg.image import RenderedImage
 from v3dg.levels.memory import in_mib, pool_bytes
 from v3dg.opening import File, opened
 from v3dg.pool import PoolSlot
-from v3dg.render.frame import AutoFrame, frame_of
+from v3dg.render.frame import frame_of
 from v3dg.render.pool_frame import PoolFrame
-from v3dg.render.request import BLACK, CutRequest, shade_of
+from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
 
@@ -104,9 +104,7 @@ class Renderer:
     def pool_frame(self) -> PoolFrame | None:
         """What it draws with where not all is resident; else None. Not part of the
         public interface."""
-        frame = self._frame
-        if isinstance(frame, AutoFrame):
-            frame = frame.chosen(self._subject)
+        frame = self._frame.chosen(self._subject)
         if isinstance(frame, PoolFrame):
             return frame
         return None
@@ -132,9 +130,11 @@ class Renderer:
     ) -> RenderedImage | tuple[RenderedImage, RenderedImage]:
         """Draw as `v3dg.render` does, of what is resident."""
         check_camera(camera)
-        request = CutRequest(tolerance, budget, min_level, fade)
-        shade = shade_of(background, min_transmittance, isinstance(self._subject, Gaussians), depth)
-        return self._frame.draw(self._subject, camera, request, shade, cut, self._steps)
+        subject = self._subject
+        shade = shade_of(background, min_transmittance, isinstance(subject, Gaussians), depth)
+        chosen = CutRequest(tolerance, budget, min_level, fade)
+        request = FrameRequest(camera, chosen, shade, cut)
+        return self._frame.chosen(subject).draw(subject, request, self._steps)
 
     def settle(
         self,
@@ -162,6 +162,6 @@ class Renderer:
             OSError: A page cannot be read. A TimeoutError if the disk does not answer.
         """
         real(timeout, "timeout", "seconds, at least 0", 0)
-        request = CutRequest(tolerance, budget, min_level, fade)
-        request.rule  # noqa: B018 - which checks it
-        self._frame.settle(self._subject, camera, request, timeout)
+        cut = CutRequest(tolerance, budget, min_level, fade)
+        cut.rule  # noqa: B018 - which checks it
+        self._frame.chosen(self._subject).settle(self._subject, camera, cut, timeout)

@@ -13,7 +13,7 @@ from v3dg.false_color import ColorBy
 from v3dg.gaussians import Array
 from v3dg.image import RenderedImage, Stats
 from v3dg.render.picture import Picture, picture_of, stats_of
-from v3dg.render.request import CutRequest
+from v3dg.render.request import CutRequest, FrameRequest
 from v3dg.residency import ResidentScene, residency
 from v3dg.scene import Scene
 from v3dg.select import Selection, over_budget
@@ -56,43 +56,43 @@ class SceneFrame:
                 self.num_bundles = len(bundles)
             self._references = resident.references
 
+    def chosen(self, subject: Subject) -> SceneFrame:
+        """This frame."""
+        return self
+
     def draw(
         self,
         subject: Subject,
-        camera: Camera | StereoCamera,
-        request: CutRequest,
-        shade: _core.Shade,
-        cut: Selection | None = None,
+        request: FrameRequest,
         steps: _core.BudgetSteps | None = None,
         stop: _core.Stop | None = None,
     ) -> Picture:
-        """Draw the cut that is requested, or the one that is given.
-
-        Args:
-            steps: The pacing of pictures that follow each other; None for a single one.
-            stop: Ends a picture early on the CPU.
-        """
-        if cut is not None:
+        """Draw the cut that is asked for."""
+        camera = request.camera
+        if request.given is not None:
             if isinstance(camera, StereoCamera):
                 left, right = (
-                    self.draw_cut(subject, eye, request, shade, cut) for eye in camera.eyes
+                    self._draw_given(subject, request, request.given, eye, stop)
+                    for eye in camera.eyes
                 )
                 return left, right
-            return self.draw_cut(subject, camera, request, shade, cut)
-        rule = request.rule
+            return self._draw_given(subject, request, request.given, camera, stop)
+        cut = request.cut
+        rule = cut.rule
         with residency.turn(self.device):
             resident = residency.scene(subject, self.device, self._resident)
             self._resident = resident
             self.take(resident)
-            drawing = self.core.draw(resident.core, camera.core, rule, shade, stop, steps)
+            asked = _core.FrameRequest(camera.core, rule, request.shade)
+            drawing = self.core.draw(resident.core, asked, None, steps, stop)
             resident.add_drawing(drawing)
 
         def finish() -> Stats:
             stats = drawing.finish()
-            if request.budget is None:
+            if cut.budget is None:
                 return stats_of(stats, rule.tolerance_px2)
             if stats.exceeds_budget:
-                raise over_budget(request.budget, stats.gaussians)
+                raise over_budget(cut.budget, stats.gaussians)
             return stats_of(stats, stats.tolerance_px2)
 
         if not self.device.is_cuda:
@@ -102,35 +102,32 @@ class SceneFrame:
     draw_settled = draw
 
     def settle(
-        self, subject: Subject, camera: Camera | StereoCamera, request: CutRequest, timeout: float
+        self, subject: Subject, camera: Camera | StereoCamera, cut: CutRequest, timeout: float
     ) -> None:
         """Return at once, for all is resident."""
 
-    def draw_cut(
+    def _draw_given(
         self,
         subject: Subject,
-        camera: Camera,
-        request: CutRequest,
-        shade: _core.Shade,
+        request: FrameRequest,
         cut: Selection,
+        eye: Camera,
+        stop: _core.Stop | None,
     ) -> RenderedImage:
         """Draw a cut that was selected before."""
         with residency.turn(self.device):
             resident = residency.scene(subject, self.device, self._resident)
             self._resident = resident
             self.take(resident)
-            _check_cut(cut, subject, resident, request)
+            _check_cut(cut, subject, resident, request.cut)
             weights = None
             if cut.given_weights is not None:
                 weights = self._on_device(cut.given_weights)
-            drawing = self.core.draw_cut(
-                resident.core,
-                camera.core,
-                self._on_device(cut.instance_ids),
-                self._on_device(cut.cluster_ids),
-                shade,
-                weights=weights,
+            pairs = _core.GivenCut(
+                self._on_device(cut.instance_ids), self._on_device(cut.cluster_ids), weights
             )
+            asked = _core.FrameRequest(eye.core, None, request.shade, pairs)
+            drawing = self.core.draw(resident.core, asked, None, None, stop)
             resident.add_drawing(drawing)
 
         def finish() -> Stats:

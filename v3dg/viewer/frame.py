@@ -20,8 +20,8 @@ from v3dg.image import RenderedImage, Stats
 from v3dg.levels import BuildConfig, build_bundle
 from v3dg.pick import Pick, pick
 from v3dg.pictures import to_8bit
-from v3dg.pool import PoolLook, chosen_bytes
-from v3dg.render import CutRequest, Renderer, render, shade_of
+from v3dg.pool import chosen_bytes
+from v3dg.render import CutRequest, FrameRequest, Look, Renderer, render, shade_of
 from v3dg.residency import residency
 from v3dg.scene import Scene, Subject
 from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, rule_of, select, select_by
@@ -318,18 +318,17 @@ class SceneView:
                 self.scene, job.chooser or job.camera, settled_request, seconds=patience
             )
 
-        def draw(cut: CutRequest, look: PoolLook, steps: _core.BudgetSteps | None) -> RenderedImage:
-            image = pool_frame.draw(
-                self.scene, job.camera, cut, _SHADE, steps=steps, stop=job.stop, look=look
-            )
+        def draw(cut: CutRequest, look: Look, steps: _core.BudgetSteps | None) -> RenderedImage:
+            asked = FrameRequest(job.camera, cut, _SHADE, look=look)
+            image = pool_frame.draw(self.scene, asked, steps, job.stop)
             assert isinstance(image, RenderedImage)
             _check(job.stop)
             return image
 
         whole: _Float32 | None = None
         if compares:
-            whole = draw(finest, PoolLook(chooser=job.chooser), None).color
-        look = PoolLook(_look_of(settings.shows), job.chooser, aside=compares)
+            whole = draw(finest, Look(chooser=job.chooser), None).color
+        look = Look(_look_of(settings.shows), job.chooser, aside=compares)
         image = draw(request, look, job.steps)
         first = min(job.edge, job.camera.width - 1)
         figures = image.stats
@@ -406,17 +405,14 @@ class SceneView:
         resident = residency.scene(self.scene, CPU)
         cut.check(resident.revision)  # the scene still has the instances of the cut
         residency.set_models(frame, resident.bundles, CPU, _color_by(shows))
-        scene = resident.core
-        part = camera.core.window(*window)
-        pairs = (cut.instance_ids, cut.cluster_ids)
-        weights = cut.given_weights
-        if shows == "count":
-            drawing = frame.count_cut(scene, part, *pairs, _SHADE, stop, weights)
-        elif shows == "error":
-            rule = rule_of(cut.tolerance, None, 0)
-            drawing = frame.draw_metrics(scene, part, rule, *pairs, _SHADE, stop, weights)
-        else:
-            drawing = frame.draw_cut(scene, part, *pairs, _SHADE, stop, weights)
+        request = _core.FrameRequest(
+            camera.core.window(*window),
+            rule_of(cut.tolerance, None, 0),
+            _SHADE,
+            _core.GivenCut(cut.instance_ids, cut.cluster_ids, cut.given_weights),
+            _look_of(shows),
+        )
+        drawing = frame.draw(resident.core, request, stop=stop)
         _check(stop)
         assert drawing.depth is not None
         return _Planes(drawing.color, drawing.alpha, drawing.depth, drawing.finish().in_frustum)
@@ -431,7 +427,7 @@ def _color_by(shows: Shows) -> ColorBy:
 
 
 def _look_of(shows: Shows) -> ColorBy | Literal["error", "count"]:
-    """What `PoolLook` calls a mode."""
+    """What `Look` calls a mode."""
     if shows in ("error", "count"):
         return shows
     return _color_by(shows)

@@ -110,7 +110,7 @@ def psnr_to_float64(gaussians: Gaussians, camera: Camera, color: Any) -> float:
         background=[0.0] * 3,
         with_depth=False,
         keep_tape=False,
-    )[0]
+    ).color
     return _checked_psnr(exact.astype(np.float32), color)
 
 

@@ -172,7 +172,7 @@ def truths(subject: Subject, camera: Camera, filter_px2: float, side: int) -> li
     rows = _touching(subject.gaussians, camera, filter_px2, boxes).numpy()
     doubles = _core.Rows(*(getattr(rows, f.name).astype(np.float64) for f in fields(rows)))
     look = {"filter_px2": filter_px2, "antialiased": False, "background": [0.0] * 3}
-    picture = _core.rasterize(doubles, camera.core, **look, with_depth=False, keep_tape=False)[0]
+    picture = _core.rasterize(doubles, camera.core, **look, with_depth=False, keep_tape=False).color
     return [picture[y0:y1, x0:x1] for x0, y0, x1, y1 in boxes]
 
 

@@ -304,7 +304,7 @@ def test_pages_are_drawn_from_wherever_they_lie(device, fade):
             frame = _core.SceneFrame(-1 if device == "cpu" else 0)
             frame.set_models([_core.Model(on(device, gaussians).rows)], [])
             shade = _core.Shade(background=[0.0, 0.0, 0.0], min_transmittance=1e-4, with_depth=True)
-            drawing = frame.draw(core, camera.core, one, shade)
+            drawing = frame.draw(core, _core.FrameRequest(camera.core, one, shade))
             assert drawing.finish().gaussians > 0
             pictures.append(host((drawing.color, drawing.alpha, drawing.depth)))
         for one_plane, other in zip(*pictures, strict=True):

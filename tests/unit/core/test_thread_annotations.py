@@ -97,10 +97,10 @@ BROKEN = {
         "requires holding mutex 'busy_'",
     ),
     "a frame on the host": (
-        "bindings/pool.h",
+        "bindings/host_frame.cpp",
         "        const MutexLock lock(busy_);\n",
         "",
-        "bindings/bind_pool.cpp",
+        "bindings/host_frame.cpp",
         "requires holding mutex 'busy_'",
     ),
 }

@@ -276,6 +276,7 @@ def test_operations_on_doubles_are_refused():
 def test_other_values_are_refused():
     camera, rule = _core.Camera(**CAMERA), _core.Rule(**RULE)
     scene, frame, model = _core.ResidentScene(-1), _core.SceneFrame(-1), _core.Model(rows())
+    request = _core.FrameRequest(camera, rule, SHADE)
     for wrong in (None, 3, camera):
         kind = type(wrong).__name__
         for name, expected, call in (
@@ -287,8 +288,9 @@ def test_other_values_are_refused():
                 "ClusterTable",
                 lambda w=wrong: _core.Palette(w, np.zeros((1, 3), np.float32), -1),
             ),
-            ("scene", "ResidentScene", lambda w=wrong: frame.draw(w, camera, rule, SHADE)),
+            ("scene", "ResidentScene", lambda w=wrong: frame.draw(w, request)),
             ("model", "Model", lambda w=wrong: _core.AssetFrame(w)),
+            ("request", "FrameRequest", lambda w=wrong: frame.draw(scene, w)),
         ):
             with pytest.raises(
                 TypeError, match=rf"{name}: expected {expected}, got <class '.*{kind}'>"
@@ -314,7 +316,8 @@ def test_frame_refuses_a_scene_of_other_bundles():
         frame, scene = _core.SceneFrame(-1), _core.ResidentScene(-1)
         frame.set_models([residency.model(bundle, CPU) for bundle in bundles[:has]], [])
         scene.set_bundles(tables)
-        arguments = scene, _core.Camera(**CAMERA), _core.Rule(**RULE), SHADE
+        camera, rule = _core.Camera(**CAMERA), _core.Rule(**RULE)
+        arguments = scene, _core.FrameRequest(camera, rule, SHADE)
         if tables == [one, two][: len(tables)] and len(tables) <= has:
             assert not frame.draw(*arguments).alpha.any()
             continue

@@ -29,13 +29,12 @@ def draw_window(scene, camera, window):
     selection = select(scene, camera, tolerance=0.0, device="cpu")
     frame = _core.SceneFrame(CPU.number)
     residency.set_models(frame, scene.bundles, CPU, "appearance")
-    drawing = frame.draw_cut(
-        residency.scene(scene, CPU).core,
+    request = _core.FrameRequest(
         camera.core.window(*window),
-        selection.instance_ids,
-        selection.cluster_ids,
-        shade_of((0.1, 0.2, 0.3), None, False, True),
+        shade=shade_of((0.1, 0.2, 0.3), None, False, True),
+        cut=_core.GivenCut(selection.instance_ids, selection.cluster_ids),
     )
+    drawing = frame.draw(residency.scene(scene, CPU).core, request)
     return drawing.color, drawing.alpha, drawing.depth, drawing.finish()
 
 

@@ -1,0 +1,43 @@
+#pragma once
+
+// Models, scenes, pools and frames of CUDA's devices. Only sources of the CUDA backend include it.
+
+#include "bindings/resident.h"
+#include "draw/scene_frame_cuda.h"
+
+namespace v3dg::cuda {
+
+// cudaStream_t is what Work calls a stream here.
+inline cudaStream_t stream_of(const Work& work) { return static_cast<cudaStream_t>(work.stream()); }
+
+// Borrows an array on any CUDA device.
+Borrowed borrow_anywhere(const py::handle& array, const char* name, const Element& element,
+                         Shape shape);
+
+class BackendTables final : public backend::Tables {
+  public:
+    BackendTables(const BoundTable& table, const Work& work)
+        : tables(table.table(), table.appearance(), stream_of(work)) {}
+    size_t bytes() const override { return tables.bytes(); }
+
+    const BundleTables tables;
+};
+
+// The tables of a bundle, which live as long as what it returns.
+std::shared_ptr<const BundleTables> tables_on(const BoundTable& table, const Work& work);
+
+std::shared_ptr<const backend::Model> make_model(const Rows& rows, const Work& work);
+std::shared_ptr<const backend::Model> make_model(const py::object& codes, const Work& work);
+std::shared_ptr<const backend::Palette> make_palette(const py::object& table, const py::array& sh,
+                                                     const Work& work);
+std::unique_ptr<backend::Scene> make_scene();
+std::unique_ptr<backend::Pool> make_pool(PagePool& pool, const py::list& tables, const Work& work);
+std::unique_ptr<backend::Frame> make_frame(const Work& work);
+std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const backend::Model> model,
+                                                      const Work& work);
+
+// As Backend::rasterize().
+Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,
+                     bool with_depth, bool keep_tape);
+
+}  // namespace v3dg::cuda
