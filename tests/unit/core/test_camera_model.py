@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[3]
 CSRC = ROOT / "csrc"
 PROGRAM = ROOT / "tests" / "cpp" / "second_camera.cpp"
 # Folders that make pictures of their own, by a pinhole that they choose themselves.
