@@ -1,6 +1,6 @@
 #pragma once
 
-// Where an operation runs, and the one place that chooses between its two halves.
+// Where an operation runs. bindings/backend.h chooses what runs it there.
 
 #include "base/stream.h"
 
@@ -20,11 +20,3 @@ struct Device {
 };
 
 }  // namespace v3dg
-
-// Runs an operation where `work` is: cpu::operation(...), or cuda::operation(..., work.stream()).
-#define V3DG_DISPATCH(work, operation, ...)                                                       \
-    [&] {                                                                                         \
-        if constexpr (V3DG_WITH_CUDA != 0)                                                        \
-            if (!(work).device().is_host()) return cuda::operation(__VA_ARGS__, (work).stream()); \
-        return cpu::operation(__VA_ARGS__);                                                       \
-    }()

@@ -140,7 +140,7 @@ class PoolFrame:
         """What a pixel shows most of; only on the CPU."""
         resident = residency.scene(subject, self.device)
         pool = self.take(resident)
-        request = _core.FrameRequest(pixel, rule, aside=True)
+        request = _core.FrameRequest(pixel, rule, look=_core.Look(aside=True))
         return self._core.pick(resident.core, request, pool.core)
 
     def _enqueue(
@@ -158,10 +158,7 @@ class PoolFrame:
             request.cut.rule,
             request.shade,
             None,
-            look.shows,
-            look.palettes(resident.bundles),
-            look.core_chooser,
-            look.aside,
+            look.core(resident.bundles),
         )
         drawing = self._core.draw(resident.core, asked, pool.core, steps, stop)
         status = pool.core.status()

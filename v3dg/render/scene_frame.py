@@ -68,22 +68,20 @@ class SceneFrame:
         stop: _core.Stop | None = None,
     ) -> Picture:
         """Draw the cut that is asked for."""
-        camera = request.camera
-        if request.given is not None:
+        camera, cut, shade, given, _ = request
+        if given is not None:
             if isinstance(camera, StereoCamera):
                 left, right = (
-                    self._draw_given(subject, request, request.given, eye, stop)
-                    for eye in camera.eyes
+                    self._draw_given(subject, request, given, eye, stop) for eye in camera.eyes
                 )
                 return left, right
-            return self._draw_given(subject, request, request.given, camera, stop)
-        cut = request.cut
+            return self._draw_given(subject, request, given, camera, stop)
         rule = cut.rule
         with residency.turn(self.device):
             resident = residency.scene(subject, self.device, self._resident)
             self._resident = resident
             self.take(resident)
-            asked = _core.FrameRequest(camera.core, rule, request.shade)
+            asked = _core.FrameRequest(camera.core, rule, shade)
             drawing = self.core.draw(resident.core, asked, None, steps, stop)
             resident.add_drawing(drawing)
 

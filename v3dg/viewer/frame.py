@@ -410,7 +410,7 @@ class SceneView:
             rule_of(cut.tolerance, None, 0),
             _SHADE,
             _core.GivenCut(cut.instance_ids, cut.cluster_ids, cut.given_weights),
-            _look_of(shows),
+            _core.Look(_look_of(shows)),
         )
         drawing = frame.draw(resident.core, request, stop=stop)
         _check(stop)
