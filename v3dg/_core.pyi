@@ -584,13 +584,10 @@ class GivenCut:
         self, instance_ids: Array, cluster_ids: Array, weights: Array | None = None
     ) -> None: ...
 
-class FrameRequest:
-    """One picture that is asked of a frame.
+class Look:
+    """What a picture shows in place of the frame's own colours, and of which cut.
 
     Args:
-        rule: What is selected; with a cut, the tolerance that metrics are compared
-            with.
-        cut: A cut that is drawn in place of what the rule selects.
         shows: "error" shows the share of the tolerance that metrics take, "count" how
             many gaussians a pixel is blended of, in place of depth, "residency" where
             pages are missing; anything else, the gaussians' or palettes' own colours.
@@ -601,14 +598,29 @@ class FrameRequest:
 
     def __init__(
         self,
-        camera: Camera | Eyes,
-        rule: Rule | None = None,
-        shade: Shade | None = None,
-        cut: GivenCut | None = None,
         shows: str = "appearance",
         colors: list[Float32] = ...,
         chooser: Camera | Eyes | None = None,
         aside: bool = False,
+    ) -> None: ...
+
+class FrameRequest:
+    """One picture that is asked of a frame.
+
+    Args:
+        rule: What is selected; with a cut, the tolerance that metrics are compared
+            with.
+        cut: A cut that is drawn in place of what the rule selects.
+        look: What it shows; None for the frame's own colours.
+    """
+
+    def __init__(
+        self,
+        camera: Camera | Eyes,
+        rule: Rule | None = None,
+        shade: Shade | None = None,
+        cut: GivenCut | None = None,
+        look: Look | None = None,
     ) -> None: ...
 
 class Pick:

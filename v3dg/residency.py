@@ -39,6 +39,7 @@ _TOO_MANY_BYTES = 1 << 62  # what no memory holds, so that pages come one by one
 _NOT_INHERITED = ("frame", "pool", "scene")
 
 _NO_VALUE = object()
+_NO_TURN = nullcontext()  # which any number of threads may be in; made once, for every frame asks
 
 
 class _LastResult:
@@ -170,7 +171,7 @@ class Residency:
         other threads wait."""
         if device.is_cuda:
             return self.lock
-        return nullcontext()
+        return _NO_TURN
 
     def scene(
         self, subject: Subject, device: Device, last: ResidentScene | None = None

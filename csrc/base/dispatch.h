@@ -1,7 +1,6 @@
 #pragma once
 
-// The device that an operation runs on, and the one place that chooses between the two halves of an
-// operation.
+// The device that an operation runs on. bindings/backend.h chooses the backend that runs it there.
 
 #include "base/stream.h"
 
@@ -21,12 +20,3 @@ struct Device {
 };
 
 }  // namespace v3dg
-
-// Runs an operation on the device of `work`: cpu::operation(...), or cuda::operation(...,
-// work.stream()).
-#define V3DG_DISPATCH(work, operation, ...)                                                       \
-    [&] {                                                                                         \
-        if constexpr (V3DG_WITH_CUDA != 0)                                                        \
-            if (!(work).device().is_host()) return cuda::operation(__VA_ARGS__, (work).stream()); \
-        return cpu::operation(__VA_ARGS__);                                                       \
-    }()

@@ -57,38 +57,49 @@ struct BoundGivenCut {
     }
 };
 
+// What a picture shows in place of the frame's own colours, and of which cut.
+struct BoundLook {
+    FrameLook look = FrameLook::appearance;
+    py::list cluster_colors;  // (C, 3) of each bundle, or none
+    std::optional<Eyes> chooser;
+    bool is_aside = false;
+};
+
 // A request, without what only the frame can read: the given cut, and colours of clusters.
 struct BoundRequest {
     FrameRequest plain;
     std::optional<BoundGivenCut> cut;
-    py::list cluster_colors;  // (C, 3) of each bundle, or none
+    py::object cluster_colors;  // as BoundLook has them; null without a look
 
     // Of a Camera or of Eyes. It looks itself which of the two it is: overloads, or a conversion,
     // would take longer than all else here.
     BoundRequest(const py::object& camera, const SelectRule* rule, const Shade* shade,
-                 const BoundGivenCut* given, const std::string& shows, const py::list& colors,
-                 const BoundEyes* chooser, bool is_aside)
+                 const BoundGivenCut* given, const BoundLook* look)
         : plain{.eyes = eyes_of(camera),
                 .rule = rule == nullptr ? SelectRule{} : *rule,
-                .shade = shade == nullptr ? Shade{} : *shade,
-                .look = look_of(shows),
-                .is_aside = is_aside},
-          cluster_colors(colors) {
+                .shade = shade == nullptr ? Shade{} : *shade},
+          cluster_colors(look == nullptr ? py::object() : py::object(look->cluster_colors)) {
         if (given != nullptr && plain.eyes.are_two)
             throw py::value_error("cut: expected one camera, got two eyes; draw each of them");
         if (given != nullptr) cut = *given;
-        if (chooser != nullptr) plain.chooser = chooser->eyes;
+        if (look == nullptr) return;
+        plain.look = look->look;
+        plain.is_aside = look->is_aside;
+        plain.chooser = look->chooser;
     }
 
-    bool is_complete() const { return !cut && cluster_colors.empty(); }
+    bool has_colors() const { return cluster_colors && py::len(cluster_colors) > 0; }
+    bool is_complete() const { return !cut && !has_colors(); }
     FrameRequest completed(Device device, const SceneState& scene) const {
         FrameRequest request = plain;
         if (cut) request.cut = cut->read(device);
-        for (size_t b = 0; !cluster_colors.empty() && b < scene.tables.size(); ++b) {
-            if (b >= cluster_colors.size())
+        if (!has_colors()) return request;
+        const py::list arrays(cluster_colors);
+        for (size_t b = 0; b < scene.tables.size(); ++b) {
+            if (b >= arrays.size())
                 throw py::value_error("colors: expected none, or of each bundle");
             const auto clusters = static_cast<py::ssize_t>(scene.tables[b].num_clusters());
-            const auto colors = cluster_colors[b].cast<py::array>();
+            const auto colors = arrays[b].cast<py::array>();
             request.cluster_colors.push_back(
                 span_of<const float>(colors, "colors", {clusters, 3}).data);
         }
@@ -292,12 +303,23 @@ void bind_frame(py::module_& m) {
                      .instance_ids = instance_ids, .cluster_ids = cluster_ids, .weights = weights};
              }),
              "instance_ids"_a, "cluster_ids"_a, "weights"_a = py::none());
-    py::class_<BoundRequest>(m, "FrameRequest", "One picture that is asked of a frame.")
-        .def(py::init<const py::object&, const SelectRule*, const Shade*, const BoundGivenCut*,
-                      const std::string&, const py::list&, const BoundEyes*, bool>(),
-             "camera"_a, "rule"_a = nullptr, "shade"_a = nullptr, "cut"_a = nullptr,
+    py::class_<BoundLook>(m, "Look",
+                          "What a picture shows in place of the frame's own colours, and of which "
+                          "cut.")
+        .def(py::init([](const std::string& shows, const py::list& colors, const BoundEyes* chooser,
+                         bool aside) {
+                 BoundLook look{.look = look_of(shows), .cluster_colors = colors};
+                 if (chooser != nullptr) look.chooser = chooser->eyes;
+                 look.is_aside = aside;
+                 return look;
+             }),
              "shows"_a = "appearance", "colors"_a = py::list(), "chooser"_a = nullptr,
              "aside"_a = false);
+    py::class_<BoundRequest>(m, "FrameRequest", "One picture that is asked of a frame.")
+        .def(py::init<const py::object&, const SelectRule*, const Shade*, const BoundGivenCut*,
+                      const BoundLook*>(),
+             "camera"_a, "rule"_a = nullptr, "shade"_a = nullptr, "cut"_a = nullptr,
+             "look"_a = nullptr);
     py::class_<ScenePick>(m, "Pick", "The gaussian that a pixel shows most of.")
         .def_readonly("instance", &ScenePick::instance)
         .def_readonly("cluster", &ScenePick::cluster)

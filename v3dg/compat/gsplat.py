@@ -398,7 +398,7 @@ def _located(
 
 def _ellipses(rows: _core.Rows, camera: _core.Camera, look: _Look) -> tuple[Array, ...]:
     """Centres, depths, conics, opacities and radii of gaussians on an image."""
-    found = _core.ellipses(
+    ellipses = _core.ellipses(
         rows,
         camera,
         filter_px2=look.eps2d,
@@ -406,4 +406,4 @@ def _ellipses(rows: _core.Rows, camera: _core.Camera, look: _Look) -> tuple[Arra
         far_depth=look.far_plane,
         min_radius_px=look.radius_clip,
     )
-    return found.centers, found.depths, found.conics, found.opacities, found.radii
+    return ellipses.centers, ellipses.depths, ellipses.conics, ellipses.opacities, ellipses.radii

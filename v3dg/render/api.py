@@ -109,12 +109,12 @@ def render(
     opened_subject = opened(subject)
     one_of(color_by, "color_by", get_args(ColorBy))
     frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
-    chosen = CutRequest(tolerance, budget, min_level, fade)
+    cut_request = CutRequest(tolerance, budget, min_level, fade)
     shade = shade_of(background, min_transmittance, isinstance(opened_subject, Gaussians), depth)
 
     def picture(view: Camera | StereoCamera) -> Picture:
         check_camera(view)
-        request = FrameRequest(view, chosen, shade, cut)
+        request = FrameRequest(view, cut_request, shade, cut)
         return frame.chosen(opened_subject).draw_settled(opened_subject, request)
 
     pictures: Picture | list[Picture] = for_each(camera, picture)

@@ -48,7 +48,7 @@ class AssetFrame:
     ) -> Picture:
         """Draw the asset; ValueError where something is asked for that only levels
         have."""
-        is_selected = request.given is None
+        is_selected = request.selection is None
         check("cut", is_selected, "a scene or a bundle to choose from, got an asset")
         check_request(request.cut)
         camera = request.camera

@@ -140,7 +140,7 @@ class PoolFrame:
         """What a pixel shows most of; only on the CPU."""
         resident = residency.scene(subject, self.device)
         pool = self.take(resident)
-        request = _core.FrameRequest(pixel, rule, aside=True)
+        request = _core.FrameRequest(pixel, rule, look=_core.Look(aside=True))
         return self._core.pick(resident.core, request, pool.core)
 
     def _enqueue(
@@ -153,17 +153,14 @@ class PoolFrame:
     ) -> Picture:
         bytes_in_at_start = pool.core.status().bytes_in
         look = request.look or self._look
-        asked = _core.FrameRequest(
+        core_request = _core.FrameRequest(
             request.camera.core,
             request.cut.rule,
             request.shade,
             None,
-            look.shows,
-            look.palettes(resident.bundles),
-            look.core_chooser,
-            look.aside,
+            look.core(resident.bundles),
         )
-        drawing = self._core.draw(resident.core, asked, pool.core, steps, stop)
+        drawing = self._core.draw(resident.core, core_request, pool.core, steps, stop)
         status = pool.core.status()
         resident.add_drawing(drawing)
         budget = request.cut.budget
@@ -191,5 +188,5 @@ def _finish(picture: Picture) -> None:
 
 
 def _refuse_given_cut(request: FrameRequest) -> None:
-    is_selected = request.given is None
+    is_selected = request.selection is None
     check("cut", is_selected, "none for a pool, which has its own, got one; give memory=None")

@@ -132,8 +132,8 @@ class Renderer:
         check_camera(camera)
         subject = self._subject
         shade = shade_of(background, min_transmittance, isinstance(subject, Gaussians), depth)
-        chosen = CutRequest(tolerance, budget, min_level, fade)
-        request = FrameRequest(camera, chosen, shade, cut)
+        cut_request = CutRequest(tolerance, budget, min_level, fade)
+        request = FrameRequest(camera, cut_request, shade, cut)
         return self._frame.chosen(subject).draw(subject, request, self._steps)
 
     def settle(

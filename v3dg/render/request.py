@@ -50,8 +50,8 @@ class CutRequest(NamedTuple):
         """The request as the core takes it; ValueError where a number is not as
         `v3dg.select` has it."""
         if self.is_plain:
-            return _known_rule(self.tolerance, self.budget, self.min_level, self.fade)
-        return _rule(self.tolerance, self.budget, self.min_level, self.fade)
+            return _known_rule(*self)
+        return _rule(*self)
 
 
 def _rule(
@@ -84,11 +84,19 @@ class Look:
     aside: bool = False
 
     @property
-    def core_chooser(self) -> _core.Camera | None:
-        """The chooser for the compiled operations."""
-        if self.chooser is None:
+    def is_plain(self) -> bool:
+        """Whether it shows the gaussians themselves, of the cut for who looks."""
+        return self.shows == "appearance" and self.chooser is None and not self.aside
+
+    def core(self, bundles: Sequence[Bundle]) -> _core.Look | None:
+        """The look for the compiled operations, of pictures of these bundles; None
+        where it is that of the gaussians themselves."""
+        if self.is_plain:
             return None
-        return self.chooser.core
+        chooser = None
+        if self.chooser is not None:
+            chooser = self.chooser.core
+        return _core.Look(self.shows, self.palettes(bundles), chooser, self.aside)
 
     def palettes(self, bundles: Sequence[Bundle]) -> list[NDArray[np.float32]]:
         """The colours of each bundle's clusters; none where the bundles have no colours
@@ -110,14 +118,14 @@ class FrameRequest(NamedTuple):
         camera: Who looks; the two eyes of a stereo camera share a cut.
         cut: Which cut is selected.
         shade: What is behind gaussians, and when a pixel stops.
-        given: A cut that was selected before, to be drawn in place of `cut`.
+        selection: A cut that was selected before, to be drawn in place of `cut`.
         look: What it shows; None for the frame's own colours.
     """
 
     camera: Camera | StereoCamera
     cut: CutRequest
     shade: _core.Shade
-    given: Selection | None = None
+    selection: Selection | None = None
     look: Look | None = None
 
 

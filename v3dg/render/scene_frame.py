@@ -68,23 +68,21 @@ class SceneFrame:
         stop: _core.Stop | None = None,
     ) -> Picture:
         """Draw the cut that is asked for."""
-        camera = request.camera
-        if request.given is not None:
+        camera, cut, shade, selection, _ = request
+        if selection is not None:
             if isinstance(camera, StereoCamera):
                 left, right = (
-                    self._draw_given(subject, request, request.given, eye, stop)
-                    for eye in camera.eyes
+                    self._draw_given(subject, request, selection, eye, stop) for eye in camera.eyes
                 )
                 return left, right
-            return self._draw_given(subject, request, request.given, camera, stop)
-        cut = request.cut
+            return self._draw_given(subject, request, selection, camera, stop)
         rule = cut.rule
         with residency.turn(self.device):
             resident = residency.scene(subject, self.device, self._resident)
             self._resident = resident
             self.take(resident)
-            asked = _core.FrameRequest(camera.core, rule, request.shade)
-            drawing = self.core.draw(resident.core, asked, None, steps, stop)
+            core_request = _core.FrameRequest(camera.core, rule, shade)
+            drawing = self.core.draw(resident.core, core_request, None, steps, stop)
             resident.add_drawing(drawing)
 
         def finish() -> Stats:
@@ -126,8 +124,8 @@ class SceneFrame:
             pairs = _core.GivenCut(
                 self._on_device(cut.instance_ids), self._on_device(cut.cluster_ids), weights
             )
-            asked = _core.FrameRequest(eye.core, None, request.shade, pairs)
-            drawing = self.core.draw(resident.core, asked, None, None, stop)
+            core_request = _core.FrameRequest(eye.core, None, request.shade, pairs)
+            drawing = self.core.draw(resident.core, core_request, None, None, stop)
             resident.add_drawing(drawing)
 
         def finish() -> Stats:

@@ -319,8 +319,8 @@ class SceneView:
             )
 
         def draw(cut: CutRequest, look: Look, steps: _core.BudgetSteps | None) -> RenderedImage:
-            asked = FrameRequest(job.camera, cut, _SHADE, look=look)
-            image = pool_frame.draw(self.scene, asked, steps, job.stop)
+            frame_request = FrameRequest(job.camera, cut, _SHADE, look=look)
+            image = pool_frame.draw(self.scene, frame_request, steps, job.stop)
             assert isinstance(image, RenderedImage)
             _check(job.stop)
             return image
@@ -410,7 +410,7 @@ class SceneView:
             rule_of(cut.tolerance, None, 0),
             _SHADE,
             _core.GivenCut(cut.instance_ids, cut.cluster_ids, cut.given_weights),
-            _look_of(shows),
+            _core.Look(_look_of(shows)),
         )
         drawing = frame.draw(resident.core, request, stop=stop)
         _check(stop)

@@ -42,7 +42,7 @@ def test_mutexes_are_held_where_they_have_to_be():
 def test_sources_with_mutexes_are_found_through_headers():
     sources = check("--list").stdout.split()
     assert {"residency/page_pool.cpp", "residency/pool_readers.cpp"} <= set(sources)
-    assert {"io/hashed_read.cpp", "bindings/bind_pool.cpp"} <= set(sources)
+    assert {"io/hashed_read.cpp", "bindings/host_frame.cpp"} <= set(sources)
 
 
 @pytest.mark.parametrize("folder", ["residency", "io"])
