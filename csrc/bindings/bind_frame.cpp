@@ -308,7 +308,7 @@ void bind_frame(py::module_& m) {
                           "cut.")
         .def(py::init([](const std::string& shows, const py::list& colors, const BoundEyes* chooser,
                          bool aside) {
-                 BoundLook look{.look = look_of(shows), .cluster_colors = colors};
+                 BoundLook look{.look = look_of(shows), .cluster_colors = colors, .chooser = {}};
                  if (chooser != nullptr) look.chooser = chooser->eyes;
                  look.is_aside = aside;
                  return look;
