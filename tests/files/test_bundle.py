@@ -602,16 +602,16 @@ def with_metadata(**values):
         ),
         (
             lambda header, _: header.pop("clusters.level") and None,
-            "clusters.level: expected a tensor",
+            "clusters.level: expected a one-dimensional tensor",
         ),
         (
             lambda header, _: header.update(extra=header["hash"]),
             '"extra": expected only the tensors',
         ),
-        (lambda header, _: header.update(pages=7), "pages: expected a tensor"),
-        (with_entry("pages", shape=[-4096]), "pages: expected a tensor"),
-        (with_entry("pages", shape=[True]), "pages: expected a tensor"),
-        (with_entry("pages", shape=[4096.0]), "pages: expected a tensor"),
+        (lambda header, _: header.update(pages=7), "pages: expected a one-dimensional tensor"),
+        (with_entry("pages", shape=[-4096]), "pages: expected a one-dimensional tensor"),
+        (with_entry("pages", shape=[True]), "pages: expected a one-dimensional tensor"),
+        (with_entry("pages", shape=[4096.0]), "pages: expected a one-dimensional tensor"),
         (with_entry("pages", shape=[2**70]), "size: expected more than"),
         (with_entry("clusters.level", shape=[2**62]), "size: expected more than"),
         (

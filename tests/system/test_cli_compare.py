@@ -191,7 +191,7 @@ def test_errors(folder, tmp_path):
     (tmp_path / "compare.png").symlink_to("a.png")
     fails(
         2,
-        "compare.png: expected another file than a.png",
+        "compare.png: expected another file than the input a.png",
         "compare",
         "a.png",
         "b.png",

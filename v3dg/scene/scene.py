@@ -349,7 +349,7 @@ def _read_only(state: _State) -> _State:
 def _rows(values: Array | None, name: str, count: int) -> Array:
     """A contiguous (count, ...) copy of a column, or of its default for None; one row
     stands for all, except of positions."""
-    if values is None:
+    if values is None and name in _DEFAULTS:
         values = _DEFAULTS[name]
     row = _ROW[name]
     is_on_device = getattr(values, "is_cuda", False) and name != "importance"
