@@ -2,7 +2,7 @@
 # all but `environment` and `compile` need the environment that `environment` makes and `install` fills.
 # shellcheck shell=bash
 
-readonly test_command="pip install '.[test]' && pytest"
+readonly test_command="pip install '.[test]' && pytest -n 2"
 readonly ci=build/ci
 
 enter() {

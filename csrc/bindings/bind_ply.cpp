@@ -1,3 +1,5 @@
+// Reading and writing of .ply files as Python has them; the work is that of io/ply_*.h.
+
 #include <cerrno>
 #include <cmath>
 #include <system_error>

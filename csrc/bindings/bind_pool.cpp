@@ -1,3 +1,6 @@
+// Pools of pages and the sources that they read from, as Python has them; residency/page_pool.h has
+// the pool.
+
 #include <algorithm>
 #include <thread>
 
