@@ -1,5 +1,5 @@
-// Draws pictures on the CPU, and their gradients: projects and bins draws piece by piece, then blends
-// tile after tile.
+// Draws pictures on the CPU, and their gradients: projects and bins draws piece by piece, then
+// blends tile after tile.
 
 #include "base/threads.h"
 #include "draw/render.h"

@@ -5,9 +5,9 @@
 #include <cfloat>
 #include <vector>
 
+#include "camera/camera.h"
 #include "fit_group/fit_group_math.h"
 #include "levels/refine_cuts.h"
-#include "camera/camera.h"
 #include "math/quat.h"
 
 namespace v3dg {

@@ -403,7 +403,9 @@ def test_scenes_fetch_nothing(there, bundle, tmp_path, monkeypatch):
 
 def test_no_scene_is_saved_with_what_goes_at_the_end(there, bundle, tmp_path):
     scene = v3dg.Scene.of(v3dg.open("memory://in/a.v3dg"))
-    with pytest.raises(ValueError, match="got one in memory or at a URL; write it to a file and open that"):
+    with pytest.raises(
+        ValueError, match="got one in memory or at a URL; write it to a file and open that"
+    ):
         scene.save(tmp_path / "a.json")
 
 

@@ -80,7 +80,14 @@ def test_lens_distortion_is_left_out_if_told(folder):
 def test_what_cannot_be_meant_is_told(folder):
     (folder / "no_eyes.json").write_text('{"frames": []}')
     before = sorted(folder.iterdir())
-    fails(2, "another file than the input donut.v3dg", "refine", "donut.v3dg", "donut.v3dg", cwd=folder)
+    fails(
+        2,
+        "another file than the input donut.v3dg",
+        "refine",
+        "donut.v3dg",
+        "donut.v3dg",
+        cwd=folder,
+    )
     fails(
         2,
         "x.ply: expected a file name ending in .v3dg",

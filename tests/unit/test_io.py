@@ -57,7 +57,9 @@ def test_other_names_are_refused_before_anything_is_opened(name, tmp_path):
 def test_versions_and_encodings_belong_to_their_formats(tmp_path):
     with pytest.raises(ValueError, match=r"version: expected None for .*a\.ply, .* got 3"):
         write_asset(tmp_path / "a.ply", ASSET, version=3)
-    with pytest.raises(ValueError, match=r"encoding: expected the default for .*a\.spz, .* got 'ascii'"):
+    with pytest.raises(
+        ValueError, match=r"encoding: expected the default for .*a\.spz, .* got 'ascii'"
+    ):
         write_asset(tmp_path / "a.spz", ASSET, encoding="ascii")
     with pytest.raises(ValueError, match=r"encoding: expected .*got 'text'"):
         write_asset(tmp_path / "a.ply", ASSET, encoding="text")

@@ -97,7 +97,11 @@ class Attack:
                 if date is not None:
                     os.utime(work / "asset.ply", ns=(date, date))
             ended = run([], work, program=program, limit_s=60)
-            if swaps and ended.code == 1 and f"{name}.partial: expected levels of this build" in ended.err:  # as it should
+            if (
+                swaps
+                and ended.code == 1
+                and f"{name}.partial: expected levels of this build" in ended.err
+            ):  # as it should
                 (work / f"{name}.partial").unlink()
                 ended = run([], work, program=program, limit_s=60)
             fault = fault_of(ended, codes=(0,))
