@@ -349,16 +349,17 @@ def _read_only(state: _State) -> _State:
 def _rows(values: Array | None, name: str, count: int) -> Array:
     """A contiguous (count, ...) copy of a column, or of its default for None; one row
     stands for all, except of positions."""
-    if values is None and name in _DEFAULTS:
-        values = _DEFAULTS[name]
+    column: Array = values
+    if values is None:
+        column = _DEFAULTS.get(name)
     row = _ROW[name]
-    is_on_device = getattr(values, "is_cuda", False) and name != "importance"
+    is_on_device = getattr(column, "is_cuda", False) and name != "importance"
     if is_on_device:
         import torch
 
-        array = values.detach().to(torch.float64, copy=True)
+        array = column.detach().to(torch.float64, copy=True)
     else:
-        array = floats(values, name)
+        array = floats(column, name)
     if name != "positions" and tuple(array.shape) == row:
         if is_on_device:
             array = array.expand(count, *row)
