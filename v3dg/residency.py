@@ -1,7 +1,9 @@
 """Residency: which data of bundles and scenes is on which device. It is the only cache
 of the package.
 
-Data is freed with its bundle or scene, or by `residency.clear()`.
+Data is freed with its bundle or scene, or by `residency.clear()`; buffers and slots of
+a `Renderer` are its own and are freed with it. docs/architecture.md, "Memory on the
+GPU", lists every owner.
 """
 
 import atexit

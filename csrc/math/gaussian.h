@@ -1,6 +1,7 @@
 #pragma once
 
-// A gaussian, the layouts in which many of them are held, and how far one reaches.
+// A gaussian, the layouts in which many of them are held, and how far one reaches. Its alpha at a
+// pixel is in rasterize/rasterize_math.h.
 
 #include <cstddef>
 #include <cstdint>

@@ -1,6 +1,7 @@
 #pragma once
 
-// Gaussians as codes of few bits: pages of bundles, pages on the host, and slots of a pool.
+// Gaussians as codes of few bits: pages of bundles, pages on the host, and slots of a pool. This is
+// the codec "quantized" of v3dg/bundle/codec.py; docs/extending.md says where another one goes.
 
 #include <cstring>
 

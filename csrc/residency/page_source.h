@@ -1,7 +1,8 @@
 #pragma once
 
 // The source of the bytes of a bundle's pages: a file, which may have to be fetched first, or
-// memory. Any thread may read from it.
+// memory; and the codecs that pages have (PageCodec). Any thread may read from it.
+// docs/extending.md says how to add a codec.
 
 #include <cstdint>
 #include <functional>

@@ -1,6 +1,7 @@
 #pragma once
 
-// Comparisons of a metric with the tolerance, and the weights that come of them with a fade.
+// Comparisons of a metric with the tolerance, and how far a group is refined. The weight of a
+// cluster is the difference of the refinements of two groups (cut_math.h).
 
 #include <cstdint>
 
