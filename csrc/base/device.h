@@ -1,8 +1,9 @@
 #pragma once
 
 // Memory and errors of the CUDA half. A DeviceBuffer frees itself into a pool of its device;
-// trim_pool() returns the pool's free memory to the driver. docs/architecture.md, "Memory on the GPU",
-// says who owns what and when it is freed. Sources that include this header are built only with CUDA.
+// trim_pool() returns the pool's free memory to the driver. docs/architecture.md, "Memory on the
+// GPU", says who owns what and when it is freed. Sources that include this header are built only
+// with CUDA.
 
 #include <cuda_runtime.h>
 

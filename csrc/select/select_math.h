@@ -25,16 +25,17 @@
 //    opposite. By 1 and 2 exactly one cluster on each path is drawn.
 // 4. Hence it does not matter who asks, in which order, or on which device: each decision depends
 //    on two metrics and on how far two pages have arrived, and two neighbours on a path compare the
-//    same bits. Every comparison of
-//    a metric with the tolerance is one of fits(), is_refined() and refinement(); those of
-//    bounds_math.h only skip clusters that are not drawn, and leave a margin.
+//    same bits. Every comparison of a metric with the tolerance is one of fits(), is_refined() and
+//    refinement(); those of bounds_math.h only skip clusters that are not drawn, and leave a
+//    margin.
 // 5. Culling drops clusters of the cut that cannot touch a pixel, and changes no weight.
 //
 // InstanceCut::drawn_weight() (cut_math.h) is the decision about a cluster. Where the tops of an
-// instance suffice (source_of_cut()) they have the weight kWhole, and only is_culled() is asked. The
-// CUDA half calls both. The CPU half composes drawn_weight() in two passes: weight() for all clusters of an instance, then is_culled() for
-// those whose weight is positive (select_cpu.cpp). With Footprint::paper 2 does not hold, as its
-// metric may decrease towards the root: several clusters on a path may then be drawn.
+// instance suffice (source_of_cut()) they have the weight kWhole, and only is_culled() is asked.
+// The CUDA half calls both. The CPU half composes drawn_weight() in two passes: weight() for all
+// clusters of an instance, then is_culled() for those whose weight is positive (select_cpu.cpp).
+// With Footprint::paper 2 does not hold, as its metric may decrease towards the root: several
+// clusters on a path may then be drawn.
 
 #include "select/bounds_math.h"
 #include "select/budget_math.h"
