@@ -185,7 +185,7 @@ class AssetFrame {
 class Target {
   public:
     virtual ~Target() = default;
-    // As fit_level() (levels/fit_level.h) has it; `error` is on the host.
+    // See fit_level() in levels/fit_level.h; `error` is on the host.
     virtual void fit_level(const FitConfig& config, Span<const FitGroup> groups,
                            const GaussianRows<float>& gaussians, float* error,
                            FitProgress& progress, const Work& work) const = 0;
@@ -290,7 +290,7 @@ class Backend {
 // The backend of a device; RuntimeError where it is not compiled in.
 const Backend& backend_of(Device device);
 
-// The host's, and the one of devices, which is null where none is compiled in.
+// The backend of the host, and the backend of devices, which is null if none is compiled in.
 const Backend& host_backend();
 const Backend* device_backend();
 

@@ -179,7 +179,7 @@ class BoundSceneFrame {
     }
 
   private:
-    // Calls body() with a request after checks that all belong together.
+    // Checks that the scene, the request and the pool belong together, then calls body() with them.
     template <class Body>
     void with_input(const py::object& scene_object, const py::object& request_object,
                     const py::object& pool_object, const Body& body) const {

@@ -139,8 +139,8 @@ class BoundHashedRead {
     std::optional<HashedRead> read_;
 };
 
-// Parts of several files. Small ones come to pieces of memory together, for which the system takes
-// large pages.
+// Reads parts of several files. Small parts share pieces of memory that are large enough for the
+// system to use huge pages for them.
 class BoundReader {
   public:
     std::unique_ptr<BoundHashedRead> read(const py::object& path, int descriptor,

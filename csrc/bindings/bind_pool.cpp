@@ -61,8 +61,9 @@ std::string text_of_error() {
     return problem.empty() ? "the fetch failed" : problem;
 }
 
-// What a function raises that is asked for parts of a file, or nothing. With Python's lock; nothing
-// here has a destructor that needs it, for Python may end the thread in the function.
+// Asks a Python function for parts of a file. Returns the text of the error that it raises, or an
+// empty text. The caller holds Python's lock; no object here may have a destructor that needs the
+// lock, because Python may end the thread inside the function.
 std::string told_by(PyObject* function, Span<const int64_t> places) {
     PyObject* const list = PyList_New(static_cast<py::ssize_t>(places.size / 2));
     for (size_t k = 0; list != nullptr && k < places.size / 2; ++k)

@@ -40,7 +40,7 @@ namespace {
 // What is asked of torch for every frame, looked up once. It stays to the end of the process, which
 // may come after Python's.
 struct Torch {
-    py::object empty, current_stream;  // the stream as a number
+    py::object empty, current_stream;  // current_stream returns the stream as a number
 
     static const Torch& get() {
         PYBIND11_CONSTINIT static py::gil_safe_call_once_and_store<Torch> known;
@@ -129,8 +129,8 @@ class CudaBackend final : public Backend {
             attributes.type == cudaMemoryTypeDevice)
             return Device{attributes.device};
         cudaGetLastError();
-        // An array of no elements has no memory. Torch knows where it is all the same; any other
-        // is as good as on the current device.
+        // An array of no elements has no memory. A torch tensor still knows its device; any other
+        // array is taken to be on the current device.
         const py::object index =
             py::getattr(py::getattr(array, "device", py::none()), "index", py::none());
         if (py::isinstance<py::int_>(index)) return Device{index.cast<int>()};

@@ -250,7 +250,7 @@ class BackendFrame final : public backend::Frame {
         std::unique_ptr<Drawing> drawing =
             frame_.draw(tables_of(input.scene), pages, request, used, images, stream_of(work),
                         place_of(pictures, device_));
-        // Without a pool, the tolerance that was asked for is reported.
+        // Without a pool, the drawing reports the tolerance of the request, else the one in `used`.
         const SelectRule& reported = pages == nullptr ? request.rule : used;
         return std::make_unique<EnqueuedDrawing>(std::move(pictures), device_, turns_,
                                                  std::move(drawing), reported, pages);

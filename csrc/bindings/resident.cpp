@@ -30,8 +30,8 @@ py::tuple BoundModel::decode(const py::array& cluster_ids) const {
     for (const int32_t c : cluster) {
         if (c < 0 || static_cast<size_t>(c) >= num_gaussians_.size())
             throw std::out_of_range("cluster_ids: expected ids below " +
-                                    std::to_string(num_gaussians_.size()) + ", got " +
-                                    std::to_string(c));
+                                    std::to_string(num_gaussians_.size()) +
+                                    " and none negative, got " + std::to_string(c));
         offset.push_back(offset.back() + num_gaussians_[c]);
     }
     const Work work(device_);

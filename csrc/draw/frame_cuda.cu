@@ -110,8 +110,8 @@ void Frame::enlarge(const FrameCounters& counters) {
     // Whoever differentiates is told what was counted before lists are spread.
     if (keeps_ == Keeps::tape) capacity_.spread = std::max(capacity_.spread, capacity_.entries);
     if (was_captured_ || capacity_ == before) return;
-    // The largest buffers go before larger ones come, and not into the pool: pieces of the old size
-    // are of no use.
+    // Free the largest buffers before larger ones are allocated, and do not leave their memory in
+    // the pool: pieces of the old size are of no use there.
     records_ = {};
     boxes_ = {};
     entries_ = {};

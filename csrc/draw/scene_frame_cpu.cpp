@@ -115,7 +115,7 @@ class CutDraws {
     const Camera& camera_;
     const bool fades_;
     std::vector<Draw<float>> draws_;
-    std::vector<uint64_t> end_of_pair_;  // among the gaussians of all draws
+    std::vector<uint64_t> end_of_pair_;  // end of each pair's gaussians, counted over all draws
     uint64_t num_gaussians_ = 0;
     int32_t last_instance_ = -1;
     ModelView<float> view_{};

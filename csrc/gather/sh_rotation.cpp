@@ -28,8 +28,8 @@ Direction direction_of(int i) {
     return {radius * std::cos(turn), radius * std::sin(turn), z};
 }
 
-// Solves least squares: row r of the solution for right-hand side b is the sum over directions of
-// weight[r] times b.
+// Solves least squares over the directions: for a right-hand side b with one row b[i] for each
+// direction i, row r of the solution is the sum over i of weight[r][i] * b[i].
 class Band {
   public:
     explicit Band(int degree) : degree_(degree), size_(2 * degree + 1) {

@@ -20,8 +20,8 @@ constexpr uint32_t kMostAlike = 12;  // most entries of a bucket that is not cro
 constexpr uint32_t kMostCrowded = kBlendThreads / 4;
 constexpr int kFewEntries = 64;   // sorted without buckets
 constexpr int kBlendBatch = 192;  // records blended at once
-// Each level takes some bits of depth or order, at least 4, after the first one, whose range is a
-// guess.
+// The range of the first level is a guess. Each level after it takes at least 4 bits, first of the
+// depth (26 bits), then of the order (28 bits).
 constexpr int kMostSpreadLevels = 1 + 26 / 4 + 28 / 4 + 2;
 constexpr uint32_t kNoBucket = ~0u;
 

@@ -78,8 +78,8 @@ V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t, StopsBefore = {}) {
     return weight;
 }
 
-// The result of a pixel that was blended to the end: the transmittance to the background, and the
-// factor of its colour.
+// What remains to be applied to a pixel when its blending is over: the transmittance to the
+// background, and the factor by which its colour is multiplied.
 template <class T>
 struct Finished {
     T transmittance, gain;

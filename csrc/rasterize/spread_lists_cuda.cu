@@ -185,7 +185,7 @@ __device__ bool spread_into_windows(const TileEntry* from, uint32_t count, TileE
     SpreadShared<kLog2Spread>& s = space.even;
     const Buckets buckets = find_buckets<kSpreadThreads>(from, 0, count, false, true, s);
     if (buckets.by_order) {
-        __syncthreads();  // before the range is found again
+        __syncthreads();  // the next find_buckets() overwrites the range
         return false;
     }
     place_buckets<kSpreadThreads>(from, 0, count, buckets, s.bucket, s.warp_sum);

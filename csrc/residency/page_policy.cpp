@@ -33,7 +33,8 @@ constexpr size_t kAhead = 16;  // needs whose memory is prefetched
 constexpr uint32_t kNumKeys = 1024;
 constexpr uint32_t kKeyShift = 19;
 constexpr uint32_t kFirstKey = 0x3f000000u >> kKeyShift;
-// The key of priority 1. Pages below it are not missed, but asked for ahead.
+// The key of priority 1. Pages with a lower key are not missing from the view: they are asked for
+// ahead.
 constexpr uint32_t kKeyOfMissed = (0x3f800000u >> kKeyShift) - kFirstKey;
 
 // A disk is faster the more it reads at once, and neighbours in a file are neighbours in space and

@@ -126,9 +126,9 @@ class PagePolicy {
     size_t missing() const { return missing_; }
     size_t needed() const { return missing_ + num_needed_; }
 
-    // Assigns slots to loaded pages, the most urgent first, of about `most_bytes`; at least one.
-    // Pages that it leaves in `loaded` wait for a later frame, or for a page above them that is
-    // being read.
+    // Assigns slots to loaded pages, the most urgent first, until they have about `most_bytes`
+    // together, but to at least one page. Pages that it leaves in `loaded` wait for a later frame,
+    // or for a page above them that is being read.
     void bring(std::vector<LoadedPage>& loaded, size_t most_bytes, PagesComing& out);
 
   private:

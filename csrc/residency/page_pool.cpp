@@ -21,7 +21,7 @@ namespace {
 
 constexpr float kToleranceLeap = 1.189207f;
 constexpr float kLeastToleranceRaised = 1e-6f;
-constexpr size_t kSamples = 1 << 14;  // of the sizes of pages
+constexpr size_t kSamples = 1 << 14;  // page sizes to sample, roughly
 // How long the end of a pool waits for its threads.
 constexpr std::chrono::seconds kMostWaitForEnd{2};
 
@@ -46,7 +46,7 @@ struct PagePool::State {
     static void start_threads(const std::shared_ptr<State>& state);
     void stop_threads();
 
-    // Constant after the construction, as far as threads other than the decider are concerned.
+    // After construction, no thread but the decider sees these change.
     PagePolicy policy;
     std::shared_ptr<BlockMemory> memory;
     int max_sh_degree = 0;
@@ -124,8 +124,8 @@ PagePool::PagePool(const std::vector<PagedBundle>& bundles, const PoolLimits& li
     State::start_threads(state_);
 }
 
-// A thread that waits for a disk forever is left behind, with the state that it writes to. So is
-// all of it in a child of fork(): its copy of the mutex may never be destroyed.
+// A thread that waits for a disk forever is left behind, with the state that it writes to. A child
+// of fork() leaves the whole state behind, because its copy of the mutex must not be destroyed.
 PagePool::~PagePool() {
     if (getpid() != state_->shared.process)
         static_cast<void>(new std::shared_ptr<State>(state_));

@@ -27,7 +27,8 @@ class PoolDecider {
     // Returns once the pool has decided about all that it has now; waits for the deciding thread,
     // or decides in this one where there is none.
     void decide_next_round(PoolShared& shared) V3DG_REQUIRES(shared.busy);
-    // Lets pages that failed be read again. Not while a round is under way.
+    // Allows pages that could not be read to be tried again. Must not be called while a round is
+    // under way.
     void forget_failures(PoolShared& shared) V3DG_REQUIRES(shared.busy);
 
   private:

@@ -86,8 +86,8 @@ struct InstanceCut {
 
     V3DG_HD bool is_culled(size_t c) const { return culls && is_outside(table.box[c], view); }
 
-    // The weight of the cluster, of kWhole, if it is not culled: how far the group above is refined
-    // less how far its own is. The head of select_math.h says why the cut is exact.
+    // The weight of the cluster before culling, out of kWhole: the refinement of the group above
+    // less that of its own group. The head of select_math.h says why the cut is exact.
     V3DG_HD int32_t weight(size_t c) const {
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
         const int32_t below = own < 0 ? 0 : groups.refinement(own);

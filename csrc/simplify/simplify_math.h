@@ -23,7 +23,7 @@ V3DG_HD inline double prune_score(const float scale[3], float opacity) {
     return o * o * o * (volume * volume);
 }
 
-// Pruning keeps the same share of each of these cells of a median split.
+// Pruning splits the gaussians at medians into these cells and keeps the same share of each cell.
 constexpr int kPruneHalvings = 3, kPruneCells = 1 << kPruneHalvings;
 
 // Computes how many of a cell's gaussians are kept when `wanted` of first .. last are. The shares

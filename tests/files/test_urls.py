@@ -672,7 +672,7 @@ def test_an_address_is_checked_once_more_when_a_connection_is_made(web, monkeypa
             ConnectionError,
             "the server redirects to something that is no web address",
         ),
-        ("gzip bomb", ConnectionError, "expected the file as it is, got a compressed answer"),
+        ("gzip bomb", ConnectionError, "expected the file uncompressed, got a compressed answer"),
         ("404 without end", FileNotFoundError, "the server answered 404"),
         ("claims 4 TB, honest parts", ValueError, "size: expected "),
         ("part without end", ValueError, "expected at most 1024 bytes, got more"),

@@ -227,7 +227,7 @@ class WebSource:
             encoding = answer.headers.get("Content-Encoding", "identity").strip().lower()
             if encoding not in ("", "identity") and answer.status < 300:
                 raise Problem(
-                    ConnectionError, "expected the file as it is, got a compressed answer"
+                    ConnectionError, "expected the file uncompressed, got a compressed answer"
                 )
             yield answer
         finally:

@@ -375,7 +375,7 @@ def _check_page_tables(pages: FilePages, file: BundleFile) -> None:
     check(
         "pages",
         num_pages == expected_num_pages,
-        f"{expected_num_pages} for the clusters, got {num_pages}",
+        f"{expected_num_pages} pages for the clusters of the file, got {num_pages}",
     )
     for name, expected in page_tables(pages.layout, pages.codec).items():
         values = file.tables[name]

@@ -48,7 +48,8 @@ _FOV_DEGREES = 50.0  # vertical, of the camera that a viewer starts with
 
 
 class _Lod(TypedDict):
-    """The gaussians of a chunk at a level: rows of one of the folders of SOG."""
+    """The gaussians of a chunk at a level: `count` rows, from row `offset` on, of
+    the SOG folder with the number `file`."""
 
     file: int
     offset: int
