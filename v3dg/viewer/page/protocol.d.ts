@@ -156,11 +156,11 @@ export interface Pick {
 }
 
 /**
- * The instance that was asked about; nothing where none is.
+ * The instance that was asked about; all fields are unset if there is none.
  *
  * Attributes:
  *     box: Lower and upper corner of its bundle, in the bundle's own coordinates.
- *     bundle: Name of the bundle's file; empty where it is none.
+ *     bundle: Name of the bundle's file; empty if the bundle is not in a file.
  *     point: The place that was picked, in the world.
  */
 export interface Picked {
