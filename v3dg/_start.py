@@ -46,9 +46,8 @@ def refuse_sub_interpreter() -> None:
 
 def begin() -> None:
     """Open closed streams on the null device, and have Ctrl-C end the process."""
-    if (
-        signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    ):  # not if the parent ignores Ctrl-C
+    # Not if the parent ignores Ctrl-C.
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end_at_once)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
@@ -57,9 +56,8 @@ def begin() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
-        getattr(sys, name).reconfigure(
-            errors="backslashreplace"
-        )  # escapes characters that an encoding lacks
+        # Escapes characters that an encoding lacks.
+        getattr(sys, name).reconfigure(errors="backslashreplace")
 
 
 def _end_at_once(number: int, frame: types.FrameType | None) -> None:

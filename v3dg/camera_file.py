@@ -125,9 +125,8 @@ def _read_frame(
         near = fields["near"].positive()
     viewmat = node.attempt(partial(viewmat_from_blender, _rows(fields["transform_matrix"])))
     for transform, scale in transforms:  # each leads back to the world before it was applied
-        with np.errstate(
-            over="ignore", invalid="ignore"
-        ):  # Camera refuses values that are not finite
+        # Camera refuses values that are not finite.
+        with np.errstate(over="ignore", invalid="ignore"):
             viewmat = viewmat @ (np.diag([scale, scale, scale, 1.0]) @ transform)
             viewmat[:3] /= scale  # the camera keeps a scale of 1
     return node.attempt(partial(Camera, viewmat, K, width, height, near))

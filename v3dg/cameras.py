@@ -122,9 +122,8 @@ class Camera:
             f"a distance that a double can hold, got {_text(goal)}",
         )
         forward = (goal - position) / distance
-        upwards = up_vector / (
-            np.abs(up_vector).max() or 1.0
-        )  # squares neither overflow nor underflow
+        # Squares neither overflow nor underflow.
+        upwards = up_vector / (np.abs(up_vector).max() or 1.0)
         right = np.cross(forward, upwards)
         length = np.linalg.norm(right)
         is_independent = length > 1e-9 * np.linalg.norm(upwards)

@@ -102,9 +102,8 @@ def _tube(count: int, rng: np.random.Generator) -> _Surface:
     points, normals = _on_tube(azimuth, section_angle, _DOUGH + (_TUBE - _DOUGH) * np.sqrt(icing))
     waves = np.sin(points @ rng.normal(scale=9, size=(3, 6)) + rng.uniform(0, 6.28, 6))
     blotch = waves.mean(1, keepdims=True)
-    pale = np.exp(-((section_angle / 0.3) ** 2))[
-        :, None
-    ]  # the stripe that floats while the dough is baked
+    # The stripe that floats while the dough is baked.
+    pale = np.exp(-((section_angle / 0.3) ** 2))[:, None]
     dough = np.array([0.42, 0.17, 0.035]) * (1 + 0.5 * blotch)
     dough += (np.array([0.7, 0.46, 0.19]) - dough) * pale
     albedo = dough + (np.array([0.66, 0.11, 0.27]) - dough) * icing[:, None]

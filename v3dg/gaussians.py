@@ -136,9 +136,8 @@ class Gaussians:
                 rows = rows.cpu().numpy()
             if isinstance(rows, slice) or rows.dtype == bool:
                 return self._map(lambda array: np.ascontiguousarray(array[rows]))
-            return self._map(
-                lambda array: array.take(rows, axis=0)
-            )  # unlike [rows], releases the GIL
+            # Unlike [rows], releases the GIL.
+            return self._map(lambda array: array.take(rows, axis=0))
         if not isinstance(index, slice):
             import torch
 

@@ -117,15 +117,13 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
 
     name = os.fspath(path)
     with warnings.catch_warnings(), open(_files.open_regular(path), "rb") as file:
-        warnings.simplefilter(
-            "ignore"
-        )  # they concern other content of the file, such as more pictures
+        # They concern other content of the file, such as more pictures.
+        warnings.simplefilter("ignore")
         is_known = file.read(8).startswith((b"\x89PNG\r\n\x1a\n", b"\xff\xd8"))
         check(name, is_known, "a PNG or a JPEG, got another file")
         with _files.value_errors(name, "a PNG or a JPEG that is not damaged"):
-            image = Image.open(
-                file, formats=("PNG", "JPEG")
-            )  # for other formats, Pillow starts programs
+            # For other formats, Pillow starts programs.
+            image = Image.open(file, formats=("PNG", "JPEG"))
         check_size(name, *image.size, MOST_PIXELS_COMPARED)
         check(name, not image.mode.startswith("I"), "8 bits a channel, got 16; convert it first")
         with _files.value_errors(name, "a PNG or a JPEG that is not damaged"):

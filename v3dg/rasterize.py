@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import EllipsisType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
@@ -251,6 +251,68 @@ def _center_parts(gradients: _core.Gradients) -> list[torch.Tensor]:
     return [torch.as_tensor(part) for part in parts if part is not None]
 
 
+class _Context(Protocol):
+    """What autograd keeps from the forward to the backward pass."""
+
+    counts: list[int]
+    probe: CenterProbe | None
+    tapes: list[_core.Tape]
+    devices: list[torch.device]
+    needs_input_grad: tuple[bool, ...]
+    saved_tensors: tuple[torch.Tensor, ...]
+
+    def save_for_backward(self, *tensors: torch.Tensor | None) -> None: ...
+    def set_materialize_grads(self, value: bool, /) -> None: ...
+
+
+def _forward(
+    ctx: _Context,
+    cameras: Sequence[_core.Camera],
+    settings: DrawSettings,
+    inputs: Sequence[torch.Tensor],
+    *,
+    keep_tape: bool,
+) -> tuple[torch.Tensor | None, ...]:
+    """The planes of the pictures of all cameras, one picture after another."""
+    pictures: list[torch.Tensor | None] = []
+    for view, camera in enumerate(cameras):
+        inputs_of_view = [inputs[slot] for slot in _slots_of_view(ctx.counts, view)]
+        planes, tape = _draw_view(camera, settings, inputs_of_view, keep_tape=keep_tape)
+        if tape is not None:
+            ctx.tapes.append(tape)
+        pictures += planes
+    # The backward pass reads them again on a GPU, so autograd must see later writes.
+    if inputs[0].is_cuda:
+        ctx.save_for_backward(*inputs[: -ctx.counts[-1]], *pictures)
+    return tuple(pictures)
+
+
+def _backward(
+    ctx: _Context, gradients: Sequence[torch.Tensor | None]
+) -> tuple[torch.Tensor | None, ...]:
+    """The gradients with respect to the centres, then to all inputs."""
+    import torch
+
+    _ = ctx.saved_tensors  # raises if a saved tensor was written to
+    wants_centers, *wants_input = ctx.needs_input_grad[5:]
+    probe = ctx.probe
+    with_sizes = probe is not None and probe.with_sizes
+    sums: list[torch.Tensor | None] = [None] * len(wants_input)
+    center_gradients: list[list[torch.Tensor]] = []
+    for view, tape in enumerate(ctx.tapes):
+        d_color, d_alpha, d_depth = map(_to_core, gradients[3 * view : 3 * view + 3])
+        parts = _core.rasterize_backward(tape, d_color, d_alpha, d_depth, wants_centers, with_sizes)
+        center_gradients.append(_center_parts(parts))
+        slots = _slots_of_view(ctx.counts, view)
+        for slot, part in zip(slots, _input_parts(parts), strict=True):
+            if wants_input[slot]:
+                _add_to(sums, slot, torch.as_tensor(part).to(ctx.devices[slot]))
+    d_centers = None
+    if wants_centers and probe is not None:
+        d_centers = _set_probe(probe, center_gradients)
+    return d_centers, *sums
+
+
 @functools.cache
 def _function() -> Callable[..., tuple[torch.Tensor, ...]]:
     """The operation and its gradient, for tensors of torch on any device."""
@@ -259,7 +321,7 @@ def _function() -> Callable[..., tuple[torch.Tensor, ...]]:
     class Rasterize(torch.autograd.Function):
         @staticmethod
         def forward(
-            ctx: Any,
+            ctx: _Context,
             cameras: Sequence[_core.Camera],
             settings: DrawSettings,
             keep_tape: bool,
@@ -267,47 +329,19 @@ def _function() -> Callable[..., tuple[torch.Tensor, ...]]:
             probe: CenterProbe | None,
             *tensors: torch.Tensor,
         ) -> tuple[torch.Tensor | None, ...]:
-            inputs = tensors[
-                1:
-            ]  # the first one is the centres, which only take part in the backward pass
+            # The first tensor, the centres, only takes part in the backward pass.
+            inputs = tensors[1:]
             ctx.set_materialize_grads(False)
             ctx.counts = counts
             ctx.probe = probe
             ctx.tapes = []
             ctx.devices = [tensor.device for tensor in inputs]
-            pictures: list[torch.Tensor | None] = []
-            for view, camera in enumerate(cameras):
-                inputs_of_view = [inputs[slot] for slot in _slots_of_view(counts, view)]
-                planes, tape = _draw_view(camera, settings, inputs_of_view, keep_tape=keep_tape)
-                ctx.tapes.append(tape)
-                pictures += planes
-            if inputs[
-                0
-            ].is_cuda:  # the backward pass reads them again, so autograd must see later writes
-                ctx.save_for_backward(*inputs[: -counts[-1]], *pictures)
-            return tuple(pictures)
+            return _forward(ctx, cameras, settings, inputs, keep_tape=keep_tape)
 
         @staticmethod
-        def backward(ctx: Any, *gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
-            _ = ctx.saved_tensors  # raises if a saved tensor was written to
-            wants_centers, *wants_input = ctx.needs_input_grad[5:]
-            probe: CenterProbe | None = ctx.probe
-            with_sizes = probe is not None and probe.with_sizes
-            sums: list[torch.Tensor | None] = [None] * len(wants_input)
-            center_gradients: list[list[torch.Tensor]] = []
-            for view, tape in enumerate(ctx.tapes):
-                d_color, d_alpha, d_depth = map(_to_core, gradients[3 * view : 3 * view + 3])
-                parts = _core.rasterize_backward(
-                    tape, d_color, d_alpha, d_depth, wants_centers, with_sizes
-                )
-                center_gradients.append(_center_parts(parts))
-                slots = _slots_of_view(ctx.counts, view)
-                for slot, part in zip(slots, _input_parts(parts), strict=True):
-                    if wants_input[slot]:
-                        _add_to(sums, slot, torch.as_tensor(part).to(ctx.devices[slot]))
-            d_centers = None
-            if wants_centers and probe is not None:
-                d_centers = _set_probe(probe, center_gradients)
-            return None, None, None, None, None, d_centers, *sums
+        def backward(
+            ctx: _Context, *gradients: torch.Tensor | None
+        ) -> tuple[torch.Tensor | None, ...]:
+            return None, None, None, None, None, *_backward(ctx, gradients)
 
     return Rasterize.apply

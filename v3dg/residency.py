@@ -69,9 +69,8 @@ class ResidentScene:
         # The references are weak, because a bundle that is drawn by itself would keep
         # itself alive otherwise.
         self.references: tuple[weakref.ref[Bundle], ...] = ()
-        self._drawings: weakref.WeakSet[_core.Drawing] = (
-            weakref.WeakSet()
-        )  # drawings that may be under way
+        # Drawings that may be under way.
+        self._drawings: weakref.WeakSet[_core.Drawing] = weakref.WeakSet()
         self._lock = threading.Lock()  # guards that set
         self.revision = (-1, -1, -1)
 

@@ -152,9 +152,8 @@ def screen_radii(gaussians: Gaussians, camera: Camera) -> Any:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     axes = library.stack([library.stack(row, -1) for row in rows], -2)
-    halves = world_to_view @ (
-        axes * gaussians.scales[:, None, :]
-    )  # covariance in the view: halves halvesᵀ
+    # Covariance in the view: halves halvesᵀ.
+    halves = world_to_view @ (axes * gaussians.scales[:, None, :])
     centers, variances = [], []
     for axis, size, focal, principal in (
         (0, camera.width, camera.fx, camera.cx),

@@ -76,9 +76,8 @@ def drag_around(
     browser.look(view, config.size)
     settle(browser, config.size)
     for _ in range(config.drags):
-        browser.look(
-            turned(eye, target, angle, view), config.size
-        )  # whose refinement the drag interrupts
+        # Whose refinement the drag interrupts.
+        browser.look(turned(eye, target, angle, view), config.size)
         until = time.perf_counter() + rng.uniform(0.3, 1.5)
         browser.pictures(until)
         begin = last = time.perf_counter()

@@ -26,9 +26,8 @@ SIZES = {0.5: 4, 1.0: 4, 2.0: 2, 4.0: 2, 8.0: 1}
 """In units of 2 px² a gaussian, as a side; the samples of a pixel's side that the
 leaves are drawn with."""
 _MOST_SAMPLES = 12_000_000  # of one picture
-_WEIGHTS = (
-    np.array([1, 1, 1, 1.5], np.float32) / 3
-)  # mean |colour| and half of |alpha|, as the fit has it
+# Mean |colour| and half of |alpha|, as the fit has it.
+_WEIGHTS = np.array([1, 1, 1, 1.5], np.float32) / 3
 _FOV = 0.3
 
 

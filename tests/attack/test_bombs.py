@@ -357,9 +357,8 @@ READ = ["splat: zeros", "ksplat: a high degree without gaussians", "spz: many st
 
 def assert_bounded(path, num_bytes):
     peak, found = read_apart(path)
-    print(
-        f"{num_bytes:,} bytes, {peak >> 20} MiB, {found}"
-    )  # what docs/robustness.md has figures of
+    # What docs/robustness.md has figures of.
+    print(f"{num_bytes:,} bytes, {peak >> 20} MiB, {found}")
     believed = FREE_GAUSSIANS + num_bytes
     count = int(found.split()[1]) if found.startswith("read") else 0
     assert count <= believed

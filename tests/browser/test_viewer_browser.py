@@ -218,9 +218,8 @@ def test_moved_picture_is_nearly_the_one_that_follows(browser, site):
         first = tab.settled()
         tab.page.evaluate("viewer.connection.send = () => {}")  # so that no picture follows
         tab.drag((200, 300), (260, 300))
-        tab.page.wait_for_timeout(
-            300
-        )  # where frames take the browser long, it follows so often only
+        # Where frames take the browser long, it follows so often only.
+        tab.page.wait_for_timeout(300)
         moved = tab.seen()
         assert differ(first, moved) > 0.02
         tab.page.evaluate("delete viewer.connection.send; viewer.requests.reset(); viewer.redraw()")
@@ -459,9 +458,8 @@ def test_clicked_instance_is_selected_moved_undone_and_saved(browser, site):
         ) as tab:
             before = tab.settled()
             layer = tab.page.locator("#overlay")
-            assert (
-                layer.evaluate("e => e.style.opacity") == "0"
-            )  # nothing to blend over the picture
+            # Nothing to blend over the picture.
+            assert layer.evaluate("e => e.style.opacity") == "0"
             at = tab.page.evaluate("viewer.overlay.projection.place([4, 0, 0])")
             tab.page.mouse.click(*at)
             tab.page.wait_for_function("() => viewer.instances.selected?.instance === 1")

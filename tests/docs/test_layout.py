@@ -98,7 +98,7 @@ MODULES = sorted((ROOT / "v3dg").rglob("*.py"))
 MEASURING = sorted(
     p for part in ("evaluation", "worlds") for p in (ROOT / "benchmarks" / part).rglob("*.py")
 )
-MOST_LINES_A_FUNCTION = 60
+MOST_LINES_A_FUNCTION = 60  # with comments and blank lines; test_shape.py counts code alone
 
 
 def module_name(path):

@@ -69,9 +69,8 @@ def members_of_module(owner):
             found[name] = READ_ONLY if value.fset is None else WRITABLE
         elif not callable(value):
             found[name] = WRITABLE
-        elif is_compared(name) and not isinstance(
-            value, types.WrapperDescriptorType
-        ):  # one of object's
+        # One of object's.
+        elif is_compared(name) and not isinstance(value, types.WrapperDescriptorType):
             found[name] = signatures_in_docstring(name, getattr(owner, name).__doc__)
     return public(found)
 

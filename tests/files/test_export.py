@@ -50,9 +50,8 @@ def assert_holds(folder, bundle, chunk):
             assert len(part) == lod["count"] <= chunk
             if level == 0:
                 assert len(part) > 0
-            if level == 0 or np.sum(bundle.groups.level == level) >= len(
-                leaves
-            ):  # else it is a share
+            # Else it is a share.
+            if level == 0 or np.sum(bundle.groups.level == level) >= len(leaves):
                 assert (part.means >= np.array(leaf["bound"]["min"]) - 1e-3).all()
                 assert (part.means <= np.array(leaf["bound"]["max"]) + 1e-3).all()
             parts.append(part)
@@ -103,9 +102,8 @@ def test_errors_of_a_chunk_are_those_of_its_pictures(bundle):
     first, second = errors.of_chunk[0], errors.of_chunk[1]
     assert first[0] == 0
     assert first[1] < 1e-6  # pictures are kept rounded
-    assert (
-        0 < 2 * first[2] < first[3] == first[4]
-    )  # every other gaussian is worse than a level of as many
+    # Every other gaussian is worse than a level of as many.
+    assert 0 < 2 * first[2] < first[3] == first[4]
     np.testing.assert_allclose(first, second, rtol=1e-3)
 
 

@@ -58,9 +58,8 @@ def test_a_scene_has_its_instances_and_cameras(place):
     for name in ("positions", "quaternions", "scales", "importance"):
         np.testing.assert_allclose(found[name], getattr(scene, name).ravel(), rtol=1e-8)
     for name in ("rotation", "camera_rotation"):
-        np.testing.assert_allclose(
-            np.array(site[name]).T @ [0, 0, 1], [0, 1, 0], atol=1e-12
-        )  # z becomes y
+        # Z becomes y.
+        np.testing.assert_allclose(np.array(site[name]).T @ [0, 0, 1], [0, 1, 0], atol=1e-12)
     view, camera = site["cameras"][0], cameras["gate"]
     assert view["name"] == "gate"
     np.testing.assert_allclose(view["position"], [3, -20, 5])

@@ -107,9 +107,8 @@ def test_a_scene_is_a_tile_an_instance(tmp_path):
     assert (done.bundles, done.instances) == (2, 3)
     assert done.tiles == sum(1 for _ in (tmp_path / "a/b").rglob("*.glb"))
     root = json.loads((tmp_path / "a/b/tileset.json").read_text())["root"]
-    np.testing.assert_allclose(
-        np.reshape(root["transform"], (4, 4)), np.eye(4), atol=1e-12
-    )  # z is up
+    # Z is up.
+    np.testing.assert_allclose(np.reshape(root["transform"], (4, 4)), np.eye(4), atol=1e-12)
     assert len(root["children"]) == 3
     for i, tile in enumerate(root["children"]):
         matrix = np.reshape(tile["transform"], (4, 4)).T

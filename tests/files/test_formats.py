@@ -391,9 +391,8 @@ def spz_of_version(version, asset, fraction_bits=12):
 def test_old_versions_of_spz_are_read(tmp_path, version):
     reference = read_asset(FIXTURES / "sh3.ply")
     (tmp_path / "a.spz").write_bytes(gzip.compress(spz_of_version(version, reference)))
-    bounds = spz_bounds() | {
-        "quats": 0.1
-    }  # where w is nearly 0, it has the square root of x y z's errors
+    # Where w is nearly 0, it has the square root of x y z's errors.
+    bounds = spz_bounds() | {"quats": 0.1}
     if version == 1:
         bounds["means"] = np.abs(reference.means).max() * 2**-11  # half precision
     assert_within(read_asset(tmp_path / "a.spz"), reference, bounds)
@@ -817,9 +816,8 @@ def hier_of(asset, half, inner=7):
         column(asset.opacities),
         column(asset.sh.reshape(len(asset), 48)),
     ]
-    nodes = [
-        (i, 0, 1) for i in range(inner)
-    ]  # where gaussians begin, how many are leaves, how many merged
+    # Where gaussians begin, how many are leaves, how many merged.
+    nodes = [(i, 0, 1) for i in range(inner)]
     nodes += [(inner + i, min(2, len(asset) - i), 0) for i in range(0, len(asset), 2)]
     if half:
         records = b"".join(struct.pack("<iiihhhh", -1, s, 0, 0, 0, n, m) for s, n, m in nodes)
@@ -867,9 +865,8 @@ def test_hostile_hier_is_refused(tmp_path, case):
 
 
 @settings(max_examples=300)
-@example(
-    name="sh3.sog", edits=[(230, 128)], in_header=True
-)  # a file name in a zip that is no UTF-8
+# A file name in a zip that is no UTF-8.
+@example(name="sh3.sog", edits=[(230, 128)], in_header=True)
 @given(
     name=st.sampled_from(
         [

@@ -625,9 +625,8 @@ def test_other_suffixes_are_refused(tmp_path):
 
 
 def test_unusual_names_work(tmp_path):
-    path = os.path.join(
-        os.fspath(tmp_path), "ünï \udcff.PLY"
-    )  # the surrogate stands for a byte that is no UTF-8
+    # The surrogate stands for a byte that is no UTF-8.
+    path = os.path.join(os.fspath(tmp_path), "ünï \udcff.PLY")
     write_asset(path, random_gaussians(3, 0))
     assert len(read_asset(path)) == 3
 

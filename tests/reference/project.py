@@ -18,9 +18,8 @@ class Projection:
     mean_px: np.ndarray  # (N,2)
     covariance_px2: np.ndarray  # (N,2,2), filter included
     determinant: np.ndarray  # (N,) of that covariance
-    compensation: (
-        np.ndarray
-    )  # (N,) factor on the opacity that keeps a gaussian's integral under the filter
+    # (N,) factor on the opacity that keeps a gaussian's integral under the filter.
+    compensation: np.ndarray
     depth: np.ndarray  # (N,)
     is_drawable: np.ndarray  # (N,) not nearer than the near plane, finite, covers an area
 
@@ -50,9 +49,8 @@ def covariance(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
 def project(gaussians, camera, *, filter_px2: float = 0.0) -> Projection:
     means = np.asarray(gaussians.means, np.float64)
     to_view, origin = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
-    with np.errstate(
-        all="ignore"
-    ):  # what is behind the camera or not finite is sorted out at the end
+    # What is behind the camera or not finite is sorted out at the end.
+    with np.errstate(all="ignore"):
         view = means @ to_view.T + origin
         depth = view[:, 2]
         slope = view[:, :2] / depth[:, None]

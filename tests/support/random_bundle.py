@@ -23,9 +23,8 @@ def random_gaussians(rng, count, sh_degree=0):
 def random_links(rng, num_levels, max_fan=3):
     """Own and parent group and level of clusters, parent and level of groups, from the
     last level down."""
-    levels = [
-        [(-1, -1)] * int(rng.integers(1, max_fan + 1))
-    ]  # of the last level: (own, parent) to be numbered
+    # Of the last level: (own, parent) to be numbered.
+    levels = [[(-1, -1)] * int(rng.integers(1, max_fan + 1))]
     groups = []  # per level, from the last: (parent, number of clusters below)
     for _ in range(num_levels - 1):
         clusters, made = levels[-1], []

@@ -47,12 +47,10 @@ CAMERAS = {
     "posed": camera(pose=pose(1)),
     "off_centre": camera(61, 37, fx=45.0, cx=9.5, cy=31.25, pose=pose(2)),
     "non_square": camera(33, 70, fx=38.0, fy=81.0, cx=14.0, cy=40.5, pose=pose(3)),
-    "outside": camera(
-        40, 40, fx=60.0, cx=-25.0, cy=55.0, pose=pose(4)
-    ),  # principal point not in the image
-    "wide": camera(
-        64, 32, fx=12.0, pose=pose(5)
-    ),  # 139 degrees: slopes are large, Jacobians get clamped
+    # Principal point not in the image.
+    "outside": camera(40, 40, fx=60.0, cx=-25.0, cy=55.0, pose=pose(4)),
+    # 139 degrees: slopes are large, Jacobians get clamped.
+    "wide": camera(64, 32, fx=12.0, pose=pose(5)),
     "one_pixel": camera(1, 1, fx=3.0),
 }
 

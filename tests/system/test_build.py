@@ -623,9 +623,8 @@ def test_every_number_has_a_range_in_which_a_build_ends(asset):
     """At either end of each, with the rest as it is: built, or refused before anything
     is allocated."""
     small = BuildConfig(cluster_size=32, steps=1, num_views=2)
-    assert not {
-        field.name for field in fields(BuildConfig) if field.type in (int, float)
-    }  # without a range
+    # Without a range.
+    assert not {field.name for field in fields(BuildConfig) if field.type in (int, float)}
     ranges = {
         field.name: get_args(field.type)[1] for field in fields(BuildConfig) if is_number(field)
     }

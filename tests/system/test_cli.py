@@ -139,9 +139,8 @@ def test_bash_completes_what_the_script_says():
     assert done.stderr == ""
     *completed, registered = done.stdout.splitlines()
     assert completed == ["render", "--tolerance"]
-    assert (
-        registered == "complete -o default -F _tyro_v3dg v3dg"
-    )  # else no file would be completed any more
+    # Else no file would be completed any more.
+    assert registered == "complete -o default -F _tyro_v3dg v3dg"
 
 
 @pytest.mark.witness

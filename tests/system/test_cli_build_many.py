@@ -108,9 +108,8 @@ def lies(config):
         config | {"asset_digest": 0},
         config | {"build": []},
         config | {"seed": {}},
-        {
-            name: value for name, value in config.items() if name != "asset_digest"
-        },  # as of earlier builds
+        # As of earlier builds.
+        {name: value for name, value in config.items() if name != "asset_digest"},
     ]
 
 

@@ -235,9 +235,8 @@ def test_few_pictures_miss_pages_after_a_teleport(device, monkeypatch, memory, m
 def test_shortage_raises_the_tolerance_from_frame_to_frame(scene, device):
     renderer = Renderer(scene, device=device, memory=scaled(scene, 150_000))
     tolerances = [FINE["tolerance"]]
-    while (
-        tolerances[-1] <= 1 and len(tolerances) < 20_000
-    ):  # a quick frame comes before the next decision
+    # A quick frame comes before the next decision.
+    while tolerances[-1] <= 1 and len(tolerances) < 20_000:
         tolerances.append(renderer.render(CAMERA, **FINE).stats.tolerance)
     steps = np.array(tolerances[1:]) / tolerances[:-1]
     assert (steps <= 1.0201).all()

@@ -197,9 +197,8 @@ def test_residency_tells_what_waits_for_pages_from_what_is_wanted(scene, monkeyp
             np.abs(image.color[covered] / image.alpha[covered][:, None] - there).max(axis=1) > 0.1
         )
 
-    monkeypatch.setattr(
-        v3dg.pool, "NUM_THREADS", 0
-    )  # so that nothing is read until it is asked for
+    # So that nothing is read until it is asked for.
+    monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
     renderer = Renderer(scene, device="cpu", memory="64MB", color_by="residency")
     first = renderer.render(CAMERA, **options)
     assert share_missing(first).mean() > 0.99  # the coarsest, everywhere

@@ -82,9 +82,8 @@ def test_position_of_a_rounded_matrix_is_what_it_brings_to_zero():
 
 def test_look_at_has_up_upwards_and_right_to_the_right():
     camera = Camera.look_at((0, -5, 0), (0, 0, 0), (0, 0, 1), math.pi / 2, width=200, height=100)
-    np.testing.assert_allclose(
-        pixel(camera, (0, 0, 1))[0], [100, 30]
-    )  # y is down: above is a smaller row
+    # Y is down: above is a smaller row.
+    np.testing.assert_allclose(pixel(camera, (0, 0, 1))[0], [100, 30])
     np.testing.assert_allclose(pixel(camera, (1, 0, 0))[0], [120, 50])
     np.testing.assert_allclose(pixel(camera, (5, 0, 0))[0], [200, 50])  # half the field of view
 

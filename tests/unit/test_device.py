@@ -153,9 +153,8 @@ def zeros(shape):
     ],
 )
 def test_wrong_arrays_on_a_device_are_named(means, error, message):
-    pattern = re.escape(message).replace(
-        r"\?", "[4N]"
-    )  # of rows, that there have to be four is known
+    # Of rows, that there have to be four is known.
+    pattern = re.escape(message).replace(r"\?", "[4N]")
     with pytest.raises(error, match=pattern):
         rows(OnDevice, means=means)
     with pytest.raises(error, match=pattern):

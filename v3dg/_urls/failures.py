@@ -75,9 +75,8 @@ def _problem_of(url: str, error: Exception) -> Problem:
     are recognised by name."""
     names = {kind.__name__ for kind in type(error).__mro__}
     cause = error
-    system_error = getattr(
-        error, "os_error", None
-    )  # aiohttp's reason why a connection could not be made
+    # Aiohttp's reason why a connection could not be made.
+    system_error = getattr(error, "os_error", None)
     if isinstance(system_error, OSError):
         cause = system_error
     text = _text_of(url, error)

@@ -127,9 +127,8 @@ class FileAtUrl(os.PathLike[str]):
         weakref.finalize(self, self.file.close)
         self._lock = threading.Lock()
         self._is_whole = False
-        self._is_fetched: dict[
-            int, NDArray[np.bool_]
-        ] = {}  # by piece, whether each block is fetched
+        # By piece, whether each block is fetched.
+        self._is_fetched: dict[int, NDArray[np.bool_]] = {}
         self.num_bytes = -1
         if source.num_bytes is None:  # a file of unknown size has no parts
             self._fetch_whole()

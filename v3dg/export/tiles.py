@@ -262,9 +262,8 @@ def _write_tileset(path: Path, root: _Tile) -> None:
         "asset": {"version": "1.1", "generator": f"v3dg {__version__}"},
         "extensionsUsed": [_CONTENT],
         "extensionsRequired": [_CONTENT],
-        "extensions": {
-            _CONTENT: extensions
-        },  # also those of tiles in other tilesets: CesiumJS reads the first tileset
+        # Also those of tiles in other tilesets: CesiumJS reads the first tileset.
+        "extensions": {_CONTENT: extensions},
         "geometricError": root["geometricError"],
         "root": {"refine": "REPLACE", **root},
     }

@@ -154,9 +154,8 @@ class Archive:
         if getattr(member, "CRC", None) == 0:  # torch writes no checksum if it is configured so
             del member.CRC  # without the attribute, zipfile does not compare it
         with value_errors(self._path, "a zip that is not damaged"), self._zip.open(member) as file:
-            content = file.read(
-                size
-            )  # without a limit, zipfile expands everything before it truncates
+            # Without a limit, zipfile expands everything before it truncates.
+            content = file.read(size)
         check(self._path, len(content) == size, f"{size} bytes in {name!a}, got {len(content)}")
         return content
 

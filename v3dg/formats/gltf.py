@@ -237,9 +237,8 @@ class _Glb:
                 "bufferViews", extension.field("extensions").field(_SPZ), "bufferView"
             )
             content = bytes(self._view(view))
-            self._expanded += len(
-                content
-            )  # limited, so that many primitives cannot share one large stream
+            # Limited, so that many primitives cannot share one large stream.
+            self._expanded += len(content)
             limit = len(self._blob)
             check(
                 self._path, self._expanded <= limit, f"{limit} bytes of .spz, got {self._expanded}"

@@ -261,9 +261,8 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
         contents["padding"] = bytes(missing)
     with _files.replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as bundle:
         for name, content in contents.items():
-            bundle.writestr(
-                zipfile.ZipInfo(name), content
-            )  # dated 1980, so that files are reproducible
+            # Dated 1980, so that files are reproducible.
+            bundle.writestr(zipfile.ZipInfo(name), content)
 
 
 def encode(gaussians: Gaussians) -> dict[str, bytes]:

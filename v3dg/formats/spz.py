@@ -37,9 +37,8 @@ _HEADER = struct.Struct("<IIIBBBB")
 _ZSTD_HEADER_BYTES = 32
 _STREAM_SIZES = struct.Struct("<QQ")
 _MAX_TRAILER = 1 << 20  # bytes after the attributes, for extensions of vendors
-_MAX_START = (
-    1 << 16
-)  # bytes that contain the header, also after the optional fields of a gzip header
+# Bytes that contain the header, also after the optional fields of a gzip header.
+_MAX_START = 1 << 16
 _COLOR_SCALE = 0.15
 _LARGEST_FIXED = (1 << 23) - 1
 
@@ -247,9 +246,8 @@ def _sections_of_gzip(
         # The limit is never 0, which would mean none.
         body = stream.decompress(stream.unconsumed_tail, total + _MAX_TRAILER)
         if not stream.eof and len(body) >= total:
-            stream.decompress(
-                stream.unconsumed_tail, 1
-            )  # reads the checksum if nothing else follows
+            # Reads the checksum if nothing else follows.
+            stream.decompress(stream.unconsumed_tail, 1)
     is_whole = len(body) >= total and stream.eof
     check(path, is_whole, f"a gzip stream that ends after {total} bytes of gaussians, got another")
     ends = np.cumsum(sizes).tolist()

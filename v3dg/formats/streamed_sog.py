@@ -100,9 +100,8 @@ def _inside(node: Node) -> PurePosixPath:
 def _finest(tree: Node, names: list[PurePosixPath]) -> dict[PurePosixPath, list[range]]:
     """For each file, the runs of gaussians that are the finest level of a leaf."""
     runs: dict[PurePosixPath, list[range]] = {}
-    todo = [
-        iter([tree])
-    ]  # iterators, because a list of a million empty nodes would be as large as a scene
+    # Iterators, because a list of a million empty nodes would be as large as a scene.
+    todo = [iter([tree])]
     while todo:
         node = next(todo[-1], None)
         if node is None:

@@ -229,9 +229,8 @@ def export(stage: Usd.Stage, path: AnyPath) -> None:
     """Write a stage to a file in one step, in the encoding that belongs to the
     suffix."""
     with _files.replacing(path) as temporary, tempfile.TemporaryDirectory() as folder:
-        file = (
-            Path(folder) / f"stage{Path(path).suffix.lower()}"
-        )  # USD takes the encoding from the suffix
+        # USD takes the encoding from the suffix.
+        file = Path(folder) / f"stage{Path(path).suffix.lower()}"
         stage.GetRootLayer().Export(os.fspath(file))
         shutil.copyfile(file, temporary)
 

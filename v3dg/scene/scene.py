@@ -266,9 +266,8 @@ class Scene:
         if isinstance(rows, np.ndarray):
             return rows
         quaternions = normalised(_device.to_host(rows))
-        quaternions[~quaternions.any(axis=1)] = (
-            np.nan
-        )  # an instance with a zero quaternion is not drawn
+        # An instance with a zero quaternion is not drawn.
+        quaternions[~quaternions.any(axis=1)] = np.nan
         return quaternions
 
     @property

@@ -107,9 +107,8 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
                 if share in (None, _SHARES[-1]) or ours_count > wanted:
                     text = f"{ours_count / count:.0%}"
                     strip += [(f"ours, {text}", ours), (f"merged, {text}", theirs)]
-                if (
-                    ours_count > wanted
-                ):  # as coarse as it gets: the eye is inside the balls of what is left
+                # As coarse as it gets: the eye is inside the balls of what is left.
+                if ours_count > wanted:
                     break
             strip[0] = f"{name}, {where}: truth", truth
             strips.append(

@@ -146,9 +146,8 @@ def report(rows: Sequence[Row]) -> None:
         cameras = dict.fromkeys(row["camera"] for row in rows if row["world"] == world)
         sets = [(of(world, camera, "built"), of(world, camera, "refined")) for camera in cameras]
         print(world, *cameras)
-        kinds = range(
-            1 + any(cuts[1] for cuts in sets)
-        )  # without refined ones there is nothing to share
+        # Without refined ones there is nothing to share.
+        kinds = range(1 + any(cuts[1] for cuts in sets))
         for tolerance in sorted(
             {row["tolerance"] for row in sets[0][0]} - {0.0} if len(kinds) > 1 else ()
         ):

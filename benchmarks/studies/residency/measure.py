@@ -238,9 +238,8 @@ def main(config: Config) -> None:
             truth[number] = pixels(roomy.render(cameras[number], tolerance=config.tolerance))
         del roomy
         result: dict[str, Any] = {
-            "config": {
-                k: str(getattr(v, "name", v)) for k, v in vars(config).items()
-            },  # without folders
+            # Without folders.
+            "config": {k: str(getattr(v, "name", v)) for k, v in vars(config).items()},
             "gaussians": sum(bundle.num_gaussians for bundle in field.scene.bundles),
             "leaves": sum(
                 int(b.clusters.offset[b.level_range(0).stop]) for b in field.scene.bundles

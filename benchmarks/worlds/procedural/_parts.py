@@ -330,14 +330,12 @@ def cover(
     middle_ratio = np.exp(0.4 * rng.gamma(3.0, size=n))
     thin_ratio = np.exp(0.5 * rng.gamma(3.0, size=n))
     size = 0.75 * spacing * np.exp(0.7 * rng.standard_normal(n))
-    base = (
-        rng.random(n) < 0.12
-    )  # large and solid, a little below the others: nothing shines through between those
+    # Large and solid, a little below the others: nothing shines through between those.
+    base = rng.random(n) < 0.12
     size[base] = 2.2 * spacing[base]
     middle_ratio[base] = np.minimum(middle_ratio[base], 2)
-    longest = np.sqrt(
-        0.4 * bend * spacing
-    )  # the ends, two deviations out, then rise by less than the spacing
+    # The ends, two deviations out, then rise by less than the spacing.
+    longest = np.sqrt(0.4 * bend * spacing)
     long, middle = size * np.sqrt(middle_ratio), np.minimum(size / np.sqrt(middle_ratio), longest)
     angle = rng.uniform(-np.pi / 2, np.pi / 2, n) * (1 - aligned) + 0.1 * rng.standard_normal(n)
     if room is not None:

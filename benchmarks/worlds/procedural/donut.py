@@ -89,18 +89,16 @@ def make_donut(num_gaussians: int = 45_624, *, seed: int = 0, sh_degree: int = 3
         outer, inner = rim(around)
         rounded = np.clip(1 - (2 * v - 1) ** 2, 0, 1)
         thick = (TUBE - _DOUGH + 0.0005) * np.minimum(1.0, 3.2 * rounded) ** 0.5
-        beads = 1 + 0.25 * np.exp(
-            -((rounded - 0.12) ** 2) / 0.01
-        )  # thicker where it stopped running
+        # Thicker where it stopped running.
+        beads = 1 + 0.25 * np.exp(-((rounded - 0.12) ** 2) / 0.01)
         return _on_tube(around, outer + v * (inner - outer), _DOUGH - 0.0005 + thick * beads)
 
     def dough(u: Array, v: Array) -> Array:
         around = 2 * np.pi * u
         outer, inner = rim(around)
         along = inner - 0.15 + v * (2 * np.pi - (inner - outer) + 0.3)
-        pinch = 1 - 0.02 * np.exp(
-            -((np.cos(along) - 1) ** 2) / 0.02
-        )  # the pale line where it floated
+        # The pale line where it floated.
+        pinch = 1 - 0.02 * np.exp(-((np.cos(along) - 1) ** 2) / 0.02)
         return _on_tube(around, along, _DOUGH * pinch)
 
     n_sprinkle = int(0.30 * num_gaussians) // _SPRINKLES

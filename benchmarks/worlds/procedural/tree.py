@@ -35,9 +35,8 @@ class _Level:
 
     children: int  # on each
     start: float  # where along the parent the first springs, in [0,1]
-    angle: tuple[
-        float, float
-    ]  # from the parent's direction, rad: at the first child and at the last
+    # From the parent's direction, rad: at the first child and at the last.
+    angle: tuple[float, float]
     length: tuple[float, float]  # relative to the parent's: at the first child and at the last
     bulge: float  # how much longer children in the middle are
     wander: float  # how crooked

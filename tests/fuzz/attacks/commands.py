@@ -286,9 +286,8 @@ def _arguments(rng, command):
     kinds = {**OPTIONS[command], **COMMON}
     if rng.random() < 0.9:
         kinds = {name: kinds[name] for name in kinds if name not in LACKING.get(command, ())}
-    if (
-        command in ("demo", "render", "compare") and "b.png" not in arguments
-    ):  # small, unless asked otherwise
+    # Small, unless asked otherwise.
+    if command in ("demo", "render", "compare") and "b.png" not in arguments:
         arguments += (
             ["--size", "24", "20"]
             if command != "demo"

@@ -16,9 +16,8 @@ import threading
 import time
 
 if __name__ == "__main__":
-    atexit.register(
-        lambda: draw_last()
-    )  # handlers run in reverse: this one after all of the package's
+    # Handlers run in reverse: this one after all of the package's.
+    atexit.register(lambda: draw_last())
 
 import numpy as np
 
@@ -172,9 +171,8 @@ def end(how, work, gap):
     if how == "handler starts threads":
 
         def start():
-            with contextlib.suppress(
-                RuntimeError
-            ):  # since Python 3.12 there are no threads any more
+            # Since Python 3.12 there are no threads any more.
+            with contextlib.suppress(RuntimeError):
                 threading.Thread(target=go_on, args=(work,), daemon=True).start()
                 time.sleep(gap)
 

@@ -71,9 +71,8 @@ class Attack:
 def ended(folder, work, ending, num_threads, seconds, gap):
     """The outcome of a program in a folder with the files of `prepare`."""
     arguments = [work, ending, str(num_threads), str(seconds), str(gap)]
-    several = environment() | {
-        "OMP_NUM_THREADS": "2"
-    }  # threads of OpenMP work while the program ends, too
+    # Threads of OpenMP work while the program ends, too.
+    several = environment() | {"OMP_NUM_THREADS": "2"}
     end = run(arguments, folder, program=PROGRAM, limit_s=60, environment=several)
     now = time.monotonic()
     said = re.search(r"^ends ([\d.]+)$", end.out, re.MULTILINE)

@@ -188,9 +188,8 @@ def _fault(ended: Ended, name):
     if ended.code == -signal.SIGINT and not ended.err:
         return f"left behind: {ended.left}" if ended.left else None  # before Python listened to it
     if "KeyboardInterrupt" in ended.err and ERROR not in ended.err and not OURS.search(ended.err):
-        return (
-            f"left behind: {ended.left}" if ended.left else None
-        )  # before any of our code was there
+        # Before any of our code was there.
+        return f"left behind: {ended.left}" if ended.left else None
     is_view = name.startswith("view")
     fault = fault_of(ended, codes=(0, 130), is_heard=not is_view)
     lines = [line for line in shown_lines(ended.err) if not PROGRESS.match(line)]

@@ -61,9 +61,8 @@ class Attack:
             ended = run(
                 COMMANDS[name], work, program=program, limit_s=90, most=resource.RLIM_INFINITY
             )
-            if (
-                "memory for thread-local data" in ended.err
-            ):  # the C library, which no program can ask to go on
+            # The C library, which no program can ask to go on.
+            if "memory for thread-local data" in ended.err:
                 return Outcome("ended by the C library")
             fault = fault_of(ended, codes=(0, 1))
             return outcome(ended, fault and f"with {more >> 10} KiB more: {fault}")

@@ -19,9 +19,8 @@ def messages_of(lengths):
     data = np.random.default_rng(len(lengths)).integers(
         0, 256, max(lengths, default=0) + 64, np.uint8
     )
-    return [
-        data[k % 64 : k % 64 + length] for k, length in enumerate(lengths)
-    ]  # hardly one is aligned
+    # Hardly one is aligned.
+    return [data[k % 64 : k % 64 + length] for k, length in enumerate(lengths)]
 
 
 def check(messages):

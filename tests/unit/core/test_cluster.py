@@ -54,9 +54,8 @@ def test_leaves_partition_the_points_evenly(device, num_points, cluster_size, se
     assert num_leaves & (num_leaves - 1) == 0
     assert sizes.max() <= cluster_size
     assert sizes.max() - sizes.min() <= 1
-    assert (
-        num_leaves == 1 or -(-num_points // (num_leaves // 2)) > cluster_size
-    )  # no deeper than needed
+    # No deeper than needed.
+    assert num_leaves == 1 or -(-num_points // (num_leaves // 2)) > cluster_size
     np.testing.assert_array_equal(np.sort(order), np.arange(num_points))
     for first, last in itertools.pairwise(leaf_offset):
         assert (np.diff(order[first:last]) > 0).all()

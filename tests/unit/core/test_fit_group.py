@@ -337,9 +337,8 @@ def test_longer_fits_come_closer(device, changes):
 
 def test_result_no_better_than_its_start_is_thrown_away(device):
     target = in_ball(6, 20)
-    start = scenes.replaced(
-        target, sh=target.sh + np.float32(0.05)
-    )  # far better than nothing at all
+    # Far better than nothing at all.
+    start = scenes.replaced(target, sh=target.sh + np.float32(0.05))
     _, before = fit(device, start, target, replace(PLAIN, steps=0))
     for step in ("step_position", "step_log_scale", "step_logit", "step_sh0"):
         out, error = fit(device, start, target, replace(PLAIN, **FROZEN | {step: 1e8}, steps=5))

@@ -219,9 +219,8 @@ def test_scales_of_all_sizes_keep_their_order_of_magnitude():
     )
     gaussians.quats[:] = [1, 0, 0, 0]
     out = rounded(gaussians, np.array([0, n]))
-    np.testing.assert_allclose(
-        out.scales, gaussians.scales, rtol=0.5 * 80 / 1023 + 2.0**-8
-    )  # of 80 octaves
+    # Of 80 octaves.
+    np.testing.assert_allclose(out.scales, gaussians.scales, rtol=0.5 * 80 / 1023 + 2.0**-8)
 
 
 def test_flat_gaussians_stay_flat():

@@ -771,9 +771,8 @@ def test_gradient_descent_finds_a_moved_gaussian(torch, device):
         decay.step()
     x, y, depth = start.means.detach()[0].tolist()
     np.testing.assert_allclose([x / depth, y / depth], [0.075, -0.05], atol=0.001)
-    np.testing.assert_allclose(
-        depth, 2.5, atol=0.05
-    )  # larger than the target: it goes where it looks as small
+    # Larger than the target: it goes where it looks as small.
+    np.testing.assert_allclose(depth, 2.5, atol=0.05)
 
 
 def draw_with_gsplat(gsplat, torch, inputs, camera, filter_px2, antialiased=False):

@@ -218,9 +218,8 @@ def test_a_budget_draws_the_same_bits_from_the_tenth_frame_at_rest_on(device, me
         ways.append(np.log2(roomy / renderer.render(last, **options).stats.tolerance))
     steps = -np.diff(ways)
     assert ways[0] > 0.04
-    assert (
-        0 <= steps.min() <= steps.max() < 2.1 * ways[0] / 8
-    )  # values of an octave are evenly apart
+    # Values of an octave are evenly apart.
+    assert 0 <= steps.min() <= steps.max() < 2.1 * ways[0] / 8
     assert settled_at(renderer, last, options) == roomy
 
 
@@ -402,9 +401,8 @@ def test_a_fade_gives_level_0_a_filter_that_has_none(filter_px2, is_antialiased,
     once something is."""
     rng = np.random.default_rng(3)
     asset = blob(rng, 900)
-    px = CAMERA.fx / np.linalg.norm(
-        CAMERA.position
-    )  # of a unit, about; none so narrow that it gets less
+    # Of a unit, about; none so narrow that it gets less.
+    px = CAMERA.fx / np.linalg.norm(CAMERA.position)
     asset = replace(asset, scales=np.clip(asset.scales, 0.2 / px, 0.5 / px).astype(np.float32))
     bundle = lod_bundle(rng, asset, 32)
     is_fine = bundle.clusters.level == 0
