@@ -46,7 +46,8 @@ def main(path: Path) -> int:
     folders: Counter[str] = Counter()
     for name, seconds in durations.items():
         folders[folder_of(name)] += seconds
-    soon, total = 0, 0.0
+    soon = 0
+    total = 0.0
     for seconds in sorted(durations.values()):
         total += seconds
         soon += total <= SOON_SECONDS

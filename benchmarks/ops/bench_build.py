@@ -97,10 +97,8 @@ def build(
 
 
 def split(means: Any, device: str, repeats: int) -> dict[str, Any]:
-    ends, depth = (
-        np.array([0, len(means)]),
-        _core.num_halvings(len(means), BuildConfig().cluster_size),
-    )
+    ends = np.array([0, len(means)])
+    depth = _core.num_halvings(len(means), BuildConfig().cluster_size)
     points = torch.from_numpy(means).to(gpu.DEVICE) if device == "cuda" else means
     seconds = []
     with gpu.PeakMemory() as peak:

@@ -93,10 +93,8 @@ def measure(asset: v3dg.Gaussians, options: Config, folder: Path) -> dict[str, A
         bundle = v3dg.build_bundle(asset, config=config, progress=False, codec=codec)
         bundle.write(folder / codec)
         leaves = len(bundle.level_gaussians(0))
-        bundles[codec], bytes_a_leaf[codec] = (
-            bundle,
-            round((folder / codec).stat().st_size / leaves, 2),
-        )
+        bundles[codec] = bundle
+        bytes_a_leaf[codec] = round((folder / codec).stat().st_size / leaves, 2)
     kept = bundles["float32"]
     result: dict[str, Any] = {"leaves": leaves, "sh_degree": asset.sh_degree, "bytes": bytes_a_leaf}
     for distance in DISTANCES:

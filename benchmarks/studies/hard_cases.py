@@ -31,10 +31,8 @@ import hard_cases as cases  # noqa: E402  (of the tests)
 DECADES = (1e-7, 1e-6, 1e-5, 1e-4)
 DOCS = ROOT / "docs" / "numerics.md"
 RESULTS = {"CPU": "hard_cases_cpu.json", "H200": "hard_cases_h200.json"}
-BEGIN, END = (
-    "<!-- hard cases: benchmarks/studies/hard_cases.py -->\n",
-    "<!-- end of hard cases -->\n",
-)
+BEGIN = "<!-- hard cases: benchmarks/studies/hard_cases.py -->\n"
+END = "<!-- end of hard cases -->\n"
 
 
 @dataclass

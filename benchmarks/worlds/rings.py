@@ -150,10 +150,8 @@ class Pile:
         tell which touch."""
         first, second, ground = contacts.first, contacts.second, contacts.second < 0
         other = np.where(ground, first, second)
-        arm_a, arm_b = (
-            contacts.point - self.positions[first],
-            contacts.point - self.positions[other],
-        )
+        arm_a = contacts.point - self.positions[first]
+        arm_b = contacts.point - self.positions[other]
         old = rotation_from_quaternion(turned_before)
 
         def moved(body: Ints, arm: Floats) -> Floats:

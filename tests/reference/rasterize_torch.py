@@ -118,10 +118,8 @@ def rasterize(
     )
     transmittance = torch.ones(height, width, dtype=f64)
     is_open = torch.ones(height, width, dtype=torch.bool)
-    color, depth_sum = (
-        torch.zeros(height, width, 3, dtype=f64),
-        torch.zeros(height, width, dtype=f64),
-    )
+    color = torch.zeros(height, width, 3, dtype=f64)
+    depth_sum = torch.zeros(height, width, dtype=f64)
     for i in torch.argsort(depth.detach(), stable=True).tolist():
         if depth[i] < camera.near:
             continue

@@ -93,10 +93,8 @@ def cheapest_pair(gaussians) -> tuple[int, int]:
     """The pair that a merge to one gaussian less joins."""
     count = len(gaussians)
     weight = gaussians.opacities * area(gaussians.scales)
-    means, colors = (
-        gaussians.means.astype(np.float64),
-        CONSTANT_BASIS * gaussians.sh[:, 0].astype(np.float64),
-    )
+    means = gaussians.means.astype(np.float64)
+    colors = CONSTANT_BASIS * gaussians.sh[:, 0].astype(np.float64)
     extent2 = np.sum((means.max(axis=0) - means.min(axis=0)) ** 2)
     costs = {}
     for i in range(count):

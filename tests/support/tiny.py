@@ -40,7 +40,8 @@ def shrink(set_attribute=setattr, set_item=dict.__setitem__):
 
         return build_quickly
 
-    bundle_quickly, file_quickly = quickly(levels.build_bundle), quickly(levels.build_file)
+    bundle_quickly = quickly(levels.build_bundle)
+    file_quickly = quickly(levels.build_file)
     for module in (v3dg, levels, demo):
         set_attribute(module, "build_bundle", bundle_quickly)
     for module in (levels, worlds):

@@ -103,7 +103,9 @@ def test_a_process_that_dies_leaves_what_can_be_gone_on_with(folder, tmp_path, a
 
 def test_an_executor_goes_on_in_the_midst_of_units(folder, tmp_path, monkeypatch):
     """Where one process was interrupted."""
-    output, left, simplify = tmp_path / "out.v3dg", [8], v3dg.levels.simplify.LevelBuilder._simplify
+    output = tmp_path / "out.v3dg"
+    left = [8]
+    simplify = v3dg.levels.simplify.LevelBuilder._simplify
 
     def some(*arguments):
         left[0] -= 1

@@ -28,7 +28,8 @@ def test_core_draws_a_scene_without_python(tmp_path):
     background = np.array([26, 26, 38])
     shown = (pixels != background).any(axis=2)
     # A ball on either side, the right one smaller.
-    left, right = shown[:, :160].sum(), shown[:, 160:].sum()
+    left = shown[:, :160].sum()
+    right = shown[:, 160:].sum()
     assert 0.1 < right / shown.size < left / shown.size < 0.4
 
 

@@ -48,7 +48,8 @@ def test_false_colors_show_what_was_chosen(device, by):
         assert seen.setdefault(name, color.tobytes()) == color.tobytes()
     assert len(set(list(seen.values())[:9])) == min(len(seen), 9)
     top = render(bundle, camera, tolerance=np.inf, color_by=by, device=device)
-    color, alpha = host(top.color), host(top.alpha)
+    color = host(top.color)
+    alpha = host(top.alpha)
     shown = color[alpha > 0.5] / alpha[alpha > 0.5, None]
     last = rgb[-1]
     np.testing.assert_allclose(shown, np.broadcast_to(last, shown.shape), atol=2e-3)

@@ -17,7 +17,9 @@ class Drawing:
     """A drawing of the core, which counts how often somebody waits for it."""
 
     def __init__(self, *, exceeds_budget=False):
-        self.color, self.alpha, self.depth = COLOR, ALPHA, None
+        self.color = COLOR
+        self.alpha = ALPHA
+        self.depth = None
         self.right = SimpleNamespace(color=COLOR + 1, alpha=ALPHA, depth=DEPTH)
         self.exceeds_budget = exceeds_budget
         self.waits = 0

@@ -29,10 +29,8 @@ def ssim_by_windows(a, b):
         for j in range(a.shape[1] - 10):
             p, q = a[i : i + 11, j : j + 11], b[i : i + 11, j : j + 11]
             mean_p, mean_q = (window * p).sum((0, 1)), (window * q).sum((0, 1))
-            var_p, var_q = (
-                (window * (p - mean_p) ** 2).sum((0, 1)),
-                (window * (q - mean_q) ** 2).sum((0, 1)),
-            )
+            var_p = (window * (p - mean_p) ** 2).sum((0, 1))
+            var_q = (window * (q - mean_q) ** 2).sum((0, 1))
             cov = (window * (p - mean_p) * (q - mean_q)).sum((0, 1))
             values.append(
                 (2 * mean_p * mean_q + 1e-4)

@@ -26,7 +26,8 @@ def composed(rng, count):
 
 def test_pick_finds_what_a_pixel_shows():
     rng = np.random.default_rng(17)
-    scene, camera = composed(rng, 15), random_camera(rng, distance=8)
+    scene = composed(rng, 15)
+    camera = random_camera(rng, distance=8)
     options = {"tolerance": 0.3}
     image = render(scene, camera, device="cpu", **options)
     full = select(scene, camera, device="cpu", **options)

@@ -118,10 +118,8 @@ def test_scene_is_taken_over_as_it_is_now(where):
 
 
 def drawn_and_chosen(scene, where):
-    image, cut = (
-        render(scene, CAMERA, depth=True, device=where),
-        select(scene, CAMERA, device=where),
-    )
+    image = render(scene, CAMERA, depth=True, device=where)
+    cut = select(scene, CAMERA, device=where)
     return *host((image.color, image.alpha, image.depth)), cut.instance_ids, cut.cluster_ids
 
 

@@ -58,10 +58,8 @@ def main(arguments: list[str] | None = None) -> int:
     scene, cameras = read_scene(options.layout, bundles={asset: Bundle.open(options.bundle)})
     rows = []
     for name in options.cameras:
-        first, middle = (
-            resized(cameras[name], tuple(options.size)),
-            np.mean(scene.positions, axis=0),
-        )
+        first = resized(cameras[name], tuple(options.size))
+        middle = np.mean(scene.positions, axis=0)
         upwards = -first.viewmat[1, :3]
         aimed = Camera.look_at(
             first.position, middle, upwards, width=first.width, height=first.height

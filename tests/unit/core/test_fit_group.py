@@ -504,10 +504,8 @@ def test_what_is_fitted_has_to_be_where_its_target_is():
 def test_devices_agree(num, num_target, degree, changes, steps):
     """Rounding moves nearly nothing; Adam makes whole steps out of gradients that are
     all rounding."""
-    start, target = (
-        with_bases(in_ball(16, num), degree),
-        with_bases(in_ball(17, num_target), degree),
-    )
+    start = with_bases(in_ball(16, num), degree)
+    target = with_bases(in_ball(17, num_target), degree)
     config = replace(PLAIN, steps=steps, **changes)
     (a, a_error), (b, b_error) = (fit(device, start, target, config) for device in ("cpu", "cuda"))
     np.testing.assert_allclose(b_error, a_error, rtol=1e-4, atol=1e-7)

@@ -171,10 +171,8 @@ def test_both_devices_give_the_same_bits():
         mixed_selection(),
         select(turned, random_camera(rng, distance=30), tolerance=0.1, device="cpu"),
     ):
-        on_cpu, on_device = (
-            selection.gaussians(device="cpu"),
-            host(selection.gaussians(device="cuda")),
-        )
+        on_cpu = selection.gaussians(device="cpu")
+        on_device = host(selection.gaussians(device="cuda"))
         assert len(on_cpu) > 0
         for name in scenes.NAMES:
             np.testing.assert_array_equal(getattr(on_cpu, name), getattr(on_device, name))

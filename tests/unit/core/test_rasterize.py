@@ -254,10 +254,8 @@ def test_a_share_of_light_is_refused_that_is_none(value):
 def test_assets_are_drawn_as_rasterized_unless_asked(device):
     camera = scenes.CAMERAS["plain"]
     gaussians = scenes.trained_like(33, camera, 600)
-    rendered, expected = (
-        draw_stopped(device, gaussians, camera, None),
-        draw(device, gaussians, camera),
-    )
+    rendered = draw_stopped(device, gaussians, camera, None)
+    expected = draw(device, gaussians, camera)
     # On CUDA an asset is drawn from covariances made beforehand, which round otherwise.
     assert np.abs(rendered.color - expected.color).max() <= 1e-5
     stopped = draw_stopped(device, gaussians, camera, 1e-3)

@@ -316,7 +316,8 @@ def test_frame_refuses_a_scene_of_other_bundles():
         frame, scene = _core.SceneFrame(-1), _core.ResidentScene(-1)
         frame.set_models([residency.model(bundle, CPU) for bundle in bundles[:has]], [])
         scene.set_bundles(tables)
-        camera, rule = _core.Camera(**CAMERA), _core.Rule(**RULE)
+        camera = _core.Camera(**CAMERA)
+        rule = _core.Rule(**RULE)
         arguments = scene, _core.FrameRequest(camera, rule, SHADE)
         if tables == [one, two][: len(tables)] and len(tables) <= has:
             assert not frame.draw(*arguments).alpha.any()

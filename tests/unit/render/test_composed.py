@@ -295,11 +295,9 @@ def test_several_cameras_are_each_as_if_alone(device):
 
 def test_cut_can_be_kept_while_the_camera_moves(device):
     rng = np.random.default_rng(12)
-    scene, camera, other = (
-        composed(rng),
-        random_camera(rng, distance=8),
-        random_camera(rng, distance=8),
-    )
+    scene = composed(rng)
+    camera = random_camera(rng, distance=8)
+    other = random_camera(rng, distance=8)
     cut = select(scene, camera, tolerance=0.5, device=device)
     same_picture(
         render(scene, camera, cut=cut, device=device),

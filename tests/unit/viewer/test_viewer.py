@@ -266,10 +266,8 @@ def test_asset_is_drawn_whole_and_has_one_level(view):
     assert scene_view.num_gaussians == 500
     for fade, filter_px2 in ((None, 0.0), (DEFAULT_FADE, 0.05)):
         frame = scene_view.frame(view, SIZE, Settings(fade=fade))
-        camera, how = (
-            view.camera(*SIZE, scene_view.near),
-            {"filter_px2": filter_px2, "antialiased": True},
-        )
+        camera = view.camera(*SIZE, scene_view.near)
+        how = {"filter_px2": filter_px2, "antialiased": True}
         whole = to_8bit(v3dg.rasterize(asset, camera, **how).color)
         assert abs(frame.pixels.astype(int) - whole).max() <= 1
         assert whole.any()
@@ -426,7 +424,10 @@ class NoPacer:
 @pytest.fixture
 def rendering(request):
     """A render loop, what it draws of, and what it sent: (view, size, is it final)."""
-    scene_view, sent, errors, is_done = FakeSceneView(), [], [], threading.Event()
+    scene_view = FakeSceneView()
+    sent = []
+    errors = []
+    is_done = threading.Event()
 
     def send(frame, number, *, is_final):
         sent.append((frame.pixels[0, 0, 0], frame.size, is_final))

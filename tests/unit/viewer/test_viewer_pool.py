@@ -39,10 +39,8 @@ def scene(tmp_path_factory):
     "given", [{"tolerance": 1.0}, {"tolerance": 2.0, "fade": None}, {"budget": 3000}]
 )
 def test_a_picture_that_waits_is_that_of_all(scene, shows, given):
-    whole, pooled = (
-        SceneView(scene, device="cpu", memory=None),
-        SceneView(scene, device="cpu", memory="64MB"),
-    )
+    whole = SceneView(scene, device="cpu", memory=None)
+    pooled = SceneView(scene, device="cpu", memory="64MB")
     settings = Settings(shows=shows, **given)
     for view in (VIEW, ASIDE):
         expected = whole.frame(view, SIZE, settings)
@@ -93,10 +91,8 @@ def test_residency_shows_what_is_missing_until_it_is_there(scene):
     ids=lambda s: f"{s.shows}-{s.split}-{'frozen' if s.frozen else 'free'}",
 )
 def test_what_is_compared_frozen_and_measured_is_that_of_all(scene, settings):
-    whole, pooled = (
-        SceneView(scene, device="cpu", memory=None),
-        SceneView(scene, device="cpu", memory="64MB"),
-    )
+    whole = SceneView(scene, device="cpu", memory=None)
+    pooled = SceneView(scene, device="cpu", memory="64MB")
     assert set(pooled.modes) == {*whole.modes, "residency"}
     assert pooled.shows_cuts
     expected = whole.frame(VIEW, SIZE, settings)
@@ -141,10 +137,8 @@ def test_a_pool_without_room_for_all_compares_with_the_finest_that_it_has_room_f
 
 
 def test_a_click_finds_what_is_resident(scene):
-    whole, pooled = (
-        SceneView(scene, device="cpu", memory=None),
-        SceneView(scene, device="cpu", memory="64MB"),
-    )
+    whole = SceneView(scene, device="cpu", memory=None)
+    pooled = SceneView(scene, device="cpu", memory="64MB")
     settings = Settings(tolerance=0.5, fade=None)
     places = [(x, y) for x in range(4, SIZE[0], 16) for y in range(4, SIZE[1], 16)]
     early = [pooled.pick(VIEW, SIZE, *place, settings) for place in places]  # of the coarsest pages
@@ -206,12 +200,10 @@ def test_a_still_is_cut_once_and_a_settled_one_twice(scene, monkeypatch):
 @pytest.fixture
 def loop(scene):
     """A render loop over a pool, and what it sent: (frame, is it final, number)."""
-    pooled, sent, is_done, errors = (
-        SceneView(scene, device="cpu", memory="64MB"),
-        [],
-        threading.Event(),
-        [],
-    )
+    pooled = SceneView(scene, device="cpu", memory="64MB")
+    sent = []
+    is_done = threading.Event()
+    errors = []
 
     def send(frame, number, *, is_final):
         sent.append((frame, is_final, number))
@@ -223,7 +215,9 @@ def loop(scene):
         is_done.set()
 
     loop = RenderLoop(pooled, send, fail)
-    loop.sent, loop.is_final, loop.errors = sent, is_done, errors
+    loop.sent = sent
+    loop.is_final = is_done
+    loop.errors = errors
     yield loop
     assert loop.close(SECONDS)
 
