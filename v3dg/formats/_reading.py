@@ -17,6 +17,7 @@ from v3dg import _files
 from v3dg._files import value_errors as value_errors
 from v3dg._json import Node
 from v3dg._numbers import check as check
+from v3dg.formats._declared import NOTHING, Declared
 from v3dg.gaussians import Gaussians, gaussian_bytes
 
 _FREE_GAUSSIANS = 1 << 18  # 15 to 62 MB: a file of any size may claim this many
@@ -37,6 +38,7 @@ class AssetFile:
             order is quickest. Its errors are those of `read_asset`.
         whole_bytes: Memory that the first read takes and keeps, if the format can only
             be read whole.
+        declared: What the file declares beside the numbers of its gaussians.
     """
 
     path: AnyPath
@@ -44,6 +46,7 @@ class AssetFile:
     sh_degree: int
     read: Callable[[int, int], Gaussians]
     whole_bytes: int = 0
+    declared: Declared = NOTHING
 
 
 def bytes_of(files: Iterable[AnyPath]) -> int:

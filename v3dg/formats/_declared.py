@@ -1,0 +1,29 @@
+"""What a file declares about its gaussians beside their numbers."""
+
+from dataclasses import dataclass
+
+from v3dg.cameras import Axis
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What a file, or its format, declares about its gaussians.
+
+    Attributes:
+        up: The axis that is up among the gaussians as they are read; None if neither
+            the file nor its format determines it.
+        up_reason: Why `up` is what it is, as a phrase.
+        antialiased: Whether opacities were trained to be compensated for the filter of
+            the rasterizer; None if the file does not say.
+        notes: What is in the file and was not understood, or was read otherwise than it
+            is written; each is one sentence without the name of the file.
+    """
+
+    up: Axis | None = None
+    up_reason: str = ""
+    antialiased: bool | None = None
+    notes: tuple[str, ...] = ()
+
+
+NOTHING = Declared()
+"""The declarations of a file that declares nothing."""
