@@ -709,7 +709,7 @@ class CutPictures:
         cameras: Sequence[Camera],
         seed: int,
     ) -> None: ...
-    def view(self, number: int) -> tuple[Camera, Int32, int]: ...
+    def view(self, number: int, cut: int = 0) -> tuple[Camera, Int32, int]: ...
 
 class FitTarget:
     """The gaussians that groups should look like."""
@@ -729,8 +729,17 @@ def fit_level(
 ) -> Float32: ...
 
 # Writes over `gaussians`.
+class CutComparison:
+    """How cuts are compared with the asset."""
+
+    def __init__(
+        self, *, windows_per_step: int, cuts_per_view: int, power: float, is_blurred: bool
+    ) -> None: ...
+
 def refine_cuts(
+    *,
     config: FitConfig,
+    comparison: CutComparison,
     target: FitTarget,
     gaussians: Rows,
     radius: Float32,

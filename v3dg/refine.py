@@ -3,7 +3,7 @@ each other."""
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol, TypeVar
 
@@ -23,7 +23,9 @@ from v3dg.opening import File
 from v3dg.residency import residency
 
 _T = TypeVar("_T", covariant=True)
-_RATE = 0.2  # factor of the step sizes of a fit, because refinement starts from a fitted level
+# The factor of the step sizes of a fit. It is small because refinement starts from a
+# fitted level, and grows with the root of the number of windows that make a step.
+_RATE = 0.2
 # The number of pictures that measure how much is seen of each gaussian.
 _NUM_WEIGHING_PICTURES = 2_000
 # A gaussian is measured if it is in the cuts of at least this many of them. Pictures
@@ -61,7 +63,8 @@ def refine_bundle(
         cameras: Views of the asset, also by name: for a room, those of its photographs.
             Views from elsewhere may get worse. Without cameras, pictures are taken from
             all around.
-        steps: Number of pictures, which are compared one after another.
+        steps: Number of pictures that are compared. A GPU takes eight for each step of
+            its gradients, and rounds up.
         drop: Share of a level's visibility, 0 to 0.5, up to which its least visible
             gaussians are dropped; 0 keeps all. Refining a bundle again drops gaussians
             again.
@@ -90,15 +93,56 @@ def refine_bundle(
     if bundle.num_levels < 2 or bundle.clusters.offset[bundle.level_range(0).stop] == 0:
         return bundle
     if drop > 0:
-        cuts = _Cuts(bundle, cameras, seed, chosen_device, progress)
-        weights, looks = cuts.run("weigh", _NUM_WEIGHING_PICTURES, _core.weigh_cuts)
-        bundle = _without_least(bundle, np.where(looks < _LEAST_LOOKS, np.nan, weights), drop)
-    refined = _Cuts(bundle, cameras, seed, chosen_device, progress).refined(steps)
+        bundle = without_unseen(bundle, cameras, drop, seed, chosen_device, progress)
+    cuts = Cuts(bundle, cameras, seed, chosen_device, progress)
+    refined = cuts.refined(steps, default_steps(chosen_device))
     record: dict[str, int | float] = {"steps": steps, "drop": drop, "seed": seed}
     if cameras:
         record["cameras"] = len(cameras)
     config = {**bundle.config, "refined": record}
     return Bundle(bundle.clusters.around(refined), bundle.groups, refined, config, bundle.codec)
+
+
+def without_unseen(
+    bundle: Bundle,
+    cameras: Sequence[Camera],
+    drop: float,
+    seed: int,
+    device: Device,
+    progress: Progress,
+) -> Bundle:
+    """Drop from each level but the first what pictures of cuts show least of, up to
+    this share of what they show of the level."""
+    cuts = Cuts(bundle, cameras, seed, device, progress)
+    weights, looks = cuts.weights(_NUM_WEIGHING_PICTURES)
+    return _without_least(bundle, np.where(looks < _LEAST_LOOKS, np.nan, weights), drop)
+
+
+@dataclass(frozen=True)
+class RefineSteps:
+    """How a refinement compares cuts with the asset, and how it moves gaussians.
+
+    Attributes:
+        windows: Windows of pictures, 1 to 32, whose gradients make one step.
+        cuts_per_view: Cuts that are compared with each picture of the asset, 1 to 128.
+        rate: Step sizes, as parts of those of a fit.
+        power: The loss of a value is this power of its difference, more than 0 and at
+            most 1.
+        is_blurred: Whether differences are blurred by a pixel first.
+    """
+
+    windows: int
+    cuts_per_view: int = 8
+    rate: float = _RATE
+    power: float = 1.0
+    is_blurred: bool = False
+
+
+def default_steps(device: Device) -> RefineSteps:
+    """The steps for a kind of device: a GPU is busy only with several windows at once,
+    a CPU with one."""
+    windows = 8 if device.is_cuda else 1
+    return RefineSteps(windows=windows, rate=_RATE * windows**0.5)
 
 
 class _CutOperation(Protocol[_T]):
@@ -107,14 +151,13 @@ class _CutOperation(Protocol[_T]):
     def __call__(
         self,
         *,
-        config: _core.FitConfig,
         gaussians: _core.Rows,
         pictures: _core.CutPictures,
         progress: _core.FitProgress,
     ) -> _T: ...
 
 
-class _Cuts:
+class Cuts:
     """Pictures of a bundle's cuts, and copies of its gaussians on a device, which they
     move."""
 
@@ -140,36 +183,53 @@ class _Cuts:
             seed=seed,
         )
 
-    def refined(self, steps: int) -> Gaussians:
+    def refined(self, num_pictures: int, settings: RefineSteps) -> Gaussians:
+        """Move the gaussians by this number of pictures, rounded up to whole steps."""
         clusters = self._bundle.clusters
         ball = self._bundle.groups.ball
         radius = np.where(clusters.own_group < 0, np.float32(1), ball[clusters.own_group, 3])
         radius = np.repeat(radius, np.diff(clusters.offset))
         leaves = self._gaussians.subset(self._leaves).rows
         target = _core.FitTarget(leaves, filter_px2=0.0, antialiased=False)
-        self.run("refine", steps, partial(_core.refine_cuts, target=target, radius=radius))
+        comparison = _core.CutComparison(
+            windows_per_step=settings.windows,
+            cuts_per_view=settings.cuts_per_view,
+            power=settings.power,
+            is_blurred=settings.is_blurred,
+        )
+        num_steps = -(-num_pictures // settings.windows)
+        move = partial(
+            _core.refine_cuts,
+            config=self._config(num_steps, settings.rate),
+            comparison=comparison,
+            target=target,
+            radius=radius,
+        )
+        self._run("refine", num_steps * settings.windows, move)
         return self._gaussians.numpy()
 
-    def run(self, name: str, steps: int, operation: _CutOperation[_T]) -> _T:
-        """Run an operation on this number of pictures, and return its result."""
+    def weights(self, num_pictures: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]:
+        """What pictures show of each gaussian, and how many of their cuts have it."""
+        weigh = partial(_core.weigh_cuts, config=self._config(num_pictures, _RATE))
+        return self._run("weigh", num_pictures, weigh)
+
+    def _config(self, num_steps: int, rate: float) -> _core.FitConfig:
         filter_px2 = float(self._bundle.clusters.filter_px2[self._bundle.level_range(1).start])
-        config = BuildConfig(steps=steps, first_steps=steps, filter_px2=filter_px2)
+        config = BuildConfig(steps=num_steps, first_steps=num_steps, filter_px2=filter_px2)
         config = replace(
             config,
-            step_position=_RATE * config.step_position,
-            step_log_scale=_RATE * config.step_log_scale,
-            step_quat=_RATE * config.step_quat,
-            step_logit=_RATE * config.step_logit,
-            step_sh0=_RATE * config.step_sh0,
-            step_sh_rest=_RATE * config.step_sh_rest,
+            step_position=rate * config.step_position,
+            step_log_scale=rate * config.step_log_scale,
+            step_quat=rate * config.step_quat,
+            step_logit=rate * config.step_logit,
+            step_sh0=rate * config.step_sh0,
+            step_sh_rest=rate * config.step_sh_rest,
         )
-        work = partial(
-            operation,
-            config=fit_config(config, self._seed, 1),
-            gaussians=self._gaussians.rows,
-            pictures=self._pictures,
-        )
-        with Bar(steps, name, self._progress) as bar:
+        return fit_config(config, self._seed, 1)
+
+    def _run(self, name: str, num_pictures: int, operation: _CutOperation[_T]) -> _T:
+        work = partial(operation, gaussians=self._gaussians.rows, pictures=self._pictures)
+        with Bar(num_pictures, name, self._progress) as bar:
 
             def show(state: _core.FitProgress) -> None:
                 bar.update(state.groups_done - bar.num_done)

@@ -190,9 +190,9 @@ class Target {
                            const GaussianRows<float>& gaussians, float* error,
                            FitProgress& progress, const Work& work) const = 0;
     // As refine_cuts() (levels/refine_cuts.h) has it.
-    virtual void refine_cuts(const FitConfig& config, const CutRows& levels,
-                             const CutPictures& pictures, FitProgress& progress,
-                             const Work& work) const = 0;
+    virtual void refine_cuts(const FitConfig& config, const CutComparison& comparison,
+                             const CutRows& levels, const CutPictures& pictures,
+                             FitProgress& progress, const Work& work) const = 0;
 };
 
 }  // namespace backend

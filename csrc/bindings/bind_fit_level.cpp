@@ -102,11 +102,17 @@ class BoundPictures {
                                      {cameras_.data(), cameras_.size()}, seed)) {}
 
     const CutPictures& pictures() const { return pictures_; }
-    py::tuple view(uint64_t number) const {
-        const CutView view = cut_view(pictures_, number);
-        const auto count = static_cast<py::ssize_t>(view.clusters.size());
-        return py::make_tuple(BoundCamera{{}, view.camera},
-                              py::array_t<int32_t>(count, view.clusters.data()), view.samples);
+    py::tuple view(uint64_t number, size_t cut) const {
+        if (cut >= kViewSlots)
+            refuse_value("cut", "expected a number below " + std::to_string(kViewSlots) + ", got " +
+                                    std::to_string(cut));
+        const AssetView view = asset_view(pictures_, number);
+        const SelectRule rule = cuts_of_view(pictures_, view, number, cut + 1)[cut];
+        const std::vector<int32_t> clusters = clusters_in_window(pictures_, view, rule);
+        return py::make_tuple(
+            BoundCamera{{}, view.window},
+            py::array_t<int32_t>(static_cast<py::ssize_t>(clusters.size()), clusters.data()),
+            view.samples);
     }
     // Throws unless these are the gaussians of the table.
     void check_all(const Rows& gaussians) const {
@@ -137,9 +143,22 @@ class BoundPictures {
     CutPictures pictures_;
 };
 
-void refine_cuts_arrays(const FitConfig& config, const BoundTarget& target, const Rows& gaussians,
-                        const py::array& radius, const BoundPictures& pictures,
-                        FitProgress& progress) {
+CutComparison make_comparison(int windows_per_step, int cuts_per_view, float power,
+                              bool is_blurred) {
+    if (windows_per_step < 1 || windows_per_step > kMostWindows)
+        refuse_value("windows_per_step", "expected 1 to " + std::to_string(kMostWindows) +
+                                             ", got " + std::to_string(windows_per_step));
+    if (cuts_per_view < 1 || cuts_per_view > int(kViewSlots))
+        refuse_value("cuts_per_view", "expected 1 to " + std::to_string(kViewSlots) + ", got " +
+                                          std::to_string(cuts_per_view));
+    if (!(power > 0 && power <= 1))
+        refuse_value("power", "expected more than 0 and at most 1, got " + std::to_string(power));
+    return {windows_per_step, cuts_per_view, power, is_blurred};
+}
+
+void refine_cuts_arrays(const FitConfig& config, const CutComparison& comparison,
+                        const BoundTarget& target, const Rows& gaussians, const py::array& radius,
+                        const BoundPictures& pictures, FitProgress& progress) {
     target.check_alike(gaussians);
     const auto count = static_cast<py::ssize_t>(gaussians.size());
     const CutRows levels{gaussians.write(), span_of<const float>(radius, "radius", {count})};
@@ -150,7 +169,7 @@ void refine_cuts_arrays(const FitConfig& config, const BoundTarget& target, cons
                                   std::to_string(radius_of_one));
     const Work work(gaussians.device());
     const Unlocked unlocked;
-    target.handle().refine_cuts(config, levels, pictures.pictures(), progress, work);
+    target.handle().refine_cuts(config, comparison, levels, pictures.pictures(), progress, work);
 }
 
 py::tuple weigh_cuts_arrays(const FitConfig& config, const Rows& gaussians,
@@ -261,14 +280,16 @@ void bind_fit_level(py::module_& m) {
         "Pictures of cuts from all around an asset, which is level 0, or from cameras.")
         .def(py::init<const BoundTable&, const Rows&, const std::vector<BoundCamera>&, uint64_t>(),
              py::kw_only(), "table"_a, "asset"_a, "cameras"_a, "seed"_a, py::keep_alive<1, 2>())
-        .def("view", &BoundPictures::view, "number"_a,
-             "The camera of a window, the clusters that it shows, and the samples of a side of a "
-             "pixel.");
-    m.def("refine_cuts", &refine_cuts_arrays, "config"_a, "target"_a, "gaussians"_a, "radius"_a,
-          "pictures"_a, "progress"_a,
+        .def("view", &BoundPictures::view, "number"_a, "cut"_a = 0,
+             "The camera of the window of a view, the clusters of one of its cuts that it shows, "
+             "and the samples of a side of a pixel.");
+    py::class_<CutComparison>(m, "CutComparison", "How cuts are compared with the asset.")
+        .def(py::init(&make_comparison), py::kw_only(), "windows_per_step"_a, "cuts_per_view"_a,
+             "power"_a, "is_blurred"_a);
+    m.def("refine_cuts", &refine_cuts_arrays, py::kw_only(), "config"_a, "comparison"_a, "target"_a,
+          "gaussians"_a, "radius"_a, "pictures"_a, "progress"_a,
           "Moves the gaussians of clusters, in place, until pictures of cuts are those of the "
-          "target: a step a "
-          "picture.");
+          "target.");
     m.def("weigh_cuts", &weigh_cuts_arrays, "config"_a, "gaussians"_a, "pictures"_a, "progress"_a,
           "What pictures of cuts, one a step, show of each gaussian: the sum (N,) of its blend "
           "weights, in "

@@ -93,9 +93,11 @@ class BackendTarget final : public backend::Target {
                    const Work& work) const override {
         cuda::fit_level(config, groups, target(), gaussians, error, progress, stream_of(work));
     }
-    void refine_cuts(const FitConfig& config, const CutRows& levels, const CutPictures& pictures,
-                     FitProgress& progress, const Work& work) const override {
-        cuda::refine_cuts(config, target(), levels, pictures, progress, stream_of(work));
+    void refine_cuts(const FitConfig& config, const CutComparison& comparison,
+                     const CutRows& levels, const CutPictures& pictures, FitProgress& progress,
+                     const Work& work) const override {
+        cuda::refine_cuts(config, comparison, target(), levels, pictures, progress,
+                          stream_of(work));
     }
 
   private:

@@ -52,9 +52,10 @@ class HostTarget final : public backend::Target {
                    const Work&) const override {
         v3dg::fit_level(config, groups, target(), gaussians, error, progress);
     }
-    void refine_cuts(const FitConfig& config, const CutRows& levels, const CutPictures& pictures,
-                     FitProgress& progress, const Work&) const override {
-        v3dg::refine_cuts(config, target(), model_->size(), levels, pictures, progress);
+    void refine_cuts(const FitConfig& config, const CutComparison& comparison,
+                     const CutRows& levels, const CutPictures& pictures, FitProgress& progress,
+                     const Work&) const override {
+        v3dg::refine_cuts(config, comparison, target(), model_->size(), levels, pictures, progress);
     }
 
   private:

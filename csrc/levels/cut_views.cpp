@@ -1,5 +1,6 @@
-// Views of random cuts of a bundle. Each follows from its number: a share of the gaussians, a size,
-// a camera, the cut of that budget, and a window in which it is compared.
+// Views of random cuts of a bundle. A view follows from its number: a size, a camera, and a window
+// in which cuts are compared. Each of its cuts has a share of the gaussians that goes with its
+// size.
 
 #include "levels/cut_views.h"
 
@@ -21,9 +22,12 @@ constexpr double kNarrowestPx = 8, kMostPx = 1 << 15;  // limits of a picture's 
 constexpr double kNativePx2 = 2;
 // The range of a picture's side, relative to the native size of its cut.
 constexpr double kLeastSize = 0.18, kOctavesOfSize = 5.75;
-constexpr double kDistance = 2.5;     // distance from the centre, in radii
-constexpr double kNear = 0.01;        // radii
-constexpr int kMostTries = 16;        // attempts to find a gaussian that a picture shows
+constexpr double kDistance = 2.5;  // distance from the centre, in radii
+constexpr double kNear = 0.01;     // radii
+constexpr int kMostTries = 16;     // attempts to find a gaussian that a picture shows
+constexpr int kMostTriesOfShare = 64;
+// More random numbers than a view, or one of its shares, takes.
+constexpr uint64_t kRandomNumbersOfView = 1024;
 constexpr double kMostOfAsset = 0.7;  // largest share of the asset's gaussians in a cut
 // The share of the gaussians within the radius; the rest may float far away.
 constexpr double kShare = 0.99;
@@ -31,7 +35,8 @@ constexpr double kShare = 0.99;
 // The random numbers of one view.
 class Random {
   public:
-    Random(uint64_t seed, uint64_t stream) : seed_(seed), stream_(stream) {}
+    Random(uint64_t seed, uint64_t stream, uint64_t counter)
+        : seed_(seed), stream_(stream), counter_(counter) {}
     double uniform() { return random_uniform(seed_, stream_, counter_++); }
     void direction(double out[3]) {
         const double z = 2 * uniform() - 1, angle = 2 * kPi * uniform(),
@@ -42,7 +47,7 @@ class Random {
     }
 
   private:
-    uint64_t seed_, stream_, counter_ = 0;
+    uint64_t seed_, stream_, counter_;
 };
 
 // Returns a camera that looks at the centre from anywhere around it; its picture is one px wide.
@@ -124,20 +129,60 @@ Camera window_of(const Camera& camera, double widest_px, const CutPictures& pict
     return window;
 }
 
-SelectOutput selected(const ClusterTable& table, const Camera& camera, const SelectRule& rule) {
+// The only instance of a bundle, where it was built.
+struct OneInstance {
     const int32_t bundle = 0;
     const double position[3] = {}, quaternion[4] = {1, 0, 0, 0}, scale = 1;
     const float importance = 1;
-    const InstanceTable instance{.bundle = {&bundle, 1},
-                                 .position = {position, 3},
-                                 .quaternion = {quaternion, 4},
-                                 .scale = {&scale, 1},
-                                 .importance = {&importance, 1}};
-    const SelectInput in{
-        .bundles = {&table, 1}, .instances = instance, .eyes = Eyes(camera), .rule = rule};
+
+    Pose pose() const { return {position, quaternion, scale}; }
+    InstanceTable table() const {
+        return {.bundle = {&bundle, 1},
+                .position = {position, 3},
+                .quaternion = {quaternion, 4},
+                .scale = {&scale, 1},
+                .importance = {&importance, 1}};
+    }
+};
+
+SelectOutput selected(const ClusterTable& table, const Camera& camera, const SelectRule& rule) {
+    const OneInstance instance;
     SelectOutput out;
-    cpu::select(in, out);
+    cpu::select(
+        {.bundles = {&table, 1}, .instances = instance.table(), .eyes = Eyes(camera), .rule = rule},
+        out);
     return out;
+}
+
+// The cuts of a picture that meet budgets.
+std::vector<BudgetCut> cuts_within(const ClusterTable& table, const Camera& camera,
+                                   const SelectRule& rule, Span<const uint64_t> budgets) {
+    const OneInstance instance;
+    std::vector<BudgetCut> cuts(budgets.size);
+    cpu::choose_tolerances(
+        {.bundles = {&table, 1}, .instances = instance.table(), .eyes = Eyes(camera), .rule = rule},
+        budgets, {cuts.data(), cuts.size()});
+    return cuts;
+}
+
+// Returns a share of the gaussians of a picture, by a uniform number.
+double share_of_part(const CutPictures& pictures, double part) {
+    const auto all = static_cast<double>(pictures.weight.size());
+    return pictures.most * std::pow(pictures.least / pictures.most, part * part) / all;
+}
+
+// Returns the share of another cut of a view. It has the distribution of all shares, as far as the
+// picture's size relative to the native size of the cut stays in its range.
+double share_of_cut(const CutPictures& pictures, const AssetView& view, uint64_t number,
+                    size_t cut) {
+    if (cut == 0) return view.share;
+    Random random(pictures.seed, number, kRandomNumbersOfView * cut);
+    for (int tries = 0; tries < kMostTriesOfShare; ++tries) {
+        const double share = share_of_part(pictures, random.uniform());
+        const double octaves = std::log2(view.size / std::sqrt(share) / kLeastSize);
+        if (octaves >= 0 && octaves < kOctavesOfSize) return share;
+    }
+    return view.share;
 }
 
 // The way in which a picture is compared: the largest side of the window, and the samples of a side
@@ -148,9 +193,9 @@ struct Comparison {
     int samples;
 };
 Comparison comparison_of(double size, double longer_px) {
-    if (size >= 2) return {512, 2};
-    if (size >= 1) return {512, 3};
-    return {256, longer_px <= 128 ? 8 : 4};
+    if (size >= 2) return {kWidestWindowPx, 2};
+    if (size >= 1) return {kWidestWindowPx, 3};
+    return {kWidestWindowPx / 2, longer_px <= 128 ? 8 : 4};
 }
 
 }  // namespace
@@ -227,48 +272,75 @@ CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const
     return pictures;
 }
 
-CutView cut_view(const CutPictures& pictures, uint64_t number) {
-    Random random(pictures.seed, number);
-    const double part = random.uniform();
-    // Gaussians of a picture without levels.
-    double all = static_cast<double>(pictures.weight.size());
-    const double share =
-        pictures.most * std::pow(pictures.least / pictures.most, part * part) / all;
-    const double size = kLeastSize * std::exp2(kOctavesOfSize * random.uniform());
+AssetView asset_view(const CutPictures& pictures, uint64_t number) {
+    Random random(pictures.seed, number, 0);
+    AssetView view{};
+    view.share = share_of_part(pictures, random.uniform());
+    view.size = kLeastSize * std::exp2(kOctavesOfSize * random.uniform()) * std::sqrt(view.share);
+    view.num_gaussians = static_cast<double>(pictures.weight.size());
+    const bool has_cameras = pictures.cameras.size > 0;
     Camera camera;
-    SelectRule rule{};
-    rule.culls = pictures.cameras.size > 0;
-    if (rule.culls) {
+    if (has_cameras) {
         const size_t n = pictures.cameras.size;
         camera = pictures.cameras[static_cast<size_t>(random.uniform() * static_cast<double>(n))];
-        all = static_cast<double>(selected(pictures.table, camera, rule).num_gaussians);
+        view.num_gaussians =
+            static_cast<double>(selected(pictures.table, camera, SelectRule{}).num_gaussians);
     } else {
         camera = camera_around(pictures, random);
     }
     const double longer = std::max(camera.width, camera.height);
-    const double area_px2 = size * size * kNativePx2 * share * all;
+    const double area_px2 = view.size * view.size * kNativePx2 * view.num_gaussians;
     const double scale = std::sqrt(area_px2 / (camera.width * camera.height));
-    const double longer_px = std::clamp(longer * scale, rule.culls ? kNarrowestPx : 0.0, kMostPx);
-    camera = resized(camera, longer_px / longer);
-    if (!rule.culls) camera = on_screen(camera, random);
-    rule.budget = static_cast<uint64_t>(std::ceil(share * all));
-    SelectOutput whole = selected(pictures.table, camera, rule);
-    // A camera inside of groups refines these at any tolerance, and only the coarsest clusters meet
-    // a budget below what remains of them. Then coarser levels alone are used.
+    const double longer_px = std::clamp(longer * scale, has_cameras ? kNarrowestPx : 0.0, kMostPx);
+    view.picture = resized(camera, longer_px / longer);
+    if (!has_cameras) view.picture = on_screen(view.picture, random);
+    const Comparison comparison = comparison_of(view.size, longer_px);
+    view.samples = comparison.samples;
+    view.window = window_of(view.picture, comparison.widest_px, pictures, random);
+    return view;
+}
+
+std::vector<SelectRule> cuts_of_view(const CutPictures& pictures, const AssetView& view,
+                                     uint64_t number, size_t count) {
+    std::vector<uint64_t> budgets;
+    for (size_t cut = 0; cut < count; ++cut)
+        budgets.push_back(static_cast<uint64_t>(
+            std::ceil(share_of_cut(pictures, view, number, cut) * view.num_gaussians)));
+    SelectRule whole{};
+    whole.culls = pictures.cameras.size > 0;
+    const std::vector<BudgetCut> cuts =
+        cuts_within(pictures.table, view.picture, whole, {budgets.data(), budgets.size()});
     const Span<const int32_t>& levels = pictures.table.level;
     const int32_t coarsest = levels.size > 0 ? levels[levels.size - 1] : 0;
-    while (std::isinf(whole.tolerance_px2) &&
-           2 * whole.num_gaussians < static_cast<int64_t>(rule.budget) &&
-           rule.min_level < coarsest) {
-        ++rule.min_level;
-        whole = selected(pictures.table, camera, rule);
+    std::vector<SelectRule> rules;
+    for (size_t cut = 0; cut < count; ++cut) {
+        SelectRule rule = whole;
+        BudgetCut found = cuts[cut];
+        // A camera inside of groups refines these at any tolerance, and only the coarsest clusters
+        // meet a budget below what remains of them. Then coarser levels alone are used.
+        while (std::isinf(found.tolerance_px2) &&
+               2 * found.num_gaussians < static_cast<int64_t>(budgets[cut]) &&
+               rule.min_level < coarsest) {
+            ++rule.min_level;
+            found = cuts_within(pictures.table, view.picture, rule, {&budgets[cut], 1})[0];
+        }
+        rule.tolerance_px2 = found.fits ? found.tolerance_px2 : FLT_MAX;
+        rule.culls = true;
+        rules.push_back(rule);
     }
-    rule.budget = kNoBudget;
-    rule.tolerance_px2 = whole.fits_budget ? whole.tolerance_px2 : FLT_MAX;
-    rule.culls = true;
-    const Comparison comparison = comparison_of(size * std::sqrt(share), longer_px);
-    const Camera window = window_of(camera, comparison.widest_px, pictures, random);
-    return {window, selected(pictures.table, window, rule).cluster, comparison.samples};
+    return rules;
+}
+
+std::vector<int32_t> clusters_in_window(const CutPictures& pictures, const AssetView& view,
+                                        const SelectRule& rule) {
+    return selected(pictures.table, view.window, rule).cluster;
+}
+
+InstanceView view_of_window(const ClusterTable& table, const Camera& window) {
+    const OneInstance instance;
+    return view_from_instance(Eyes(window), sides_of_eyes(Eyes(window), table.pad_px),
+                              axes_of_instance(window, instance.pose()), instance.pose(),
+                              instance.importance);
 }
 
 }  // namespace v3dg

@@ -1,4 +1,4 @@
-// One picture is drawn at a time, on all threads; views are made some ahead.
+// One window is drawn at a time, on all threads; views are made some ahead.
 
 #include "levels/refine_cuts.h"
 
@@ -16,7 +16,8 @@ namespace v3dg {
 
 namespace {
 
-constexpr size_t kGaussiansAtOnce = 256, kViewsAtOnce = 32;
+constexpr size_t kGaussiansAtOnce = 256, kWindowsAtOnce = 32;
+static_assert(kWindowsAtOnce <= kViewSlots, "windows that are made together have own slots");
 
 // The memory of one picture: colour and alpha.
 class Canvas {
@@ -36,51 +37,196 @@ class Canvas {
     size_t num_pixels() const { return static_cast<size_t>(width_) * static_cast<size_t>(height_); }
     float* color() { return values_.data(); }
     float* alpha() { return values_.data() + 3 * num_pixels(); }
+    ReadPlanes planes() const { return {values_.data(), values_.data() + 3 * num_pixels()}; }
 
   private:
     int width_ = 0, height_ = 0;
     std::vector<float> values_;
 };
 
-// Puts the slopes of the loss in place of the picture.
-void compare(const FitConfig& config, int samples, Canvas& picture, Canvas& target) {
-    const auto width = static_cast<size_t>(picture.width()),
-               height = static_cast<size_t>(picture.height());
-    std::vector<double> loss_of_row(height, 0.0);
-    parallel_for(height, 8, [&](size_t y) {
-        for (size_t x = 0; x < width; ++x) {
-            float* color = picture.color() + 3 * (y * width + x);
-            float& alpha = picture.alpha()[y * width + x];
-            for (int k = 0; k < 3; ++k)
-                color[k] -= box_average(target.color(), width, 3, k, x, y, samples);
-            alpha -= box_average(target.alpha(), width, 1, 0, x, y, samples);
-            loss_of_row[y] += loss_of_pixel(config.loss, color, alpha);
-        }
-    });
-    const float weight =
-        weight_of_picture(std::accumulate(loss_of_row.begin(), loss_of_row.end(), 0.0),
-                          static_cast<double>(width * height));
-    for (size_t i = 0; i < width * height; ++i)
-        put_slopes(config.loss, weight, picture.color() + 3 * i, picture.alpha()[i]);
-}
-
-// Makes the views of pictures, some ahead.
-class Views {
+// Compares windows with their targets.
+class Comparison {
   public:
-    Views(const CutPictures& pictures, size_t count)
-        : pictures_(pictures), count_(count), views_(kViewsAtOnce) {}
-    // Returns a view. Numbers must be asked for in ascending order from 0.
-    const CutView& operator[](size_t number) {
-        if (number % kViewsAtOnce == 0)
-            parallel_for(std::min(kViewsAtOnce, count_ - number), 1,
-                         [&](size_t k) { views_[k] = cut_view(pictures_, number + k); });
-        return views_[number % kViewsAtOnce];
+    Comparison(const LossWeights& loss, const CutComparison& comparison)
+        : loss_(loss), comparison_(comparison) {}
+
+    // Puts the slopes of the loss in place of the picture.
+    void compare(Canvas& picture, const Canvas& target) {
+        width_ = static_cast<size_t>(picture.width());
+        height_ = static_cast<size_t>(picture.height());
+        slopes_.resize(width_ * height_);
+        const ReadPlanes drawn = picture.planes(), wanted = target.planes();
+        std::vector<double> loss_of_row(height_, 0.0);
+        for_each_pixel([&](size_t x, size_t y) {
+            PixelValues pixel = filtered(x, y, [&](size_t column, size_t row) {
+                PixelValues difference = drawn.at(row * width_ + column);
+                const PixelValues of_target = wanted.at(row * width_ + column);
+                for (int k = 0; k < 4; ++k) difference.value[k] -= of_target.value[k];
+                return difference;
+            });
+            loss_of_row[y] += put_slopes(loss_, comparison_.power, pixel);
+            slopes_[y * width_ + x] = pixel;
+        });
+        const float weight =
+            weight_of_picture(std::accumulate(loss_of_row.begin(), loss_of_row.end(), 0.0),
+                              static_cast<double>(width_ * height_));
+        for_each_pixel([&](size_t x, size_t y) {
+            const PixelValues slope = filtered(
+                x, y, [&](size_t column, size_t row) { return slopes_[row * width_ + column]; });
+            const size_t i = y * width_ + x;
+            for (size_t k = 0; k < 3; ++k) picture.color()[3 * i + k] = weight * slope.value[k];
+            picture.alpha()[i] = weight * slope.value[3];
+        });
     }
 
   private:
+    template <class Visit>
+    void for_each_pixel(const Visit& visit) const {
+        parallel_for(height_, 8, [&](size_t y) {
+            for (size_t x = 0; x < width_; ++x) visit(x, y);
+        });
+    }
+    template <class ValuesAt>
+    PixelValues filtered(size_t x, size_t y, const ValuesAt& values_at) const {
+        return comparison_.is_blurred ? blurred(width_, height_, x, y, values_at) : values_at(x, y);
+    }
+
+    const LossWeights& loss_;
+    const CutComparison& comparison_;
+    size_t width_ = 0, height_ = 0;
+    std::vector<PixelValues> slopes_;
+};
+
+// A window as it is drawn.
+struct CutWindow {
+    PlannedWindow plan;
+    Camera camera;
+    int samples;
+    std::vector<int32_t> clusters;
+};
+
+// Plans windows, some ahead on all threads.
+class Windows {
+  public:
+    Windows(const CutPictures& pictures, size_t count, size_t cuts_per_view)
+        : pictures_(pictures),
+          count_(count),
+          cuts_per_view_(cuts_per_view),
+          views_(kViewSlots),
+          windows_(kWindowsAtOnce) {}
+    // Returns a window. Numbers must be asked for in ascending order from 0.
+    const CutWindow& operator[](size_t number) {
+        if (number % kWindowsAtOnce == 0)
+            parallel_for(std::min(kWindowsAtOnce, count_ - number), 1,
+                         [&](size_t k) { windows_[k] = window(number + k); });
+        return windows_[number % kWindowsAtOnce];
+    }
+
+  private:
+    struct View {
+        AssetView view;
+        std::vector<SelectRule> cuts;
+    };
+
+    CutWindow window(size_t number) {
+        const PlannedWindow plan = planned_window(number, cuts_per_view_);
+        View& of_slot = views_[plan.slot];
+        if (plan.is_new) {
+            of_slot.view = asset_view(pictures_, plan.view);
+            of_slot.cuts = cuts_of_view(pictures_, of_slot.view, plan.view, cuts_per_view_);
+        }
+        return {plan, of_slot.view.window, of_slot.view.samples,
+                clusters_in_window(pictures_, of_slot.view, of_slot.cuts[plan.cut])};
+    }
+
     const CutPictures& pictures_;
-    const size_t count_;
-    std::vector<CutView> views_;
+    const size_t count_, cuts_per_view_;
+    std::vector<View> views_;
+    std::vector<CutWindow> windows_;
+};
+
+// The pictures of the asset in the windows of all slots.
+class Targets {
+  public:
+    Targets(const FitTarget& target, uint64_t count)
+        : target_(target), count_(count), pictures_(kViewSlots) {}
+
+    // Returns the picture of a window, which is drawn if the window is new.
+    const Canvas& picture_of(const CutWindow& window) {
+        Canvas& picture = pictures_[window.plan.slot];
+        if (!window.plan.is_new) return picture;
+        const Camera larger = enlarged(window.camera, window.samples);
+        const Draw<float> whole{.model = target_.model,
+                                .first = 0,
+                                .count = count_,
+                                .view = view_of_world<float>(larger),
+                                .appearance = {target_.filter_px2, target_.antialiased, false}};
+        render<float>({whole}, larger.intrinsics<float>(), larger_.start(larger), false,
+                      workspace_);
+        picture.start(window.camera);
+        average(larger_, window.samples, picture);
+        return picture;
+    }
+
+  private:
+    static void average(Canvas& larger, int samples, Canvas& picture) {
+        const auto width = static_cast<size_t>(picture.width());
+        parallel_for(static_cast<size_t>(picture.height()), 8, [&](size_t y) {
+            for (size_t x = 0; x < width; ++x) {
+                const size_t i = y * width + x;
+                for (size_t k = 0; k < 3; ++k)
+                    picture.color()[3 * i + k] =
+                        box_average(larger.color(), width, 3, k, x, y, samples);
+                picture.alpha()[i] = box_average(larger.alpha(), width, 1, 0, x, y, samples);
+            }
+        });
+    }
+
+    const FitTarget& target_;
+    const uint64_t count_;
+    Canvas larger_;
+    Workspace<float> workspace_;
+    std::vector<Canvas> pictures_;
+};
+
+// The gradients of all gaussians, summed over the windows of a step.
+class GradientSum {
+  public:
+    GradientSum(size_t count, int sh_degree)
+        : values_(num_values(sh_degree) * count, 0.0f),
+          sum_(rows_in(values_.data(), count, sh_degree)),
+          zeros_(num_values(sh_degree), 0.0f),
+          zero_(rows_in(zeros_.data(), 1, sh_degree)),
+          is_shown_(count, 0) {}
+
+    void add(const std::vector<uint32_t>& index, const GaussianRows<const float>& gradient) {
+        for (const uint32_t i : index)
+            if (is_shown_[i] == 0) {
+                is_shown_[i] = 1;
+                shown_.push_back(i);
+            }
+        parallel_for(index.size(), kGaussiansAtOnce,
+                     [&](size_t g) { add_gradient(gradient, g, sum_, index[g]); });
+    }
+    // Calls move(i, sum) for each gaussian i that was shown, and begins the next sum.
+    template <class Move>
+    void move_shown(const Move& move) {
+        parallel_for(shown_.size(), kGaussiansAtOnce, [&](size_t k) {
+            const size_t i = shown_[k];
+            move(i, GaussianRows<const float>(sum_));
+            copy_gaussian(zero_, 0, sum_, i);
+            is_shown_[i] = 0;
+        });
+        shown_.clear();
+    }
+
+  private:
+    std::vector<float> values_;
+    GaussianRows<float> sum_;
+    std::vector<float> zeros_;
+    GaussianRows<const float> zero_;
+    std::vector<uint8_t> is_shown_;
+    std::vector<uint32_t> shown_;
 };
 
 // The gaussians of one view, their picture, and its backward pass.
@@ -136,15 +282,15 @@ class CutFrame {
 void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows,
                 const CutPictures& pictures, const SeenOfGaussians& seen, FitProgress& progress) {
     const auto steps = static_cast<size_t>(config.steps);
-    Views views(pictures, steps);
+    Windows windows(pictures, steps, 1);
     CutFrame frame(config);
     for (size_t i = 0; i < steps && !progress.cancel; ++i) {
-        const CutView& view = views[i];
-        const std::vector<uint32_t> index = gaussians_of(pictures.table, view);
+        const CutWindow& window = windows[i];
+        const std::vector<uint32_t> index = gaussians_of(pictures.table, window.clusters);
         const GaussianRows<float>& shown = frame.start(index.size(), 0);
         parallel_for(index.size(), kGaussiansAtOnce,
                      [&](size_t g) { copy_in_grey(rows, index[g], shown, g); });
-        Canvas& picture = frame.draw(view.camera);
+        Canvas& picture = frame.draw(window.camera);
         const size_t count = picture.num_pixels();
         for (size_t i = 0; i < count; ++i)
             put_sum_slopes(picture.color() + 3 * i, picture.alpha()[i]);
@@ -157,41 +303,38 @@ void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows,
     }
 }
 
-void refine_cuts(const FitConfig& config, const FitTarget& target, uint64_t target_count,
-                 const CutRows& levels, const CutPictures& pictures, FitProgress& progress) {
+void refine_cuts(const FitConfig& config, const CutComparison& comparison, const FitTarget& target,
+                 uint64_t target_count, const CutRows& levels, const CutPictures& pictures,
+                 FitProgress& progress) {
     const GaussianRows<float>& rows = levels.rows;
     const size_t num = num_values(rows.sh_degree);
     std::vector<float> moments(2 * num * rows.size, 0.0f);
     const Moments adam_moments{moments.data(), moments.data() + num * rows.size};
-    Workspace<float> of_target;
-    Canvas wanted;
-    const auto steps = static_cast<size_t>(config.steps);
-    Views views(pictures, steps);
+    const auto steps = static_cast<size_t>(config.steps),
+               per_step = static_cast<size_t>(comparison.windows_per_step);
+    Windows windows(pictures, steps * per_step, static_cast<size_t>(comparison.cuts_per_view));
+    Targets targets(target, target_count);
+    Comparison compared(config.loss, comparison);
     CutFrame frame(config);
-    for (size_t i = 0; i < steps && !progress.cancel; ++i) {
-        const CutView& view = views[i];
-        const Camera larger = enlarged(view.camera, view.samples);
-        const Draw<float> whole{.model = target.model,
-                                .first = 0,
-                                .count = target_count,
-                                .view = view_of_world<float>(larger),
-                                .appearance = {target.filter_px2, target.antialiased, false}};
-        render<float>({whole}, larger.intrinsics<float>(), wanted.start(larger), false, of_target);
-
-        const std::vector<uint32_t> index = gaussians_of(pictures.table, view);
-        const GaussianRows<float>& shown = frame.start(index.size(), rows.sh_degree);
-        parallel_for(index.size(), kGaussiansAtOnce,
-                     [&](size_t g) { copy_gaussian(rows, index[g], shown, g); });
-        compare(config, view.samples, frame.draw(view.camera), wanted);
-        const GaussianRows<const float> gradient = frame.backward();
-
+    GradientSum sum(rows.size, rows.sh_degree);
+    for (size_t i = 0; i < steps; ++i) {
+        for (size_t number = i * per_step; number < (i + 1) * per_step; ++number) {
+            if (progress.cancel) return;
+            const CutWindow& window = windows[number];
+            const Canvas& wanted = targets.picture_of(window);
+            const std::vector<uint32_t> index = gaussians_of(pictures.table, window.clusters);
+            const GaussianRows<float>& shown = frame.start(index.size(), rows.sh_degree);
+            parallel_for(index.size(), kGaussiansAtOnce,
+                         [&](size_t g) { copy_gaussian(rows, index[g], shown, g); });
+            compared.compare(frame.draw(window.camera), wanted);
+            sum.add(index, frame.backward());
+            ++progress.groups_done;
+        }
         const FitStep step = fit_step(config, static_cast<int>(i));
-        parallel_for(index.size(), kGaussiansAtOnce, [&](size_t g) {
-            if (index[g] < target_count) return;
-            move_gaussian(rows, index[g], gradient, g, levels.radius[index[g]], step, config.beta2,
-                          adam_moments);
+        sum.move_shown([&](size_t g, const GaussianRows<const float>& gradient) {
+            if (g < target_count) return;
+            move_gaussian(rows, g, gradient, g, levels.radius[g], step, config.beta2, adam_moments);
         });
-        ++progress.groups_done;
     }
 }
 

@@ -1,139 +1,261 @@
-// One step follows another on the caller's stream. Threads with streams of their own make what the
-// steps compare with, some steps ahead.
+// One step follows another on the caller's stream. All windows of a step are one frame, and go back
+// together. Other threads with streams of their own plan windows, cut them, and draw the pictures
+// of the asset that they are compared with, some steps ahead.
 
 #include "levels/refine_cuts_cuda.h"
+
+#include <algorithm>
+#include <memory>
 
 #include "base/ahead.h"
 #include "base/device_guard.h"
 #include "base/event.h"
 #include "base/launch.cuh"
 #include "base/own_stream.h"
-#include "draw/render_backward_cuda.h"
+#include "draw/scene_frame_cuda.h"
+#include "levels/cut_windows_cuda.h"
 #include "levels/refine_kernels.cuh"
+#include "project/project_backward.h"
+#include "rasterize/rasterize.h"
 
 namespace v3dg {
 namespace cuda {
 
 namespace {
 
-// The numbers of the target's pictures that are drawn at once, and that are kept ahead of their
-// steps.
-constexpr unsigned kThreadsAhead = 3, kPicturesAhead = 2 * kThreadsAhead;
+// Steps that are planned ahead by each thread.
+constexpr unsigned kStepsAhead = 3;
+// A slot's target is overwritten while the steps before it are drawn.
+static_assert(kViewSlots >= (kStepsAhead + 1) * kMostWindows, "no step that is drawn reads it");
+// Threads that plan windows without targets. Targets are drawn by one, whose stream their memory
+// belongs to.
+constexpr unsigned kPlanners = 3;
 
-// The memory of one picture: colour and alpha.
-class Canvas {
-  public:
-    const PicturePlanes& start(const Camera& camera, cudaStream_t stream) {
-        float* color = values_.reserve(4 * num_pixels(camera), stream);
-        planes_ = {color, color + 3 * num_pixels(camera), nullptr};
-        return planes_;
-    }
-    const PicturePlanes& planes() const { return planes_; }
+constexpr size_t kMostPixels = kWidestWindowPx * kWidestWindowPx;  // of a window
 
-  private:
-    DeviceBuffer<float> values_;
-    PicturePlanes planes_{};
-};
-
-ModelPicture picture_of(const GaussianRows<const float>& rows, float filter_px2, bool antialiased,
-                        const Camera& camera, const PicturePlanes& planes) {
+FrameImage image_of(const Camera& camera, const PicturePlanes& planes) {
     const float black[3] = {};
-    return {.rows = rows,
-            .view = view_of_world<float>(camera),
-            .filter_px2 = filter_px2,
-            .antialiased = antialiased,
-            .image = frame_image(camera.intrinsics<float>(), static_cast<int>(camera.width),
-                                 static_cast<int>(camera.height), black, planes)};
+    return frame_image(camera.intrinsics<float>(), static_cast<int>(camera.width),
+                       static_cast<int>(camera.height), black, planes);
 }
 
-// Writes the slopes of the loss by the values of a picture.
-class Comparison {
+// Adds a window to the tables.
+void add_window(const ClusterTable& table, const Camera& camera, const SelectRule& rule,
+                const PicturePlanes& planes, WindowTables& windows) {
+    const uint32_t w = windows.count++;
+    windows.view[w] = view_of_window(table, camera);
+    windows.rule[w] = rule;
+    windows.placement[w] = {view_of_world<float>(camera), 0, w};
+    windows.image[w] = image_of(camera, planes);
+    if (w > 0) {
+        const FrameImage& before = windows.image[w - 1];
+        windows.image[w].first_tile =
+            before.first_tile + static_cast<uint32_t>(before.tile_columns * before.tile_rows);
+    }
+}
+
+FrameBatch batch_of(const DeviceBuffer<GaussianRows<const float>>& model,
+                    const DeviceWindows& windows) {
+    return {.models = model.data(),
+            .placements = windows.tables()->placement,
+            .images = windows.tables()->image,
+            .num_images = windows.count(),
+            .num_tiles = windows.num_tiles(),
+            .has_depth = false};
+}
+
+// The gaussians of a step's windows, their pictures, and the backward pass.
+class StepFrame {
   public:
-    const PicturePlanes& slopes(const LossWeights& loss, const Camera& camera,
-                                const PicturePlanes& picture, const PicturePlanes& target,
-                                cudaStream_t stream) {
-        const size_t count = num_pixels(camera);
-        const unsigned num_blocks = blocks_for(count, kThreads);
-        slope_.start(camera, stream);
-        double* losses = losses_.reserve(num_blocks, stream);
-        float* weight = weight_.reserve(1, stream);
-        launch("difference_kernel", difference_kernel, num_blocks, kThreads, 0, stream, picture,
-               target, slope_.planes(), count, loss, losses);
-        launch("weigh_kernel", weigh_kernel, 1, 32, 0, stream, losses, num_blocks,
-               static_cast<double>(count), weight);
-        launch("slope_kernel", slope_kernel, num_blocks, kThreads, 0, stream, slope_.planes(),
-               count, loss, weight);
-        return slope_.planes();
-    }
+    StepFrame(const FitConfig& config, const GaussianRows<const float>& rows,
+              const DeviceTable& table, cudaStream_t stream)
+        : appearance_{config.filter_px2, config.antialiased, false},
+          rows_(rows),
+          table_(table),
+          stream_(stream),
+          model_(Span<const GaussianRows<const float>>{&rows, 1}, stream) {}
 
-  private:
-    Canvas slope_;
-    DeviceBuffer<double> losses_;
-    DeviceBuffer<float> weight_;
-};
-
-// The gaussians of one view, their picture, and its backward pass.
-class CutFrame {
-  public:
-    CutFrame(const FitConfig& config, cudaStream_t stream)
-        : config_(config), stream_(stream), background_(3, stream) {}
-
-    // Returns the rows of `count` gaussians, which the caller writes before they are drawn.
-    const GaussianRows<float>& start(size_t count, int sh_degree) {
-        rows_ = rows_in(values_.reserve(num_values(sh_degree) * count, stream_), count, sh_degree);
-        return rows_;
+    // Returns when it is sure that the pictures will be drawn.
+    void draw(const DeviceWindows& windows) {
+        const std::unique_ptr<Drawing> drawing = frame_.draw(
+            batch_of(model_, windows),
+            [&](const ItemList& items, cudaStream_t on) {
+                windows.write_items(table_, appearance_, items, on);
+            },
+            stream_);
+        const FrameCounters& counters = drawing->settle();
+        num_slots_ = counters.slots;
+        num_items_ = static_cast<unsigned>(counters.items);
     }
-    const PicturePlanes& draw(const Camera& camera) {
-        const PicturePlanes& planes = picture_.start(camera, stream_);
-        frame_.draw(picture_of(rows_, config_.filter_px2, config_.antialiased, camera, planes),
-                    stream_);
-        return planes;
-    }
-    GaussianRows<const float> backward(const PicturePlanes& slopes) {
+    // Returns the gradients of the gaussians of items, kItemSize an item, whose slopes by pixels
+    // the windows have. Those of items that begin before row `first_wanted` are undefined.
+    GaussianRows<float> backward(const DeviceWindows& windows, uint64_t first_wanted) {
+        const size_t count = size_t(kItemSize) * num_items_;
         const GaussianRows<float> gradient =
-            rows_in(gradients_.reserve(num_values(rows_.sh_degree) * rows_.size, stream_),
-                    rows_.size, rows_.sh_degree);
-        frame_.backward({slopes.color, slopes.alpha, nullptr}, gradient, {}, background_.data(),
-                        stream_);
+            rows_in(gradients_.reserve(num_values(rows_.sh_degree) * count, stream_), count,
+                    rows_.sh_degree);
+        const FrameTape tape = frame_.tape();
+        const GradientSlots slots{tape.first_slot, slots_.reserve(num_slots_, stream_), nullptr,
+                                  is_touched_.reserve(num_slots_, stream_)};
+        if (num_slots_ > 0)
+            check(cudaMemsetAsync(slots.is_touched, 0, num_slots_, stream_), "cudaMemsetAsync");
+        const WindowTables* tables = windows.tables();
+        rasterize_backward({.image = {},
+                            .records = tape.lists.records,
+                            .tile_first = tape.lists.tile_first,
+                            .order = tape.raster.order,
+                            .blended = tape.raster.blended,
+                            .plans = tape.lists.plans,
+                            .d_picture = {}},
+                           {.images = tables->image,
+                            .d_pictures = tables->slope,
+                            .num_tiles = windows.num_tiles()},
+                           slots, stream_);
+        project_backward({.item_records = tape.item_records,
+                          .records = tape.lists.records,
+                          .source = tape.source,
+                          .rows = rows_,
+                          .view = {},
+                          .camera = {},
+                          .filter_px2 = appearance_.filter_px2,
+                          .antialiased = appearance_.antialiased},
+                         {.items = tape.items,
+                          .num_items = num_items_,
+                          .placements = tables->placement,
+                          .images = tables->image,
+                          .first_wanted = first_wanted},
+                         slots, gradient, stream_);
         return gradient;
     }
+    ShownCluster shown(const DeviceWindows& windows) const {
+        return {.item_of_cluster = windows.item_of_cluster(),
+                .num_items = windows.num_items(),
+                .num_clusters = table_.table().num_clusters(),
+                .num_windows = windows.count()};
+    }
 
   private:
-    const FitConfig& config_;
+    const Appearance<float> appearance_;
+    const GaussianRows<const float> rows_;
+    const DeviceTable& table_;
     const cudaStream_t stream_;
-    DeviceBuffer<float> values_, gradients_, background_;
-    GaussianRows<float> rows_{};
-    DifferentiableFrame frame_;
-    Canvas picture_;
+    DeviceBuffer<GaussianRows<const float>> model_;
+    Frame frame_{Frame::Keeps::tape};
+    unsigned long long num_slots_ = 0;
+    unsigned num_items_ = 0;
+    DeviceBuffer<float> gradients_;
+    DeviceBuffer<RecordGradient<float>> slots_;
+    DeviceBuffer<uint8_t> is_touched_;
 };
 
-// The input of one step: the view, its gaussians, and its target picture.
-struct Wanted {
-    Camera camera;
-    size_t num_gaussians;
-    DeviceBuffer<uint32_t> gaussians;
-    Canvas picture;
+// The pictures of all windows of a step, and their slopes.
+class Canvases {
+  public:
+    Canvases(unsigned num_windows, cudaStream_t stream)
+        : pictures_(4 * kMostPixels * num_windows, stream),
+          slopes_(4 * kMostPixels * num_windows, stream) {}
+
+    PicturePlanes picture(size_t window) const {
+        return planes_of_window(pictures_.data(), kMostPixels, window);
+    }
+    PictureGradient<float> slope(size_t window) const {
+        const PicturePlanes planes = planes_of_window(slopes_.data(), kMostPixels, window);
+        return {planes.color, planes.alpha, nullptr};
+    }
+    float* slopes() const { return slopes_.data(); }
+
+  private:
+    DeviceBuffer<float> pictures_, slopes_;
+};
+
+// The input of one step.
+struct PlannedStep {
+    DeviceWindows windows;
+    unsigned blocks_per_window = 0;  // of kThreads pixels
     Event made, used;
 };
 
-// Makes the input of steps ahead of them: a step waits for the host as often as it draws, and
-// leaves most of the device idle.
-class WantedAhead {
+// Draws pictures of the asset.
+class TargetPainter {
   public:
-    WantedAhead(const FitConfig& config, const DeviceFitTarget& target, const CutPictures& pictures,
-                cudaStream_t stream)
-        : config_(config),
+    TargetPainter(const DeviceFitTarget& target, const DeviceTable& table, cudaStream_t stream)
+        : target_(target),
+          table_(table),
+          stream_(stream),
+          model_(Span<const GaussianRows<const float>>{&target.rows, 1}, stream) {}
+
+    // Draws the asset in a window; `windows` is scratch. The pixels are in `picture`, whose memory
+    // belongs to the stream.
+    ReadPlanes draw(const ClusterTable& table, const AssetView& view, WindowTables& windows,
+                    DeviceBuffer<float>& picture) {
+        const Camera camera = enlarged(view.window, view.samples);
+        const PicturePlanes larger = planes_in(larger_, num_pixels(camera));
+        windows.count = 0;
+        add_window(table, camera, SelectRule{}, larger, windows);
+        leaves_.cut(table_, windows, Shown::leaves, stream_);
+        frame_
+            .draw(
+                batch_of(model_, leaves_),
+                [&](const ItemList& items, cudaStream_t on) {
+                    leaves_.write_items(table_, {target_.filter_px2, target_.antialiased, false},
+                                        items, on);
+                },
+                stream_)
+            ->finish();
+        const size_t count = num_pixels(view.window);
+        const PicturePlanes small = planes_in(picture, count);
+        launch("average_kernel", average_kernel, blocks_for(count, kThreads), kThreads, 0, stream_,
+               larger, small, static_cast<unsigned>(view.window.width),
+               static_cast<unsigned>(view.window.height), view.samples);
+        return {small.color, small.alpha};
+    }
+
+  private:
+    PicturePlanes planes_in(DeviceBuffer<float>& memory, size_t count) {
+        float* color = memory.reserve(4 * count, stream_);
+        return {color, color + 3 * count, nullptr};
+    }
+
+    const DeviceFitTarget& target_;
+    const DeviceTable& table_;
+    const cudaStream_t stream_;
+    DeviceBuffer<GaussianRows<const float>> model_;
+    DeviceBuffer<float> larger_;
+    DeviceWindows leaves_;
+    Frame frame_;
+};
+
+// Plans the windows of steps ahead of them: a step waits for the host once, and choosing
+// tolerances takes the host as long as a step takes the device.
+class StepsAhead {
+  public:
+    // Without a target, each window has a view of its own and nothing to compare it with.
+    StepsAhead(const CutPictures& pictures, const DeviceTable& table, const Canvases& canvases,
+               uint64_t num_windows, unsigned windows_per_step, unsigned cuts_per_view,
+               const DeviceFitTarget* target, cudaStream_t stream)
+        : pictures_(pictures),
+          table_(table),
+          canvases_(canvases),
+          num_windows_(num_windows),
+          windows_per_step_(windows_per_step),
+          cuts_per_view_(cuts_per_view),
           target_(target),
-          pictures_(pictures),
           stream_(stream),
           device_(current_device()),
-          ahead_(static_cast<uint64_t>(config.steps), kThreadsAhead, kPicturesAhead,
+          num_threads_(target == nullptr ? kPlanners : 1),
+          workers_(num_threads_),
+          views_(kViewSlots),
+          steps_(kStepsAhead * num_threads_),
+          ahead_(num_steps(), num_threads_, kStepsAhead * num_threads_,
                  [this](uint64_t number) { make(number); }) {}
     // Steps read members until they are done.
-    ~WantedAhead() { cudaStreamSynchronize(stream_); }
+    ~StepsAhead() { cudaStreamSynchronize(stream_); }
 
-    const Wanted& wait_for_next() {
-        next_ = &wanted_[ahead_.wait_for_next()];
+    uint64_t num_steps() const {
+        return (num_windows_ + windows_per_step_ - 1) / windows_per_step_;
+    }
+    const PlannedStep& wait_for_next() {
+        next_ = &steps_[ahead_.wait_for_next()];
         next_->made.hold_back(stream_);
         return *next_;
     }
@@ -145,73 +267,163 @@ class WantedAhead {
   private:
     struct Worker {
         OwnStream stream;
-        DifferentiableFrame frame;
-        Canvas larger;
+        std::unique_ptr<TargetPainter> painter;
+        WindowTables windows{}, scratch{};
     };
+    struct View {
+        AssetView view;
+        std::vector<SelectRule> cuts;
+        ReadPlanes target{};
+        DeviceBuffer<float> picture;
+    };
+
+    PlannedWindow planned(uint64_t number) const {
+        if (target_ != nullptr) return planned_window(number, cuts_per_view_);
+        return {.view = number, .slot = number % kViewSlots, .cut = 0, .is_new = true};
+    }
 
     void make(uint64_t number) {
         const DeviceGuard guard(device_);
-        Worker& worker = workers_[number % kThreadsAhead];
-        Wanted& wanted = wanted_[number % kPicturesAhead];
+        Worker& worker = workers_[number % num_threads_];
+        PlannedStep& step = steps_[number % steps_.size()];
         const cudaStream_t stream = worker.stream.get();
-        wanted.used.hold_back(stream);
-        const CutView view = cut_view(pictures_, number);
-        const std::vector<uint32_t> gaussians = gaussians_of(pictures_.table, view);
-        wanted.camera = view.camera;
-        wanted.num_gaussians = gaussians.size();
-        wanted.gaussians.copy_from({gaussians.data(), gaussians.size()}, stream);
-        const Camera camera = enlarged(view.camera, view.samples);
-        const PicturePlanes& larger = worker.larger.start(camera, stream);
-        worker.frame.draw(
-            picture_of(target_.rows, target_.filter_px2, target_.antialiased, camera, larger),
-            stream);
-        launch("average_kernel", average_kernel, blocks_for(num_pixels(view.camera), kThreads),
-               kThreads, 0, stream, larger, wanted.picture.start(view.camera, stream),
-               static_cast<unsigned>(view.camera.width), static_cast<unsigned>(view.camera.height),
-               view.samples);
-        wanted.made.record(stream);
+        step.used.hold_back(stream);
+        worker.windows.count = 0;
+        step.blocks_per_window = 0;
+        const uint64_t first = number * windows_per_step_,
+                       end = std::min(first + windows_per_step_, num_windows_);
+        for (uint64_t n = first; n < end; ++n) {
+            const PlannedWindow plan = planned(n);
+            View& view = views_[plan.slot];
+            if (plan.is_new) renew(plan, worker, view);
+            const size_t w = worker.windows.count;
+            worker.windows.target[w] = view.target;
+            worker.windows.slope[w] = canvases_.slope(w);
+            add_window(pictures_.table, view.view.window, view.cuts[plan.cut], canvases_.picture(w),
+                       worker.windows);
+            step.blocks_per_window = std::max(step.blocks_per_window,
+                                              blocks_for(num_pixels(view.view.window), kThreads));
+        }
+        step.windows.cut(table_, worker.windows, Shown::cuts, stream);
+        step.made.record(stream);
     }
 
-    const FitConfig& config_;
-    const DeviceFitTarget& target_;
+    void renew(const PlannedWindow& plan, Worker& worker, View& view) {
+        view.view = asset_view(pictures_, plan.view);
+        view.cuts = cuts_of_view(pictures_, view.view, plan.view, cuts_per_view_);
+        if (target_ == nullptr) return;
+        if (worker.painter == nullptr)
+            worker.painter = std::make_unique<TargetPainter>(*target_, table_, worker.stream.get());
+        view.target =
+            worker.painter->draw(pictures_.table, view.view, worker.scratch, view.picture);
+    }
+
     const CutPictures& pictures_;
+    const DeviceTable& table_;
+    const Canvases& canvases_;
+    const uint64_t num_windows_;
+    const unsigned windows_per_step_, cuts_per_view_;
+    const DeviceFitTarget* const target_;
     const cudaStream_t stream_;
     const int device_;
-    Wanted* next_ = nullptr;
-    Worker workers_[kThreadsAhead];
-    Wanted wanted_[kPicturesAhead];
+    const unsigned num_threads_;
+    PlannedStep* next_ = nullptr;
+    std::vector<Worker> workers_;
+    std::vector<View> views_;
+    std::vector<PlannedStep> steps_;
     Ahead ahead_;  // the last member, because its threads use all others
 };
 
+// Writes the slopes of the loss by the pixels of a step's windows.
+class Comparison {
+  public:
+    Comparison(const LossWeights& loss, const CutComparison& comparison, const Canvases& canvases,
+               cudaStream_t stream)
+        : loss_(loss),
+          comparison_(comparison),
+          canvases_(canvases),
+          stream_(stream),
+          num_windows_(static_cast<unsigned>(comparison.windows_per_step)),
+          slopes_(kMostPixels * num_windows_, stream),
+          losses_(blocks_for(kMostPixels, kThreads) * num_windows_, stream),
+          weights_(num_windows_, stream) {}
+
+    void compare(const PlannedStep& step) {
+        if (comparison_.is_blurred)
+            compare<true>(step);
+        else
+            compare<false>(step);
+    }
+
+  private:
+    template <bool kIsBlurred>
+    void compare(const PlannedStep& step) {
+        const WindowTables* windows = step.windows.tables();
+        const dim3 grid(step.blocks_per_window, step.windows.count());
+        launch("compare_kernel", compare_kernel<kIsBlurred>, grid, kThreads, 0, stream_, windows,
+               loss_, comparison_.power, kMostPixels, slopes_.data(), losses_.data());
+        launch("weigh_kernel", weigh_kernel, step.windows.count(), kThreads, 0, stream_, windows,
+               losses_.data(), step.blocks_per_window, weights_.data());
+        launch("slope_kernel", slope_kernel<kIsBlurred>, grid, kThreads, 0, stream_, windows,
+               slopes_.data(), kMostPixels, weights_.data(), canvases_.slopes());
+    }
+
+    const LossWeights loss_;
+    const CutComparison comparison_;
+    const Canvases& canvases_;
+    const cudaStream_t stream_;
+    const unsigned num_windows_;
+    DeviceBuffer<float4> slopes_;
+    DeviceBuffer<double> losses_;
+    DeviceBuffer<float> weights_;
+};
+
+// Returns the grid of kernels that handle the gaussians of clusters from `first` on.
+dim3 grid_of_clusters(const ClusterTable& table, size_t first) {
+    int64_t most = 1;
+    for (size_t c = first; c < table.num_clusters(); ++c)
+        most = std::max(most, table.num_gaussians(c));
+    return dim3(static_cast<unsigned>(table.num_clusters() - first),
+                blocks_for(static_cast<size_t>(most), kItemSize));
+}
+
 }  // namespace
 
-void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const CutRows& levels,
-                 const CutPictures& pictures, FitProgress& progress, Stream stream) {
+void refine_cuts(const FitConfig& config, const CutComparison& comparison,
+                 const DeviceFitTarget& target, const CutRows& levels, const CutPictures& pictures,
+                 FitProgress& progress, Stream stream) {
     const GaussianRows<float>& rows = levels.rows;
     const size_t num = num_values(rows.sh_degree), num_moments = 2 * num * rows.size;
     const DeviceBuffer<float> moments(num_moments, stream), radius(levels.radius, stream);
     if (num_moments > 0)
         check(cudaMemsetAsync(moments.data(), 0, num_moments * sizeof(float), stream),
               "cudaMemsetAsync");
+    const auto windows_per_step = static_cast<unsigned>(comparison.windows_per_step);
+    const DeviceTable table(pictures.table, stream);
+    const Canvases canvases(windows_per_step, stream);
+    StepFrame frame(config, rows, table, stream);
+    Comparison compared(config.loss, comparison, canvases, stream);
+    const Span<const int64_t>& offset = pictures.table.offset;
+    const auto first_moving = static_cast<size_t>(
+        std::lower_bound(offset.begin(), offset.end(), static_cast<int64_t>(target.rows.size)) -
+        offset.begin());
+    const dim3 grid = grid_of_clusters(pictures.table, first_moving);
     check(cudaStreamSynchronize(stream),
           "refine_cuts");  // All streams see the memory that pictures are made of from here on.
-    CutFrame frame(config, stream);
-    Comparison comparison;
-    WantedAhead ahead(config, target, pictures, stream);
+    StepsAhead ahead(pictures, table, canvases, uint64_t(config.steps) * windows_per_step,
+                     windows_per_step, static_cast<unsigned>(comparison.cuts_per_view), &target,
+                     stream);
     for (int i = 0; i < config.steps && !progress.cancel; ++i) {
-        const Wanted& wanted = ahead.wait_for_next();
-        const Span<const uint32_t> index{wanted.gaussians.data(), wanted.num_gaussians};
-        const unsigned num_blocks = blocks_for(index.size, kGaussiansABlock);
-        launch("gather_kernel", gather_kernel, num_blocks, kGaussiansABlock, 0, stream, rows, index,
-               frame.start(index.size, rows.sh_degree));
-        const PicturePlanes& drawn = frame.draw(wanted.camera);
-        const GaussianRows<const float> gradient = frame.backward(
-            comparison.slopes(config.loss, wanted.camera, drawn, wanted.picture.planes(), stream));
-        launch("move_kernel", move_kernel, num_blocks, kGaussiansABlock, 0, stream, rows, index,
-               gradient, radius.data(), target.rows.size, fit_step(config, i), config.beta2,
+        const PlannedStep& step = ahead.wait_for_next();
+        frame.draw(step.windows);
+        compared.compare(step);
+        const GaussianRows<float> gradient = frame.backward(step.windows, target.rows.size);
+        launch("move_kernel", move_kernel, grid, kItemSize, 0, stream, frame.shown(step.windows),
+               table.table().offset, first_moving, rows, gradient, radius.data(),
+               fit_step(config, i), config.beta2,
                Moments{moments.data(), moments.data() + num * rows.size});
         ahead.next_is_used();
-        ++progress.groups_done;
+        progress.groups_done += windows_per_step;
     }
     check(cudaStreamSynchronize(stream), "refine_cuts");
 }
@@ -219,30 +431,40 @@ void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const C
 void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows,
                 const CutPictures& pictures, const SeenOfGaussians& seen, FitProgress& progress,
                 Stream stream) {
+    constexpr unsigned kWindowsPerStep = 8;
     const DeviceBuffer<double> weights(Span<const double>(seen.weight), stream);
-    CutFrame frame(config, stream);
-    DeviceBuffer<uint32_t> gaussians;
-    Canvas slopes;
-    for (int i = 0; i < config.steps && !progress.cancel; ++i) {
-        const CutView view = cut_view(pictures, static_cast<uint64_t>(i));
-        const std::vector<uint32_t> shown = gaussians_of(pictures.table, view);
-        for (const uint32_t i : shown) ++seen.num_looks[i];
-        gaussians.copy_from({shown.data(), shown.size()}, stream);
-        const Span<const uint32_t> index{gaussians.data(), shown.size()};
-        const unsigned num_blocks = blocks_for(index.size, kGaussiansABlock);
-        launch("gather_in_grey_kernel", gather_in_grey_kernel, num_blocks, kGaussiansABlock, 0,
-               stream, rows, index, frame.start(index.size, 0));
-        frame.draw(view.camera);
-        const PicturePlanes& slope = slopes.start(view.camera, stream);
-        const size_t count = num_pixels(view.camera);
-        launch("sum_slope_kernel", sum_slope_kernel, blocks_for(count, kThreads), kThreads, 0,
-               stream, slope, count);
-        launch("weight_kernel", weight_kernel, num_blocks, kGaussiansABlock, 0, stream, index,
-               frame.backward(slope), count, weights.data());
-        ++progress.groups_done;
+    const DeviceBuffer<int32_t> num_looks(Span<const int32_t>(seen.num_looks), stream);
+    const DeviceBuffer<float> grey(3 * rows.size, stream);
+    if (rows.size > 0)
+        check(cudaMemsetAsync(grey.data(), 0, grey.bytes(), stream), "cudaMemsetAsync");
+    // The gradient by a colour says how much is seen of a gaussian, whatever its own colour is.
+    GaussianRows<const float> rows_in_grey = rows;
+    rows_in_grey.sh = grey.data();
+    rows_in_grey.sh_degree = 0;
+    const DeviceTable table(pictures.table, stream);
+    const Canvases canvases(kWindowsPerStep, stream);
+    StepFrame frame(config, rows_in_grey, table, stream);
+    const dim3 grid = grid_of_clusters(pictures.table, 0);
+    check(cudaStreamSynchronize(stream), "weigh_cuts");
+    StepsAhead ahead(pictures, table, canvases, static_cast<uint64_t>(config.steps),
+                     kWindowsPerStep, 1, nullptr, stream);
+    for (uint64_t i = 0; i < ahead.num_steps() && !progress.cancel; ++i) {
+        const PlannedStep& step = ahead.wait_for_next();
+        frame.draw(step.windows);
+        launch("sum_slope_kernel", sum_slope_kernel,
+               dim3(step.blocks_per_window, step.windows.count()), kThreads, 0, stream,
+               step.windows.tables(), kMostPixels, canvases.slopes());
+        launch("weight_kernel", weight_kernel, grid, kItemSize, 0, stream,
+               frame.shown(step.windows), step.windows.tables(), table.table().offset,
+               frame.backward(step.windows, 0), weights.data(), num_looks.data());
+        ahead.next_is_used();
+        progress.groups_done += step.windows.count();
     }
     check(cudaMemcpyAsync(seen.weight.data, weights.data(), seen.weight.size * sizeof(double),
                           cudaMemcpyDeviceToHost, stream),
+          "weigh_cuts");
+    check(cudaMemcpyAsync(seen.num_looks.data, num_looks.data(),
+                          seen.num_looks.size * sizeof(int32_t), cudaMemcpyDeviceToHost, stream),
           "weigh_cuts");
     check(cudaStreamSynchronize(stream), "weigh_cuts");
 }

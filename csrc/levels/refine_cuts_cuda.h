@@ -10,8 +10,9 @@ namespace cuda {
 
 // As v3dg::refine_cuts, with rows on the device and all else on the host. Returns when all is done.
 // Every run gives the same bytes.
-void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const CutRows& levels,
-                 const CutPictures& pictures, FitProgress& progress, Stream stream);
+void refine_cuts(const FitConfig& config, const CutComparison& comparison,
+                 const DeviceFitTarget& target, const CutRows& levels, const CutPictures& pictures,
+                 FitProgress& progress, Stream stream);
 
 // As v3dg::weigh_cuts, with rows on the device and all else on the host. Returns when all is done.
 void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows,

@@ -37,10 +37,61 @@ V3DG_HD inline float box_average(const float* plane, size_t width, size_t num_va
     return sum / static_cast<float>(samples * samples);
 }
 
-// Returns the loss of a pixel from the differences of its colour and alpha.
-V3DG_HD inline float loss_of_pixel(const LossWeights& loss, const float color[3], float alpha) {
-    return loss.l1 / 3 * (::fabsf(color[0]) + ::fabsf(color[1]) + ::fabsf(color[2])) +
-           loss.alpha * ::fabsf(alpha);
+// The values of one pixel: premultiplied colour and alpha.
+struct PixelValues {
+    float value[4];
+};
+
+// The memory of a picture: colour with three channels, and alpha.
+struct ReadPlanes {
+    const float *color, *alpha;
+
+    V3DG_HD PixelValues at(size_t pixel) const {
+        return {{color[3 * pixel], color[3 * pixel + 1], color[3 * pixel + 2], alpha[pixel]}};
+    }
+};
+
+// Returns a pixel after a blur by [1 2 1] / 4 along both axes, with zeros beyond the border, so
+// that the blur is its own transpose; `values_at(x, y)` has the pixels before.
+template <class ValuesAt>
+V3DG_HD inline PixelValues blurred(size_t width, size_t height, size_t x, size_t y,
+                                   const ValuesAt& values_at) {
+    PixelValues sum{};
+    for (size_t row = y > 0 ? y - 1 : y; row <= y + 1 && row < height; ++row)
+        for (size_t column = x > 0 ? x - 1 : x; column <= x + 1 && column < width; ++column) {
+            const float weight = (row == y ? 0.5f : 0.25f) * (column == x ? 0.5f : 0.25f);
+            const PixelValues values = values_at(column, row);
+            for (int k = 0; k < 4; ++k) sum.value[k] += weight * values.value[k];
+        }
+    return sum;
+}
+
+// Added to a difference before it is taken to a power below 1, so that slopes stay finite: one step
+// of 8 bits.
+constexpr float kLeastDifference = 0.004f;
+
+// Returns the loss of a value, from its difference.
+V3DG_HD inline float loss_of_value(float difference, float power) {
+    const float size = ::fabsf(difference);
+    return power == 1 ? size : ::powf(size + kLeastDifference, power);
+}
+// Returns its slope.
+V3DG_HD inline float slope_of_value(float difference, float power) {
+    const float slope = l1_vjp(difference, 1.0f);
+    if (power == 1) return slope;
+    return slope * power * ::powf(::fabsf(difference) + kLeastDifference, power - 1);
+}
+
+// Puts the slopes of the loss in place of the differences of a pixel, as if the picture had the
+// weight 1. Returns the pixel's loss.
+V3DG_HD inline float put_slopes(const LossWeights& loss, float power, PixelValues& pixel) {
+    float sum = 0;
+    for (int k = 0; k < 4; ++k) {
+        const float weight = k < 3 ? loss.l1 / 3 : loss.alpha;
+        sum += weight * loss_of_value(pixel.value[k], power);
+        pixel.value[k] = weight * slope_of_value(pixel.value[k], power);
+    }
+    return sum;
 }
 
 // Returns the weight of a picture, which is by its relative loss, not by its absolute one.
@@ -49,14 +100,6 @@ V3DG_HD inline float loss_of_pixel(const LossWeights& loss, const float color[3]
 constexpr double kLeastLoss = 1e-4;
 V3DG_HD inline float weight_of_picture(double loss_sum, double num_pixels) {
     return static_cast<float>(1 / (loss_sum + kLeastLoss * num_pixels));
-}
-
-// Puts the slopes of the loss by a pixel in place of its differences; `weight` is that of the
-// picture.
-V3DG_HD inline void put_slopes(const LossWeights& loss, float weight, float color[3],
-                               float& alpha) {
-    for (int k = 0; k < 3; ++k) color[k] = l1_vjp(color[k], loss.l1 / 3 * weight);
-    alpha = l1_vjp(alpha, loss.alpha * weight);
 }
 
 // Puts the slopes of the sum of a picture's first channel in place of a pixel.
@@ -69,6 +112,17 @@ V3DG_HD inline void put_sum_slopes(float color[3], float& alpha) {
 struct Moments {
     float *m, *v;
 };
+
+// Adds gradients of a gaussian, row `from`, to those in row `to`.
+V3DG_HD inline void add_gradient(const GaussianRows<const float>& source, size_t from,
+                                 const GaussianRows<float>& sum, size_t to) {
+    for (size_t k = 0; k < 3; ++k) sum.means[3 * to + k] += source.means[3 * from + k];
+    for (size_t k = 0; k < 4; ++k) sum.quats[4 * to + k] += source.quats[4 * from + k];
+    for (size_t k = 0; k < 3; ++k) sum.scales[3 * to + k] += source.scales[3 * from + k];
+    sum.opacities[to] += source.opacities[from];
+    const auto num_sh = static_cast<size_t>(source.num_sh());
+    for (size_t k = 0; k < num_sh; ++k) sum.sh[num_sh * to + k] += source.sh[num_sh * from + k];
+}
 
 // Moves gaussian i by a step; its gradient is row g of `gradient`. The position moves in fractions
 // of `radius`, scales by their logarithm and opacity by its logit, both within the range of a fit.
@@ -147,10 +201,11 @@ V3DG_HD inline GaussianRows<float> rows_in(float* memory, size_t count, int sh_d
             .sh_degree = sh_degree};
 }
 
-// Returns the gaussians of a view's clusters.
-inline std::vector<uint32_t> gaussians_of(const ClusterTable& table, const CutView& view) {
+// Returns the gaussians of clusters.
+inline std::vector<uint32_t> gaussians_of(const ClusterTable& table,
+                                          const std::vector<int32_t>& clusters) {
     std::vector<uint32_t> gaussians;
-    for (const int32_t c : view.clusters)
+    for (const int32_t c : clusters)
         for (int64_t i = table.offset[c]; i < table.offset[c + 1]; ++i)
             gaussians.push_back(static_cast<uint32_t>(i));
     return gaussians;

@@ -1,10 +1,11 @@
 #pragma once
 
-// The kernels of refine_cuts and weigh_cuts: they handle the pixels of a picture and the gaussians
-// of a view before and after drawing and its backward pass.
+// The kernels of refine_cuts and weigh_cuts: they handle the pixels of windows and the gaussians of
+// clusters before and after drawing and its backward pass. A row of blocks has a window where
+// pixels are handled; where gaussians are, a block has up to kItemSize of those of a cluster.
 
 #include "base/launch.cuh"
-#include "frame/image.h"
+#include "levels/cut_windows_cuda.h"
 #include "levels/refine_cuts_math.h"
 
 namespace v3dg {
@@ -13,7 +14,6 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kThreads = 256;
-constexpr unsigned kGaussiansABlock = 64;  // few, so that some thousands spread over the device
 
 // Averages a picture that is `samples` times as wide, a thread a pixel.
 __global__ void average_kernel(PicturePlanes larger, PicturePlanes picture, unsigned width,
@@ -26,19 +26,47 @@ __global__ void average_kernel(PicturePlanes larger, PicturePlanes picture, unsi
     picture.alpha[pixel] = box_average(larger.alpha, width, 1, 0, x, y, samples);
 }
 
-// Writes the differences of pixels, a thread each, and the loss of each block.
-__global__ void difference_kernel(PicturePlanes picture, PicturePlanes target,
-                                  PicturePlanes difference, size_t num_pixels, LossWeights loss,
-                                  double* loss_of_block) {
-    const size_t pixel = size_t(blockIdx.x) * kThreads + threadIdx.x;
+// A pixel of a window and its place there.
+struct WindowPixel {
+    const FrameImage& image;
+    size_t width, height, pixel;
+
+    __device__ WindowPixel(const WindowTables& windows, unsigned window)
+        : image(windows.image[window]),
+          width(static_cast<size_t>(image.width)),
+          height(static_cast<size_t>(image.height)),
+          pixel(size_t(blockIdx.x) * kThreads + threadIdx.x) {}
+    __device__ bool is_in_window() const { return pixel < width * height; }
+
+    template <bool kIsBlurred, class ValuesAt>
+    __device__ PixelValues filtered(const ValuesAt& values_at) const {
+        const size_t x = pixel % width, y = pixel / width;
+        if constexpr (kIsBlurred) return blurred(width, height, x, y, values_at);
+        return values_at(x, y);
+    }
+};
+
+// Writes the slopes of pixels as if windows had the weight 1, a thread each, and the loss of each
+// block. `slopes` has room for kMostPixels of each window.
+template <bool kIsBlurred>
+__global__ void __launch_bounds__(kThreads)
+    compare_kernel(const WindowTables* windows, LossWeights loss, float power, size_t most_pixels,
+                   float4* slopes, double* loss_of_block) {
+    const unsigned w = blockIdx.y;
+    const WindowPixel p(*windows, w);
     double pixel_loss = 0;
-    if (pixel < num_pixels) {
-        float* color = difference.color + 3 * pixel;
-        for (size_t k = 0; k < 3; ++k)
-            color[k] = picture.color[3 * pixel + k] - target.color[3 * pixel + k];
-        const float alpha = picture.alpha[pixel] - target.alpha[pixel];
-        difference.alpha[pixel] = alpha;
-        pixel_loss = loss_of_pixel(loss, color, alpha);
+    if (p.is_in_window()) {
+        const ReadPlanes drawn{p.image.planes.color, p.image.planes.alpha};
+        const ReadPlanes& target = windows->target[w];
+        PixelValues values = p.filtered<kIsBlurred>([&](size_t x, size_t y) {
+            PixelValues difference = drawn.at(y * p.width + x);
+            const PixelValues wanted = target.at(y * p.width + x);
+            for (int k = 0; k < 4; ++k) difference.value[k] -= wanted.value[k];
+            return difference;
+        });
+        pixel_loss = put_slopes(loss, power, values);
+        slopes[w * most_pixels + p.pixel] =
+            make_float4(values.value[0], values.value[1], values.value[2], values.value[3]);
     }
     __shared__ double of_warp[kThreads / 32];
     pixel_loss = warp_sum(pixel_loss);
@@ -47,55 +75,109 @@ __global__ void difference_kernel(PicturePlanes picture, PicturePlanes target,
     if (threadIdx.x > 0) return;
     double sum = 0;
     for (const double warp_loss : of_warp) sum += warp_loss;
-    loss_of_block[blockIdx.x] = sum;
+    loss_of_block[size_t(w) * gridDim.x + blockIdx.x] = sum;
 }
 
-// Computes the weight of the picture from the losses of its blocks; called by one warp.
-__global__ void weigh_kernel(const double* loss_of_block, unsigned num_blocks, double num_pixels,
-                             float* weight) {
+// Computes the weights of windows from the losses of their blocks, a block each.
+__global__ void __launch_bounds__(kThreads)
+    weigh_kernel(const WindowTables* windows, const double* loss_of_block, unsigned num_blocks,
+                 float* weight) {
+    const FrameImage& image = windows->image[blockIdx.x];
+    __shared__ double of_warp[kThreads / 32];
     double sum = 0;
-    for (unsigned i = threadIdx.x; i < num_blocks; i += 32) sum += loss_of_block[i];
+    for (unsigned i = threadIdx.x; i < num_blocks; i += kThreads)
+        sum += loss_of_block[size_t(blockIdx.x) * num_blocks + i];
     sum = warp_sum(sum);
-    if (threadIdx.x == 0) *weight = weight_of_picture(sum, num_pixels);
+    if (threadIdx.x % 32 == 0) of_warp[threadIdx.x / 32] = sum;
+    __syncthreads();
+    if (threadIdx.x > 0) return;
+    sum = 0;
+    for (const double warp_loss : of_warp) sum += warp_loss;
+    weight[blockIdx.x] = weight_of_picture(sum, static_cast<double>(image.width) * image.height);
 }
 
-// Puts the slopes of the loss in place of the differences, a thread a pixel.
-__global__ void slope_kernel(PicturePlanes difference, size_t num_pixels, LossWeights loss,
-                             const float* weight) {
-    const size_t pixel = size_t(blockIdx.x) * kThreads + threadIdx.x;
-    if (pixel >= num_pixels) return;
-    put_slopes(loss, *weight, difference.color + 3 * pixel, difference.alpha[pixel]);
+// Writes the slopes of the loss by the pixels of windows, a thread each.
+template <bool kIsBlurred>
+__global__ void __launch_bounds__(kThreads)
+    slope_kernel(const WindowTables* windows, const float4* slopes, size_t most_pixels,
+                 const float* weight, float* planes) {
+    const unsigned w = blockIdx.y;
+    const WindowPixel p(*windows, w);
+    if (!p.is_in_window()) return;
+    const float4* of_window = slopes + w * most_pixels;
+    const PixelValues slope = p.filtered<kIsBlurred>([&](size_t x, size_t y) -> PixelValues {
+        const float4 at = of_window[y * p.width + x];
+        return {{at.x, at.y, at.z, at.w}};
+    });
+    const PicturePlanes out = planes_of_window(planes, most_pixels, w);
+    for (size_t k = 0; k < 3; ++k) out.color[3 * p.pixel + k] = weight[w] * slope.value[k];
+    out.alpha[p.pixel] = weight[w] * slope.value[3];
 }
 
 // Writes the slopes of the sum of one channel, a thread a pixel.
-__global__ void sum_slope_kernel(PicturePlanes slope, size_t num_pixels) {
-    const size_t pixel = size_t(blockIdx.x) * kThreads + threadIdx.x;
-    if (pixel >= num_pixels) return;
-    put_sum_slopes(slope.color + 3 * pixel, slope.alpha[pixel]);
+__global__ void __launch_bounds__(kThreads)
+    sum_slope_kernel(const WindowTables* windows, size_t most_pixels, float* planes) {
+    const WindowPixel p(*windows, blockIdx.y);
+    if (!p.is_in_window()) return;
+    const PicturePlanes out = planes_of_window(planes, most_pixels, blockIdx.y);
+    put_sum_slopes(out.color + 3 * p.pixel, out.alpha[p.pixel]);
 }
 
-// These handle a gaussian of the view a thread; `index` has its row among all.
-__global__ void gather_kernel(GaussianRows<const float> rows, Span<const uint32_t> index,
-                              GaussianRows<float> shown) {
-    const size_t g = size_t(blockIdx.x) * kGaussiansABlock + threadIdx.x;
-    if (g < index.size) copy_gaussian(rows, index[g], shown, g);
+// The places of a cluster's gaussians in the gradients of a step, window by window.
+struct ShownCluster {
+    const int32_t* item_of_cluster;
+    const uint32_t* num_items;
+    size_t num_clusters;
+    unsigned num_windows;
+
+    // Calls visit(window, row) for each window that shows gaussian `i` of cluster `c`, in the order
+    // of the windows; row `row` of the gradients is its.
+    template <class Visit>
+    __device__ void for_each_window(size_t c, size_t i, const Visit& visit) const {
+        size_t first = 0;
+        for (unsigned w = 0; w < num_windows; ++w) {
+            const int32_t item = item_of_cluster[w * num_clusters + c];
+            if (item >= 0) visit(w, kItemSize * (first + static_cast<size_t>(item)) + i);
+            first += num_items[w];
+        }
+    }
+};
+
+// Moves the gaussians of clusters from `first_cluster` on, by the sum of their gradients, which
+// takes the place of the first one.
+__global__ void __launch_bounds__(kItemSize)
+    move_kernel(ShownCluster shown, Span<const int64_t> offset, size_t first_cluster,
+                GaussianRows<float> rows, GaussianRows<float> gradient, const float* radius,
+                FitStep step, float beta2, Moments moments) {
+    const size_t c = first_cluster + blockIdx.x, i = size_t(blockIdx.y) * kItemSize + threadIdx.x,
+                 row = static_cast<size_t>(offset[c]) + i;
+    if (row >= static_cast<size_t>(offset[c + 1])) return;
+    constexpr size_t kNone = ~size_t(0);
+    size_t sum = kNone;
+    shown.for_each_window(c, i, [&](unsigned, size_t of_window) {
+        if (sum == kNone)
+            sum = of_window;
+        else
+            add_gradient(GaussianRows<const float>(gradient), of_window, gradient, sum);
+    });
+    if (sum == kNone) return;
+    move_gaussian(rows, row, GaussianRows<const float>(gradient), sum, radius[row], step, beta2,
+                  moments);
 }
-__global__ void gather_in_grey_kernel(GaussianRows<const float> rows, Span<const uint32_t> index,
-                                      GaussianRows<float> shown) {
-    const size_t g = size_t(blockIdx.x) * kGaussiansABlock + threadIdx.x;
-    if (g < index.size) copy_in_grey(rows, index[g], shown, g);
-}
-__global__ void weight_kernel(Span<const uint32_t> index, GaussianRows<const float> gradient,
-                              size_t num_pixels, double* weight) {
-    const size_t g = size_t(blockIdx.x) * kGaussiansABlock + threadIdx.x;
-    if (g < index.size) weight[index[g]] += blend_weight(gradient.sh[3 * g], num_pixels);
-}
-__global__ void move_kernel(GaussianRows<float> rows, Span<const uint32_t> index,
-                            GaussianRows<const float> gradient, const float* radius,
-                            size_t num_fixed, FitStep step, float beta2, Moments moments) {
-    const size_t g = size_t(blockIdx.x) * kGaussiansABlock + threadIdx.x;
-    if (g < index.size && index[g] >= num_fixed)
-        move_gaussian(rows, index[g], gradient, g, radius[index[g]], step, beta2, moments);
+
+// Adds what windows show of all gaussians, and counts the windows that have a cluster.
+__global__ void __launch_bounds__(kItemSize)
+    weight_kernel(ShownCluster shown, const WindowTables* windows, Span<const int64_t> offset,
+                  GaussianRows<const float> gradient, double* weight, int32_t* num_looks) {
+    const size_t c = blockIdx.x, i = size_t(blockIdx.y) * kItemSize + threadIdx.x,
+                 row = static_cast<size_t>(offset[c]) + i;
+    if (row >= static_cast<size_t>(offset[c + 1])) return;
+    shown.for_each_window(c, i, [&](unsigned w, size_t of_window) {
+        const FrameImage& image = windows->image[w];
+        const size_t num_pixels = size_t(image.width) * size_t(image.height);
+        weight[row] += blend_weight(gradient.sh[3 * of_window], num_pixels);
+        ++num_looks[row];
+    });
 }
 
 }  // namespace

@@ -1,7 +1,7 @@
 #pragma once
 
 // Backward pass of projection on CUDA: from the gradients of the records of a frame that shows one
-// model to those of the model's gaussians.
+// model, in one picture or in several, to those of the model's gaussians.
 
 #include "base/device.h"
 #include "frame/draw_list.h"
@@ -22,10 +22,19 @@ struct ProjectBackwardInput {
     RecordPlanes records;
     const uint32_t* source;  // each record's gaussian
     GaussianRows<const float> rows;
-    ModelView<float> view;
-    Intrinsics<float> camera;
+    ModelView<float> view;     // of the only picture; unused where there is a batch
+    Intrinsics<float> camera;  // of the only picture
     float filter_px2;
     bool antialiased;
+};
+// The items of a batch of pictures. Item i has any gaussians of the model, at most kItemSize, and
+// its records are consecutive from i * kItemSize on.
+struct ItemBatch {
+    const DrawItem* items;
+    unsigned num_items;
+    const Placement* placements;
+    const FrameImage* images;
+    uint64_t first_wanted;  // items that begin before this gaussian have no gradients
 };
 
 // Writes the gradients of every gaussian, zeros for those without a record. Those of the SH
@@ -33,6 +42,12 @@ struct ProjectBackwardInput {
 // `centers` does.
 void project_backward(const ProjectBackwardInput& in, const GradientSlots& slots,
                       const GaussianRows<float>& out, const CenterGradients<float>& centers,
+                      cudaStream_t stream);
+// Writes the gradients of the gaussians of each wanted item of a batch to the rows of `out` from
+// kItemSize * item on, zeros for those without a record. The view and the camera of `in` are
+// unused.
+void project_backward(const ProjectBackwardInput& in, const ItemBatch& batch,
+                      const GradientSlots& slots, const GaussianRows<float>& out,
                       cudaStream_t stream);
 
 }  // namespace cuda

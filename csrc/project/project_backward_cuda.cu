@@ -110,21 +110,53 @@ struct ShRow {
     static constexpr int kStride = kWords | 1;
 };
 
-template <int kDegree>
+// The gaussians of a block: of the only model, kItemSize after another, or of an item of a batch.
+struct BlockRows {
+    uint64_t first;  // row of the first gaussian
+    int count;
+};
+template <bool kIsBatch>
+__device__ BlockRows rows_of_block(const ProjectBackwardInput& in, const ItemBatch& batch) {
+    if constexpr (kIsBatch) {
+        const DrawItem& item = batch.items[blockIdx.x];
+        return {item.first, static_cast<int>(item.count)};
+    }
+    const uint64_t first = static_cast<uint64_t>(blockIdx.x) * kItemSize;
+    return {first, static_cast<int>(min(static_cast<uint64_t>(kItemSize), in.rows.size - first))};
+}
+// They are asked with a compile-time constant, so that those of a single picture stay in constant
+// memory.
+template <bool kIsBatch>
+__device__ const ModelView<float>& view_of_block(const ProjectBackwardInput& in,
+                                                 const ItemBatch& batch) {
+    if constexpr (kIsBatch) return batch.placements[batch.items[blockIdx.x].placement].view;
+    return in.view;
+}
+template <bool kIsBatch>
+__device__ const Intrinsics<float>& camera_of_block(const ProjectBackwardInput& in,
+                                                    const ItemBatch& batch) {
+    if constexpr (kIsBatch)
+        return batch.images[batch.placements[batch.items[blockIdx.x].placement].image].camera;
+    return in.camera;
+}
+
+template <int kDegree, bool kIsBatch>
 __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
-    project_backward_kernel(ProjectBackwardInput in, GradientSlots slots, GaussianRows<float> out,
-                            float* d_centers) {
+    project_backward_kernel(ProjectBackwardInput in, ItemBatch batch, GradientSlots slots,
+                            GaussianRows<float> out, float* d_centers) {
     using Row = ShRow<kDegree>;
     using Word = typename Row::Word;
     Word* sh_rows = reinterpret_cast<Word*>(shared_memory());
     __shared__ bool is_used[kThreads];  // whether anything flows into the gaussian
-    const uint64_t first = static_cast<uint64_t>(blockIdx.x) * kItemSize;
-    const int num_here =
-        static_cast<int>(min(static_cast<uint64_t>(kItemSize), in.rows.size - first));
+    const BlockRows block = rows_of_block<kIsBatch>(in, batch);
+    const uint64_t first = block.first,
+                   first_record = static_cast<uint64_t>(blockIdx.x) * kItemSize;
+    const int num_here = block.count;
+    if (kIsBatch && first < batch.first_wanted) return;
     is_used[threadIdx.x] = false;
     __syncthreads();
 
-    const uint64_t record = first + threadIdx.x;
+    const uint64_t record = first_record + threadIdx.x;
     const bool is_record = threadIdx.x < in.item_records[blockIdx.x];
     const uint64_t i = is_record ? in.source[record] : 0;  // the gaussian of the record
     Gaussian3d<float> g{};
@@ -169,36 +201,41 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
     }
     __syncthreads();
 
+    // Gradients go to the gaussians' own rows, or in a batch to those of their item.
+    const uint64_t first_out = kIsBatch ? first_record : first;
     if (used) {
+        const ModelView<float>& view = view_of_block<kIsBatch>(in, batch);
+        const Intrinsics<float>& camera = camera_of_block<kIsBatch>(in, batch);
+        const uint64_t row_out = first_out + (i - first);
         Projection<float> s;
-        to_view(in.view, g.mean, s.p);
+        to_view(view, g.mean, s.p);
         const Ellipse<float> e =
-            project_gaussian(g, in.view, in.camera, in.filter_px2, in.antialiased, s);
-        Gaussian3d<float> d_gaussian = project_gaussian_vjp(g, in.view, in.camera, in.filter_px2,
-                                                            in.antialiased, s, e, d.ellipse);
+            project_gaussian(g, view, camera, in.filter_px2, in.antialiased, s);
+        Gaussian3d<float> d_gaussian =
+            project_gaussian_vjp(g, view, camera, in.filter_px2, in.antialiased, s, e, d.ellipse);
         Word words[Row::kWords];
         Word* row = sh_rows + (i - first) * Row::kStride;
         for (int k = 0; k < Row::kWords; ++k) words[k] = row[k];
         float* sh = reinterpret_cast<float*>(words);
         float direction[3];
-        from_eye(in.view, g.mean, direction);
+        from_eye(view, g.mean, direction);
         color_of_sh_vjp(kDegree, direction, sh, color, d.color, d_gaussian.mean, sh);
         for (int k = 0; k < Row::kWords; ++k) row[k] = words[k];
-        store_row<3>(out.means, i, d_gaussian.mean);
-        store_row<4>(out.quats, i, d_gaussian.quat);
-        store_row<3>(out.scales, i, d_gaussian.scale);
-        out.opacities[i] = d_gaussian.opacity;
+        store_row<3>(out.means, row_out, d_gaussian.mean);
+        store_row<4>(out.quats, row_out, d_gaussian.quat);
+        store_row<3>(out.scales, row_out, d_gaussian.scale);
+        out.opacities[row_out] = d_gaussian.opacity;
     }
     if (static_cast<int>(threadIdx.x) < num_here && !is_used[threadIdx.x]) {
         const float zeros[4] = {0, 0, 0, 0};
-        store_row<3>(out.means, first + threadIdx.x, zeros);
-        store_row<4>(out.quats, first + threadIdx.x, zeros);
-        store_row<3>(out.scales, first + threadIdx.x, zeros);
-        out.opacities[first + threadIdx.x] = 0;
+        store_row<3>(out.means, first_out + threadIdx.x, zeros);
+        store_row<4>(out.quats, first_out + threadIdx.x, zeros);
+        store_row<3>(out.scales, first_out + threadIdx.x, zeros);
+        out.opacities[first_out + threadIdx.x] = 0;
         if (d_centers != nullptr) store_row<2>(d_centers, first + threadIdx.x, zeros);
     }
     __syncthreads();
-    Word* sh_out = reinterpret_cast<Word*>(out.sh + Row::kValues * first);
+    Word* sh_out = reinterpret_cast<Word*>(out.sh + Row::kValues * first_out);
     for (int k = threadIdx.x; k < Row::kWords * num_here; k += kThreads)
         sh_out[k] = is_used[k / Row::kWords]
                         ? sh_rows[k / Row::kWords * Row::kStride + k % Row::kWords]
@@ -216,13 +253,27 @@ __global__ void __launch_bounds__(kThreads)
         sizes[in.source[record]] = size;
 }
 
-template <int kDegree>
-void start(const ProjectBackwardInput& in, const GradientSlots& slots,
+template <int kDegree, bool kIsBatch>
+void start(const ProjectBackwardInput& in, const ItemBatch& batch, const GradientSlots& slots,
            const GaussianRows<float>& out, float* d_centers, cudaStream_t stream) {
-    launch("project_backward_kernel", &project_backward_kernel<kDegree>,
-           blocks_for(in.rows.size, kItemSize), kThreads,
+    launch("project_backward_kernel", &project_backward_kernel<kDegree, kIsBatch>,
+           kIsBatch ? batch.num_items : blocks_for(in.rows.size, kItemSize), kThreads,
            kThreads * ShRow<kDegree>::kStride * sizeof(typename ShRow<kDegree>::Word), stream, in,
-           slots, out, d_centers);
+           batch, slots, out, d_centers);
+}
+
+template <bool kIsBatch>
+void start_of_degree(const ProjectBackwardInput& in, const ItemBatch& batch,
+                     const GradientSlots& slots, const GaussianRows<float>& out, float* d_centers,
+                     cudaStream_t stream) {
+    switch (in.rows.sh_degree) {
+        case kPlainColor:
+            return start<kPlainColor, kIsBatch>(in, batch, slots, out, d_centers, stream);
+        case 0: return start<0, kIsBatch>(in, batch, slots, out, d_centers, stream);
+        case 1: return start<1, kIsBatch>(in, batch, slots, out, d_centers, stream);
+        case 2: return start<2, kIsBatch>(in, batch, slots, out, d_centers, stream);
+        default: return start<3, kIsBatch>(in, batch, slots, out, d_centers, stream);
+    }
 }
 
 }  // namespace
@@ -242,13 +293,13 @@ void project_backward(const ProjectBackwardInput& in, const GradientSlots& slots
         launch("center_sizes_kernel", &center_sizes_kernel, blocks_for(in.rows.size, kItemSize),
                kThreads, 0, stream, in, slots, centers.size);
     }
-    switch (in.rows.sh_degree) {
-        case kPlainColor: return start<kPlainColor>(in, slots, out, centers.sum, stream);
-        case 0: return start<0>(in, slots, out, centers.sum, stream);
-        case 1: return start<1>(in, slots, out, centers.sum, stream);
-        case 2: return start<2>(in, slots, out, centers.sum, stream);
-        default: return start<3>(in, slots, out, centers.sum, stream);
-    }
+    start_of_degree<false>(in, {}, slots, out, centers.sum, stream);
+}
+
+void project_backward(const ProjectBackwardInput& in, const ItemBatch& batch,
+                      const GradientSlots& slots, const GaussianRows<float>& out,
+                      cudaStream_t stream) {
+    start_of_degree<true>(in, batch, slots, out, nullptr, stream);
 }
 
 }  // namespace cuda

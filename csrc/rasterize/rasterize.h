@@ -51,21 +51,32 @@ uint32_t most_plans(uint32_t num_tiles);
 // The result does not depend on the order of the entries within a tile's list. `tape` may be null.
 void rasterize(const FrameLists& lists, const RasterTape* tape, Stream stream);
 
-// A picture as it was drawn, the lists it was blended from, and its gradients, all on the device.
+// Pictures as they were drawn, the lists they were blended from, and their gradients, all on the
+// device.
 struct RasterizeBackwardInput {
-    FrameImage image;
+    FrameImage image;  // of the only picture; unused where there is a batch
     RecordPlanes records;
     const unsigned long long* tile_first;  // [num_tiles + 1] into order
     const uint32_t* order;                 // each tile's records front to back
     const uint32_t* blended;  // [num_tiles] of them, those in front of where all pixels had stopped
     const TilePlan* plans;    // [num_tiles] in the order in which blocks take the tiles
-    PictureGradient<float> d_picture;
+    PictureGradient<float> d_picture;  // of the only picture
+};
+// The pictures of a batch, without depth.
+struct PictureBatch {
+    const FrameImage* images;
+    const PictureGradient<float>* d_pictures;
+    uint32_t num_tiles;  // of all pictures together
 };
 
 // Writes the slots and the gradient of the background (3) of one picture. `d_background_of_tile` is
 // scratch, (num_tiles, 3).
 void rasterize_backward(const RasterizeBackwardInput& in, const GradientSlots& slots,
                         float* d_background_of_tile, float* d_background, Stream stream);
+// Writes the slots of all pictures of a batch, without sizes. The image and the gradient of `in`
+// are unused.
+void rasterize_backward(const RasterizeBackwardInput& in, const PictureBatch& batch,
+                        const GradientSlots& slots, Stream stream);
 
 }  // namespace cuda
 

@@ -1,7 +1,6 @@
 // Each block takes a tile, each warp 8 x 4 of its pixels, each lane one pixel; they walk the tile's
 // list front to back as the forward pass did.
 //
-//
 // The sums over a warp's pixels are made for kHeld gaussians at once: each lane stores the
 // contribution of its pixel to each of them, then each lane sums a row of 8 pixels of one gaussian.
 // That costs a fifth of adding up across lanes gaussian by gaussian.
@@ -102,7 +101,8 @@ struct PixelGradient {
 };
 
 // Reads the pixel at (column, row) of the picture; adds to `d_background`.
-__device__ PixelGradient read_pixel(const RasterizeBackwardInput& in, int column, int row,
+__device__ PixelGradient read_pixel(const FrameImage& image,
+                                    const PictureGradient<float>& d_picture, int column, int row,
                                     float d_background[3]) {
     PixelGradient p{.x = column + 0.5f,
                     .y = row + 0.5f,
@@ -112,21 +112,21 @@ __device__ PixelGradient read_pixel(const RasterizeBackwardInput& in, int column
                     .total = 0,
                     .running = 0,
                     .transmittance = -1};
-    if (column >= in.image.width || row >= in.image.height) return p;
-    const size_t pixel = static_cast<size_t>(row) * in.image.width + column;
-    const float alpha = in.image.planes.alpha[pixel], t = 1 - alpha;
+    if (column >= image.width || row >= image.height) return p;
+    const size_t pixel = static_cast<size_t>(row) * image.width + column;
+    const float alpha = image.planes.alpha[pixel], t = 1 - alpha;
     p.transmittance = 1;
-    p.d_weight = in.d_picture.alpha[pixel];
+    p.d_weight = d_picture.alpha[pixel];
     for (int c = 0; c < 3; ++c) {
-        const float d = in.d_picture.color[3 * pixel + c];
+        const float d = d_picture.color[3 * pixel + c];
         p.d_color[c] = d;
-        p.d_weight -= d * in.image.background[c];
-        p.total += d * (in.image.planes.color[3 * pixel + c] - t * in.image.background[c]);
+        p.d_weight -= d * image.background[c];
+        p.total += d * (image.planes.color[3 * pixel + c] - t * image.background[c]);
         d_background[c] = d * t;
     }
-    if (in.d_picture.depth != nullptr && alpha > 0) {
-        const float depth = in.image.planes.depth[pixel];
-        p.d_depth = in.d_picture.depth[pixel] / alpha;
+    if (d_picture.depth != nullptr && alpha > 0) {
+        const float depth = image.planes.depth[pixel];
+        p.d_depth = d_picture.depth[pixel] / alpha;
         p.d_weight -= p.d_depth * depth;
         p.total += p.d_depth * depth * alpha;
     }
@@ -258,23 +258,42 @@ __device__ void add_up_pairs(const Shared<kWithSize>& s, const Batch& batch, int
     }
 }
 
-template <bool kWithDepth, bool kWithSize>
+// The only picture, and one of a batch. They are asked with a compile-time constant, so that a
+// single picture stays in constant memory.
+template <bool kIsBatch>
+__device__ const FrameImage& image_of(const RasterizeBackwardInput& in, const PictureBatch& batch,
+                                      uint32_t image) {
+    if constexpr (kIsBatch) return batch.images[image];
+    return in.image;
+}
+template <bool kIsBatch>
+__device__ const PictureGradient<float>& gradient_of(const RasterizeBackwardInput& in,
+                                                     const PictureBatch& batch, uint32_t image) {
+    if constexpr (kIsBatch) return batch.d_pictures[image];
+    return in.d_picture;
+}
+
+// `d_background_of_tile` is null for a batch.
+template <bool kWithDepth, bool kWithSize, bool kIsBatch>
 __global__ void __launch_bounds__(kThreads, 2)
-    rasterize_backward_kernel(RasterizeBackwardInput in, GradientSlots slots,
+    rasterize_backward_kernel(RasterizeBackwardInput in, PictureBatch batch, GradientSlots slots,
                               float* d_background_of_tile) {
     Shared<kWithSize>& s = *reinterpret_cast<Shared<kWithSize>*>(shared_memory());
     const int lane = threadIdx.x % 32;
     const int warp = __shfl_sync(kAllLanes, static_cast<int>(threadIdx.x) / 32,
                                  0);  // tells the compiler that all lanes agree
-    const uint32_t tile = in.plans[blockIdx.x].tile;
-    const int tile_column = tile % in.image.tile_columns, tile_row = tile / in.image.tile_columns;
+    const uint32_t tile = in.plans[blockIdx.x].tile, number = in.plans[blockIdx.x].image;
+    const FrameImage& image = image_of<kIsBatch>(in, batch, number);
+    const uint32_t in_image = tile - image.first_tile;
+    const int tile_column = in_image % image.tile_columns, tile_row = in_image / image.tile_columns;
     const int left = tile_column * kFrameTileWidth, top = tile_row * kFrameTileHeight;
     const int warp_left = left + warp % kWarpColumns * kWarpWidth,
               warp_top = top + warp / kWarpColumns * kWarpHeight;
 
     float d_background[3] = {0, 0, 0};
     PixelGradient p =
-        read_pixel(in, warp_left + lane % kWarpWidth, warp_top + lane / kWarpWidth, d_background);
+        read_pixel(image, gradient_of<kIsBatch>(in, batch, number), warp_left + lane % kWarpWidth,
+                   warp_top + lane / kWarpWidth, d_background);
     s.d_color[warp][lane / kWarpWidth][lane % kWarpWidth] =
         make_float4(p.d_color[0], p.d_color[1], p.d_color[2], p.d_depth);
     for (int c = 0; c < 3; ++c) {
@@ -287,7 +306,7 @@ __global__ void __launch_bounds__(kThreads, 2)
         s.record[kBatch].log2_opacity = -INFINITY;
     }
     __syncthreads();
-    if (threadIdx.x < 3) {
+    if (!kIsBatch && threadIdx.x < 3) {
         float sum = 0;
         for (int w = 0; w < kWarps; ++w) sum += s.d_background[w][threadIdx.x];
         d_background_of_tile[3 * tile + threadIdx.x] = sum;
@@ -300,7 +319,7 @@ __global__ void __launch_bounds__(kThreads, 2)
     for (int turn = 0;; turn ^= 1) {
         // Some warps load a batch while the others add up the one before.
         const bool goes_on = first < count && s.alive != 0;
-        Batch& batch = s.batch[turn];
+        Batch& entries = s.batch[turn];
         uint32_t end_pair = 0;
         if (i >= kBatch) {
             add_up_pairs(s, s.batch[turn ^ 1], num, i - kBatch, kThreads - kBatch, slots);
@@ -310,12 +329,12 @@ __global__ void __launch_bounds__(kThreads, 2)
                 const uint32_t r = order[first + i];
                 const Record<float> g = load_record(in.records, r, in.records.box[r]);
                 s.record[i] = g;
-                batch.slot[i] =
+                entries.slot[i] =
                     slots.first[r] + slot_of_tile(in.records.box[r], tile_column, tile_row);
                 warps = warps_of(g, left, top) & s.alive;
             }
             s.warps[i] = warps;
-            batch.took_part[i] = 0;
+            entries.took_part[i] = 0;
             end_pair = warp_prefix<32, uint32_t>(__popc(warps));
             if (lane == 31) s.pairs_of_warp[warp] = end_pair;
         }
@@ -323,11 +342,11 @@ __global__ void __launch_bounds__(kThreads, 2)
         __syncthreads();
         if (i < kBatch) {
             for (int w = 0; w < warp; ++w) end_pair += s.pairs_of_warp[w];
-            batch.first_pair[i] = end_pair - __popc(s.warps[i]);
+            entries.first_pair[i] = end_pair - __popc(s.warps[i]);
         }
         // These are the entries of the batch whose pairs fit.
         num = __syncthreads_count(i < min(kBatch, count - first) && end_pair <= kPairs);
-        blend_batch_vjp<kWithDepth, kWithSize>(s, batch, warp, num, p, warp_left + 0.5f,
+        blend_batch_vjp<kWithDepth, kWithSize>(s, entries, warp, num, p, warp_left + 0.5f,
                                                warp_top + 0.5f);
         first += num;
         __syncthreads();
@@ -337,9 +356,9 @@ __global__ void __launch_bounds__(kThreads, 2)
 template <bool kWithDepth, bool kWithSize>
 void start(const RasterizeBackwardInput& in, const GradientSlots& slots,
            float* d_background_of_tile, cudaStream_t stream) {
-    launch("rasterize_backward_kernel", &rasterize_backward_kernel<kWithDepth, kWithSize>,
+    launch("rasterize_backward_kernel", &rasterize_backward_kernel<kWithDepth, kWithSize, false>,
            in.image.tile_columns * in.image.tile_rows, kThreads, sizeof(Shared<kWithSize>), stream,
-           in, slots, d_background_of_tile);
+           in, PictureBatch{}, slots, d_background_of_tile);
 }
 
 constexpr int kSumThreads = 256;
@@ -370,6 +389,12 @@ void rasterize_backward(const RasterizeBackwardInput& in, const GradientSlots& s
     run(in, slots, d_background_of_tile, stream);
     launch("sum_over_tiles_kernel", &sum_over_tiles_kernel, 3, kSumThreads, 0, stream,
            d_background_of_tile, num_tiles, d_background);
+}
+
+void rasterize_backward(const RasterizeBackwardInput& in, const PictureBatch& batch,
+                        const GradientSlots& slots, cudaStream_t stream) {
+    launch("rasterize_backward_kernel", &rasterize_backward_kernel<false, false, true>,
+           batch.num_tiles, kThreads, sizeof(Shared<false>), stream, in, batch, slots, nullptr);
 }
 
 }  // namespace cuda

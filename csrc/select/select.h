@@ -63,8 +63,19 @@ struct GivenCut {
     V3DG_HD float weight_of(size_t s) const { return weight.size == 0 ? 1.0f : weight[s]; }
 };
 
+// The cut that meets a budget.
+struct BudgetCut {
+    float tolerance_px2;
+    bool fits;              // whether any cut does; if not, the number is that of the coarsest one
+    int64_t num_gaussians;  // before pages that are not resident and fades change it
+};
+
 namespace cpu {
 void select(const SelectInput& in, SelectOutput& out);
+
+// Chooses the tolerance of each of several budgets for one view, as select() does with that budget
+// in its rule, at once. Costs little more than one of them.
+void choose_tolerances(const SelectInput& in, Span<const uint64_t> budgets, Span<BudgetCut> chosen);
 
 // Writes the metric of every group of every instance, px2. Those of instance i begin at
 // metric_offset[i].

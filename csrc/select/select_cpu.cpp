@@ -254,18 +254,26 @@ void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins,
     }
 }
 
-// Sets the tolerance of `rule` by its budget. Returns whether a cut fits; if none does,
-// `least_count` is the number of gaussians of the coarsest cut.
-bool meet_budget(const View& view, SelectRule& rule, int64_t& least_count) {
+// The numbers of gaussians by which the cut of each bin differs from that of the bin before, in
+// parts that add up.
+using BinChanges = std::vector<std::vector<int64_t>>;
+BinChanges count_changes(const View& view) {
     const size_t num_instances = view.in.instances.bundle.size;
     // Each part has every kBudgetParts-th instance, because neighbours cost about the same.
-    std::vector<std::vector<int64_t>> changes(std::min(kBudgetParts, num_instances));
+    BinChanges changes(std::min(kBudgetParts, num_instances));
     parallel_for(changes.size(), 1, [&](size_t part) {
         changes[part].assign(kNumBudgetBins + 1, 0);
         std::vector<GroupBins> bins(view.most_groups);
         for (size_t i = part; i < num_instances; i += changes.size())
             count_instance(view, i, bins, changes[part]);
     });
+    return changes;
+}
+
+// Sets the tolerance of `rule` by its budget. Returns whether a cut fits; if none does,
+// `least_count` is the number of gaussians of the coarsest cut.
+bool meet_budget(const View& view, SelectRule& rule, int64_t& least_count) {
+    const BinChanges changes = count_changes(view);
     const uint64_t goal_count = goal_of_budget(rule.budget);
     uint32_t least = 0, goal = 0, none = kNoBin;
     for (uint32_t bin = 0; bin < kNumBudgetBins; ++bin) {
@@ -314,6 +322,34 @@ void cpu::select(const SelectInput& in, SelectOutput& out) {
         std::copy(chunks[k].cluster.begin(), chunks[k].cluster.end(),
                   out.cluster.begin() + first[k]);
         std::copy(chunks[k].weight.begin(), chunks[k].weight.end(), out.weight.begin() + first[k]);
+    }
+}
+
+void cpu::choose_tolerances(const SelectInput& in, Span<const uint64_t> budgets,
+                            Span<BudgetCut> chosen) {
+    View view(in);
+    view.find_runs();
+    const BinChanges changes = count_changes(view);
+    // Cuts differ at few bins.
+    struct Step {
+        uint32_t bin;
+        int64_t count;
+    };
+    std::vector<Step> steps{{0, 0}};
+    for (uint32_t bin = 0; bin < kNumBudgetBins; ++bin) {
+        int64_t change = 0;
+        for (const std::vector<int64_t>& part : changes) change += part[bin];
+        if (bin > 0 && change != 0) steps.push_back({bin, steps.back().count});
+        steps.back().count += change;
+    }
+    for (size_t k = 0; k < budgets.size; ++k) {
+        size_t least = steps.size();
+        while (least > 0 && static_cast<uint64_t>(steps[least - 1].count) <= budgets[k]) --least;
+        const bool fits = least < steps.size();
+        chosen[k] = {
+            .tolerance_px2 = fits ? tolerance_of_bin(steps[least].bin, in.rule.tolerance_px2) : 0,
+            .fits = fits,
+            .num_gaussians = steps[fits ? least : least - 1].count};
     }
 }
 

@@ -375,6 +375,9 @@ def arguments(bundle, device, config, pictures):
     leaves = gaussians.subset(slice(0, len(bundle.level_gaussians(0))))
     given = {
         "config": fit_config(config, 0, 1),
+        "comparison": _core.CutComparison(
+            windows_per_step=1, cuts_per_view=8, power=1.0, is_blurred=False
+        ),
         "target": _core.FitTarget(leaves.rows, 0.0, False),
         "gaussians": gaussians.rows,
         "radius": np.full(bundle.num_gaussians, 2.0, np.float32),
@@ -384,7 +387,40 @@ def arguments(bundle, device, config, pictures):
     return gaussians, given
 
 
-def test_a_step_goes_down_the_slope_of_the_loss(bundle, device):
+def planned_views(pictures, num_windows):
+    """The windows of the first step: the first views, each with a cut of another
+    number."""
+    return [pictures.view(number, number % 8) for number in range(num_windows)]
+
+
+def loss_of_window(window, drawn, leaves, samples, camera, comparison):
+    """The loss of a window relative to its own value, as torch computes it."""
+    import torch
+
+    shown = replace(camera, K=window.K, width=window.width, height=window.height)
+    larger = v3dg.rasterize(leaves, shown.scaled(samples))
+    wanted = [
+        torch.tensor(box_downsample(array, samples).astype(np.float64))
+        for array in (larger.color, larger.alpha)
+    ]
+    color = drawn.color - wanted[0]
+    alpha = drawn.alpha - wanted[1]
+    values = torch.cat([color, alpha[..., None]], dim=2).permute(2, 0, 1)[:, None]
+    if comparison["is_blurred"]:
+        kernel = torch.tensor([0.25, 0.5, 0.25], dtype=torch.float64)
+        kernel = kernel[:, None] * kernel
+        values = torch.nn.functional.conv2d(values, kernel[None, None], padding=1)
+    power = comparison["power"]
+    losses = values.abs() if power == 1 else (values.abs() + 0.004) ** power
+    loss = losses[:3].mean() + 0.5 * losses[3].mean()
+    return loss / (loss.detach() + 1e-4)
+
+
+@pytest.mark.parametrize(
+    ("num_windows", "power", "is_blurred"),
+    [(1, 1.0, False), (5, 1.0, False), (2, 0.7, True), (1, 0.5, False)],
+)
+def test_a_step_goes_down_the_slope_of_the_loss(bundle, device, num_windows, power, is_blurred):
     """The first step of Adam has the size of the step and the sign of the slope,
     whatever that is."""
     torch = pytest.importorskip("torch")
@@ -392,56 +428,129 @@ def test_a_step_goes_down_the_slope_of_the_loss(bundle, device):
     config = replace(BuildConfig(), steps=1, first_steps=1, filter_px2=0.1, **sizes)
     camera = v3dg.turntable((0, 0, 0), 3.0, 1, width=160, height=160)[0]
     pictures = pictures_of(bundle, [camera])
-    window, clusters, samples = pictures.view(0)
+    comparison = {"power": power, "is_blurred": is_blurred}
     gaussians, given = arguments(bundle, device, config, pictures)
+    given["comparison"] = _core.CutComparison(
+        windows_per_step=num_windows, cuts_per_view=8, **comparison
+    )
     _core.refine_cuts(**given)
     moved = host(gaussians)
 
     offset = bundle.clusters.offset
-    rows = np.concatenate([np.arange(offset[c], offset[c + 1]) for c in clusters])
-    start = bundle.gaussians.subset(rows)
-    shown = replace(camera, K=window.K, width=window.width, height=window.height)
-    tensors = [torch.tensor(a.astype(np.float64), requires_grad=True) for a in vars(start).values()]
-    drawn = v3dg.rasterize(v3dg.Gaussians(*tensors), shown, filter_px2=0.1, antialiased=True)
     leaves = bundle.level_gaussians(0)
-    larger = v3dg.rasterize(leaves, shown.scaled(samples))
-    wanted = [
-        torch.tensor(box_downsample(a, samples).astype(np.float64))
-        for a in (larger.color, larger.alpha)
-    ]
-    loss = (drawn.color - wanted[0]).abs().mean() + 0.5 * (drawn.alpha - wanted[1]).abs().mean()
+    start = bundle.gaussians
+    tensors = [torch.tensor(a.astype(np.float64), requires_grad=True) for a in vars(start).values()]
+    is_shown = np.zeros(bundle.num_gaussians, bool)
+    loss = 0
+    for window, clusters, samples in planned_views(pictures, num_windows):
+        rows = np.concatenate([np.arange(offset[c], offset[c + 1]) for c in clusters])
+        is_shown[rows] = True
+        shown = replace(camera, K=window.K, width=window.width, height=window.height)
+        drawn = v3dg.rasterize(
+            v3dg.Gaussians(*(t[torch.tensor(rows)] for t in tensors)),
+            shown,
+            filter_px2=0.1,
+            antialiased=True,
+        )
+        loss = loss + loss_of_window(window, drawn, leaves, samples, camera, comparison)
     loss.backward()
     slopes = dict(zip(vars(start), (t.grad.numpy() for t in tensors), strict=True))
+    moves = is_shown & (np.arange(bundle.num_gaussians) >= len(leaves))
     is_faint = start.opacities < 0.99  # beyond, the logit of a float has few digits
-    is_level_0 = rows < len(leaves)
 
     def logit(gaussians):
         opacities = gaussians.opacities[is_faint].astype(np.float64)
         return np.log(opacities / (1 - opacities))
 
-    after = moved.subset(rows)
     steps = {
-        "means": (after.means - start.means, 2.0 * sizes["step_position"]),
-        "scales": (np.log(after.scales / start.scales), sizes["step_log_scale"]),
-        "opacities": (logit(after) - logit(start), sizes["step_logit"]),
-        "sh": (after.sh - start.sh, sizes["step_sh0"]),
+        "means": (moved.means - start.means, 2.0 * sizes["step_position"]),
+        "scales": (np.log(moved.scales / start.scales), sizes["step_log_scale"]),
+        "opacities": (logit(moved) - logit(start), sizes["step_logit"]),
+        "sh": (moved.sh - start.sh, sizes["step_sh0"]),
     }
     for name, (step, size) in steps.items():
-        slope, moves = slopes[name], ~is_level_0
+        slope = slopes[name]
+        is_compared = moves
         if name == "opacities":
-            slope, moves = slope[is_faint], moves[is_faint]
+            slope = slope[is_faint]
+            is_compared = moves[is_faint]
         if name == "sh":
-            step, slope = step[:, 0], slope[:, 0]
-        step, slope = step[moves], slope[moves]
+            step = step[:, 0]
+            slope = slope[:, 0]
+        step = step[is_compared]
+        slope = slope[is_compared]
         is_steep = np.abs(slope) > 0.05 * np.abs(slope).max()
         assert is_steep.sum() > 20
         np.testing.assert_allclose(
             step[is_steep], -size * np.sign(slope[is_steep]), rtol=0.05, err_msg=name
         )
-    others = np.ones(bundle.num_gaussians, bool)
-    others[rows[~is_level_0]] = False
     for name, values in vars(bundle.gaussians).items():
-        np.testing.assert_array_equal(getattr(moved, name)[others], values[others])
+        np.testing.assert_array_equal(getattr(moved, name)[~moves], values[~moves])
+
+
+def test_all_cuts_of_a_view_have_its_window(bundle):
+    """A target is drawn once and compared with several cuts."""
+    cameras = v3dg.turntable((0, 0, 0), 3.0, 3, width=640, height=360)
+    for pictures in (pictures_of(bundle), pictures_of(bundle, cameras)):
+        num_shown = []
+        for number in range(20):
+            views = [pictures.view(number, cut) for cut in range(5)]
+            assert len({place_of(view) for view in views}) == 1
+            np.testing.assert_array_equal(views[2][1], pictures.view(number, 2)[1])
+            num_shown.append([len(clusters) for _, clusters, _ in views])
+        num_shown = np.array(num_shown)
+        assert (num_shown.min(axis=1) < num_shown.max(axis=1)).mean() > 0.7
+
+
+def test_steps_of_several_windows_are_the_same_with_any_number_of_them_ahead(bundle, device):
+    """A picture of the asset is replaced only after the steps that use it."""
+    config = BuildConfig(steps=90, first_steps=90, filter_px2=0.05)
+
+    def moved():
+        gaussians, given = arguments(bundle, device, config, pictures_of(bundle))
+        given["comparison"] = _core.CutComparison(
+            windows_per_step=4, cuts_per_view=3, power=1.0, is_blurred=False
+        )
+        _core.refine_cuts(**given)
+        assert given["progress"].groups_done == 4 * 90
+        return np.concatenate([array.ravel() for array in vars(host(gaussians)).values()])
+
+    np.testing.assert_array_equal(moved(), moved())
+
+
+@pytest.mark.gpu
+def test_both_devices_take_the_same_steps(bundle):
+    """Several rounds of the pictures of the asset, each with new cuts."""
+    config = BuildConfig(steps=40, first_steps=40, filter_px2=0.05)
+    config = replace(config, **{name: 0.1 * getattr(config, name) for name in SIZES})
+    moved = {}
+    for device in ("cpu", "cuda"):
+        gaussians, given = arguments(bundle, device, config, pictures_of(bundle))
+        given["comparison"] = _core.CutComparison(
+            windows_per_step=8, cuts_per_view=2, power=0.7, is_blurred=True
+        )
+        _core.refine_cuts(**given)
+        moved[device] = host(gaussians)
+    for name, start in vars(bundle.gaussians).items():
+        steps = [getattr(gaussians, name) - start for gaussians in moved.values()]
+        distance = np.linalg.norm(steps[0] - steps[1])
+        assert distance < 0.2 * np.linalg.norm(steps[0]), name
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"windows_per_step": 0}, "windows_per_step: expected 1 to 32, got 0"),
+        ({"windows_per_step": 33}, "windows_per_step: expected 1 to 32, got 33"),
+        ({"cuts_per_view": 0}, "cuts_per_view: expected 1 to 128, got 0"),
+        ({"power": 0.0}, "power: expected more than 0 and at most 1, got 0"),
+        ({"power": float("nan")}, "power: expected more than 0 and at most 1, got nan"),
+    ],
+)
+def test_a_comparison_is_refused_that_makes_no_sense(change, message):
+    settings = {"windows_per_step": 1, "cuts_per_view": 8, "power": 1.0, "is_blurred": False}
+    with pytest.raises(ValueError, match=message):
+        _core.CutComparison(**(settings | change))
 
 
 def test_the_core_refuses_what_does_not_fit(bundle, device):

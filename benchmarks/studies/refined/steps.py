@@ -1,0 +1,303 @@
+"""The time and the gain of a refinement: windows a step, cuts a picture of the asset,
+step sizes and losses.
+
+    python -m benchmarks.studies.refined.steps --donut donut.ply --old OLD -o steps
+
+Two assets are refined in each way: a donut, and eleven of them in a heap, which hide
+each other. OLD is a folder with the package of an older version, which refines the same
+bundles in 10,000 and 30,000 steps. FLIP of cuts of some shares of the gaussians, at
+some sizes, is compared with that of the levels as they are built, at equal counts, and
+with that of other ways of the same run. The most important ways come first; none is
+begun after `--seconds`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+import v3dg
+from benchmarks.evaluation import record
+from benchmarks.studies.pairs.measure import cluster_sizes, cuts_of, errors, weighted
+from benchmarks.studies.pairs.subject import Size, Subject
+from v3dg import _device
+from v3dg._judges import Judges
+from v3dg.metrics import draw_truth
+from v3dg.pictures import Picture, to_8bit
+from v3dg.refine import Cuts, RefineSteps, without_unseen
+
+Row = dict[str, Any]
+
+_DONUTS = 11
+_RATE = 0.2  # of the step sizes of a fit, for one window a step
+_PERCENTS = (50.0, 12.5, 3.0)
+_FACTORS = (0.5, 1.0, 2.0, 4.0)
+_RATE_PICTURES = 4_000  # that a rate of steps is measured by
+_WINDOWS = (1, 2, 4, 8, 16, 32)
+_OLD_PROGRAM = """
+import json, sys, time
+import v3dg
+bundle = v3dg.Bundle.open(sys.argv[1])
+def refine(steps, drop):
+    start = time.perf_counter()
+    refined = v3dg.refine_bundle(bundle, steps=steps, drop=drop, device=sys.argv[3], progress=False)
+    return refined, time.perf_counter() - start
+refine(200, 0.02)
+result = {"ms": 1e3 / int(sys.argv[4]) * refine(int(sys.argv[4]), 0)[1]}
+for steps in map(int, sys.argv[5:]):
+    refined, result[str(steps)] = refine(steps, 0.02)
+    refined.write(f"{sys.argv[2]}_{steps}.v3dg")
+print(json.dumps(result))
+"""
+
+
+@dataclass
+class Config:
+    donut: Path
+    """The paper's donut, or another asset of its size."""
+    old: Path | None = None
+    """A folder with the package `v3dg` of an older version, built."""
+    seconds: float = 270
+    assets: tuple[Literal["donut", "heap"], ...] = ("heap", "donut")
+    pictures: int = 30_000
+    """Pictures of a refinement, unless a way has another number."""
+    views: int = 2
+    """Sides from which cuts are compared."""
+    device: Literal["cpu", "cuda"] = "cuda"
+    output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to refine: `rate` is relative to that of one window a step."""
+
+    windows: int = 8
+    cuts_per_view: int = 8
+    rate: float = 2.8
+    power: float = 1.0
+    is_blurred: bool = False
+    share: float = 1.0
+    """Of the pictures."""
+
+    def steps(self) -> RefineSteps:
+        return RefineSteps(
+            windows=self.windows,
+            cuts_per_view=self.cuts_per_view,
+            rate=_RATE * self.rate,
+            power=self.power,
+            is_blurred=self.is_blurred,
+        )
+
+
+# The most important first.
+_WAYS = (
+    Way(),
+    Way(share=1 / 3),
+    Way(rate=4.0),
+    Way(rate=2.0),
+    Way(windows=16, rate=4.0),
+    Way(windows=4, rate=2.0),
+    Way(power=0.7, is_blurred=True),
+    Way(cuts_per_view=1),
+    Way(cuts_per_view=16),
+    Way(power=0.7),
+    Way(is_blurred=True),
+    Way(windows=16, rate=2.8),
+    Way(rate=1.4),
+    Way(share=2.0),
+    Way(windows=32, rate=5.6),
+    Way(windows=4, rate=2.8),
+    Way(windows=1, rate=1.0),
+)
+
+
+def heap_of(donut: v3dg.Gaussians) -> v3dg.Gaussians:
+    """Donuts in a ball, turned at random."""
+    rng = np.random.default_rng(0)
+    center = np.median(donut.means, axis=0)
+    radius = float(np.quantile(np.linalg.norm(donut.means - center, axis=1), 0.99))
+    parts = []
+    for _ in range(_DONUTS):
+        outwards = rng.normal(size=3)
+        outwards *= 2 * radius * rng.random() ** (1 / 3) / np.linalg.norm(outwards)
+        parts.append(donut.transform(rng.normal(size=4), outwards, 1.0))
+    return v3dg.Gaussians.concatenate(parts)
+
+
+@dataclass(frozen=True)
+class View:
+    """A count and a size, seen from one side."""
+
+    about: Row
+    count: int
+    size: Size
+    truth: Picture
+
+
+class Study:
+    """One asset: its bundle as built, and truths that all ways are compared with."""
+
+    def __init__(self, config: Config, name: str, asset: v3dg.Gaussians, folder: Path) -> None:
+        self.name = name
+        self._config = config
+        self._device = _device.resolve(config.device)
+        v3dg.write_asset(folder / f"{name}.ply", asset)
+        subject = Subject(folder, name, {"file": f"{name}.ply", "up": (0, 0, 1)}, config.views)
+        start = time.perf_counter()
+        self.built = v3dg.build_bundle(asset, device=config.device, progress=False)
+        self.build_seconds = time.perf_counter() - start
+        self.path = folder / f"{name}.v3dg"
+        self.built.write(self.path)
+        placed = asset.torch("cuda") if self._device.is_cuda else asset
+        self._views = [
+            View(
+                {"percent": percent, "factor": factor, "view": number},
+                count,
+                size,
+                draw_truth(placed, size.window, config.device, 4),
+            )
+            for percent in _PERCENTS
+            for count in [round(len(asset) * percent / 100)]
+            for factor in _FACTORS
+            for number, size in enumerate(subject.sizes(count, factor, 512))
+        ]
+
+    def pictures(self, bundle: v3dg.Bundle) -> Iterator[tuple[Row, Picture, Picture]]:
+        sizes = cluster_sizes(bundle)
+        for view in self._views:
+            for cut in cuts_of("cut", bundle, view.size.camera, view.count, sizes):
+                image = v3dg.render(
+                    cut.subject, view.size.window, device=self._config.device, **cut.cut
+                )
+                row = {"gaussians": cut.gaussians, "weight": cut.weight}
+                row["tolerance"] = cut.cut["tolerance"]
+                yield view.about | row, view.truth, to_8bit(image.color)
+
+    def flips(self, bundle: v3dg.Bundle, judges: Judges) -> list[float]:
+        """FLIP at each count and size, means over the views."""
+        rows: dict[tuple[float, float], list[Row]] = {}
+        for (about, _, _), found in judges.measured(self.pictures(bundle), errors):
+            rows.setdefault((about["percent"], about["factor"]), []).append(about | found)
+        return [weighted(of_pair)["flip"] for of_pair in rows.values()]
+
+    def milliseconds(self, way: Way) -> float:
+        """The time of a picture, with nothing dropped."""
+        steps = way.steps()
+        self._cuts(self.built).refined(8 * way.windows, steps)
+        cuts = self._cuts(self.built)
+        start = time.perf_counter()
+        cuts.refined(_RATE_PICTURES, steps)
+        return 1e3 * (time.perf_counter() - start) / _RATE_PICTURES
+
+    def refined(self, way: Way, num_pictures: int) -> tuple[v3dg.Bundle, Row]:
+        """The bundle, and seconds of both parts."""
+        start = time.perf_counter()
+        dropped = without_unseen(self.built, [], 0.02, 0, self._device, False)
+        after_drop = time.perf_counter()
+        cuts = self._cuts(dropped)
+        gaussians = cuts.refined(num_pictures, way.steps())
+        end = time.perf_counter()
+        clusters = dropped.clusters.around(gaussians)
+        bundle = v3dg.Bundle(clusters, dropped.groups, gaussians, dropped.config, dropped.codec)
+        return bundle, {"drop_seconds": after_drop - start, "move_seconds": end - after_drop}
+
+    def _cuts(self, bundle: v3dg.Bundle) -> Cuts:
+        return Cuts(bundle, [], 0, self._device, False)
+
+
+def old_results(config: Config, study: Study, folder: Path) -> tuple[Row, dict[int, Path]]:
+    """What an older version takes for the bundle, and what it makes of it."""
+    counts = (config.pictures // 3, config.pictures)
+    output = folder / f"{study.name}_old"
+    words = [study.path, output, config.device, min(_RATE_PICTURES, 2000), *counts]
+    path = os.pathsep.join((str(config.old), *filter(None, [os.environ.get("PYTHONPATH")])))
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", _OLD_PROGRAM, *map(str, words)],
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode != 0:
+        raise RuntimeError(f"{config.old}: the older version failed: {done.stderr[-2000:]}")
+    return json.loads(done.stdout), {n: Path(f"{output}_{n}.v3dg") for n in counts}
+
+
+def compared(flips: list[float], built: list[float]) -> Row:
+    """Geometric mean and range of FLIP relative to the levels as built."""
+    ratios = [a / max(b, 1e-9) for a, b in zip(flips, built, strict=True)]
+    mean = math.exp(statistics.fmean(math.log(max(ratio, 1e-9)) for ratio in ratios))
+    return {"ratio": round(mean, 4), "best": round(min(ratios), 4), "worst": round(max(ratios), 4)}
+
+
+class Results:
+    """Rows that are written as soon as they are known."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._start = time.perf_counter()
+        self._rows: list[Row] = []
+
+    def is_over(self) -> bool:
+        return time.perf_counter() - self._start > self._config.seconds
+
+    def add(self, row: Row) -> None:
+        self._rows.append(row)
+        print(row, flush=True)
+        settings = {"pictures": self._config.pictures, "percents": _PERCENTS, "factors": _FACTORS}
+        about: Row = settings | {"seconds": round(time.perf_counter() - self._start, 1)}
+        record.write(self._config.output, about | {"rows": self._rows}, self._config.device)
+
+
+def main(config: Config) -> None:
+    results = Results(config)
+    donut = v3dg.read_asset(config.donut)
+    with (
+        tempfile.TemporaryDirectory() as name,
+        contextlib.closing(Judges()) as judges,
+    ):
+        folder = Path(name)
+        assets = {"donut": donut, "heap": heap_of(donut)}
+        studies = [Study(config, key, assets[key], folder) for key in config.assets]
+        built = {}
+        for study in studies:
+            row: Row = {"asset": study.name, "gaussians": len(assets[study.name])}
+            built[study.name] = study.flips(study.built, judges)
+            row |= {"build_seconds": study.build_seconds, "flips": built[study.name]}
+            results.add(row)
+            rates = {n: study.milliseconds(Way(windows=n)) for n in _WINDOWS}
+            results.add({"asset": study.name, "ms_a_picture": rates})
+        for study in studies if config.old is not None else ():
+            seconds, paths = old_results(config, study, folder)
+            results.add({"asset": study.name, "old": seconds})
+            for count, path in paths.items():
+                flips = study.flips(v3dg.Bundle.open(path), judges)
+                row = {"asset": study.name, "way": "old", "pictures": count, "flips": flips}
+                results.add(row | compared(flips, built[study.name]))
+        for way in _WAYS:
+            for study in studies:
+                if results.is_over():
+                    return
+                num_pictures = round(way.share * config.pictures)
+                bundle, seconds = study.refined(way, num_pictures)
+                flips = study.flips(bundle, judges)
+                row = {"asset": study.name, "way": asdict(way), "pictures": num_pictures}
+                results.add(row | seconds | compared(flips, built[study.name]) | {"flips": flips})
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
