@@ -46,7 +46,6 @@ _DONUTS = 11
 _RATE = 0.2  # of the step sizes of a fit, for one window a step
 _PERCENTS = (50.0, 12.5, 3.0)
 _FACTORS = (0.5, 1.0, 2.0, 4.0)
-_RATE_PICTURES = 4_000  # that a rate of steps is measured by
 _WINDOWS = (1, 2, 4, 8, 16, 32)
 _OLD_PROGRAM = """
 import json, sys, time
@@ -75,6 +74,8 @@ class Config:
     assets: tuple[Literal["donut", "heap"], ...] = ("heap", "donut")
     pictures: int = 30_000
     """Pictures of a refinement, unless a way has another number."""
+    rate_pictures: int = 4_000
+    """Pictures that the time of one is measured by."""
     views: int = 2
     """Sides from which cuts are compared."""
     device: Literal["cpu", "cuda"] = "cuda"
@@ -200,8 +201,8 @@ class Study:
         self._cuts(self.built).refined(8 * way.windows, steps)
         cuts = self._cuts(self.built)
         start = time.perf_counter()
-        cuts.refined(_RATE_PICTURES, steps)
-        return 1e3 * (time.perf_counter() - start) / _RATE_PICTURES
+        cuts.refined(self._config.rate_pictures, steps)
+        return 1e3 * (time.perf_counter() - start) / self._config.rate_pictures
 
     def refined(self, way: Way, num_pictures: int) -> tuple[v3dg.Bundle, Row]:
         """The bundle, and seconds of both parts."""
@@ -223,7 +224,7 @@ def old_results(config: Config, study: Study, folder: Path) -> tuple[Row, dict[i
     """What an older version takes for the bundle, and what it makes of it."""
     counts = (config.pictures // 3, config.pictures)
     output = folder / f"{study.name}_old"
-    words = [study.path, output, config.device, min(_RATE_PICTURES, 2000), *counts]
+    words = [study.path, output, config.device, min(config.rate_pictures, 2000), *counts]
     path = os.pathsep.join((str(config.old), *filter(None, [os.environ.get("PYTHONPATH")])))
     done = subprocess.run(
         [sys.executable, "-P", "-c", _OLD_PROGRAM, *map(str, words)],
