@@ -732,9 +732,7 @@ def fit_level(
 class CutComparison:
     """How cuts are compared with the asset."""
 
-    def __init__(
-        self, *, windows_per_step: int, cuts_per_view: int, power: float, is_blurred: bool
-    ) -> None: ...
+    def __init__(self, *, windows_per_step: int, cuts_per_view: int) -> None: ...
 
 def refine_cuts(
     *,

@@ -143,17 +143,14 @@ class BoundPictures {
     CutPictures pictures_;
 };
 
-CutComparison make_comparison(int windows_per_step, int cuts_per_view, float power,
-                              bool is_blurred) {
+CutComparison make_comparison(int windows_per_step, int cuts_per_view) {
     if (windows_per_step < 1 || windows_per_step > kMostWindows)
         refuse_value("windows_per_step", "expected 1 to " + std::to_string(kMostWindows) +
                                              ", got " + std::to_string(windows_per_step));
     if (cuts_per_view < 1 || cuts_per_view > int(kViewSlots))
         refuse_value("cuts_per_view", "expected 1 to " + std::to_string(kViewSlots) + ", got " +
                                           std::to_string(cuts_per_view));
-    if (!(power > 0 && power <= 1))
-        refuse_value("power", "expected more than 0 and at most 1, got " + std::to_string(power));
-    return {windows_per_step, cuts_per_view, power, is_blurred};
+    return {windows_per_step, cuts_per_view};
 }
 
 void refine_cuts_arrays(const FitConfig& config, const CutComparison& comparison,
@@ -284,8 +281,7 @@ void bind_fit_level(py::module_& m) {
              "The camera of the window of a view, the clusters of one of its cuts that it shows, "
              "and the samples of a side of a pixel.");
     py::class_<CutComparison>(m, "CutComparison", "How cuts are compared with the asset.")
-        .def(py::init(&make_comparison), py::kw_only(), "windows_per_step"_a, "cuts_per_view"_a,
-             "power"_a, "is_blurred"_a);
+        .def(py::init(&make_comparison), py::kw_only(), "windows_per_step"_a, "cuts_per_view"_a);
     m.def("refine_cuts", &refine_cuts_arrays, py::kw_only(), "config"_a, "comparison"_a, "target"_a,
           "gaussians"_a, "radius"_a, "pictures"_a, "progress"_a,
           "Moves the gaussians of clusters, in place, until pictures of cuts are those of the "

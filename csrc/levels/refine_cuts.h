@@ -17,10 +17,6 @@ struct CutRows {
 struct CutComparison {
     int windows_per_step;  // windows, 1 to kMostWindows, whose gradients make one step
     int cuts_per_view;     // cuts that each picture of the target is compared with
-    // The loss of a value is the power of its difference, 0 < power <= 1; 1 is the L1 distance.
-    float power;
-    // Whether differences are blurred by [1 2 1] / 4 along both axes before, as an eye does.
-    bool is_blurred;
 };
 constexpr int kMostWindows = 32;
 
@@ -32,8 +28,8 @@ constexpr int kMostWindows = 32;
 //
 // Cuts are drawn with the filter of `config`, including level 0, which is drawn without one
 // elsewhere: in small pictures that is a third of the error of cuts. The target's pictures are
-// drawn larger and box-averaged. The loss is that of the fit without D-SSIM, as `comparison` has
-// it; positions move in steps of a part of the radius. The sizes, samples and numbers of views in
+// drawn larger and box-averaged. The loss is that of the fit without D-SSIM; positions move in steps
+// of a part of the radius. The sizes of steps in `config` are for gaussians that one window shows. The sizes, samples and numbers of views in
 // `config` are ignored. The result does not depend on the number of threads. Returns early once
 // `progress.cancel` is set; `progress.groups_done` counts windows.
 void refine_cuts(const FitConfig& config, const CutComparison& comparison, const FitTarget& target,

@@ -44,58 +44,31 @@ class Canvas {
     std::vector<float> values_;
 };
 
-// Compares windows with their targets.
-class Comparison {
-  public:
-    Comparison(const LossWeights& loss, const CutComparison& comparison)
-        : loss_(loss), comparison_(comparison) {}
-
-    // Puts the slopes of the loss in place of the picture.
-    void compare(Canvas& picture, const Canvas& target) {
-        width_ = static_cast<size_t>(picture.width());
-        height_ = static_cast<size_t>(picture.height());
-        slopes_.resize(width_ * height_);
-        const ReadPlanes drawn = picture.planes(), wanted = target.planes();
-        std::vector<double> loss_of_row(height_, 0.0);
-        for_each_pixel([&](size_t x, size_t y) {
-            PixelValues pixel = filtered(x, y, [&](size_t column, size_t row) {
-                PixelValues difference = drawn.at(row * width_ + column);
-                const PixelValues of_target = wanted.at(row * width_ + column);
-                for (int k = 0; k < 4; ++k) difference.value[k] -= of_target.value[k];
-                return difference;
-            });
-            loss_of_row[y] += put_slopes(loss_, comparison_.power, pixel);
-            slopes_[y * width_ + x] = pixel;
-        });
-        const float weight =
-            weight_of_picture(std::accumulate(loss_of_row.begin(), loss_of_row.end(), 0.0),
-                              static_cast<double>(width_ * height_));
-        for_each_pixel([&](size_t x, size_t y) {
-            const PixelValues slope = filtered(
-                x, y, [&](size_t column, size_t row) { return slopes_[row * width_ + column]; });
-            const size_t i = y * width_ + x;
-            for (size_t k = 0; k < 3; ++k) picture.color()[3 * i + k] = weight * slope.value[k];
-            picture.alpha()[i] = weight * slope.value[3];
-        });
-    }
-
-  private:
-    template <class Visit>
-    void for_each_pixel(const Visit& visit) const {
-        parallel_for(height_, 8, [&](size_t y) {
-            for (size_t x = 0; x < width_; ++x) visit(x, y);
-        });
-    }
-    template <class ValuesAt>
-    PixelValues filtered(size_t x, size_t y, const ValuesAt& values_at) const {
-        return comparison_.is_blurred ? blurred(width_, height_, x, y, values_at) : values_at(x, y);
-    }
-
-    const LossWeights& loss_;
-    const CutComparison& comparison_;
-    size_t width_ = 0, height_ = 0;
-    std::vector<PixelValues> slopes_;
-};
+// Puts the slopes of the loss in place of the picture.
+void put_slopes(const LossWeights& loss, const Canvas& target, Canvas& picture) {
+    const auto width = static_cast<size_t>(picture.width()),
+               height = static_cast<size_t>(picture.height());
+    const ReadPlanes drawn = picture.planes(), wanted = target.planes();
+    std::vector<double> loss_of_row(height, 0.0);
+    parallel_for(height, 8, [&](size_t y) {
+        for (size_t i = y * width; i < (y + 1) * width; ++i) {
+            PixelValues pixel = drawn.at(i);
+            const PixelValues of_target = wanted.at(i);
+            for (int k = 0; k < 4; ++k) pixel.value[k] -= of_target.value[k];
+            loss_of_row[y] += put_slopes(loss, pixel);
+            for (size_t k = 0; k < 3; ++k) picture.color()[3 * i + k] = pixel.value[k];
+            picture.alpha()[i] = pixel.value[3];
+        }
+    });
+    const double loss_sum = std::accumulate(loss_of_row.begin(), loss_of_row.end(), 0.0);
+    const float weight = weight_of_picture(loss_sum, static_cast<double>(width * height));
+    parallel_for(height, 8, [&](size_t y) {
+        for (size_t i = y * width; i < (y + 1) * width; ++i) {
+            for (size_t k = 0; k < 3; ++k) picture.color()[3 * i + k] *= weight;
+            picture.alpha()[i] *= weight;
+        }
+    });
+}
 
 // A window as it is drawn.
 struct CutWindow {
@@ -197,25 +170,23 @@ class GradientSum {
           sum_(rows_in(values_.data(), count, sh_degree)),
           zeros_(num_values(sh_degree), 0.0f),
           zero_(rows_in(zeros_.data(), 1, sh_degree)),
-          is_shown_(count, 0) {}
+          num_windows_(count, 0) {}
 
     void add(const std::vector<uint32_t>& index, const GaussianRows<const float>& gradient) {
         for (const uint32_t i : index)
-            if (is_shown_[i] == 0) {
-                is_shown_[i] = 1;
-                shown_.push_back(i);
-            }
+            if (num_windows_[i]++ == 0) shown_.push_back(i);
         parallel_for(index.size(), kGaussiansAtOnce,
                      [&](size_t g) { add_gradient(gradient, g, sum_, index[g]); });
     }
-    // Calls move(i, sum) for each gaussian i that was shown, and begins the next sum.
+    // Calls move(i, sum, num_windows) for each gaussian i that windows showed, and begins the next
+    // sum.
     template <class Move>
     void move_shown(const Move& move) {
         parallel_for(shown_.size(), kGaussiansAtOnce, [&](size_t k) {
             const size_t i = shown_[k];
-            move(i, GaussianRows<const float>(sum_));
+            move(i, GaussianRows<const float>(sum_), num_windows_[i]);
             copy_gaussian(zero_, 0, sum_, i);
-            is_shown_[i] = 0;
+            num_windows_[i] = 0;
         });
         shown_.clear();
     }
@@ -225,7 +196,7 @@ class GradientSum {
     GaussianRows<float> sum_;
     std::vector<float> zeros_;
     GaussianRows<const float> zero_;
-    std::vector<uint8_t> is_shown_;
+    std::vector<uint8_t> num_windows_;  // at most kMostWindows
     std::vector<uint32_t> shown_;
 };
 
@@ -314,7 +285,6 @@ void refine_cuts(const FitConfig& config, const CutComparison& comparison, const
                per_step = static_cast<size_t>(comparison.windows_per_step);
     Windows windows(pictures, steps * per_step, static_cast<size_t>(comparison.cuts_per_view));
     Targets targets(target, target_count);
-    Comparison compared(config.loss, comparison);
     CutFrame frame(config);
     GradientSum sum(rows.size, rows.sh_degree);
     for (size_t i = 0; i < steps; ++i) {
@@ -326,14 +296,15 @@ void refine_cuts(const FitConfig& config, const CutComparison& comparison, const
             const GaussianRows<float>& shown = frame.start(index.size(), rows.sh_degree);
             parallel_for(index.size(), kGaussiansAtOnce,
                          [&](size_t g) { copy_gaussian(rows, index[g], shown, g); });
-            compared.compare(frame.draw(window.camera), wanted);
+            put_slopes(config.loss, wanted, frame.draw(window.camera));
             sum.add(index, frame.backward());
             ++progress.groups_done;
         }
         const FitStep step = fit_step(config, static_cast<int>(i));
-        sum.move_shown([&](size_t g, const GaussianRows<const float>& gradient) {
+        sum.move_shown([&](size_t g, const GaussianRows<const float>& gradient, int num_windows) {
             if (g < target_count) return;
-            move_gaussian(rows, g, gradient, g, levels.radius[g], step, config.beta2, adam_moments);
+            move_gaussian(rows, g, gradient, g, levels.radius[g],
+                          step_of_windows(step, num_windows), config.beta2, adam_moments);
         });
     }
 }

@@ -27,9 +27,18 @@ namespace {
 constexpr unsigned kStepsAhead = 3;
 // A slot's target is overwritten while the steps before it are drawn.
 static_assert(kViewSlots >= (kStepsAhead + 1) * kMostWindows, "no step that is drawn reads it");
-// Threads that plan windows without targets. Targets are drawn by one, whose stream their memory
-// belongs to.
-constexpr unsigned kPlanners = 3;
+constexpr unsigned kMostPlanners = 4;
+
+// Returns the number of threads that plan steps. All windows of a slot have one thread, whose
+// stream the memory of the target belongs to, and no step that is drawn reads a target that is
+// being overwritten.
+constexpr unsigned num_planners(unsigned windows_per_step) {
+    unsigned num = kMostPlanners;
+    while (num > 1 && (kViewSlots % (num * windows_per_step) != 0 ||
+                       kViewSlots < kStepsAhead * num * windows_per_step))
+        num /= 2;
+    return num;
+}
 
 constexpr size_t kMostPixels = kWidestWindowPx * kWidestWindowPx;  // of a window
 
@@ -242,7 +251,7 @@ class StepsAhead {
           target_(target),
           stream_(stream),
           device_(current_device()),
-          num_threads_(target == nullptr ? kPlanners : 1),
+          num_threads_(num_planners(windows_per_step)),
           workers_(num_threads_),
           views_(kViewSlots),
           steps_(kStepsAhead * num_threads_),
@@ -337,43 +346,29 @@ class StepsAhead {
 // Writes the slopes of the loss by the pixels of a step's windows.
 class Comparison {
   public:
-    Comparison(const LossWeights& loss, const CutComparison& comparison, const Canvases& canvases,
+    Comparison(const LossWeights& loss, unsigned num_windows, const Canvases& canvases,
                cudaStream_t stream)
         : loss_(loss),
-          comparison_(comparison),
           canvases_(canvases),
           stream_(stream),
-          num_windows_(static_cast<unsigned>(comparison.windows_per_step)),
-          slopes_(kMostPixels * num_windows_, stream),
-          losses_(blocks_for(kMostPixels, kThreads) * num_windows_, stream),
-          weights_(num_windows_, stream) {}
+          losses_(blocks_for(kMostPixels, kThreads) * num_windows, stream),
+          weights_(num_windows, stream) {}
 
-    void compare(const PlannedStep& step) {
-        if (comparison_.is_blurred)
-            compare<true>(step);
-        else
-            compare<false>(step);
-    }
-
-  private:
-    template <bool kIsBlurred>
     void compare(const PlannedStep& step) {
         const WindowTables* windows = step.windows.tables();
         const dim3 grid(step.blocks_per_window, step.windows.count());
-        launch("compare_kernel", compare_kernel<kIsBlurred>, grid, kThreads, 0, stream_, windows,
-               loss_, comparison_.power, kMostPixels, slopes_.data(), losses_.data());
+        launch("compare_kernel", compare_kernel, grid, kThreads, 0, stream_, windows, loss_,
+               kMostPixels, canvases_.slopes(), losses_.data());
         launch("weigh_kernel", weigh_kernel, step.windows.count(), kThreads, 0, stream_, windows,
                losses_.data(), step.blocks_per_window, weights_.data());
-        launch("slope_kernel", slope_kernel<kIsBlurred>, grid, kThreads, 0, stream_, windows,
-               slopes_.data(), kMostPixels, weights_.data(), canvases_.slopes());
+        launch("weigh_slopes_kernel", weigh_slopes_kernel, grid, kThreads, 0, stream_, windows,
+               kMostPixels, weights_.data(), canvases_.slopes());
     }
 
+  private:
     const LossWeights loss_;
-    const CutComparison comparison_;
     const Canvases& canvases_;
     const cudaStream_t stream_;
-    const unsigned num_windows_;
-    DeviceBuffer<float4> slopes_;
     DeviceBuffer<double> losses_;
     DeviceBuffer<float> weights_;
 };
@@ -402,7 +397,7 @@ void refine_cuts(const FitConfig& config, const CutComparison& comparison,
     const DeviceTable table(pictures.table, stream);
     const Canvases canvases(windows_per_step, stream);
     StepFrame frame(config, rows, table, stream);
-    Comparison compared(config.loss, comparison, canvases, stream);
+    Comparison compared(config.loss, windows_per_step, canvases, stream);
     const Span<const int64_t>& offset = pictures.table.offset;
     const auto first_moving = static_cast<size_t>(
         std::lower_bound(offset.begin(), offset.end(), static_cast<int64_t>(target.rows.size)) -

@@ -51,45 +51,14 @@ struct ReadPlanes {
     }
 };
 
-// Returns a pixel after a blur by [1 2 1] / 4 along both axes, with zeros beyond the border, so
-// that the blur is its own transpose; `values_at(x, y)` has the pixels before.
-template <class ValuesAt>
-V3DG_HD inline PixelValues blurred(size_t width, size_t height, size_t x, size_t y,
-                                   const ValuesAt& values_at) {
-    PixelValues sum{};
-    for (size_t row = y > 0 ? y - 1 : y; row <= y + 1 && row < height; ++row)
-        for (size_t column = x > 0 ? x - 1 : x; column <= x + 1 && column < width; ++column) {
-            const float weight = (row == y ? 0.5f : 0.25f) * (column == x ? 0.5f : 0.25f);
-            const PixelValues values = values_at(column, row);
-            for (int k = 0; k < 4; ++k) sum.value[k] += weight * values.value[k];
-        }
-    return sum;
-}
-
-// Added to a difference before it is taken to a power below 1, so that slopes stay finite: one step
-// of 8 bits.
-constexpr float kLeastDifference = 0.004f;
-
-// Returns the loss of a value, from its difference.
-V3DG_HD inline float loss_of_value(float difference, float power) {
-    const float size = ::fabsf(difference);
-    return power == 1 ? size : ::powf(size + kLeastDifference, power);
-}
-// Returns its slope.
-V3DG_HD inline float slope_of_value(float difference, float power) {
-    const float slope = l1_vjp(difference, 1.0f);
-    if (power == 1) return slope;
-    return slope * power * ::powf(::fabsf(difference) + kLeastDifference, power - 1);
-}
-
 // Puts the slopes of the loss in place of the differences of a pixel, as if the picture had the
 // weight 1. Returns the pixel's loss.
-V3DG_HD inline float put_slopes(const LossWeights& loss, float power, PixelValues& pixel) {
+V3DG_HD inline float put_slopes(const LossWeights& loss, PixelValues& pixel) {
     float sum = 0;
     for (int k = 0; k < 4; ++k) {
         const float weight = k < 3 ? loss.l1 / 3 : loss.alpha;
-        sum += weight * loss_of_value(pixel.value[k], power);
-        pixel.value[k] = weight * slope_of_value(pixel.value[k], power);
+        sum += weight * ::fabsf(pixel.value[k]);
+        pixel.value[k] = l1_vjp(pixel.value[k], weight);
     }
     return sum;
 }
@@ -106,6 +75,16 @@ V3DG_HD inline float weight_of_picture(double loss_sum, double num_pixels) {
 V3DG_HD inline void put_sum_slopes(float color[3], float& alpha) {
     for (int k = 0; k < 3; ++k) color[k] = k == 0 ? 1.0f : 0.0f;
     alpha = 0;
+}
+
+// Returns the step of a gaussian that `num_windows` of the step's windows show: the noise of a sum of
+// n gradients, relative to the sum, falls with the root of n.
+V3DG_HD inline FitStep step_of_windows(FitStep step, int num_windows) {
+    const float factor = ::sqrtf(static_cast<float>(num_windows));
+    for (float* size : {&step.position, &step.quat, &step.log_scale, &step.logit, &step.sh0,
+                        &step.sh_rest})
+        *size *= factor;
+    return step;
 }
 
 // The moments of Adam: value k of gaussian i of n is at k * n + i.

@@ -37,36 +37,25 @@ struct WindowPixel {
           height(static_cast<size_t>(image.height)),
           pixel(size_t(blockIdx.x) * kThreads + threadIdx.x) {}
     __device__ bool is_in_window() const { return pixel < width * height; }
-
-    template <bool kIsBlurred, class ValuesAt>
-    __device__ PixelValues filtered(const ValuesAt& values_at) const {
-        const size_t x = pixel % width, y = pixel / width;
-        if constexpr (kIsBlurred) return blurred(width, height, x, y, values_at);
-        return values_at(x, y);
-    }
 };
 
 // Writes the slopes of pixels as if windows had the weight 1, a thread each, and the loss of each
-// block. `slopes` has room for kMostPixels of each window.
-template <bool kIsBlurred>
+// block. `planes` has room for `most_pixels` of each window.
 __global__ void __launch_bounds__(kThreads)
-    compare_kernel(const WindowTables* windows, LossWeights loss, float power, size_t most_pixels,
-                   float4* slopes, double* loss_of_block) {
+    compare_kernel(const WindowTables* windows, LossWeights loss, size_t most_pixels, float* planes,
+                   double* loss_of_block) {
     const unsigned w = blockIdx.y;
     const WindowPixel p(*windows, w);
     double pixel_loss = 0;
     if (p.is_in_window()) {
         const ReadPlanes drawn{p.image.planes.color, p.image.planes.alpha};
-        const ReadPlanes& target = windows->target[w];
-        PixelValues values = p.filtered<kIsBlurred>([&](size_t x, size_t y) {
-            PixelValues difference = drawn.at(y * p.width + x);
-            const PixelValues wanted = target.at(y * p.width + x);
-            for (int k = 0; k < 4; ++k) difference.value[k] -= wanted.value[k];
-            return difference;
-        });
-        pixel_loss = put_slopes(loss, power, values);
-        slopes[w * most_pixels + p.pixel] =
-            make_float4(values.value[0], values.value[1], values.value[2], values.value[3]);
+        PixelValues values = drawn.at(p.pixel);
+        const PixelValues wanted = windows->target[w].at(p.pixel);
+        for (int k = 0; k < 4; ++k) values.value[k] -= wanted.value[k];
+        pixel_loss = put_slopes(loss, values);
+        const PicturePlanes slopes = planes_of_window(planes, most_pixels, w);
+        for (size_t k = 0; k < 3; ++k) slopes.color[3 * p.pixel + k] = values.value[k];
+        slopes.alpha[p.pixel] = values.value[3];
     }
     __shared__ double of_warp[kThreads / 32];
     pixel_loss = warp_sum(pixel_loss);
@@ -96,22 +85,16 @@ __global__ void __launch_bounds__(kThreads)
     weight[blockIdx.x] = weight_of_picture(sum, static_cast<double>(image.width) * image.height);
 }
 
-// Writes the slopes of the loss by the pixels of windows, a thread each.
-template <bool kIsBlurred>
+// Multiplies the slopes of windows by their weights, a thread a pixel.
 __global__ void __launch_bounds__(kThreads)
-    slope_kernel(const WindowTables* windows, const float4* slopes, size_t most_pixels,
-                 const float* weight, float* planes) {
+    weigh_slopes_kernel(const WindowTables* windows, size_t most_pixels, const float* weight,
+                        float* planes) {
     const unsigned w = blockIdx.y;
     const WindowPixel p(*windows, w);
     if (!p.is_in_window()) return;
-    const float4* of_window = slopes + w * most_pixels;
-    const PixelValues slope = p.filtered<kIsBlurred>([&](size_t x, size_t y) -> PixelValues {
-        const float4 at = of_window[y * p.width + x];
-        return {{at.x, at.y, at.z, at.w}};
-    });
-    const PicturePlanes out = planes_of_window(planes, most_pixels, w);
-    for (size_t k = 0; k < 3; ++k) out.color[3 * p.pixel + k] = weight[w] * slope.value[k];
-    out.alpha[p.pixel] = weight[w] * slope.value[3];
+    const PicturePlanes slopes = planes_of_window(planes, most_pixels, w);
+    for (size_t k = 0; k < 3; ++k) slopes.color[3 * p.pixel + k] *= weight[w];
+    slopes.alpha[p.pixel] *= weight[w];
 }
 
 // Writes the slopes of the sum of one channel, a thread a pixel.
@@ -152,17 +135,17 @@ __global__ void __launch_bounds__(kItemSize)
     const size_t c = first_cluster + blockIdx.x, i = size_t(blockIdx.y) * kItemSize + threadIdx.x,
                  row = static_cast<size_t>(offset[c]) + i;
     if (row >= static_cast<size_t>(offset[c + 1])) return;
-    constexpr size_t kNone = ~size_t(0);
-    size_t sum = kNone;
+    size_t sum = 0;
+    int num_windows = 0;
     shown.for_each_window(c, i, [&](unsigned, size_t of_window) {
-        if (sum == kNone)
+        if (num_windows++ == 0)
             sum = of_window;
         else
             add_gradient(GaussianRows<const float>(gradient), of_window, gradient, sum);
     });
-    if (sum == kNone) return;
-    move_gaussian(rows, row, GaussianRows<const float>(gradient), sum, radius[row], step, beta2,
-                  moments);
+    if (num_windows == 0) return;
+    move_gaussian(rows, row, GaussianRows<const float>(gradient), sum, radius[row],
+                  step_of_windows(step, num_windows), beta2, moments);
 }
 
 // Adds what windows show of all gaussians, and counts the windows that have a cluster.

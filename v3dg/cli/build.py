@@ -25,6 +25,7 @@ from v3dg.cli._views import ask_up, is_at_terminal
 from v3dg.gaussians import Gaussians
 from v3dg.io import SUFFIXES, open_asset, run_files
 from v3dg.levels import BuildConfig, build_file, levels_path
+from v3dg.levels.quality import Quality
 from v3dg.levels.scheduler import SchedulerError
 from v3dg.upright import ASSUMED, up_of
 
@@ -55,6 +56,11 @@ class Build(_common.OnDevice):
     codec: Literal["float32", "quantized"] = "float32"
     """Encoding of gaussians, with every bit, or rounded to 16 to 40 bytes
     (docs/format.md has the error)."""
+    quality: Quality = "draft"
+    """How close levels come to the asset: `draft` as they are built; `standard` also
+    refined together, which takes seconds on a GPU and minutes on a CPU; `best` with
+    five times as many pictures. For a place that is seen from inside, use
+    `v3dg refine --cameras` instead."""
     up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
     """The axis that is up in the asset, which the bundle records; if it is unknown, a
     user at a terminal is asked."""
@@ -310,6 +316,7 @@ def _build(
         "gaussians": bundle.num_gaussians,
         "clusters": len(bundle.clusters),
         "levels": bundle.num_levels,
+        "quality": options.quality,
         "bytes": output.stat().st_size,
         "seconds": time.perf_counter() - start,
     }
@@ -340,6 +347,7 @@ def _build_file(
             memory=options.memory,
             executor=executor,
             codec=options.codec,
+            quality=options.quality,
             up=options.up,
         )
 
@@ -380,4 +388,10 @@ def _lines(result: JsonObject) -> list[str]:
     ]
     if result["dropped"]:
         lines.append("left out: " + describe(result["dropped"]))
+    if result["status"] == "built" and result["quality"] == "draft":
+        output = Path(result["output"])
+        lines.append(
+            f"draft: `v3dg refine {output} {output.stem}_refined.v3dg` brings its levels closer to "
+            "the asset, in seconds on a GPU or minutes on a CPU"
+        )
     return lines

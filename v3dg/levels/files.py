@@ -11,7 +11,7 @@ from typing import Literal
 
 from v3dg import _files
 from v3dg._device import Device
-from v3dg._numbers import check_type
+from v3dg._numbers import check, check_type
 from v3dg._progress import Progress
 from v3dg._urls import shown
 from v3dg.bundle import Bundle
@@ -20,7 +20,8 @@ from v3dg.gaussians import Gaussians
 from v3dg.levels.config import BuildConfig
 from v3dg.levels.leaves import Leaves, MemoryLeaves, made_with
 from v3dg.levels.leaves_on_disk import MOST_GAUSSIANS, leaves_on_disk
-from v3dg.levels.memory import in_bytes, most_units, unit_bytes
+from v3dg.levels.memory import in_bytes, in_mib, most_units, unit_bytes
+from v3dg.levels.quality import Quality, refine_bytes, refinement_of
 from v3dg.levels.unfinished import discard_levels
 from v3dg.levels.whole import build_into, devices_for
 
@@ -41,6 +42,7 @@ def build_file(
     memory: int | str | None = None,
     executor: Executor | None = None,
     codec: Literal["float32", "quantized"] = "float32",
+    quality: Quality = "draft",
     up: Axis | None = None,
 ) -> tuple[Bundle, bool]:
     """Build the bundle of an asset's file, or of several that make one asset, straight
@@ -59,7 +61,9 @@ def build_file(
             memory.
         up: The axis that is up in the asset, which the bundle records for viewers and
             exports.
-        config, seed, progress, device, unusable, executor, codec: See `build_bundle`.
+        config, seed, progress, device, unusable, executor, codec, quality: See
+            `build_bundle`. A build that is interrupted during the refinement leaves the
+            levels as they are built.
 
     Returns:
         The bundle, opened from its file, and whether it was built.
@@ -83,6 +87,7 @@ def build_file(
         num_bytes=in_bytes(memory),
         executor=executor,
         codec=codec,
+        quality=quality,
         up=up,
     )
     if not resume:
@@ -130,6 +135,7 @@ class _FileBuild:
     num_bytes: int  # memory of the host
     executor: Executor | None
     codec: str
+    quality: Quality
     up: Axis | None
 
     @property
@@ -160,6 +166,7 @@ class _FileBuild:
                 with suppress(RuntimeError):  # another build has begun to write there
                     discard_levels(self.levels_path)
                 return Bundle.open(self.bundle_path), False
+            self._check_memory(leaves)
             bundle = build_into(
                 self.levels_path,
                 leaves,
@@ -168,6 +175,7 @@ class _FileBuild:
                 self.devices,
                 self.progress,
                 codec=self.codec,
+                quality=self.quality,
                 bundle_path=self.bundle_path,
                 most_units=most_units(self.num_bytes, leaves),
                 executor=self.executor,
@@ -175,13 +183,27 @@ class _FileBuild:
             )
             return bundle, True
 
+    def _check_memory(self, leaves: Leaves) -> None:
+        """Refuse, before the build, an asset that is too large to be refined."""
+        count = leaves.num_gaussians
+        required = refine_bytes(self.quality, count, leaves.sh_degree)
+        check(
+            "memory",
+            self.num_bytes >= required,
+            f"at least {in_mib(required)} to refine an asset of {count:,} gaussians, "
+            f"got {in_mib(self.num_bytes)}; give more, or build with the quality draft",
+        )
+
     def _is_finished(self, leaves: Leaves) -> bool:
         """Whether the bundle exists, was made of these leaves with these settings, and
         was not converted to another codec since."""
-        config = made_with(leaves, self.config, self.seed, self.codec, self.up)
+        settings = made_with(leaves, self.config, self.seed, self.codec, self.up)
+        refinement = refinement_of(self.quality, leaves.num_gaussians, settings["seed"])
         try:
             bundle = Bundle.open(self.bundle_path)
-            return bundle.config == config and bundle.codec == self.codec
+            if refinement is not None:
+                settings = refinement.settings_of(bundle, settings)
+            return bundle.config == settings and bundle.codec == self.codec
         except (ValueError, OSError):  # missing, damaged, or of another version: build it
             return False
 

@@ -11,7 +11,7 @@ import os
 import stat
 import struct
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from io import FileIO
@@ -54,6 +54,9 @@ class FinishedLevel:
 Part = Mapping[int, tuple[LevelPlan, PageRun]]
 """The work of one worker: the plan and the pages of each level, by the number of the
 level."""
+
+Refine = Callable[[Bundle], Bundle]
+"""Returns a bundle with refined levels."""
 
 
 @dataclass(frozen=True)
@@ -232,9 +235,20 @@ class Unfinished:
             self.is_whole = True
             os.ftruncate(descriptor, self._plan.num_bytes)
 
-    def bundle(self) -> Bundle:
-        """The whole bundle, moved to its final path."""
-        if self._bundle_path is not None:
+    def bundle(self, refine: Refine | None = None) -> Bundle:
+        """The whole bundle, moved to its final path.
+
+        A refined one is written there; until then this file has the levels as they are
+        built, and a build that is killed refines them again. Without a final path this
+        file stays, and the refined bundle is in memory.
+        """
+        if refine is not None:
+            refined = refine(Bundle.open(self._path))
+            if self._bundle_path is None:
+                return refined
+            refined.write(self._bundle_path)
+            self._path.unlink()
+        elif self._bundle_path is not None:
             _files.put_in_place(self._path, self._bundle_path)
         return Bundle.open(self._bundle_path or self._path)
 
@@ -266,10 +280,13 @@ class MemoryStore:
         self._clusters = clusters
         self._groups = groups
 
-    def bundle(self) -> Bundle:
-        return Bundle(
+    def bundle(self, refine: Refine | None = None) -> Bundle:
+        bundle = Bundle(
             self._clusters, self._groups, self._gaussians, self._plan.config, self.codec.name
         )
+        if refine is None:
+            return bundle
+        return refine(bundle)
 
 
 def described(device: Device) -> tuple[str, str]:

@@ -28,6 +28,7 @@ from v3dg.levels.config import BuildConfig
 from v3dg.levels.leaves import Leaves, MemoryLeaves, made_with
 from v3dg.levels.plan import Plan
 from v3dg.levels.progress import Bar
+from v3dg.levels.quality import Quality, refinement_of
 from v3dg.levels.scheduler import Watch, completed, watch_over
 from v3dg.levels.simplify import Level, LevelBuilder, LevelTables, Show
 from v3dg.levels.smooth import measured_config
@@ -66,6 +67,7 @@ def build_into(
     progress: Progress,
     *,
     codec: str,
+    quality: Quality = "draft",
     bundle_path: Path | None = None,
     most_units: int | None = None,
     executor: Executor | None = None,
@@ -80,6 +82,7 @@ def build_into(
     units = plan.units(UNIT_LEAVES)
     page_codec = codec_of(codec, leaves.sh_degree)
     file = BundlePlan(plan.layout, page_codec, made_with(leaves, config, seed, codec, up))
+    refinement = refinement_of(quality, leaves.num_gaussians, file.config["seed"])
     parts = _parts(plan, units, file)
     opened: AbstractContextManager[Unfinished | MemoryStore]
     if path is not None:
@@ -98,7 +101,9 @@ def build_into(
                 if config.smooth == "yes" and len(tables) > 1:
                     tables = build.grown(tables, devices[0])
             store.finish(*assemble(plan, tables, config), hashes)
-        return store.bundle()
+        if refinement is None:
+            return store.bundle()
+        return store.bundle(partial(refinement.refined, device=devices[0], progress=progress))
 
 
 def _parts(plan: Plan, units: Sequence[Plan], file: BundlePlan) -> list[Part]:

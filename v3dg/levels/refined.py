@@ -1,0 +1,211 @@
+"""Levels that are refined together, in pictures of cuts, where gaussians hide each
+other."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Protocol, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg import _core, _device
+from v3dg._device import Device
+from v3dg._json import JsonObject
+from v3dg._progress import Bar, Progress
+from v3dg.bundle import Bundle
+from v3dg.cameras import Camera
+from v3dg.gaussians import Gaussians
+from v3dg.levels.config import BuildConfig
+from v3dg.levels.fit import fit_config, run_fit
+from v3dg.residency import residency
+
+_T = TypeVar("_T", covariant=True)
+# The factor of the step sizes of a fit. It is small because refinement starts from a
+# fitted level.
+_RATE = 0.2
+# The share of the visibility of a level that is dropped, unless the caller has another.
+DROP = 0.02
+# The number of pictures that measure how much is seen of each gaussian.
+_NUM_WEIGHING_PICTURES = 2_000
+# A gaussian is measured if it is in the cuts of at least this many of them. Pictures
+# show only parts of a very large asset, so some gaussians are in too few.
+_LEAST_LOOKS = 8
+
+
+def refined_bundle(
+    bundle: Bundle,
+    *,
+    cameras: Sequence[Camera] = (),
+    steps: int,
+    drop: float = DROP,
+    seed: int,
+    device: Device,
+    progress: Progress,
+) -> Bundle:
+    """A copy of a bundle with refined levels, as `v3dg.refine_bundle`."""
+    if bundle.num_levels < 2 or bundle.clusters.offset[bundle.level_range(0).stop] == 0:
+        return bundle
+    if drop > 0:
+        bundle = without_unseen(bundle, cameras, drop, seed, device, progress)
+    cuts = Cuts(bundle, cameras, seed, device, progress)
+    refined = cuts.refined(steps, default_steps(device))
+    config = {**bundle.config, "refined": record_of(steps, drop, seed, len(cameras))}
+    return Bundle(bundle.clusters.around(refined), bundle.groups, refined, config, bundle.codec)
+
+
+def record_of(steps: int, drop: float, seed: int, num_cameras: int = 0) -> JsonObject:
+    """What the config of a bundle says of its refinement."""
+    record: JsonObject = {"steps": steps, "drop": drop, "seed": seed}
+    if num_cameras > 0:
+        record["cameras"] = num_cameras
+    return record
+
+
+def without_unseen(
+    bundle: Bundle,
+    cameras: Sequence[Camera],
+    drop: float,
+    seed: int,
+    device: Device,
+    progress: Progress,
+) -> Bundle:
+    """Drop from each level but the first what pictures of cuts show least of, up to
+    this share of what they show of the level."""
+    cuts = Cuts(bundle, cameras, seed, device, progress)
+    weights, looks = cuts.weights(_NUM_WEIGHING_PICTURES)
+    return _without_least(bundle, np.where(looks < _LEAST_LOOKS, np.nan, weights), drop)
+
+
+@dataclass(frozen=True)
+class RefineSteps:
+    """How a refinement compares cuts with the asset, and how it moves gaussians.
+
+    Attributes:
+        windows: Windows of pictures, 1 to 32, whose gradients make one step.
+        cuts_per_view: Cuts that are compared with each picture of the asset, 1 to 128.
+        rate: Step sizes of a gaussian that one of the windows shows, as parts of those
+            of a fit; they grow with the root of the number of windows that show it.
+    """
+
+    windows: int
+    cuts_per_view: int = 8
+    rate: float = _RATE
+
+
+def default_steps(device: Device) -> RefineSteps:
+    """The steps for a kind of device: a GPU is busy only with several windows at once,
+    a CPU with one."""
+    if device.is_cuda:
+        return RefineSteps(windows=8)
+    return RefineSteps(windows=1)
+
+
+class _CutOperation(Protocol[_T]):
+    """An operation of the core on pictures of cuts."""
+
+    def __call__(
+        self,
+        *,
+        gaussians: _core.Rows,
+        pictures: _core.CutPictures,
+        progress: _core.FitProgress,
+    ) -> _T: ...
+
+
+class Cuts:
+    """Pictures of a bundle's cuts, and copies of its gaussians on a device, which they
+    move."""
+
+    def __init__(
+        self,
+        bundle: Bundle,
+        cameras: Sequence[Camera],
+        seed: int,
+        device: Device,
+        progress: Progress,
+    ) -> None:
+        self._bundle = bundle
+        self._seed = seed
+        self._device = device
+        self._progress = progress
+        everything = bundle.gaussians
+        self._leaves = slice(0, int(bundle.clusters.offset[bundle.level_range(0).stop]))
+        self._gaussians = _device.place(everything.subset(np.arange(len(everything))), device)
+        self._pictures = _core.CutPictures(
+            table=residency.table(bundle),
+            asset=everything.subset(self._leaves).rows,
+            cameras=[camera.core for camera in cameras],
+            seed=seed,
+        )
+
+    def refined(self, num_pictures: int, settings: RefineSteps) -> Gaussians:
+        """Move the gaussians by this number of pictures, rounded up to whole steps."""
+        clusters = self._bundle.clusters
+        ball = self._bundle.groups.ball
+        radius = np.where(clusters.own_group < 0, np.float32(1), ball[clusters.own_group, 3])
+        radius = np.repeat(radius, np.diff(clusters.offset))
+        leaves = self._gaussians.subset(self._leaves).rows
+        target = _core.FitTarget(leaves, filter_px2=0.0, antialiased=False)
+        comparison = _core.CutComparison(
+            windows_per_step=settings.windows,
+            cuts_per_view=settings.cuts_per_view,
+        )
+        num_steps = -(-num_pictures // settings.windows)
+        move = partial(
+            _core.refine_cuts,
+            config=self._config(num_steps, settings.rate),
+            comparison=comparison,
+            target=target,
+            radius=radius,
+        )
+        self._run("refine", num_steps * settings.windows, move)
+        return self._gaussians.numpy()
+
+    def weights(self, num_pictures: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]:
+        """What pictures show of each gaussian, and how many of their cuts have it."""
+        weigh = partial(_core.weigh_cuts, config=self._config(num_pictures, _RATE))
+        return self._run("weigh", num_pictures, weigh)
+
+    def _config(self, num_steps: int, rate: float) -> _core.FitConfig:
+        filter_px2 = float(self._bundle.clusters.filter_px2[self._bundle.level_range(1).start])
+        config = BuildConfig(steps=num_steps, first_steps=num_steps, filter_px2=filter_px2)
+        config = replace(
+            config,
+            step_position=rate * config.step_position,
+            step_log_scale=rate * config.step_log_scale,
+            step_quat=rate * config.step_quat,
+            step_logit=rate * config.step_logit,
+            step_sh0=rate * config.step_sh0,
+            step_sh_rest=rate * config.step_sh_rest,
+        )
+        return fit_config(config, self._seed, 1)
+
+    def _run(self, name: str, num_pictures: int, operation: _CutOperation[_T]) -> _T:
+        work = partial(operation, gaussians=self._gaussians.rows, pictures=self._pictures)
+        with Bar(num_pictures, name, self._progress) as bar:
+
+            def show(state: _core.FitProgress) -> None:
+                bar.update(state.groups_done - bar.num_done)
+
+            return run_fit(lambda state: work(progress=state), self._device, show)
+
+
+def _without_least(bundle: Bundle, weight: npt.NDArray[np.float64], share: float) -> Bundle:
+    """Drop from each level but the first its gaussians of least weight, up to a share
+    of the level's weight.
+
+    Gaussians whose weight is not a number stay, and count for nothing in the sum.
+    """
+    offset = bundle.clusters.offset
+    is_kept = np.ones(bundle.num_gaussians, bool)
+    for level in range(1, bundle.num_levels):
+        clusters_of_level = bundle.level_range(level)
+        rows = slice(offset[clusters_of_level.start], offset[clusters_of_level.stop])
+        order = np.argsort(weight[rows], kind="stable")
+        cumulated = np.cumsum(weight[rows][order])
+        is_kept[rows][order[cumulated < share * np.nansum(weight[rows])]] = False
+    kept_rows = np.flatnonzero(is_kept)
+    clusters = replace(bundle.clusters, offset=np.searchsorted(kept_rows, offset))
+    gaussians = bundle.gaussians.subset(kept_rows)
+    return Bundle(clusters, bundle.groups, gaussians, bundle.config, bundle.codec)
