@@ -93,10 +93,7 @@ def build_file(
     if not resume:
         discard_levels(build.levels_path)
     with _naming_asset(build.paths[0]):
-        if asset is None:
-            source = build.leaves_on_disk()
-        else:
-            source = nullcontext(MemoryLeaves(asset, config, unusable, build.devices[0]))
+        source = build.leaves_of(asset)
         del asset
         return build.run(source, resume=resume)
 
@@ -142,8 +139,10 @@ class _FileBuild:
     def levels_path(self) -> Path:
         return levels_path(self.bundle_path)
 
-    def leaves_on_disk(self) -> AbstractContextManager[Leaves]:
-        """The leaves in the files of the asset."""
+    def leaves_of(self, asset: Gaussians | None) -> AbstractContextManager[Leaves]:
+        """The leaves of an asset in memory, or in its files."""
+        if asset is not None:
+            return nullcontext(MemoryLeaves(asset, self.config, self.unusable, self.devices[0]))
         most_in_memory = MOST_GAUSSIANS
         if self.executor is not None:  # its workers cannot read the memory of this process
             most_in_memory = 0

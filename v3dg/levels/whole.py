@@ -84,11 +84,7 @@ def build_into(
     file = BundlePlan(plan.layout, page_codec, made_with(leaves, config, seed, codec, up))
     refinement = refinement_of(quality, leaves.num_gaussians, file.config["seed"])
     parts = _parts(plan, units, file)
-    opened: AbstractContextManager[Unfinished | MemoryStore]
-    if path is not None:
-        opened = Unfinished(Path(path), file, parts, devices[0], bundle_path)
-    else:
-        opened = nullcontext(MemoryStore(file))
+    opened = _opened(path, file, parts, devices[0], bundle_path)
     with _device.memory_errors(), opened as store:
         if not store.is_whole:
             config = measured_config(config, plan, leaves, seed, page_codec, devices[0])
@@ -104,6 +100,19 @@ def build_into(
         if refinement is None:
             return store.bundle()
         return store.bundle(partial(refinement.refined, device=devices[0], progress=progress))
+
+
+def _opened(
+    path: str | os.PathLike[str] | None,
+    file: BundlePlan,
+    parts: Sequence[Part],
+    device: Device,
+    bundle_path: Path | None,
+) -> AbstractContextManager[Unfinished | MemoryStore]:
+    """The place of the levels of a build: a file, or memory."""
+    if path is None:
+        return nullcontext(MemoryStore(file))
+    return Unfinished(Path(path), file, parts, device, bundle_path)
 
 
 def _parts(plan: Plan, units: Sequence[Plan], file: BundlePlan) -> list[Part]:
