@@ -1,11 +1,11 @@
 """The time and the gain of a refinement: windows a step, cuts a picture of the asset,
-step sizes and losses.
+step sizes and numbers of pictures.
 
     python -m benchmarks.studies.refined.steps --donut donut.ply --old OLD -o steps
 
 Two assets are refined in each way: a donut, and eleven of them in a heap, which hide
 each other. OLD is a folder with the package of an older version, which refines the same
-bundles in 10,000 and 30,000 steps. FLIP of cuts of some shares of the gaussians, at
+bundles in a third as many steps. FLIP of cuts of some shares of the gaussians, at
 some sizes, is compared with that of the levels as they are built, at equal counts, and
 with that of other ways of the same run. The most important ways come first; none is
 begun after `--seconds`.
@@ -14,7 +14,6 @@ begun after `--seconds`.
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import os
 import statistics
@@ -25,7 +24,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -35,20 +34,20 @@ from benchmarks.evaluation import record
 from benchmarks.studies.pairs.measure import cluster_sizes, cuts_of, errors, weighted
 from benchmarks.studies.pairs.subject import Size, Subject
 from v3dg import _device
+from v3dg._json import JsonObject
 from v3dg._judges import Judges
+from v3dg.levels.refined import Cuts, RefineSteps, without_unseen
 from v3dg.metrics import draw_truth
 from v3dg.pictures import Picture, to_8bit
-from v3dg.refine import Cuts, RefineSteps, without_unseen
 
-Row = dict[str, Any]
+Row = JsonObject
 
 _DONUTS = 11
-_RATE = 0.2  # of the step sizes of a fit, for one window a step
 _PERCENTS = (50.0, 12.5, 3.0)
 _FACTORS = (0.5, 1.0, 2.0, 4.0)
-_WINDOWS = (1, 2, 4, 8, 16, 32)
+_WINDOWS = (8, 16)
 _OLD_PROGRAM = """
-import json, sys, time
+import sys, time
 import v3dg
 bundle = v3dg.Bundle.open(sys.argv[1])
 def refine(steps, drop):
@@ -56,11 +55,9 @@ def refine(steps, drop):
     refined = v3dg.refine_bundle(bundle, steps=steps, drop=drop, device=sys.argv[3], progress=False)
     return refined, time.perf_counter() - start
 refine(200, 0.02)
-result = {"ms": 1e3 / int(sys.argv[4]) * refine(int(sys.argv[4]), 0)[1]}
-for steps in map(int, sys.argv[5:]):
-    refined, result[str(steps)] = refine(steps, 0.02)
-    refined.write(f"{sys.argv[2]}_{steps}.v3dg")
-print(json.dumps(result))
+refined, seconds = refine(int(sys.argv[4]), 0.02)
+refined.write(sys.argv[2])
+print(seconds)
 """
 
 
@@ -70,7 +67,7 @@ class Config:
     """The paper's donut, or another asset of its size."""
     old: Path | None = None
     """A folder with the package `v3dg` of an older version, built."""
-    seconds: float = 270
+    seconds: float = 140
     assets: tuple[Literal["donut", "heap"], ...] = ("heap", "donut")
     pictures: int = 30_000
     """Pictures of a refinement, unless a way has another number."""
@@ -84,13 +81,12 @@ class Config:
 
 @dataclass(frozen=True)
 class Way:
-    """A way to refine: `rate` is relative to that of one window a step."""
+    """A way to refine."""
 
     windows: int = 8
     cuts_per_view: int = 8
-    rate: float = 2.8
-    power: float = 1.0
-    is_blurred: bool = False
+    rate: float = 1.0
+    """Relative to the step sizes of the default."""
     share: float = 1.0
     """Of the pictures."""
 
@@ -98,31 +94,23 @@ class Way:
         return RefineSteps(
             windows=self.windows,
             cuts_per_view=self.cuts_per_view,
-            rate=_RATE * self.rate,
-            power=self.power,
-            is_blurred=self.is_blurred,
+            rate=self.rate * RefineSteps.rate,
         )
 
 
 # The most important first.
 _WAYS = (
     Way(),
-    Way(share=1 / 3),
-    Way(rate=4.0),
-    Way(rate=2.0),
-    Way(windows=16, rate=4.0),
-    Way(windows=4, rate=2.0),
-    Way(power=0.7, is_blurred=True),
-    Way(cuts_per_view=1),
-    Way(cuts_per_view=16),
-    Way(power=0.7),
-    Way(is_blurred=True),
-    Way(windows=16, rate=2.8),
-    Way(rate=1.4),
-    Way(share=2.0),
-    Way(windows=32, rate=5.6),
-    Way(windows=4, rate=2.8),
-    Way(windows=1, rate=1.0),
+    Way(cuts_per_view=4),
+    Way(windows=16, cuts_per_view=4),
+    Way(windows=16, cuts_per_view=4, share=1.5),
+    Way(cuts_per_view=2),
+    Way(cuts_per_view=4, share=1.5),
+    Way(windows=16),
+    Way(windows=16, cuts_per_view=2),
+    Way(cuts_per_view=4, rate=1.4),
+    Way(windows=16, share=1.5),
+    Way(share=1.5),
 )
 
 
@@ -143,7 +131,7 @@ def heap_of(donut: v3dg.Gaussians) -> v3dg.Gaussians:
 class View:
     """A count and a size, seen from one side."""
 
-    about: Row
+    labels: Row
     count: int
     size: Size
     truth: Picture
@@ -163,7 +151,9 @@ class Study:
         self.build_seconds = time.perf_counter() - start
         self.path = folder / f"{name}.v3dg"
         self.built.write(self.path)
-        placed = asset.torch("cuda") if self._device.is_cuda else asset
+        placed = asset
+        if self._device.is_cuda:
+            placed = asset.torch("cuda")
         self._views = [
             View(
                 {"percent": percent, "factor": factor, "view": number},
@@ -186,13 +176,14 @@ class Study:
                 )
                 row = {"gaussians": cut.gaussians, "weight": cut.weight}
                 row["tolerance"] = cut.cut["tolerance"]
-                yield view.about | row, view.truth, to_8bit(image.color)
+                yield view.labels | row, view.truth, to_8bit(image.color)
 
     def flips(self, bundle: v3dg.Bundle, judges: Judges) -> list[float]:
         """FLIP at each count and size, means over the views."""
         rows: dict[tuple[float, float], list[Row]] = {}
-        for (about, _, _), found in judges.measured(self.pictures(bundle), errors):
-            rows.setdefault((about["percent"], about["factor"]), []).append(about | found)
+        for (labels, _, _), measured in judges.measured(self.pictures(bundle), errors):
+            row = labels | measured
+            rows.setdefault((row["percent"], row["factor"]), []).append(row)
         return [weighted(of_pair)["flip"] for of_pair in rows.values()]
 
     def milliseconds(self, way: Way) -> float:
@@ -220,22 +211,23 @@ class Study:
         return Cuts(bundle, [], 0, self._device, False)
 
 
-def old_results(config: Config, study: Study, folder: Path) -> tuple[Row, dict[int, Path]]:
-    """What an older version takes for the bundle, and what it makes of it."""
-    counts = (config.pictures // 3, config.pictures)
-    output = folder / f"{study.name}_old"
-    words = [study.path, output, config.device, min(config.rate_pictures, 2000), *counts]
-    path = os.pathsep.join((str(config.old), *filter(None, [os.environ.get("PYTHONPATH")])))
-    done = subprocess.run(
+def refined_by_old(config: Config, study: Study, folder: Path) -> tuple[v3dg.Bundle, Row]:
+    """What an older version makes of the bundle, its number of steps, and seconds."""
+    num_steps = config.pictures // 3
+    output = folder / f"{study.name}_old.v3dg"
+    words = [study.path, output, config.device, num_steps]
+    paths = [str(config.old), *filter(None, [os.environ.get("PYTHONPATH")])]
+    process = subprocess.run(
         [sys.executable, "-P", "-c", _OLD_PROGRAM, *map(str, words)],
-        env=os.environ | {"PYTHONPATH": path},
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
         capture_output=True,
         text=True,
         check=False,
     )
-    if done.returncode != 0:
-        raise RuntimeError(f"{config.old}: the older version failed: {done.stderr[-2000:]}")
-    return json.loads(done.stdout), {n: Path(f"{output}_{n}.v3dg") for n in counts}
+    if process.returncode != 0:
+        raise RuntimeError(f"{config.old}: the older version failed: {process.stderr[-2000:]}")
+    row: Row = {"asset": study.name, "way": "old", "pictures": num_steps}
+    return v3dg.Bundle.open(output), row | {"seconds": float(process.stdout)}
 
 
 def compared(flips: list[float], built: list[float]) -> Row:
@@ -259,45 +251,46 @@ class Results:
     def add(self, row: Row) -> None:
         self._rows.append(row)
         print(row, flush=True)
-        settings = {"pictures": self._config.pictures, "percents": _PERCENTS, "factors": _FACTORS}
-        about: Row = settings | {"seconds": round(time.perf_counter() - self._start, 1)}
-        record.write(self._config.output, about | {"rows": self._rows}, self._config.device)
+        settings: Row = {
+            "pictures": self._config.pictures,
+            "percents": _PERCENTS,
+            "factors": _FACTORS,
+        }
+        settings["seconds"] = round(time.perf_counter() - self._start, 1)
+        record.write(self._config.output, settings | {"rows": self._rows}, self._config.device)
+
+
+def measure(config: Config, folder: Path, judges: Judges) -> None:
+    results = Results(config)
+    donut = v3dg.read_asset(config.donut)
+    assets = {"donut": donut, "heap": heap_of(donut)}
+    studies = [Study(config, name, assets[name], folder) for name in config.assets]
+    built = {}
+    for study in studies:
+        flips = study.flips(study.built, judges)
+        built[study.name] = flips
+        row: Row = {"asset": study.name, "gaussians": len(assets[study.name])}
+        results.add(row | {"build_seconds": study.build_seconds, "flips": flips})
+        rates = {number: study.milliseconds(Way(windows=number)) for number in _WINDOWS}
+        results.add({"asset": study.name, "ms_a_picture": rates})
+        if config.old is not None:
+            bundle, row = refined_by_old(config, study, folder)
+            flips = study.flips(bundle, judges)
+            results.add(row | compared(flips, built[study.name]) | {"flips": flips})
+    for way in _WAYS:
+        for study in studies:
+            if results.is_over():
+                return
+            num_pictures = round(way.share * config.pictures)
+            bundle, seconds = study.refined(way, num_pictures)
+            flips = study.flips(bundle, judges)
+            row = {"asset": study.name, "way": asdict(way), "pictures": num_pictures}
+            results.add(row | seconds | compared(flips, built[study.name]) | {"flips": flips})
 
 
 def main(config: Config) -> None:
-    results = Results(config)
-    donut = v3dg.read_asset(config.donut)
-    with (
-        tempfile.TemporaryDirectory() as name,
-        contextlib.closing(Judges()) as judges,
-    ):
-        folder = Path(name)
-        assets = {"donut": donut, "heap": heap_of(donut)}
-        studies = [Study(config, key, assets[key], folder) for key in config.assets]
-        built = {}
-        for study in studies:
-            row: Row = {"asset": study.name, "gaussians": len(assets[study.name])}
-            built[study.name] = study.flips(study.built, judges)
-            row |= {"build_seconds": study.build_seconds, "flips": built[study.name]}
-            results.add(row)
-            rates = {n: study.milliseconds(Way(windows=n)) for n in _WINDOWS}
-            results.add({"asset": study.name, "ms_a_picture": rates})
-        for study in studies if config.old is not None else ():
-            seconds, paths = old_results(config, study, folder)
-            results.add({"asset": study.name, "old": seconds})
-            for count, path in paths.items():
-                flips = study.flips(v3dg.Bundle.open(path), judges)
-                row = {"asset": study.name, "way": "old", "pictures": count, "flips": flips}
-                results.add(row | compared(flips, built[study.name]))
-        for way in _WAYS:
-            for study in studies:
-                if results.is_over():
-                    return
-                num_pictures = round(way.share * config.pictures)
-                bundle, seconds = study.refined(way, num_pictures)
-                flips = study.flips(bundle, judges)
-                row = {"asset": study.name, "way": asdict(way), "pictures": num_pictures}
-                results.add(row | seconds | compared(flips, built[study.name]) | {"flips": flips})
+    with tempfile.TemporaryDirectory() as folder, contextlib.closing(Judges()) as judges:
+        measure(config, Path(folder), judges)
 
 
 if __name__ == "__main__":

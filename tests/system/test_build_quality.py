@@ -1,0 +1,256 @@
+"""Builds that end with a refinement: which one, what stays, and what an interrupted one
+leaves."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import v3dg
+from benchmarks.worlds.procedural import make_asset
+from v3dg import BuildConfig, build_bundle
+from v3dg.levels import build_file, levels_path
+from v3dg.levels.quality import refinement_of
+
+QUICK = BuildConfig(cluster_size=64, steps=0)
+STEPS = 12
+PATIENCE = 60
+SCRIPT = """
+import sys
+from v3dg import BuildConfig
+from v3dg.levels import build_file
+build_file(
+    sys.argv[1], sys.argv[2], config=BuildConfig(cluster_size=64, steps=0), progress=False,
+    device=sys.argv[3], quality="standard",
+)
+"""
+
+
+@pytest.fixture(scope="module")
+def asset():
+    return make_asset(num_gaussians=1000, seed=0)
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Refinements of few pictures."""
+    monkeypatch.setattr("v3dg.levels.quality._LEAST_PICTURES", STEPS)
+    monkeypatch.setattr("v3dg.levels.quality._GAUSSIANS_PER_PICTURE", 1 << 40)
+    monkeypatch.setattr("v3dg.levels.refined._NUM_WEIGHING_PICTURES", 40)
+
+
+@pytest.fixture
+def file(asset, tmp_path):
+    path = tmp_path / "asset.ply"
+    v3dg.write_asset(path, asset)
+    return path
+
+
+def bytes_of(bundle, folder):
+    path = folder / "bytes.v3dg"
+    bundle.write(path)
+    return path.read_bytes()
+
+
+def refined_by_hand(asset, device, seed=0, steps=STEPS):
+    bundle = build_bundle(asset, config=QUICK, seed=seed, device=device, progress=False)
+    return v3dg.refine_bundle(bundle, steps=steps, seed=seed, device=device, progress=False)
+
+
+def names_in(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("quality", "num_gaussians", "steps"),
+    [
+        ("standard", 1000, 20_020),
+        ("standard", 500_000, 30_000),
+        ("standard", 10_000_000, 100_000),
+        ("best", 500_000, 150_000),
+        ("best", 10_000_000, 500_000),
+    ],
+)
+def test_large_assets_are_refined_by_more_pictures(quality, num_gaussians, steps):
+    refinement = refinement_of(quality, num_gaussians, 7)
+    assert (refinement.steps, refinement.seed) == (steps, 7)
+    assert refinement_of("draft", num_gaussians, 7) is None
+
+
+def test_a_build_of_a_quality_is_a_build_and_a_refinement(short, asset, device, tmp_path):
+    for quality, steps in (("standard", STEPS), ("best", 5 * STEPS)):
+        bundle = build_bundle(
+            asset, config=QUICK, seed=3, device=device, progress=False, quality=quality
+        )
+        expected = refined_by_hand(asset, device, seed=3, steps=steps)
+        assert bytes_of(bundle, tmp_path) == bytes_of(expected, tmp_path)
+        assert bundle.config["refined"] == {"steps": steps, "drop": 0.02, "seed": 3}
+
+
+def test_level_0_stays(short, asset, device):
+    draft = build_bundle(asset, config=QUICK, device=device, progress=False)
+    bundle = build_bundle(asset, config=QUICK, device=device, progress=False, quality="standard")
+    assert "refined" not in draft.config
+    for name, values in vars(draft.level_gaussians(0)).items():
+        np.testing.assert_array_equal(values, getattr(bundle.level_gaussians(0), name))
+    assert not np.array_equal(draft.level_gaussians(1).means, bundle.level_gaussians(1).means)
+
+
+def test_workers_do_not_change_the_bytes(short, file, device, tmp_path, monkeypatch):
+    """Neither their number, nor whether the levels are in a file."""
+    monkeypatch.setattr("v3dg.levels.whole.UNIT_LEAVES", 300)
+    expected = bytes_of(refined_by_hand(file, device), tmp_path)
+    output = tmp_path / "out.v3dg"
+    for num_workers in (None, 1, 3):
+        executor = None
+        if num_workers is not None:
+            executor = ThreadPoolExecutor(num_workers)
+        _, is_built = build_file(
+            file,
+            output,
+            config=QUICK,
+            device=device,
+            progress=False,
+            quality="standard",
+            executor=executor,
+        )
+        assert is_built
+        assert output.read_bytes() == expected
+        assert names_in(tmp_path) == ["asset.ply", "bytes.v3dg", "out.v3dg"]
+
+
+MOMENTS = {
+    "it begins": "v3dg.levels.refined.without_unseen",
+    "gaussians move": "v3dg.levels.refined.Cuts.refined",
+    "it is written": "v3dg.bundle.bundle.Bundle.write",
+    "it is there": "v3dg.levels.unfinished.Path.unlink",
+}
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_a_refinement_that_is_interrupted_begins_again(
+    short, file, device, tmp_path, monkeypatch, moment
+):
+    """The levels stay as they are built, as a bundle, and are not built again."""
+    expected = bytes_of(refined_by_hand(file, device), tmp_path)
+    output = tmp_path / "out.v3dg"
+
+    def build(**options):
+        return build_file(
+            file, output, config=QUICK, device=device, progress=False, quality="standard", **options
+        )
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    def fail(*_):
+        raise AssertionError("built a level again")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MOMENTS[moment], interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            build()
+    left = v3dg.Bundle.open(levels_path(output))
+    assert "refined" not in left.config
+    assert output.exists() == (moment == "it is there")
+    monkeypatch.setattr("v3dg.levels.simplify.LevelBuilder._simplify", fail)
+    _, is_built = build(resume=True)
+    assert is_built == (moment != "it is there")
+    assert output.read_bytes() == expected
+    assert not levels_path(output).exists()
+    assert build(resume=True)[1] is False
+
+
+def test_a_build_that_is_killed_leaves_its_levels(file, device, tmp_path):
+    """The refinement of 20,020 pictures is far from its end."""
+    output = tmp_path / "out.v3dg"
+    roots = [str(Path(path).parents[1]) for path in (v3dg.__file__, Path(__file__).parent)]
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, file, output, device],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(roots)},
+    )
+    try:
+        levels = levels_path(output)
+        end = time.monotonic() + PATIENCE
+        while process.poll() is None and time.monotonic() < end and not is_bundle(levels):
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+        assert process.wait(PATIENCE) == -signal.SIGKILL
+    finally:
+        process.kill()
+        process.wait()
+    assert names_in(tmp_path) == ["asset.ply", "out.v3dg.partial"]
+    draft, is_built = build_file(
+        file, output, config=QUICK, device=device, progress=False, resume=True
+    )
+    assert is_built
+    expected = build_bundle(file, config=QUICK, device=device, progress=False)
+    assert bytes_of(draft, tmp_path) == bytes_of(expected, tmp_path)
+
+
+def is_bundle(path):
+    try:
+        v3dg.Bundle.open(path)
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def test_levels_at_a_path_stay_as_they_are_built(short, asset, device, tmp_path):
+    """So that a build of another quality continues from them."""
+    levels = tmp_path / "levels"
+    options = {"config": QUICK, "device": device, "progress": False, "resume_path": levels}
+    bundle = build_bundle(asset, quality="standard", **options)
+    assert bundle.path is None
+    assert bytes_of(bundle, tmp_path) == bytes_of(refined_by_hand(asset, device), tmp_path)
+    draft = build_bundle(asset, **options)
+    assert draft.path == str(levels)
+    assert "refined" not in draft.config
+
+
+def test_a_bundle_of_another_quality_is_built_again(short, file, device, tmp_path):
+    output = tmp_path / "out.v3dg"
+    options = {"config": QUICK, "device": device, "progress": False, "resume": True}
+    for quality in ("draft", "standard", "best", "draft"):
+        for expected in (True, False):
+            bundle, is_built = build_file(file, output, quality=quality, **options)
+            assert is_built == expected
+            assert ("refined" in bundle.config) == (quality != "draft")
+
+
+def test_an_asset_without_levels_is_built_once(short, file, device, tmp_path):
+    config = replace(QUICK, min_gaussians=1000)
+    for expected in (True, False):
+        bundle, is_built = build_file(
+            file,
+            tmp_path / "out.v3dg",
+            config=config,
+            device=device,
+            progress=False,
+            quality="standard",
+            resume=True,
+        )
+        assert bundle.num_levels == 1
+        assert is_built == expected
+
+
+def test_an_asset_that_is_too_large_to_be_refined_is_refused_before(file, tmp_path, monkeypatch):
+    monkeypatch.setattr("v3dg.levels.quality._COPIES", 1 << 20)
+    options = {"config": QUICK, "device": "cpu", "progress": False, "memory": "1GiB"}
+    message = r"memory: expected at least [\d,]+ MiB to refine an asset of 1,000 gaussians, got"
+    with pytest.raises(ValueError, match=message):
+        build_file(file, tmp_path / "out.v3dg", quality="standard", **options)
+    assert names_in(tmp_path) == ["asset.ply"]
+    build_file(file, tmp_path / "out.v3dg", **options)
+
+
+def test_a_wrong_quality_is_refused(asset):
+    with pytest.raises(ValueError, match="quality: expected"):
+        build_bundle(asset, config=QUICK, progress=False, quality="good")
