@@ -28,10 +28,11 @@ constexpr int kMostWindows = 32;
 //
 // Cuts are drawn with the filter of `config`, including level 0, which is drawn without one
 // elsewhere: in small pictures that is a third of the error of cuts. The target's pictures are
-// drawn larger and box-averaged. The loss is that of the fit without D-SSIM; positions move in steps
-// of a part of the radius. The sizes of steps in `config` are for gaussians that one window shows. The sizes, samples and numbers of views in
-// `config` are ignored. The result does not depend on the number of threads. Returns early once
-// `progress.cancel` is set; `progress.groups_done` counts windows.
+// drawn larger and box-averaged. The loss is that of the fit without D-SSIM; positions move in
+// steps of a part of the radius. The sizes of steps in `config` are for gaussians that one window
+// shows. The sizes, samples and numbers of views in `config` are ignored. The result does not
+// depend on the number of threads. Returns early once `progress.cancel` is set;
+// `progress.groups_done` counts windows.
 void refine_cuts(const FitConfig& config, const CutComparison& comparison, const FitTarget& target,
                  uint64_t target_count, const CutRows& levels, const CutPictures& pictures,
                  FitProgress& progress);

@@ -77,12 +77,12 @@ V3DG_HD inline void put_sum_slopes(float color[3], float& alpha) {
     alpha = 0;
 }
 
-// Returns the step of a gaussian that `num_windows` of the step's windows show: the noise of a sum of
-// n gradients, relative to the sum, falls with the root of n.
+// Returns the step of a gaussian that `num_windows` of the step's windows show: the noise of a sum
+// of n gradients, relative to the sum, falls with the root of n.
 V3DG_HD inline FitStep step_of_windows(FitStep step, int num_windows) {
     const float factor = ::sqrtf(static_cast<float>(num_windows));
-    for (float* size : {&step.position, &step.quat, &step.log_scale, &step.logit, &step.sh0,
-                        &step.sh_rest})
+    for (float* size :
+         {&step.position, &step.quat, &step.log_scale, &step.logit, &step.sh0, &step.sh_rest})
         *size *= factor;
     return step;
 }
