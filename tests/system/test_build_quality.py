@@ -2,6 +2,7 @@
 leaves."""
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import pytest
 import v3dg
 from benchmarks.worlds.procedural import make_asset
 from v3dg import BuildConfig, build_bundle
+from v3dg.cli import build as command
 from v3dg.levels import build_file, levels_path
 from v3dg.levels.quality import refinement_of
 
@@ -25,6 +27,7 @@ PATIENCE = 60
 SCRIPT = """
 import sys
 from v3dg import BuildConfig
+from v3dg.cli import build as command
 from v3dg.levels import build_file
 build_file(
     sys.argv[1], sys.argv[2], config=BuildConfig(cluster_size=64, steps=0), progress=False,
@@ -254,3 +257,27 @@ def test_an_asset_that_is_too_large_to_be_refined_is_refused_before(file, tmp_pa
 def test_a_wrong_quality_is_refused(asset):
     with pytest.raises(ValueError, match="quality: expected"):
         build_bundle(asset, config=QUICK, progress=False, quality="good")
+
+
+def test_the_command_builds_each_quality(short, file, tmp_path, capsys):
+    """And says of a draft which command refines it."""
+    output = tmp_path / "a scene.v3dg"
+    for quality in ("draft", "standard"):
+        command.run(
+            command.Build(
+                assets=(file,),
+                output=output,
+                cluster_size=64,
+                up="z",
+                device="cpu",
+                quiet=True,
+                quality=quality,
+            )
+        )
+        lines = capsys.readouterr().out.splitlines()
+        advice = [line for line in lines if line.startswith("draft: ")]
+        assert ("refined" in v3dg.Bundle.open(output).config) == (quality == "standard")
+        assert len(advice) == (quality == "draft")
+        if advice:
+            words = shlex.split(advice[0].split("`")[1])
+            assert words == ["v3dg", "refine", str(output), str(tmp_path / "a scene_refined.v3dg")]

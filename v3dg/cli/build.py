@@ -1,6 +1,7 @@
 """`v3dg build`."""
 
 import logging
+import shlex
 import time
 import warnings
 from collections import Counter
@@ -377,6 +378,16 @@ def _resume_advice(output: Path) -> str:
     return ""
 
 
+def _refine_advice(output: Path) -> str:
+    """The command that refines a draft, and what it takes."""
+    refined = output.with_name(f"{output.stem}_refined.v3dg")
+    command = shlex.join(["v3dg", "refine", str(output), str(refined)])
+    return (
+        f"draft: `{command}` brings its levels closer to the asset, in seconds on a GPU or "
+        "minutes on a CPU"
+    )
+
+
 def _lines(result: JsonObject) -> list[str]:
     time_text = f"{result['seconds']:.1f} s"
     if result["status"] == "kept":
@@ -389,9 +400,5 @@ def _lines(result: JsonObject) -> list[str]:
     if result["dropped"]:
         lines.append("left out: " + describe(result["dropped"]))
     if result["status"] == "built" and result["quality"] == "draft":
-        output = Path(result["output"])
-        lines.append(
-            f"draft: `v3dg refine {output} {output.stem}_refined.v3dg` brings its levels closer to "
-            "the asset, in seconds on a GPU or minutes on a CPU"
-        )
+        lines.append(_refine_advice(Path(result["output"])))
     return lines
