@@ -12,6 +12,7 @@ from v3dg._numbers import check, check_type, one_of
 from v3dg._urls import FileAtUrl, beside, in_parts, reading, shown
 from v3dg.formats import checkpoint, gltf, hier, ksplat, ply, sog, splat, spz, streamed_sog, usd
 from v3dg.formats._reading import AnyPath, AssetFile, bytes_of
+from v3dg.formats.content import content_of
 from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
 
@@ -116,14 +117,28 @@ def open_asset(path: AnyPath) -> AssetFile:
     at_url = in_parts(path)
     if isinstance(at_url, FileAtUrl):
         return _open_fetched(at_url, reader)
-    return reader(at_url)
+    return _open_by_content(at_url, reader)
+
+
+def _open_by_content(path: AnyPath, reader: Callable[[AnyPath], AssetFile]) -> AssetFile:
+    """An asset whose bytes may be those of another format than its name says; a note
+    then says so. ValueError if they are those of a format that is not read."""
+    content = content_of(path)
+    if content is None or _READERS.get(content.suffix) is reader:
+        return reader(path)
+    ending = next(ending for ending, function in _READERS.items() if function is reader)
+    is_readable = content.suffix not in ("", *usd.SUFFIXES)  # USD takes it from the name
+    check(path, is_readable, f"a {ending}, got {content.text}")
+    file = _READERS[content.suffix](path)
+    note = f"its name ends in {ending}, but it is {content.text}, and was read as such"
+    return replace(file, declared=replace(file.declared, notes=(note, *file.declared.notes)))
 
 
 def _open_fetched(at_url: FileAtUrl, reader: Callable[[AnyPath], AssetFile]) -> AssetFile:
     """An asset at a URL, whose local copy exists as long as this object; errors name
     the URL."""
     with reading(at_url) as local:
-        file = reader(local)
+        file = _open_by_content(local, reader)
         whole = None
         if at_url.needs_name:
             whole = file.read(0, file.num_gaussians)
