@@ -32,7 +32,11 @@ def parse_json(text: str | bytes) -> Json:
     if isinstance(text, bytes):
         text = text.decode("utf-8")
     try:
-        return json.loads(text.removeprefix(_BYTE_ORDER_MARK), object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
+        return json.loads(
+            text.removeprefix(_BYTE_ORDER_MARK),
+            object_pairs_hook=_unique_keys,
+            parse_constant=_refuse_constant,
+        )
     except RecursionError:
         raise ValueError("nested too deep") from None
 

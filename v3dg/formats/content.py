@@ -55,7 +55,9 @@ def content_of(path: AnyPath) -> Content | None:
 
     A few kilobytes are read, and of a zip its list of names.
     """
-    with contextlib.suppress(OSError, ValueError, zipfile.BadZipFile, zlib.error):
+    # zipfile and zlib do not document what damaged content raises; the reader that the
+    # name determines then says what is wrong.
+    with contextlib.suppress(Exception):
         with open(_files.open_regular(path), "rb") as file:
             start = file.read(_START_BYTES)
             if start.startswith(b"PK\3\4"):
@@ -82,15 +84,14 @@ def _plain_content(start: bytes) -> Content | None:
     return None
 
 
-def _gzip_content(start: bytes) -> Content:
+def _gzip_content(start: bytes) -> Content | None:
     unpacked = zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(start, _UNPACKED_BYTES)
     if unpacked.startswith(b"NGSP"):
         return Content(".spz", "a .spz")
     inner = _plain_content(unpacked)
-    name = "another file"
-    if inner is not None and inner.suffix:
-        name = inner.text
-    return Content("", f"a gzip of {name}; unpack it")
+    if inner is None or not inner.suffix:
+        return None
+    return Content("", f"a gzip of {inner.text}; unpack it")
 
 
 def _zip_content(names: list[str]) -> Content:
