@@ -9,7 +9,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, NamedTuple, NoReturn
+from typing import IO, Literal, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -33,34 +33,34 @@ class _Model(NamedTuple):
     Attributes:
         num_focal: Focal lengths, which are the first parameters; the centre follows.
         num_distortion: Parameters of the lens after these.
-        is_pinhole: Whether it is a pinhole where these parameters are 0.
+        projection: What it is where these parameters are 0.
     """
 
     name: str
     num_focal: int
     num_distortion: int
-    is_pinhole: bool
+    projection: Literal["pinhole", "fisheye", "sphere"]
 
 
 _MODELS = (
-    _Model("SIMPLE_PINHOLE", 1, 0, True),
-    _Model("PINHOLE", 2, 0, True),
-    _Model("SIMPLE_RADIAL", 1, 1, True),
-    _Model("RADIAL", 1, 2, True),
-    _Model("OPENCV", 2, 4, True),
-    _Model("OPENCV_FISHEYE", 2, 4, False),
-    _Model("FULL_OPENCV", 2, 8, True),
-    _Model("FOV", 2, 1, True),
-    _Model("SIMPLE_RADIAL_FISHEYE", 1, 1, False),
-    _Model("RADIAL_FISHEYE", 1, 2, False),
-    _Model("THIN_PRISM_FISHEYE", 2, 8, False),
-    _Model("RAD_TAN_THIN_PRISM_FISHEYE", 2, 12, False),
-    _Model("SIMPLE_DIVISION", 1, 1, True),
-    _Model("DIVISION", 2, 1, True),
-    _Model("SIMPLE_FISHEYE", 1, 0, False),
-    _Model("FISHEYE", 2, 0, False),
-    _Model("EUCM", 2, 2, True),
-    _Model("EQUIRECTANGULAR", 0, 0, False),
+    _Model("SIMPLE_PINHOLE", 1, 0, "pinhole"),
+    _Model("PINHOLE", 2, 0, "pinhole"),
+    _Model("SIMPLE_RADIAL", 1, 1, "pinhole"),
+    _Model("RADIAL", 1, 2, "pinhole"),
+    _Model("OPENCV", 2, 4, "pinhole"),
+    _Model("OPENCV_FISHEYE", 2, 4, "fisheye"),
+    _Model("FULL_OPENCV", 2, 8, "pinhole"),
+    _Model("FOV", 2, 1, "pinhole"),
+    _Model("SIMPLE_RADIAL_FISHEYE", 1, 1, "fisheye"),
+    _Model("RADIAL_FISHEYE", 1, 2, "fisheye"),
+    _Model("THIN_PRISM_FISHEYE", 2, 8, "fisheye"),
+    _Model("RAD_TAN_THIN_PRISM_FISHEYE", 2, 12, "fisheye"),
+    _Model("SIMPLE_DIVISION", 1, 1, "pinhole"),
+    _Model("DIVISION", 2, 1, "pinhole"),
+    _Model("SIMPLE_FISHEYE", 1, 0, "fisheye"),
+    _Model("FISHEYE", 2, 0, "fisheye"),
+    _Model("EUCM", 2, 2, "pinhole"),
+    _Model("EQUIRECTANGULAR", 0, 0, "sphere"),
 )
 _NUM_WIDTH_HEIGHT = 2  # the parameters of EQUIRECTANGULAR
 

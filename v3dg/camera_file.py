@@ -285,7 +285,8 @@ def _read_colmap(images: Path, distortion: str) -> dict[str, Camera]:
     for image in read_model(images):
         lens = image.lens
         place = f"{images}: {image.name}"
-        is_right = lens.model.is_pinhole and (not lens.is_distorted or distortion == "ignore")
+        is_plain = distortion == "ignore" or not lens.is_distorted
+        is_right = lens.model.projection == "pinhole" and is_plain
         expected = "a pinhole without lens distortion"
         check(place, is_right, f"{expected}, got {lens.model.name}; {_UNDISTORT}")
         K = np.diag([lens.focal_lengths[0], lens.focal_lengths[-1], 1.0])

@@ -30,7 +30,7 @@ _READERS: dict[str, Callable[[AnyPath], AssetFile]] = {
     ".sog": sog.open_file,
     "lod-meta.json": streamed_sog.open_file,
     "meta.json": sog.open_file,
-    **dict.fromkeys((".ckpt", ".pt"), checkpoint.open_file),
+    **dict.fromkeys((".ckpt", ".pt", ".pth"), checkpoint.open_file),
 }
 _WRITERS: dict[str, Callable[[AnyPath, Gaussians], None]] = {
     ".compressed.ply": ply.write_compressed,
@@ -80,8 +80,11 @@ def read_asset(path: AnyPath) -> Gaussians:
     - `.splat`, of antimatter15; `.ksplat`, of mkkellogg; `.spz`, of Niantic, version 1
       to 4; `.sog` of PlayCanvas, version 2, or the `meta.json` of one that is not in a
       zip; the finest level of streamed SOG, by its `lod-meta.json`.
-    - `.pt` and `.ckpt`, checkpoints of gsplat's trainer and of nerfstudio's splatfacto,
-      from which nothing but tensors is taken.
+    - `.pt`, `.ckpt` and `.pth`, checkpoints of gsplat's trainer, of nerfstudio's
+      splatfacto and of the code of the 3DGS paper and 2DGS, from which nothing but
+      tensors is taken.
+
+    A file whose bytes are those of another of these formats is read as such.
 
     With the extra `fsspec`, the file may be at a URL, which is fetched once per
     process, unless it refers to other files.
@@ -126,7 +129,8 @@ def _open_by_content(path: AnyPath, reader: Callable[[AnyPath], AssetFile]) -> A
     content = content_of(path)
     if content is None or _READERS.get(content.suffix) is reader:
         return reader(path)
-    ending = next(ending for ending, function in _READERS.items() if function is reader)
+    name = beside(path).name.lower()
+    ending = next(ending for ending in _READERS if name.endswith(ending))
     is_readable = content.suffix not in ("", *usd.SUFFIXES)  # USD takes it from the name
     check(path, is_readable, f"a {ending}, got {content.text}")
     file = _READERS[content.suffix](path)

@@ -32,7 +32,7 @@ _NOT_READ = {
     b"\x89png": "a picture",
     b"\xff\xd8\xff\xe0": "a picture",
     b"\xff\xd8\xff\xe1": "a picture",
-    b"\x80\x02\x8a\nl\xfc\x9cf": "a checkpoint of torch before 1.6; load and save it with a newer one",
+    b"\x80\x02\x8a\nl\xfc\x9cf": "a checkpoint of torch before 1.6; save it again",
     b"7z\xbc\xaf\x27\x1c": "an archive of 7-Zip; unpack it",
     b"rar!\x1a\x07": "an archive of RAR; unpack it",
 }

@@ -80,11 +80,11 @@ def is_start_of_one(start: bytes) -> bool:
     )
     is_version = major == 0 < minor
     has_sections = 0 < num_sections <= most_sections <= _MAX_SECTIONS
-    return is_version and has_sections and compression <= 2
+    return bool(is_version and has_sections and compression <= 2)
 
 
 def _declared(start: bytes) -> Declared:
-    """What the header declares: a newer version may mean something that is not known."""
+    """What the header declares: a newer version may mean something unknown."""
     minor = start[1]
     if minor <= _MINOR:
         return NOTHING

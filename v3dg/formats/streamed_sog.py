@@ -26,8 +26,17 @@ from v3dg.formats._reading import (
 )
 from v3dg.gaussians import Gaussians
 
-_FIELDS = ("version", "count", "counts", "lodLevels", "environment", "filenames", "tree")
-_FIELDS += ("asset", "lodErrors")
+_FIELDS = (
+    "version",
+    "asset",
+    "count",
+    "counts",
+    "environment",
+    "filenames",
+    "lodErrors",
+    "lodLevels",
+    "tree",
+)
 _LEVEL = re.compile(r"[0-9]{1,9}")
 
 
