@@ -27,7 +27,7 @@ _UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 def parse_json(text: str | bytes) -> Json:
-    """Parse strict JSON, also after a byte order mark of UTF-8: no NaN, no key twice, no
+    """Parse strict JSON, also after a byte order mark: no NaN, no key twice, no
     unbounded nesting; ValueError otherwise."""
     if isinstance(text, bytes):
         text = text.decode("utf-8")

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -86,33 +86,20 @@ def read_cameras(
     """
     one_of(distortion, "distortion", ("refuse", "ignore"))
     one_of(applied_transform, "applied_transform", ("keep", "undo"))
-    file = Path(path)
-    if file.name in IMAGE_FILES:
-        return _read_colmap(file, distortion)
-    folder = file
-    if file.name == _RUN:
-        folder = file.parent
-    training: Path | None = None
-    if (folder / _RUN).is_file():
-        training = folder / _TRAINING
-        file = _data_of(folder)
-    elif file.is_dir():
-        file = _file_in(folder)
-        if file.name in IMAGE_FILES:
-            return _read_colmap(file, distortion)
-        if file.name in _FRAMES and (folder / _TRAINING).is_file():
-            training = folder / _TRAINING
-    document = read_json(file)
+    place = _place_of(Path(path))
+    if place.file.name in IMAGE_FILES:
+        return _read_colmap(place.file, distortion)
+    document = read_json(place.file)
     if isinstance(document.value, list) and document.value:
         return _named(map(_read_3dgs, document.items()))
     if document.has("camera_path"):
         return _named(_read_path(document, size))
     top = _frames_at_top(document)
     transforms = []
-    if training is not None or applied_transform == "undo":
+    if place.training is not None or applied_transform == "undo":
         transforms.append(_applied(top))
-    if training is not None:
-        transforms.append(_trained(training))
+    if place.training is not None:
+        transforms.append(_trained(place.training))
     named = []
     for node in top["frames"].items():
         frame = node.some_fields(("transform_matrix",))
@@ -122,6 +109,29 @@ def read_cameras(
             name = frame["file_path"].text()
         named.append((name, camera))
     return _named(named)
+
+
+class _Place(NamedTuple):
+    """The file that has the cameras, and that of the training whose frame they get."""
+
+    file: Path
+    training: Path | None = None
+
+
+def _place_of(path: Path) -> _Place:
+    """Where the cameras of a file, a folder or a run of nerfstudio are."""
+    folder = path
+    if path.name == _RUN:
+        folder = path.parent
+    if (folder / _RUN).is_file():
+        return _Place(_data_of(folder), folder / _TRAINING)
+    if not path.is_dir():
+        return _Place(path)
+    file = _file_in(path)
+    training = path / _TRAINING
+    if file.name in _FRAMES and training.is_file():
+        return _Place(file, training)
+    return _Place(file)
 
 
 def _named(pairs: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:

@@ -144,7 +144,8 @@ void bind_ply(py::module_& m) {
         .def(py::init<const py::object&>(), "path"_a)
         .def_property_readonly("num_gaussians", &BoundPlyFile::num_gaussians)
         .def_property_readonly("sh_degree", &BoundPlyFile::sh_degree)
-        .def_property_readonly("used", &BoundPlyFile::used, "Names of the properties that are read.")
+        .def_property_readonly("used", &BoundPlyFile::used,
+                               "Names of the properties that are read.")
         .def("read", &BoundPlyFile::read, "first"_a, "last"_a);
     m.def("ply_header", &ply_header, "path"_a,
           "Encoding, bytes of the header, and elements: name, count, and properties' names and "

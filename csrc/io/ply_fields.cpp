@@ -1,3 +1,6 @@
+// Finds the properties of a vertex that make a gaussian, in the files of the 3DGS code and in those
+// of other trainers, and says what a file is that has too few.
+
 #include "io/ply_fields.h"
 
 #include <algorithm>
@@ -72,8 +75,8 @@ double color_scale(const std::string& name, PlyType type) {
 
 // The name of the property of each slot; none for a slot that the file does not fill.
 std::vector<std::string> slot_names(const Fields& fields, size_t num_stored, PlyLayout& layout) {
-    std::vector<std::string> names = {"x",       "y",       "z",       "rot_0",   "rot_1",  "rot_2",
-                                      "rot_3",   "scale_0", "scale_1", "scale_2", "opacity"};
+    std::vector<std::string> names = {"x",     "y",       "z",       "rot_0",   "rot_1",  "rot_2",
+                                      "rot_3", "scale_0", "scale_1", "scale_2", "opacity"};
     if (layout.is_flat) names[kScale + 2].clear();
     names.push_back(layout.has_filter ? "filter_3D" : "");
     const std::vector<std::string> colors = base_color_names(fields);

@@ -73,9 +73,7 @@ bool is_swapped(PlyEncoding encoding) {
 class RowDecoder {
   public:
     RowDecoder(const PlyFile& ply, const PlyGaussians<float>& out)
-        : layout_(ply.layout),
-          is_swapped_(is_swapped(ply.encoding)),
-          out_(out) {
+        : layout_(ply.layout), is_swapped_(is_swapped(ply.encoding)), out_(out) {
         for (const PlyProperty& property : ply.vertex.properties)
             if (!property.is_list) row_bytes_ += size_of(property.type);
         const auto is_float = [](const PlyField& field) { return field.type == PlyType::float32; };

@@ -412,7 +412,7 @@ def test_prims_of_several_degrees_are_one_asset(tmp_path):
     v3dg.formats.usd.define(stage, "/large", assets[1])
     stage.GetRootLayer().Save()
     found, notes = read_with_notes(tmp_path / "a.usda")
-    np.testing.assert_allclose(found.means[:9], assets[0].means + [0, 5, 0], rtol=1e-6)
+    np.testing.assert_allclose(found.means[:9], assets[0].means + np.array([0, 5, 0]), rtol=1e-6)
     np.testing.assert_array_equal(found.sh[:9, :1], assets[0].sh)
     assert not found.sh[:9, 1:].any()
     np.testing.assert_array_equal(found.sh[9:], assets[1].sh)

@@ -134,8 +134,9 @@ class _Layout(NamedTuple):
     @property
     def num_scales(self) -> int:
         """Stored scales a gaussian: 2 for 2DGS, whose gaussians are flat."""
-        shape = self.fields["scales"].shape
-        return 2 if len(shape) == 2 and shape[1] == 2 else 3
+        if self.fields["scales"].shape[1:] == (2,):
+            return 2
+        return 3
 
 
 class _Settings(NamedTuple):
@@ -251,8 +252,9 @@ def _settings_of(path: AnyPath) -> _Settings:
     with Claims().open(file) as opened:
         content = opened.read(_MAX_SETTINGS_BYTES + 1)
     if len(content) > _MAX_SETTINGS_BYTES:
-        return _Settings(notes=(f"{file.name} is too large to be that of a run and was not read",))
-    # YAML with Python objects, of which only lines of a name and a plain value are read.
+        note = f"{file.name} is too large to be that of a run and was not read"
+        return _Settings(notes=(note,))
+    # YAML with Python objects, of which lines of a name and a plain value are read.
     pattern = r"^[ ]*(\w+): +'?([\w.+-]+)'?[ ]*\r?$"
     if file.name == _SETTINGS[0]:
         pattern = pattern.replace("[ ]*", "", 1)  # those of the run, not of an object in it
@@ -285,8 +287,7 @@ def _doubles(values: _Numbers) -> Floats:
 
 
 def _layout(path: AnyPath, content: _Value) -> _Layout:
-    """Where the gaussians are in what was pickled; ValueError if a tensor is
-    missing."""
+    """Where the gaussians are in what was pickled; ValueError if a tensor is missing."""
     members: dict[str, _Value] = {}
     if isinstance(content, dict):
         members = content
@@ -297,17 +298,15 @@ def _layout(path: AnyPath, content: _Value) -> _Layout:
         return _gsplat_layout(path, splats, others)
     if isinstance(pipeline, dict):
         return _nerfstudio_layout(path, pipeline)
-    if isinstance(content, tuple) and len(content) == 2 and isinstance(content[0], tuple):
-        captured = content[0]
-        has_fields = len(captured) >= _MIN_CAPTURE
-        check(path, has_fields, f"{_MIN_CAPTURE} captured values, got {len(captured)}")
-        values = dict(zip(_FIELDS, (captured[i] for i in _CAPTURED), strict=True))
-        return _Layout(_tensors(path, values))
-    keys = ", ".join(f"{key[:40]!a}" for key in list(members)[:6]) or "none"
-    refuse(
-        path,
-        f"'splats' (gsplat), 'pipeline' (nerfstudio) or a tuple (the code of 3DGS), got {keys}",
-    )
+    is_captured = isinstance(content, tuple) and len(content) == 2
+    if not is_captured or not isinstance(content[0], tuple):
+        expected = "'splats' (gsplat), 'pipeline' (nerfstudio) or a tuple (the code of 3DGS)"
+        refuse(path, f"{expected}, got {listed(members) or 'none'}")
+    captured = content[0]
+    has_fields = len(captured) >= _MIN_CAPTURE
+    check(path, has_fields, f"{_MIN_CAPTURE} captured values, got {len(captured)}")
+    values = dict(zip(_FIELDS, (captured[i] for i in _CAPTURED), strict=True))
+    return _Layout(_tensors(path, values))
 
 
 def _gsplat_layout(path: AnyPath, splats: dict[str, _Value], notes: tuple[str, ...]) -> _Layout:
@@ -347,8 +346,8 @@ def _nerfstudio_layout(path: AnyPath, pipeline: dict[str, _Value]) -> _Layout:
 
 
 def _left_out(members: Iterable[str]) -> tuple[str, ...]:
-    """A sentence for each member of a checkpoint that changes what its gaussians look
-    like, and one for all others."""
+    """A sentence for each member of a checkpoint that is known to change something, and
+    one for all others."""
     names = list(members)
     notes = [_NOT_GAUSSIANS[name] for name in names if name in _NOT_GAUSSIANS]
     unknown = [name for name in names if name not in _NOT_GAUSSIANS]

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from v3dg import _core, _files
 from v3dg.formats import _packing
-from v3dg.formats._packing import SH_C0, SQRT2, Floats, assemble
 from v3dg.formats._declared import Declared
+from v3dg.formats._packing import SH_C0, SQRT2, Floats, assemble
 from v3dg.formats._reading import AnyPath, AssetFile, File, check, listed
 from v3dg.gaussians import Gaussians
 

@@ -218,8 +218,8 @@ def _is_coarse(usd: ModuleType, prim: Usd.Prim) -> bool:
 
 
 def _is_hidden(usd: ModuleType, prim: Usd.Prim) -> bool:
-    """Whether a prim and all below it are not drawn: it is made invisible, or a stand-in
-    or an aid for editing."""
+    """Whether a prim and all below it are not drawn: it is made invisible, or stands in
+    for others, or helps to edit."""
     imageable = usd.UsdGeom.Imageable(prim)
     if not imageable:
         return False
