@@ -52,10 +52,10 @@ class AssetFile:
 
 def listed(names: Iterable[str]) -> str:
     """Names for a message: the first ones, each short, and how many more there are."""
-    every = list(names)
-    text = ", ".join(f"{name[:40]!a}" for name in every[:_MAX_NAMES])
-    if len(every) > _MAX_NAMES:
-        text += f" and {len(every) - _MAX_NAMES} more"
+    all_names = list(names)
+    text = ", ".join(f"{name[:40]!a}" for name in all_names[:_MAX_NAMES])
+    if len(all_names) > _MAX_NAMES:
+        text += f" and {len(all_names) - _MAX_NAMES} more"
     return text
 
 

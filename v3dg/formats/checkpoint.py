@@ -287,15 +287,15 @@ def _doubles(values: _Numbers) -> Floats:
 
 
 def _layout(path: AnyPath, content: _Value) -> _Layout:
-    """Where the gaussians are in what was pickled; ValueError if a tensor is missing."""
+    """Where the gaussians are in what was pickled; ValueError if one is missing."""
     members: dict[str, _Value] = {}
     if isinstance(content, dict):
         members = content
     splats = members.get("splats")
     pipeline = members.get("pipeline")
     if isinstance(splats, dict):
-        others = _left_out(name for name in members if name not in _GSPLAT_MEMBERS)
-        return _gsplat_layout(path, splats, others)
+        unread = _left_out(name for name in members if name not in _GSPLAT_MEMBERS)
+        return _gsplat_layout(path, splats, unread)
     if isinstance(pipeline, dict):
         return _nerfstudio_layout(path, pipeline)
     is_captured = isinstance(content, tuple) and len(content) == 2
@@ -318,9 +318,9 @@ def _gsplat_layout(path: AnyPath, splats: dict[str, _Value], notes: tuple[str, .
         notes = _left_out(["app_module"]) + tuple(
             note for note in notes if note != _NOT_GAUSSIANS["app_module"]
         )
-    others = [name for name in splats if name not in used]
-    if others:
-        notes += (f"tensors of splats were left out: {listed(others)}",)
+    unread = [name for name in splats if name not in used]
+    if unread:
+        notes += (f"tensors of splats were left out: {listed(unread)}",)
     return _Layout(_tensors(path, values), notes)
 
 
@@ -336,8 +336,8 @@ def _nerfstudio_layout(path: AnyPath, pipeline: dict[str, _Value]) -> _Layout:
         for name in pipeline
         if name.startswith("_model.") and name not in names
     ]
-    others = dict.fromkeys(name for name in modules if name not in _NERFSTUDIO_MEMBERS)
-    notes = _left_out(others)
+    unread = dict.fromkeys(name for name in modules if name not in _NERFSTUDIO_MEMBERS)
+    notes = _left_out(unread)
     tensors = _tensors(path, values)
     if math.prod(tensors["shN"].shape) == 0 and tensors["means"].shape[0] > 0:
         # Of SH degree 0, splatfacto stores logits of colours.

@@ -95,13 +95,13 @@ def _notes(elements: Mapping[str, _Element]) -> tuple[str, ...]:
         "vertex": list(_PACKED),
     }
     notes = []
-    for element, known in used.items():
-        names = [name for name in elements[element].kinds if name not in known]
+    for element, read_names in used.items():
+        names = [name for name in elements[element].kinds if name not in read_names]
         if names:
             notes.append(f"properties of {element} were left out: {listed(names)}")
-    others = [name for name in elements if name not in (*used, "sh")]
-    if others:
-        notes.append(f"elements beside chunk, vertex and sh were left out: {listed(others)}")
+    unread = [name for name in elements if name not in (*used, "sh")]
+    if unread:
+        notes.append(f"elements beside chunk, vertex and sh were left out: {listed(unread)}")
     return tuple(notes)
 
 

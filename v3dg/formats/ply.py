@@ -58,7 +58,7 @@ def _check_colors(path: AnyPath, gaussians: Gaussians) -> None:
 def _declared(elements: _Elements, used: set[str]) -> Declared:
     """What a file has beside the numbers that are read as they are meant."""
     vertex = next(properties for name, _, properties in elements if name == "vertex")
-    others = [name for name, _ in vertex if name not in used and name not in _NORMALS]
+    unread = [name for name, _ in vertex if name not in used and name not in _NORMALS]
     notes = []
     if "scale_2" not in used:
         notes.append(
@@ -71,12 +71,12 @@ def _declared(elements: _Elements, used: set[str]) -> Declared:
     if "filter_3D" in used:
         antialiased = True
         notes.append("filter_3D of Mip-Splatting was applied to scales and opacities")
-    above = [name for name in others if name.startswith("f_rest_")]
-    if above:
+    high_coefficients = [name for name in unread if name.startswith("f_rest_")]
+    if high_coefficients:
         notes.append("coefficients of SH degree 4 were left out")
-        others = [name for name in others if name not in above]
-    if others:
-        notes.append(f"properties of vertex that no gaussian has were left out: {listed(others)}")
+        unread = [name for name in unread if name not in high_coefficients]
+    if unread:
+        notes.append(f"properties of vertex that no gaussian has were left out: {listed(unread)}")
     left_out = [name for name, count, _ in elements if name != "vertex" and count]
     if left_out:
         notes.append(f"elements beside vertex were left out: {listed(left_out)}")

@@ -93,8 +93,10 @@ def _folder_in(path: Path, archive: Archive) -> str:
     if "meta.json" in names:
         return ""
     folders = [name.removesuffix("meta.json") for name in names if name.endswith("/meta.json")]
-    found = listed(folders)
-    check(path, len(folders) <= 1, f"one SOG in the zip, got several: {found}; unpack it")
+    names_of_folders = listed(folders)
+    check(
+        path, len(folders) <= 1, f"one SOG in the zip, got several: {names_of_folders}; unpack it"
+    )
     return "".join(folders)
 
 
@@ -207,9 +209,9 @@ def _declared(meta: dict[str, Node]) -> Declared:
             notes.append("the gaussians are those of 2DGS; they were read as flat ellipsoids")
         elif model not in ("default", "antialiased"):
             notes.append(f"the model {json_text(model)} is not known and was left out")
-    others = [name for name in meta if name not in _FIELDS]
-    if others:
-        notes.append(f"fields of meta.json were left out: {listed(others)}")
+    unread = [name for name in meta if name not in _FIELDS]
+    if unread:
+        notes.append(f"fields of meta.json were left out: {listed(unread)}")
     return Declared(antialiased=antialiased, notes=tuple(notes))
 
 

@@ -46,7 +46,7 @@ class _Index(NamedTuple):
     tree: Node
     names: list[PurePosixPath]  # of the files that the tree refers to by number
     environment: PurePosixPath | None  # the file of what belongs to no leaf
-    others: list[str]  # fields that are not read
+    unread: list[str]  # fields that are not read
 
 
 def open_file(path: str | os.PathLike[str]) -> AssetFile:
@@ -67,8 +67,8 @@ def open_file(path: str | os.PathLike[str]) -> AssetFile:
 def _declared(index: _Index, parts: list[Declared]) -> Declared:
     """What the index declares, and what all of its parts do."""
     notes = list(dict.fromkeys(note for part in parts for note in part.notes))
-    if index.others:
-        notes.append(f"fields of lod-meta.json were left out: {listed(index.others)}")
+    if index.unread:
+        notes.append(f"fields of lod-meta.json were left out: {listed(index.unread)}")
     antialiased = parts[0].antialiased
     if any(part.antialiased != antialiased for part in parts):
         antialiased = None
@@ -126,8 +126,8 @@ def _index(path: Path, claims: Claims) -> _Index:
     environment = None
     if index.has("environment") and index.field("environment").value is not None:
         environment = _inside(index.field("environment"))
-    others = [name for name in index.some_fields(()) if name not in _FIELDS]
-    return _Index(index.field("tree"), names, environment, others)
+    unread = [name for name in index.some_fields(()) if name not in _FIELDS]
+    return _Index(index.field("tree"), names, environment, unread)
 
 
 def _inside(node: Node) -> PurePosixPath:

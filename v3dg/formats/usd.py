@@ -242,7 +242,7 @@ def _left_out(usd: ModuleType, root: Usd.Prim) -> list[str]:
     """What is on a stage and is not read, one sentence each."""
     hidden: list[str] = []
     particles: list[str] = []
-    others: list[str] = []
+    unread: list[str] = []
     walk = iter(usd.Usd.PrimRange(root, usd.Usd.TraverseInstanceProxies()))
     for prim in walk:
         path = str(prim.GetPath())
@@ -254,14 +254,14 @@ def _left_out(usd: ModuleType, root: Usd.Prim) -> list[str]:
         elif prim.IsA(usd.UsdVol.ParticleField) and _kernel(usd, prim) is None:
             particles.append(path)
         elif prim.IsA(usd.UsdGeom.Gprim) and _kernel(usd, prim) is None:
-            others.append(path)
+            unread.append(path)
     notes = []
     if hidden:
         notes.append(f"prims that are invisible or not for drawing were left out: {listed(hidden)}")
     if particles:
         notes.append(f"particles that are no gaussians were left out: {listed(particles)}")
-    if others:
-        notes.append(f"other geometry was left out: {listed(others)}")
+    if unread:
+        notes.append(f"other geometry was left out: {listed(unread)}")
     return notes
 
 
@@ -389,9 +389,9 @@ def _notes_of(usd: ModuleType, prim: Usd.Prim) -> list[str]:
             if value != default:
                 notes.append(f"the hint {name} is {value[:40]!a}, which was left out")
     names = [attribute.GetName() for attribute in authored]
-    others = [name for name in names if name not in _KNOWN and not name.startswith("xformOp:")]
-    if others:
-        notes.append(f"attributes of gaussians were left out: {listed(others)}")
+    unread = [name for name in names if name not in _KNOWN and not name.startswith("xformOp:")]
+    if unread:
+        notes.append(f"attributes of gaussians were left out: {listed(unread)}")
     return notes
 
 
