@@ -58,7 +58,7 @@ def read_cameras(
 
     - the `cameras.json` that the code of the 3DGS paper writes;
     - a `camera_path.json` of nerfstudio's viewer, whose frames are named by their
-      number;
+      number unless they have a `file_path`;
     - a folder with one of these files: where `dataparser_transforms.json` is beside a
       `transforms.json`, cameras are in the frame of that training;
     - a model of COLMAP, binary or text, by its folder or its `images` file, whose
@@ -92,7 +92,7 @@ def read_cameras(
     document = read_json(place.file)
     if isinstance(document.value, list) and document.value:
         return _named(map(_read_3dgs, document.items()))
-    if document.has("camera_path"):
+    if document.has("camera_path") and document.field("camera_path").value != []:
         return _named(_read_path(document, size))
     top = _frames_at_top(document)
     transforms = []
@@ -163,9 +163,9 @@ def _file_in(folder: Path) -> Path:
 
 def _frames_at_top(document: Node) -> dict[str, Node]:
     """The fields of a file with frames; ValueError says what other files are."""
-    if document.has("keyframes"):
-        advice = "save the path in nerfstudio's viewer, which then writes camera_path, too"
-        raise document.problem(f"expected camera_path, got keyframes alone; {advice}")
+    if document.has("keyframes") or document.has("camera_path"):
+        advice = "save the path in nerfstudio's viewer, which then writes them, too"
+        raise document.problem(f"expected frames in camera_path, got none; {advice}")
     if document.has("transform") and document.has("scale"):
         advice = "give the folder of the run, or put it beside transforms.json"
         raise document.problem(f"expected cameras, got the transform of a run's training; {advice}")
@@ -196,13 +196,12 @@ def _read_3dgs(node: Node) -> tuple[str, Camera]:
 
 
 def _read_path(document: Node, size: tuple[int, int] | None) -> Iterator[tuple[str, Camera]]:
-    """The frames of a path of nerfstudio's viewer: camera to world with x right, y up,
-    z backward, and the vertical field of view in degrees of square pixels."""
-    kind = "perspective"
-    if document.has("camera_type"):
-        kind = document.field("camera_type").text()
-    if kind != "perspective":
-        raise document.field("camera_type").error('"perspective"')
+    """The frames of a path of nerfstudio's viewer, by their number or `file_path`:
+    camera to world with x right, y up, z backward, and the vertical field of view in
+    degrees of square pixels."""
+    for key in ("camera_type", "camera_model"):
+        if document.has(key) and document.field(key).text() != "perspective":
+            raise document.field(key).error('"perspective"')
     if document.has("render_width") and document.has("render_height"):
         width = document.field("render_width").size()
         height = document.field("render_height").size()
@@ -216,7 +215,10 @@ def _read_path(document: Node, size: tuple[int, int] | None) -> Iterator[tuple[s
         K = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])
         pose = _flat_or_rows(node.field("camera_to_world"))
         viewmat = node.attempt(partial(viewmat_from_blender, pose))
-        yield str(number), node.attempt(partial(Camera, viewmat, K, width, height))
+        name = str(number)
+        if node.has("file_path"):
+            name = node.field("file_path").text()
+        yield name, node.attempt(partial(Camera, viewmat, K, width, height))
 
 
 def _flat_or_rows(node: Node) -> Floats:

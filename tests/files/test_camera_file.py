@@ -318,6 +318,13 @@ def test_a_path_of_the_viewer_of_nerfstudio_is_read(tmp_path):
             assert (camera.width, camera.height) == (640, 480)
 
 
+def test_frames_of_a_path_may_have_names(tmp_path):
+    frames = [
+        {**frame, "file_path": name} for frame, name in zip(PATH["camera_path"], "ba", strict=True)
+    ]
+    assert list(read_cameras(put(tmp_path, PATH | {"camera_path": frames}))) == ["b", "a"]
+
+
 def without_size():
     return {key: value for key, value in PATH.items() if not key.startswith("render_")}
 
@@ -336,7 +343,15 @@ OTHER_FILES = {
     ),
     "keyframes alone": (
         {"keyframes": PATH["keyframes"]},
-        "top level: expected camera_path, got keyframes alone; save the path in",
+        "top level: expected frames in camera_path, got none; save the path in",
+    ),
+    "keyframes and an empty path": (
+        PATH | {"camera_path": []},
+        "top level: expected frames in camera_path, got none; save the path in",
+    ),
+    "a path of another model": (
+        PATH | {"camera_model": "fisheye"},
+        'camera_model: expected "perspective", got "fisheye"',
     ),
     "an open angle": (
         PATH | {"camera_path": [PATH["camera_path"][0] | {"fov": 180}]},
