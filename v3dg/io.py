@@ -12,6 +12,7 @@ from v3dg._numbers import check, check_type, one_of
 from v3dg._urls import FileAtUrl, beside, in_parts, reading, shown
 from v3dg.formats import checkpoint, gltf, hier, ksplat, ply, sog, splat, spz, streamed_sog, usd
 from v3dg.formats._reading import AnyPath, AssetFile, bytes_of
+from v3dg.formats.content import content_of
 from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
 
@@ -29,7 +30,7 @@ _READERS: dict[str, Callable[[AnyPath], AssetFile]] = {
     ".sog": sog.open_file,
     "lod-meta.json": streamed_sog.open_file,
     "meta.json": sog.open_file,
-    **dict.fromkeys((".ckpt", ".pt"), checkpoint.open_file),
+    **dict.fromkeys((".ckpt", ".pt", ".pth"), checkpoint.open_file),
 }
 _WRITERS: dict[str, Callable[[AnyPath, Gaussians], None]] = {
     ".compressed.ply": ply.write_compressed,
@@ -79,8 +80,11 @@ def read_asset(path: AnyPath) -> Gaussians:
     - `.splat`, of antimatter15; `.ksplat`, of mkkellogg; `.spz`, of Niantic, version 1
       to 4; `.sog` of PlayCanvas, version 2, or the `meta.json` of one that is not in a
       zip; the finest level of streamed SOG, by its `lod-meta.json`.
-    - `.pt` and `.ckpt`, checkpoints of gsplat's trainer and of nerfstudio's splatfacto,
-      from which nothing but tensors is taken.
+    - `.pt`, `.ckpt` and `.pth`, checkpoints of gsplat's trainer, of nerfstudio's
+      splatfacto and of the code of the 3DGS paper and 2DGS, from which nothing but
+      tensors is taken.
+
+    A file whose bytes are those of another of these formats is read as such.
 
     With the extra `fsspec`, the file may be at a URL, which is fetched once per
     process, unless it refers to other files.
@@ -116,14 +120,29 @@ def open_asset(path: AnyPath) -> AssetFile:
     at_url = in_parts(path)
     if isinstance(at_url, FileAtUrl):
         return _open_fetched(at_url, reader)
-    return reader(at_url)
+    return _open_by_content(at_url, reader)
+
+
+def _open_by_content(path: AnyPath, reader: Callable[[AnyPath], AssetFile]) -> AssetFile:
+    """An asset whose bytes may be those of another format than its name says; a note
+    then says so. ValueError if they are those of a format that is not read."""
+    content = content_of(path)
+    if content is None or _READERS.get(content.suffix) is reader:
+        return reader(path)
+    name = beside(path).name.lower()
+    ending = next(ending for ending in _READERS if name.endswith(ending))
+    is_readable = content.suffix not in ("", *usd.SUFFIXES)  # USD takes it from the name
+    check(path, is_readable, f"a {ending}, got {content.text}")
+    file = _READERS[content.suffix](path)
+    note = f"its name ends in {ending}, but it is {content.text}, and was read as such"
+    return replace(file, declared=replace(file.declared, notes=(note, *file.declared.notes)))
 
 
 def _open_fetched(at_url: FileAtUrl, reader: Callable[[AnyPath], AssetFile]) -> AssetFile:
     """An asset at a URL, whose local copy exists as long as this object; errors name
     the URL."""
     with reading(at_url) as local:
-        file = reader(local)
+        file = _open_by_content(local, reader)
         whole = None
         if at_url.needs_name:
             whole = file.read(0, file.num_gaussians)

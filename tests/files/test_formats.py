@@ -12,6 +12,7 @@ import struct
 import sys
 import tracemalloc
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import gsply
@@ -25,6 +26,7 @@ import v3dg
 from test_ply import random_gaussians
 from v3dg import Gaussians, read_asset, write_asset
 from v3dg.formats import _reading
+from v3dg.io import open_asset
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 SH_C0 = 0.28209479177387814
@@ -898,6 +900,12 @@ def test_changed_bytes_never_do_worse_than_an_error(tmp_path_factory, name, edit
         assert str(error).startswith(f"{path}")  # noqa: PT017 (either outcome is right)
 
 
+def read_quietly(path):
+    """All gaussians, without what reading them may warn of."""
+    file = open_asset(path)
+    return file.read(0, file.num_gaussians)
+
+
 def gsplat_tensors(asset):
     """What gsplat's trainer calls the parameters of an asset."""
     tensors = asset.torch()
@@ -945,11 +953,140 @@ def test_checkpoints_of_nerfstudio_are_read(tmp_path, degree):
         "optimizers": {"means": optimizer.state_dict()},
         "scalers": {},
     }
-    asset = Gaussians(
-        tensors["means"].numpy(), asset.quats, asset.scales, asset.opacities, asset.sh
-    )
+    asset = replace(asset, means=tensors["means"].numpy())
+    if degree == 0:  # splatfacto then has logits of colours, see `shs_0` of its model
+        colors = 1 / (1 + np.exp(-asset.sh.astype(np.float64)))
+        asset = replace(asset, sh=((colors - 0.5) / SH_C0).astype(np.float32))
     torch.save(content, tmp_path / "step-000029999.ckpt")
-    assert_same(read_asset(tmp_path / "step-000029999.ckpt"), asset)
+    assert_same(read_quietly(tmp_path / "step-000029999.ckpt"), asset)
+    notes = open_asset(tmp_path / "step-000029999.ckpt").declared.notes
+    wanted = ["cameras were moved in training (camera_optimizer), so those of the data are not"]
+    if degree == 0:
+        wanted.append("colours are stored as logits without view dependence, and were read as")
+    assert [note[: len(text)] for note, text in zip(notes, wanted, strict=True)] == wanted
+
+
+def test_checkpoints_of_older_splatfacto_are_read(tmp_path):
+    asset = random_gaussians(20, 2)
+    names = {"sh0": "features_dc", "shN": "features_rest"}
+    tensors = {names.get(name, name): tensor for name, tensor in gsplat_tensors(asset).items()}
+    pipeline = {f"_model.{name}": tensor for name, tensor in tensors.items()}
+    grids = {"_model.bil_grids.grids": torch.zeros(2), "_model.new_net.weight": torch.zeros(2)}
+    torch.save({"pipeline": pipeline | grids}, tmp_path / "a.ckpt")
+    assert_same(read_quietly(tmp_path / "a.ckpt"), asset)
+    first, second = open_asset(tmp_path / "a.ckpt").declared.notes
+    assert first.startswith("the bilateral grids of single photographs were left out")
+    assert second == "parts of the checkpoint were left out: 'new_net'"
+
+
+def test_colours_of_a_gsplat_with_appearance_are_those_without_it(tmp_path):
+    asset = random_gaussians(20, 0)
+    tensors = gsplat_tensors(asset)
+    logits = torch.randn(20, 3)
+    splats = {name: tensors[name] for name in ("means", "scales", "quats", "opacities")}
+    splats |= {"features": torch.zeros(20, 32), "colors": logits, "motion": torch.zeros(20)}
+    torch.save({"splats": splats, "app_module": {"color_head": torch.zeros(3)}}, tmp_path / "a.pt")
+    colors = torch.sigmoid(logits.double()).numpy()[:, None]
+    wanted = replace(asset, sh=((colors - 0.5) / SH_C0).astype(np.float32))
+    assert_same(read_quietly(tmp_path / "a.pt"), wanted)
+    file = open_asset(tmp_path / "a.pt")
+    assert file.sh_degree == 0
+    appearance, tensors_left_out, as_logits = file.declared.notes
+    assert appearance.startswith("the appearance of single photographs (app_module) was left out")
+    assert tensors_left_out == "tensors of splats were left out: 'motion'"
+    assert as_logits.startswith("colours are stored as logits")
+
+
+class Captured(torch.nn.Module):
+    """What the code of the 3DGS paper captures; 2DGS stores two scales."""
+
+    def __init__(self, asset, num_scales):
+        super().__init__()
+        tensors = gsplat_tensors(asset)
+        self.parameters_of = [
+            torch.nn.Parameter(
+                tensors[name][..., :num_scales] if name == "scales" else tensors[name]
+            )
+            for name in ("means", "sh0", "shN", "scales", "quats", "opacities")
+        ]
+
+    def content(self):
+        optimizer = torch.optim.Adam(self.parameters_of)
+        self.parameters_of[0].grad = torch.ones_like(self.parameters_of[0])
+        optimizer.step()
+        statistics = [torch.zeros(2)] * 3
+        extent = np.float64(3.5)
+        captured = (3, *self.parameters_of, *statistics, optimizer.state_dict(), extent)
+        return captured, 30000
+
+
+@pytest.mark.parametrize("num_scales", [2, 3])
+def test_checkpoints_of_the_papers_code_are_read(tmp_path, num_scales):
+    asset = random_gaussians(20, 3)
+    captured = Captured(asset, num_scales)
+    torch.save(captured.content(), tmp_path / "chkpnt30000.pth")
+    asset = replace(asset, means=captured.parameters_of[0].detach().numpy())
+    notes = open_asset(tmp_path / "chkpnt30000.pth").declared.notes
+    if num_scales == 2:
+        asset.scales[:, 2] = 0
+        assert notes == (
+            "the gaussians are those of 2DGS; they were read as ellipsoids of no thickness",
+        )
+    assert_same(read_quietly(tmp_path / "chkpnt30000.pth"), asset)
+    assert (notes == ()) == (num_scales == 3)
+
+
+SETTINGS = {
+    "gsplat": ("cfg.yml", "antialiased: {flag}\npacked: false\n", "a.pt"),
+    "nerfstudio": (
+        "config.yml",
+        "pipeline: !!python/object:x.Y\n  model: !!python/object:x.Z\n"
+        "    rasterize_mode: {mode}\n    antialiased: maybe\n",
+        "a.ckpt",
+    ),
+}
+
+
+@pytest.mark.parametrize("place", ["", "ckpts"])
+@pytest.mark.parametrize("trainer", SETTINGS)
+@pytest.mark.parametrize("antialiased", [True, False])
+def test_the_settings_of_a_run_say_whether_it_is_antialiased(tmp_path, trainer, antialiased, place):
+    name, text, checkpoint = SETTINGS[trainer]
+    mode = "antialiased" if antialiased else "classic"
+    (tmp_path / name).write_text(text.format(flag=str(antialiased).lower(), mode=mode))
+    (tmp_path / "ckpts").mkdir()
+    file = tmp_path / place / checkpoint
+    torch.save({"splats": gsplat_tensors(random_gaussians(2, 0))}, file)
+    assert open_asset(file).declared.antialiased is antialiased
+    (tmp_path / name).unlink()
+    assert open_asset(file).declared.antialiased is None
+
+
+def test_settings_are_only_read_as_far_as_they_are_plain(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    torch.save({"splats": gsplat_tensors(random_gaussians(2, 0))}, tmp_path / "a.pt")
+    text = "a: !!python/object/apply:os.system ['touch harm']\nantialiased: true\n"
+    settings = tmp_path / "cfg.yml"
+    settings.write_text(text)
+    assert open_asset("a.pt").declared.antialiased is True
+    assert not Path("harm").exists()
+    settings.write_bytes(b"antialiased: true\n" + b"#" * (1 << 20))
+    declared = open_asset("a.pt").declared
+    assert declared.antialiased is None
+    assert declared.notes == ("cfg.yml is too large to be that of a run and was not read",)
+    settings.write_bytes(b"\xff\xfe\0antialiased: [true\nstrategy:\n  antialiased: true\n")
+    assert open_asset("a.pt").declared.antialiased is None
+
+
+def test_gaussians_of_2dgs_trained_by_gsplat_are_flat(tmp_path):
+    asset = random_gaussians(20, 1)
+    torch.save({"splats": gsplat_tensors(asset)}, tmp_path / "a.pt")
+    (tmp_path / "cfg.yml").write_text("model_type: 2dgs\nwith_eval3d: true\n")
+    asset.scales[:, 2] = 0
+    assert_same(read_quietly(tmp_path / "a.pt"), asset)
+    along_rays, flat = open_asset(tmp_path / "a.pt").declared.notes
+    assert along_rays.startswith("gaussians were trained to be evaluated along rays")
+    assert flat.startswith("the gaussians are those of 2DGS")
 
 
 class Harmful:
@@ -982,7 +1119,7 @@ def test_checkpoints_that_do_not_fit_are_refused(tmp_path, change, message):
     assert_refused_cheaply(tmp_path / "a.pt", message)
     torch.save({"model": 3}, tmp_path / "a.pt")
     assert_refused_cheaply(
-        tmp_path / "a.pt", "expected 'splats' (gsplat) or 'pipeline' (nerfstudio)"
+        tmp_path / "a.pt", "expected 'splats' (gsplat), 'pipeline' (nerfstudio) or a tuple"
     )
 
 

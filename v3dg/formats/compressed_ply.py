@@ -8,7 +8,7 @@ colour and opacity (8 bits each), and element `sh` a byte a coefficient, channel
 channel, for -4 to 4. See docs/formats.md.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from v3dg import _core, _files
 from v3dg.formats import _packing
+from v3dg.formats._declared import Declared
 from v3dg.formats._packing import SH_C0, SQRT2, Floats, assemble
-from v3dg.formats._reading import AnyPath, AssetFile, File, check
+from v3dg.formats._reading import AnyPath, AssetFile, File, check, listed
 from v3dg.gaussians import Gaussians
 
 _CHUNK = 256
@@ -84,7 +85,24 @@ def open_file(path: AnyPath) -> AssetFile:
 
         return assemble(last - first, degree, decode)
 
-    return AssetFile(path, count, degree, read_rows)
+    return AssetFile(path, count, degree, read_rows, declared=Declared(notes=_notes(elements)))
+
+
+def _notes(elements: Mapping[str, _Element]) -> tuple[str, ...]:
+    """What is in the file and is not read, one sentence each."""
+    used = {
+        "chunk": [name for kind in _RANGES for name in _range_names(kind)],
+        "vertex": list(_PACKED),
+    }
+    notes = []
+    for element, read_names in used.items():
+        names = [name for name in elements[element].kinds if name not in read_names]
+        if names:
+            notes.append(f"properties of {element} were left out: {listed(names)}")
+    unread = [name for name in elements if name not in (*used, "sh")]
+    if unread:
+        notes.append(f"elements beside chunk, vertex and sh were left out: {listed(unread)}")
+    return tuple(notes)
 
 
 def _decoded(

@@ -91,6 +91,7 @@ READERS = {
     "bundle": read_bundle,
     "scene": read_scene,
     "cameras": read_cameras,
+    "colmap": read_cameras,
     "picture": read_picture,
 }
 
