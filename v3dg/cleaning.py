@@ -37,7 +37,8 @@ _WRONG = (1 << KINDS.index("transparent")) - 1  # the bits of all kinds before i
 
 
 class AssetWarning(UserWarning):
-    """Gaussians of an asset have wrong values and were left out."""
+    """Gaussians of an asset have wrong values and were left out; or something in its
+    file was not understood, or read otherwise than it is written."""
 
 
 @dataclass(frozen=True, eq=False)

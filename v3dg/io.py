@@ -3,6 +3,7 @@
 import os
 import pathlib
 import re
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -10,7 +11,22 @@ from typing import Literal, TypeVar, get_args
 
 from v3dg._numbers import check, check_type, one_of
 from v3dg._urls import FileAtUrl, beside, in_parts, reading, shown
-from v3dg.formats import checkpoint, gltf, hier, ksplat, ply, sog, splat, spz, streamed_sog, usd
+from v3dg.cameras import AXES, Axis
+from v3dg.cleaning import AssetWarning
+from v3dg.formats import (
+    _axes,
+    checkpoint,
+    gltf,
+    hier,
+    ksplat,
+    ply,
+    sog,
+    splat,
+    spz,
+    streamed_sog,
+    usd,
+)
+from v3dg.formats._declared import declare
 from v3dg.formats._reading import AnyPath, AssetFile, bytes_of
 from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
@@ -31,7 +47,7 @@ _READERS: dict[str, Callable[[AnyPath], AssetFile]] = {
     "meta.json": sog.open_file,
     **dict.fromkeys((".ckpt", ".pt"), checkpoint.open_file),
 }
-_WRITERS: dict[str, Callable[[AnyPath, Gaussians], None]] = {
+_WRITERS: dict[str, Callable[..., None]] = {
     ".compressed.ply": ply.write_compressed,
     ".ply": ply.write,
     ".spz": spz.write,
@@ -39,6 +55,9 @@ _WRITERS: dict[str, Callable[[AnyPath, Gaussians], None]] = {
     **dict.fromkeys(usd.SUFFIXES, usd.write),
     ".sog": sog.write,
 }
+# Ends of the names of files that have axes, to which gaussians are turned, and the axis
+# that is up there.
+_UP: dict[str, Axis] = dict.fromkeys((".spz", ".glb", *usd.SUFFIXES), "y")
 # Functions that list the files of an asset that may have several.
 _FILES: dict[str, Callable[[pathlib.Path], list[pathlib.Path]]] = {
     "lod-meta.json": streamed_sog.files,
@@ -85,8 +104,11 @@ def read_asset(path: AnyPath) -> Gaussians:
     With the extra `fsspec`, the file may be at a URL, which is fetched once per
     process, unless it refers to other files.
 
-    Coordinates are those of the file: no axes are turned. Memory and time are bounded
-    by the size of the file (docs/robustness.md).
+    Files of formats that have axes (`.spz`, glTF, OpenUSD) are turned, with their
+    harmonics, to those of trainers' `.ply`: right, down, forward. Coordinates of all
+    others are those of the file. What a file declares that was not understood is a
+    `v3dg.cleaning.AssetWarning` each. Memory and time are bounded by the size of the
+    file (docs/robustness.md).
 
     Raises:
         ValueError: The name is unknown, or the content does not match it; the message
@@ -95,7 +117,9 @@ def read_asset(path: AnyPath) -> Gaussians:
             IsADirectoryError, ...).
     """
     file = open_asset(path)
-    return file.read(0, file.num_gaussians)
+    for note in file.declared.notes:
+        warnings.warn(f"{shown(path)}: {note}", AssetWarning, stacklevel=2)
+    return declare(file.read(0, file.num_gaussians), file.declared)
 
 
 def loaded(asset: Gaussians | AnyPath) -> Gaussians:
@@ -166,6 +190,7 @@ def write_asset(
     path: AnyPath,
     gaussians: Gaussians | AnyPath,
     *,
+    up: Axis = _axes.MEMORY_UP,
     encoding: PlyEncoding = "binary_little_endian",
     version: Literal[2, 3, 4] | None = None,
 ) -> None:
@@ -187,8 +212,13 @@ def write_asset(
       numbers.
     - `.sog`: version 2. The order changes.
 
+    Gaussians are turned so that what is up is y in `.spz`, `.glb` and OpenUSD; the
+    other formats have no axes, and are written as the gaussians are.
+
     Args:
         gaussians: The asset, or its file.
+        up: The axis that is up among the gaussians; -y as in most trained assets, and
+            in all that `read_asset` has turned.
         encoding: Encoding of a `.ply`; other formats have only one.
         version: Version of a `.spz`; 3 if None. Version 2 is for viewers from before
             2025, 4 for those since 2026.
@@ -215,7 +245,20 @@ def write_asset(
     else:
         expected = f"the default for {os.fspath(path)}, which is not a .ply, got {encoding!r}"
         check("encoding", encoding == "binary_little_endian", expected)
+    one_of(up, "up", AXES)
+    if turned_up(path) is not None:
+        write = partial(write, up=up)
     write(path, gaussians)
+
+
+def turned_up(path: AnyPath) -> Axis | None:
+    """The axis that is up in a file that `write_asset` writes, by its name; None for
+    formats without axes."""
+    name = beside(path).name.lower()
+    for ending, axis in _UP.items():
+        if name.endswith(ending):
+            return axis
+    return None
 
 
 def _by_name(path: AnyPath, formats: Mapping[str, Format]) -> Format:

@@ -105,7 +105,7 @@ def _asked_up(path: Path) -> Axis | None:
     stride = max(asset.num_gaussians // _NUM_SAMPLES, _SAMPLE_SIZE)
     for start in range(0, asset.num_gaussians, stride):
         samples.append(asset.read(start, min(start + _SAMPLE_SIZE, asset.num_gaussians)))
-    axis, reason = up_of(Gaussians.concatenate(samples), path=path)
+    axis, reason = up_of(Gaussians.concatenate(samples), declared=asset.declared)
     if reason == ASSUMED:
         return ask_up(path, axis)
     return None

@@ -1,8 +1,9 @@
 """OpenUSD: gaussians as prims `ParticleField3DGaussianSplat`, with Pixar's usd-core.
 
 One prim is written. All prims are read and transformed, into one asset, or into an
-asset each with the poses of its instances. Of levels of detail, the first is read.
-Coordinates are passed on as they are stored.
+asset each with the poses of its instances. Of levels of detail, the first is read. An
+asset is turned from the axes of the stage to those of memory; a world keeps the
+stage's.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from numpy.typing import NDArray
 from v3dg import _extras, _files
 from v3dg._numbers import check
 from v3dg.cameras import Axis, Floats, is_rotation
+from v3dg.formats import _axes
+from v3dg.formats._declared import Declared
 from v3dg.formats._packing import check_writable
 from v3dg.formats._reading import AnyPath, AssetFile, value_errors
 from v3dg.gaussians import Gaussians
@@ -32,6 +35,8 @@ if TYPE_CHECKING:
     from pxr import Sdf, Usd
 
 SUFFIXES = (".usd", ".usda", ".usdc")
+# The axes of a stage by the one that is up; its cameras look back.
+_AXES = {"Y": _axes.OPENGL, "Z": _axes.Z_UP}
 _Pose: TypeAlias = tuple[tuple[float, float, float, float], Floats, float]
 _SH = "radiance:sphericalHarmonics"
 _HALVES = (
@@ -61,16 +66,16 @@ def pxr() -> ModuleType:
 
 def open_file(path: AnyPath) -> AssetFile:
     """Open a USD file, which is read whole."""
-    gaussians = read(path)
+    gaussians, declared = read(path)
 
     def read_rows(first: int, last: int) -> Gaussians:
         return gaussians.subset(slice(first, last))
 
-    return AssetFile(path, len(gaussians), gaussians.sh_degree, read_rows)
+    return AssetFile(path, len(gaussians), gaussians.sh_degree, read_rows, declared=declared)
 
 
-def read(path: AnyPath) -> Gaussians:
-    """Read the gaussians of a USD file as one asset."""
+def read(path: AnyPath) -> tuple[Gaussians, Declared]:
+    """Read the gaussians of a USD file as one asset, and what the stage declares."""
     with _opened(path, "OpenUSD with gaussians of one SH degree, without instances") as (usd, root):
         for prim in _prims(usd, root):
             if prim.IsA(usd.UsdGeom.PointInstancer):
@@ -81,7 +86,19 @@ def read(path: AnyPath) -> Gaussians:
             if not np.array_equal(matrix, np.eye(4)):
                 gaussians = gaussians.transform(*_similarity(prim, matrix))
             parts.append(gaussians)
-        return Gaussians.concatenate(parts)
+        letter = str(usd.UsdGeom.GetStageUpAxis(root.GetStage()))
+        gaussians = _axes.turned(Gaussians.concatenate(parts), _AXES[letter], _axes.MEMORY)
+        return gaussians, _declared(usd, root.GetStage(), letter)
+
+
+def _declared(usd: ModuleType, stage: Usd.Stage, letter: str) -> Declared:
+    """What a stage of which this axis is up declares."""
+    notes = []
+    unit = usd.UsdGeom.GetStageMetersPerUnit(stage)
+    if usd.UsdGeom.StageHasAuthoredMetersPerUnit(stage) and unit != 1:
+        notes.append(f"Its unit is {unit:g} m; coordinates stay in that unit.")
+    reason = f"as its stage says ({letter} is up in the file)"
+    return Declared(up=_axes.MEMORY_UP, up_reason=reason, notes=tuple(notes))
 
 
 def has_instances(path: AnyPath) -> bool:
@@ -208,9 +225,10 @@ def _gaussians_of(prim: Usd.Prim) -> Gaussians:
     )
 
 
-def write(path: AnyPath, gaussians: Gaussians) -> None:
-    """Write a USD file of one prim; the order stays."""
-    host = check_writable(gaussians)
+def write(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) -> None:
+    """Write a USD file of one prim, of gaussians of which `up` is up; the order
+    stays."""
+    host = _axes.turned(check_writable(gaussians), _axes.axes_of_up(up), _AXES["Y"])
     stage = new_stage("Y")
     stage.SetDefaultPrim(define(stage, "/gaussians", host))
     export(stage, path)
