@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Literal, TypeVar, get_args
 
+from v3dg import _core
 from v3dg._numbers import check, check_type, one_of
 from v3dg._urls import FileAtUrl, beside, in_parts, reading, shown
 from v3dg.cameras import AXES, Axis
@@ -16,6 +17,7 @@ from v3dg.cleaning import AssetWarning
 from v3dg.formats import (
     _axes,
     checkpoint,
+    compressed_ply,
     gltf,
     hier,
     ksplat,
@@ -27,6 +29,8 @@ from v3dg.formats import (
     usd,
 )
 from v3dg.formats._declared import declare
+from v3dg.formats._losses import Losses, losses
+from v3dg.formats._packing import Limits
 from v3dg.formats._reading import AnyPath, AssetFile, bytes_of
 from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
@@ -63,6 +67,14 @@ _FILES: dict[str, Callable[[pathlib.Path], list[pathlib.Path]]] = {
     "lod-meta.json": streamed_sog.files,
     "meta.json": sog.files,
     "": lambda path: [path],
+}
+
+# Ends of the names of packed files, what these can hold, and whether gaussians are put
+# in the order of a Morton curve.
+_PACKED: dict[str, tuple[Limits, bool]] = {
+    ".compressed.ply": (compressed_ply.LIMITS, True),
+    ".spz": (spz.LIMITS, False),
+    ".sog": (Limits(), True),
 }
 
 # Checkpoints of gsplat, one for each GPU, and of nerfstudio, and what the code of the
@@ -258,6 +270,27 @@ def turned_up(path: AnyPath) -> Axis | None:
     for ending, axis in _UP.items():
         if name.endswith(ending):
             return axis
+    return None
+
+
+def losses_of(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) -> Losses | None:
+    """What a file does not hold of the gaussians that `write_asset` wrote to it, which
+    is read back; None for formats of float32 numbers, which lose nothing.
+
+    Args:
+        up: As it was given to `write_asset`.
+    """
+    name = beside(path).name.lower()
+    for ending, (limits, is_sorted) in _PACKED.items():
+        if not name.endswith(ending):
+            continue
+        written = gaussians.numpy()
+        if turned_up(path) is not None:
+            written = _axes.turned(written, _axes.axes_of_up(up), _axes.MEMORY)
+        if is_sorted:
+            written = written.subset(_core.morton_order(written.means))
+        file = open_asset(path)
+        return losses(written, file.read(0, file.num_gaussians), limits)
     return None
 
 

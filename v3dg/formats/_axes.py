@@ -5,6 +5,8 @@ Axes are named by where x, y and z point, as SPZ's specification names them: R o
 `.ply` files, right, down, forward. Turns that change nothing but signs are exact.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -107,11 +109,10 @@ def _mirrored(gaussians: Gaussians, signs: Floats) -> Gaussians:
     for row, coordinates in enumerate(_ODD[:num_harmonics]):
         for coordinate in coordinates:
             harmonics[row] *= sign_of_coordinate[coordinate]
-    return Gaussians(
+    return replace(
+        gaussians,
         means=gaussians.means * np.array([x, y, z]),
         quats=gaussians.quats * np.array([1, y * z, x * z, x * y], np.float32),
-        scales=gaussians.scales,
-        opacities=gaussians.opacities,
         sh=gaussians.sh * harmonics,
     )
 

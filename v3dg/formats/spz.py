@@ -57,6 +57,14 @@ _AXES = (
 _STORED_AXES: dict[Axis, str] = {"y": _axes.OPENGL, "-y": _axes.MEMORY, "z": _axes.Z_UP}
 
 
+LIMITS = _packing.Limits(
+    log_scale=(-10.0, -10.0 + 255 / 16),
+    color=(-0.5 / _COLOR_SCALE, 0.5 / _COLOR_SCALE),
+    harmonic=(-1.0, 127.5 / 128),
+)
+"""What the format can hold, with half a step more where that is rounded to it."""
+
+
 class _Header(NamedTuple):
     version: int
     sh_degree: int
