@@ -8,6 +8,7 @@ import numpy as np
 from v3dg._numbers import Floats
 from v3dg.bundle import Bundle
 from v3dg.cameras import AXES, Axis, Camera
+from v3dg.formats import _axes
 from v3dg.formats._declared import Declared, declared_of
 from v3dg.gaussians import Gaussians
 from v3dg.scene import Scene, Subject
@@ -76,6 +77,16 @@ def up_of(
     if flat is not None:
         return flat, "guessed from the plane of its gaussians"
     return "-y", ASSUMED
+
+
+def turned_upright(gaussians: Gaussians, up: Axis) -> Gaussians:
+    """Turn gaussians of which an axis is up so that -y is, as `write_asset` and viewers
+    of files without axes take it; colours turn, too.
+
+    Raises:
+        ValueError: `up` is no axis.
+    """
+    return _axes.turned(gaussians.numpy(), _axes.axes_of_up(up), _axes.MEMORY)
 
 
 def _middles(subject: Bundle | Gaussians) -> Floats:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from v3dg._json import JsonObject
 from v3dg.cleaning import SMALLEST_OPACITY, ball_of_most
 from v3dg.formats._packing import SH_C0, Limits, log_scales
 from v3dg.gaussians import Gaussians
@@ -47,6 +48,15 @@ class Losses:
         if self.harmonics_error:
             errors += f", harmonics {self.harmonics_error:.4f}"
         return [*lines, f"largest errors of rounding: {errors}"]
+
+    def result(self) -> JsonObject:
+        """The same for a command's result as JSON."""
+        errors = {
+            "positions": self.position_error,
+            "colors": self.color_error,
+            "harmonics": self.harmonics_error,
+        }
+        return {"cut": self.cut, "largest_errors": errors}
 
     def _kind(self, kind: str) -> str:
         limits = self.limits
