@@ -259,3 +259,20 @@ def test_usd_is_turned_from_the_axis_of_its_stage(tmp_path, asset):
     stage.GetRootLayer().Save()
     with pytest.warns(v3dg.cleaning.AssetWarning, match=r"a\.usda: Its unit is 0\.01 m"):
         read_asset(tmp_path / "a.usda")
+
+
+@pytest.mark.parametrize("ending", [b"\n", b"\r\n"])
+def test_ply_of_nerfstudio_says_what_is_up(tmp_path, asset, ending):
+    write_asset(tmp_path / "a.ply", asset)
+    content = (tmp_path / "a.ply").read_bytes()
+    head, _, rows = content.partition(b"end_header\n")
+    lines = head.split(b"\n")
+    lines.insert(2, b"comment Vertical Axis: z")
+    (tmp_path / "a.ply").write_bytes(ending.join(lines) + b"end_header" + ending + rows)
+    found = read_asset(tmp_path / "a.ply")
+    assert up_of(found) == ("z", "as its header says")
+    np.testing.assert_array_equal(found.means, asset.means)
+    lines[2] = b"comment Vertical Axis: w"
+    (tmp_path / "a.ply").write_bytes(b"\n".join(lines) + b"end_header\n" + rows)
+    with pytest.warns(v3dg.cleaning.AssetWarning, match="unknown vertical axis, 'w'"):
+        read_asset(tmp_path / "a.ply")
