@@ -3,14 +3,34 @@
 import os
 import pathlib
 import re
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Literal, TypeVar, get_args
 
+from v3dg import _core
 from v3dg._numbers import check, check_type, one_of
 from v3dg._urls import FileAtUrl, beside, in_parts, reading, shown
-from v3dg.formats import checkpoint, gltf, hier, ksplat, ply, sog, splat, spz, streamed_sog, usd
+from v3dg.cameras import AXES, Axis
+from v3dg.cleaning import AssetWarning
+from v3dg.formats import (
+    _axes,
+    checkpoint,
+    compressed_ply,
+    gltf,
+    hier,
+    ksplat,
+    ply,
+    sog,
+    splat,
+    spz,
+    streamed_sog,
+    usd,
+)
+from v3dg.formats._declared import declare
+from v3dg.formats._losses import Losses, losses
+from v3dg.formats._packing import Limits
 from v3dg.formats._reading import AnyPath, AssetFile, bytes_of
 from v3dg.formats.content import content_of
 from v3dg.formats.ply import PlyEncoding
@@ -32,7 +52,7 @@ _READERS: dict[str, Callable[[AnyPath], AssetFile]] = {
     "meta.json": sog.open_file,
     **dict.fromkeys((".ckpt", ".pt", ".pth"), checkpoint.open_file),
 }
-_WRITERS: dict[str, Callable[[AnyPath, Gaussians], None]] = {
+_WRITERS: dict[str, Callable[..., None]] = {
     ".compressed.ply": ply.write_compressed,
     ".ply": ply.write,
     ".spz": spz.write,
@@ -40,11 +60,22 @@ _WRITERS: dict[str, Callable[[AnyPath, Gaussians], None]] = {
     **dict.fromkeys(usd.SUFFIXES, usd.write),
     ".sog": sog.write,
 }
+# Ends of the names of files that have axes, to which gaussians are turned, and the axis
+# that is up there.
+_UP: dict[str, Axis] = dict.fromkeys((".spz", ".glb", *usd.SUFFIXES), "y")
 # Functions that list the files of an asset that may have several.
 _FILES: dict[str, Callable[[pathlib.Path], list[pathlib.Path]]] = {
     "lod-meta.json": streamed_sog.files,
     "meta.json": sog.files,
     "": lambda path: [path],
+}
+
+# Ends of the names of packed files, what these can hold, and whether gaussians are put
+# in the order of a Morton curve.
+_PACKED: dict[str, tuple[Limits, bool]] = {
+    ".compressed.ply": (compressed_ply.LIMITS, True),
+    ".spz": (spz.LIMITS, False),
+    ".sog": (Limits(), True),
 }
 
 # Checkpoints of gsplat, one for each GPU, and of nerfstudio, and what the code of the
@@ -89,8 +120,11 @@ def read_asset(path: AnyPath) -> Gaussians:
     With the extra `fsspec`, the file may be at a URL, which is fetched once per
     process, unless it refers to other files.
 
-    Coordinates are those of the file: no axes are turned. Memory and time are bounded
-    by the size of the file (docs/robustness.md).
+    Files of formats that have axes (`.spz`, glTF, OpenUSD) are turned, with their
+    harmonics, to those of trainers' `.ply`: right, down, forward. Coordinates of all
+    others are those of the file. What a file declares that was not understood is a
+    `v3dg.cleaning.AssetWarning` each. Memory and time are bounded by the size of the
+    file (docs/robustness.md).
 
     Raises:
         ValueError: The name is unknown, or the content does not match it; the message
@@ -99,7 +133,9 @@ def read_asset(path: AnyPath) -> Gaussians:
             IsADirectoryError, ...).
     """
     file = open_asset(path)
-    return file.read(0, file.num_gaussians)
+    for note in file.declared.notes:
+        warnings.warn(f"{shown(path)}: {note}", AssetWarning, stacklevel=2)
+    return declare(file.read(0, file.num_gaussians), file.declared)
 
 
 def loaded(asset: Gaussians | AnyPath) -> Gaussians:
@@ -185,6 +221,7 @@ def write_asset(
     path: AnyPath,
     gaussians: Gaussians | AnyPath,
     *,
+    up: Axis = _axes.MEMORY_UP,
     encoding: PlyEncoding = "binary_little_endian",
     version: Literal[2, 3, 4] | None = None,
 ) -> None:
@@ -206,8 +243,13 @@ def write_asset(
       numbers.
     - `.sog`: version 2. The order changes.
 
+    Gaussians are turned so that what is up is y in `.spz`, `.glb` and OpenUSD; the
+    other formats have no axes, and are written as the gaussians are.
+
     Args:
         gaussians: The asset, or its file.
+        up: The axis that is up among the gaussians; -y as in most trained assets, and
+            in all that `read_asset` has turned.
         encoding: Encoding of a `.ply`; other formats have only one.
         version: Version of a `.spz`; 3 if None. Version 2 is for viewers from before
             2025, 4 for those since 2026.
@@ -234,7 +276,41 @@ def write_asset(
     else:
         expected = f"the default for {os.fspath(path)}, which is not a .ply, got {encoding!r}"
         check("encoding", encoding == "binary_little_endian", expected)
+    one_of(up, "up", AXES)
+    if turned_up(path) is not None:
+        write = partial(write, up=up)
     write(path, gaussians)
+
+
+def turned_up(path: AnyPath) -> Axis | None:
+    """The axis that is up in a file that `write_asset` writes, by its name; None for
+    formats without axes."""
+    name = beside(path).name.lower()
+    for ending, axis in _UP.items():
+        if name.endswith(ending):
+            return axis
+    return None
+
+
+def losses_of(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) -> Losses | None:
+    """What a file does not hold of the gaussians that `write_asset` wrote to it, which
+    is read back; None for formats of float32 numbers, which lose nothing.
+
+    Args:
+        up: As it was given to `write_asset`.
+    """
+    name = beside(path).name.lower()
+    for ending, (limits, is_sorted) in _PACKED.items():
+        if not name.endswith(ending):
+            continue
+        written = gaussians.numpy()
+        if turned_up(path) is not None:
+            written = _axes.turned(written, _axes.axes_of_up(up), _axes.MEMORY)
+        if is_sorted:
+            written = written.subset(_core.morton_order(written.means))
+        file = open_asset(path)
+        return losses(written, file.read(0, file.num_gaussians), limits)
+    return None
 
 
 def _by_name(path: AnyPath, formats: Mapping[str, Format]) -> Format:

@@ -105,7 +105,7 @@ def _asked_up(path: Path) -> Axis | None:
     stride = max(asset.num_gaussians // _NUM_SAMPLES, _SAMPLE_SIZE)
     for start in range(0, asset.num_gaussians, stride):
         samples.append(asset.read(start, min(start + _SAMPLE_SIZE, asset.num_gaussians)))
-    axis, reason = up_of(Gaussians.concatenate(samples), path=path)
+    axis, reason = up_of(Gaussians.concatenate(samples), declared=asset.declared)
     if reason == ASSUMED:
         return ask_up(path, axis)
     return None
@@ -295,6 +295,9 @@ def _build(
     start = time.perf_counter()
     with _resume_advised(output):
         bundle, is_built = _build_file(options, paths, output, executor)
+    notes = _notes(paths)
+    for note in notes:
+        _common.tell(note)
     asset: str | list[str] = [shown(path) for path in paths]
     if len(paths) == 1:
         asset = shown(paths[0])
@@ -312,7 +315,21 @@ def _build(
         "levels": bundle.num_levels,
         "bytes": output.stat().st_size,
         "seconds": time.perf_counter() - start,
+        "notes": notes,
     }
+
+
+def _notes(paths: Sequence[Path]) -> list[str]:
+    """Lines about what the files of an asset declare."""
+    lines = []
+    for path in paths:
+        declared = open_asset(path).declared
+        if declared.up is not None:
+            lines.append(f"{shown(path)}: {declared.up} is up, {declared.up_reason}")
+        if declared.antialiased:
+            lines.append(f"{shown(path)}: trained with antialiasing")
+        lines += [f"{shown(path)}: {note}" for note in declared.notes]
+    return lines
 
 
 def _build_file(

@@ -23,6 +23,9 @@ from v3dg.formats._reading import AnyPath, AssetFile, File, check, listed
 from v3dg.gaussians import Gaussians
 
 _CHUNK = 256
+_MAX_LOG_SCALE = 20.0
+LIMITS = _packing.Limits(log_scale=(-20.0, _MAX_LOG_SCALE), harmonic=(-4.0, 4.0))
+"""What the format can hold."""
 _PLY_TYPES = {"float": "<f4", "uint": "<u4", "uchar": "u1"}
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _RANGES = {"": "xyz", "scale_": "xyz", "color": "rgb"}
@@ -140,7 +143,7 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
     num_chunks = -(-count // _CHUNK)
     values = {
         "": host.means[order].astype(np.float64),
-        "scale_": np.minimum(_packing.log_scales(host.scales[order]), 20.0),
+        "scale_": np.minimum(_packing.log_scales(host.scales[order]), _MAX_LOG_SCALE),
         "color": host.sh[order, 0].astype(np.float64) * SH_C0 + 0.5,
     }
     starts = np.arange(num_chunks) * _CHUNK

@@ -2,12 +2,13 @@
 `.spz`.
 
 The writer writes one primitive; the reader reads all primitives of gaussians, of nodes
-without transforms. Coordinates are passed on as they are stored; glTF's have y up.
+without transforms. Both turn gaussians: the axes of glTF are left, up, forward.
 """
 
 import json
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -18,7 +19,9 @@ from v3dg import _files
 from v3dg._json import Node, parse_json
 from v3dg._numbers import Floats
 from v3dg._version import __version__
-from v3dg.formats import spz
+from v3dg.cameras import Axis
+from v3dg.formats import _axes, spz
+from v3dg.formats._declared import Declared
 from v3dg.formats._packing import SH_C0, assemble, check_writable
 from v3dg.formats._reading import (
     AnyPath,
@@ -51,24 +54,30 @@ JsonObject: TypeAlias = dict[str, object]
 def open_file(path: AnyPath) -> AssetFile:
     """Open a `.glb` file; all of it is read with its first rows."""
     file = _Glb(Path(path))
-    return whole_file(path, sum(map(file.count_of, file.primitives)), file.degree, read)
+    opened = whole_file(path, sum(map(file.count_of, file.primitives)), file.degree, read)
+    return replace(opened, declared=Declared(up=_axes.MEMORY_UP, up_reason="as in glTF"))
 
 
 def read(path: AnyPath) -> Gaussians:
     """Read the gaussians of a `.glb` file."""
     file = _Glb(Path(path))
-    return Gaussians.concatenate([file.gaussians_of(primitive) for primitive in file.primitives])
+    gaussians = Gaussians.concatenate(
+        [file.gaussians_of(primitive) for primitive in file.primitives]
+    )
+    return _axes.turned(gaussians, _axes.GLTF, _axes.MEMORY)
 
 
-def write(path: AnyPath, gaussians: Gaussians) -> None:
-    """Write a `.glb` file with float attributes; the order stays."""
-    content = encode(check_writable(gaussians))
+def write(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) -> None:
+    """Write a `.glb` file with float attributes, of gaussians of which `up` is up; the
+    order stays."""
+    content = encode(_axes.turned(check_writable(gaussians), _axes.axes_of_up(up), _axes.GLTF))
     with _files.replacing(path) as temporary:
         Path(temporary).write_bytes(content)
 
 
 def encode(host: Gaussians, *, compressed: bool = False) -> bytes:
-    """A `.glb` file of NumPy gaussians, whose values the format can hold."""
+    """A `.glb` file of NumPy gaussians with the axes of the file, whose values the
+    format can hold."""
     columns = _columns(host, compressed=compressed)
     if compressed:
         parts = [b"".join(spz.encode(host))]

@@ -3,7 +3,8 @@
 One prim is written. All prims are read and transformed, into one asset, or into an
 asset each with the poses of its instances. Of levels of detail, the first is read; of
 values that change with time, the first, too. What is invisible or for other purposes
-than drawing is left out. Coordinates are passed on as they are stored.
+than drawing is left out. An asset is turned from the axes of the stage to those of
+memory; a world keeps the stage's.
 
 Source: Pixar, OpenUSD 26.11, the schemas of UsdVol, and Usdz File Format Specification.
 """
@@ -29,6 +30,7 @@ from numpy.typing import NDArray
 from v3dg import _extras, _files
 from v3dg._numbers import check
 from v3dg.cameras import Axis, Floats, is_rotation
+from v3dg.formats import _axes
 from v3dg.formats._declared import Declared
 from v3dg.formats._packing import check_writable
 from v3dg.formats._reading import AnyPath, AssetFile, listed, value_errors
@@ -39,6 +41,8 @@ if TYPE_CHECKING:
     from pxr import Sdf, Usd
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+# The axes of a stage by the one that is up; its cameras look back.
+_AXES = {"Y": _axes.OPENGL, "Z": _axes.Z_UP}
 _Pose: TypeAlias = tuple[tuple[float, float, float, float], Floats, float]
 _SH = "radiance:sphericalHarmonics"
 _HALVES = (
@@ -113,7 +117,19 @@ def read(path: AnyPath) -> tuple[Gaussians, Declared]:
             notes += notes_of_prim
         degree = max(part.sh_degree for part in parts)
         joined = Gaussians.concatenate([_padded(part, degree) for part in parts])
-        return joined, Declared(notes=tuple(dict.fromkeys(notes)))
+        letter = str(usd.UsdGeom.GetStageUpAxis(root.GetStage()))
+        gaussians = _axes.turned(joined, _AXES[letter], _axes.MEMORY)
+        return gaussians, _declared(usd, root.GetStage(), letter, notes)
+
+
+def _declared(usd: ModuleType, stage: Usd.Stage, letter: str, notes: list[str]) -> Declared:
+    """What a stage of which this axis is up declares, and the notes about its prims."""
+    unit = usd.UsdGeom.GetStageMetersPerUnit(stage)
+    distinct = list(dict.fromkeys(notes))
+    if usd.UsdGeom.StageHasAuthoredMetersPerUnit(stage) and unit != 1:
+        distinct.append(f"its unit is {unit:g} m, and coordinates stay in that unit")
+    reason = f"as its stage says ({letter} is up in the file)"
+    return Declared(up=_axes.MEMORY_UP, up_reason=reason, notes=tuple(distinct))
 
 
 def _padded(gaussians: Gaussians, degree: int) -> Gaussians:
@@ -395,9 +411,10 @@ def _notes_of(usd: ModuleType, prim: Usd.Prim) -> list[str]:
     return notes
 
 
-def write(path: AnyPath, gaussians: Gaussians) -> None:
-    """Write a USD file of one prim; the order stays."""
-    host = check_writable(gaussians)
+def write(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) -> None:
+    """Write a USD file of one prim, of gaussians of which `up` is up; the order
+    stays."""
+    host = _axes.turned(check_writable(gaussians), _axes.axes_of_up(up), _AXES["Y"])
     stage = new_stage("Y")
     stage.SetDefaultPrim(define(stage, "/gaussians", host))
     export(stage, path)

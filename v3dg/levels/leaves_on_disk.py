@@ -25,6 +25,7 @@ from v3dg._numbers import check
 from v3dg._progress import Bar, Progress
 from v3dg._urls import shown
 from v3dg.bundle.codec import Codec
+from v3dg.cameras import Axis
 from v3dg.formats._reading import AssetFile
 from v3dg.gaussians import Gaussians, gaussian_bytes, put
 from v3dg.io import open_asset
@@ -102,7 +103,8 @@ def leaves_on_disk(
     """
     files = map(open_asset, paths)  # lazily, so that few files are open at once
     tiles = [
-        _Tile(file.path, file.num_gaussians, file.sh_degree, file.whole_bytes) for file in files
+        _Tile(file.path, file.num_gaussians, file.sh_degree, file.whole_bytes, file.declared.up)
+        for file in files
     ]
     count = sum(tile.num_gaussians for tile in tiles)
     check("asset", count < MOST_GAUSSIANS, f"fewer than 2^32 gaussians, got {count:,}")
@@ -122,7 +124,7 @@ def leaves_on_disk(
             for _ in _blocks(tiles, buffer, bar):
                 pass
             bar.close()
-            leaves = MemoryLeaves(buffer, config, unusable, device)
+            leaves = MemoryLeaves(buffer, config, unusable, device, tiles[0].up)
             del buffer
             yield leaves
         else:
@@ -147,6 +149,7 @@ class _Tile(NamedTuple):
     num_gaussians: int
     sh_degree: int
     whole_bytes: int
+    up: Axis | None
 
     def open(self) -> AssetFile:
         file = open_asset(self.path)
@@ -260,8 +263,7 @@ def _sort_on_disk(
             bucket_depth = min(depth, _core.num_halvings(count, sizes.in_bucket))
             files = (point_file, spare_file)
             external_split.split(files, count, bucket_depth, sizes.in_node, order_file)
-        points.unlink()
-        spare.unlink()
+        _remove(points, spare)
         offset = halved(np.array([count]), bucket_depth)
         ends = _ends_in_buckets(order_file, offset, sizes.in_block, tally.num_gaussians)
         with RowFile(rows, gaussian_bytes(degree) // 4, np.float32, must_be_new=True) as row_file:
@@ -276,10 +278,16 @@ def _sort_on_disk(
         dropped=tally.counts,
         digest=digest,
         resident_bytes=int(np.diff(offset).max()) * _bytes_in_bucket(degree),
+        up=tiles[0].up,
         path=rows.absolute(),
         bucket_offset=offset,
         bucket_depth=depth - bucket_depth,
     )
+
+
+def _remove(*paths: Path) -> None:
+    for path in paths:
+        path.unlink()
 
 
 def _new_words(path: Path, width: int) -> external_split.WordFile:
