@@ -144,7 +144,7 @@ def _write_bundles(
     """Write the levels of each bundle to the folder of its name, which is made unless
     it is `.`."""
     levels: list[Export] = []
-    with Bar(sum(plan.bundle.num_gaussians for plan in plans), "export", progress) as bar:
+    with Bar(sum(plan.num_gaussians for plan in plans), "export", progress) as bar:
         for name, plan in zip(names, plans, strict=True):
             (folder / name).mkdir(exist_ok=True)
             levels.append(write_levels(plan, folder / name, turn, bar.update))
