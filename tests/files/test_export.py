@@ -31,6 +31,12 @@ def leaves_of(node):
     return [leaf for child in node["children"] for leaf in leaves_of(child)]
 
 
+def level_of_chunks(bundle, leaves):
+    """The level at which every chunk is a single group."""
+    num_groups = np.bincount(bundle.groups.level, minlength=bundle.num_levels)
+    return int(np.flatnonzero(num_groups == len(leaves))[0])
+
+
 def assert_holds(folder, bundle, chunk):
     """Every leaf has gaussians at all levels; together the leaves have each gaussian of
     the bundle's levels once, halves above those, and the files nothing else."""
@@ -38,7 +44,7 @@ def assert_holds(folder, bundle, chunk):
     leaves = leaves_of(index["tree"])
     files = [v3dg.read_asset(folder / name) for name in index["filenames"]]
     used = [np.zeros(len(file), int) for file in files]
-    top = max(n for n in range(bundle.num_levels) if np.sum(bundle.groups.level == n) == len(leaves))
+    top = level_of_chunks(bundle, leaves)
     for level in range(index["lodLevels"]):
         parts = []
         for leaf in leaves:
@@ -232,6 +238,33 @@ def test_bundles_of_any_shape_are_exported(tmp_path, seed):
         assert min(counts) > 0
     assert index["counts"][0] == len(bundle.level_gaussians(0))
     assert index["counts"][-1] == len(leaves)
+
+
+def test_chunks_of_any_levels_are_one_picture_without_gaps(tmp_path, bundle):
+    """Above the level at which chunks are groups, too: every other chunk is one or two
+    levels coarser than its neighbours."""
+    write_streamed_sog(bundle, tmp_path / "web", chunk=250)
+    index = json.loads((tmp_path / "web" / "lod-meta.json").read_text())
+    leaves = leaves_of(index["tree"])
+    files = [v3dg.read_asset(tmp_path / "web" / name) for name in index["filenames"]]
+
+    def alpha(level_of_leaf):
+        parts = []
+        for leaf, level in zip(leaves, level_of_leaf, strict=True):
+            lod = leaf["lods"][str(level)]
+            rows = slice(lod["offset"], lod["offset"] + lod["count"])
+            parts.append(files[lod["file"]].subset(rows))
+        camera = v3dg.Camera.look_at((0, -6, 0.5), (0, 0, 0.5), fov_x=0.4, width=48, height=48)
+        return v3dg.rasterize(v3dg.Gaussians.concatenate(parts), camera, filter_px2=0.3).alpha
+
+    covered = alpha([0] * len(leaves)) > 0.9
+    assert covered.sum() > 100
+    top = level_of_chunks(bundle, leaves)
+    for step in (1, 2):
+        mixed = alpha([top + step * (number % 2) for number in range(len(leaves))])
+        coarse = alpha([top + step] * len(leaves))
+        print(step, mixed[covered].mean(), coarse[covered].mean(), alpha([top]*len(leaves))[covered].mean())
+        assert mixed[covered].mean() > coarse[covered].mean()
 
 
 def test_many_chunks_share_a_folder_up_to_its_size(tmp_path, bundle, monkeypatch):

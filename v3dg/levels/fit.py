@@ -15,11 +15,8 @@ from v3dg.levels.config import BuildConfig
 _T = TypeVar("_T")
 
 
-def fit_config(
-    config: BuildConfig, seed: int, level: int, *, antialiased: bool = True
-) -> _core.FitConfig:
-    """The settings of the core's fit for the groups of a level; `antialiased` if they
-    are drawn with opacities compensated for their filter."""
+def fit_config(config: BuildConfig, seed: int, level: int) -> _core.FitConfig:
+    """The settings of the core's fit for the groups of a level."""
     return _core.FitConfig(
         steps=config.steps_at(level),
         views_per_step=config.views_per_step,
@@ -29,7 +26,7 @@ def fit_config(
         px2_per_gaussian=config.px2_per_gaussian,
         distance=config.distance,
         filter_px2=config.filter_px2,
-        antialiased=antialiased,
+        antialiased=True,
         loss_l1=config.loss_l1,
         loss_dssim=config.loss_dssim,
         loss_alpha=config.loss_alpha,
