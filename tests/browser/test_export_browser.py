@@ -163,7 +163,7 @@ def settled(browser, server, address):
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto(f"http://127.0.0.1:{server.server_address[1]}/{address}")
     states = [None, None]
-    for _ in range(60):
+    for _ in range(180):
         page.wait_for_timeout(1000)
         states.append(page.evaluate("window.v3dg ? [window.v3dg.ready, window.v3dg.drawn] : null"))
         if states[-1] and states[-1][0] and states[-1] == states[-2] == states[-3]:
@@ -171,6 +171,7 @@ def settled(browser, server, address):
     picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")) / 255
     page.close()
     assert errors == []
+    assert states[-1][0], "the page did not settle"
     return picture, states[-1][1]
 
 

@@ -263,7 +263,12 @@ def test_chunks_of_any_levels_are_one_picture_without_gaps(tmp_path, bundle):
     for step in (1, 2):
         mixed = alpha([top + step * (number % 2) for number in range(len(leaves))])
         coarse = alpha([top + step] * len(leaves))
-        print(step, mixed[covered].mean(), coarse[covered].mean(), alpha([top]*len(leaves))[covered].mean())
+        print(
+            step,
+            mixed[covered].mean(),
+            coarse[covered].mean(),
+            alpha([top] * len(leaves))[covered].mean(),
+        )
         assert mixed[covered].mean() > coarse[covered].mean()
 
 

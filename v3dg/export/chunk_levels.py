@@ -21,8 +21,8 @@ from v3dg.levels.config import BuildConfig
 from v3dg.levels.fit import fit_config, run_fit
 from v3dg.levels.plan import Offsets
 
-# With a small budget viewers draw levels larger than the native size of a bundle's. Fits
-# at four times the area are 0.3 to 0.7 dB better there, and no worse at the native size.
+# With a small budget viewers draw levels larger than the native size of a bundle's.
+# Fits at four times the area are up to 1 dB better there, and no worse at that size.
 _PX2_PER_GAUSSIAN = 8.0
 _STEPS = 150  # four times as many gain nothing
 _LEVEL = 9  # the level of a bundle whose targets have the most samples
