@@ -44,9 +44,9 @@ def test_a_scene_has_each_bundle_once_with_all_levels(place):
         index = json.loads((place / "deep/er/site" / listed["url"]).read_text())
         assert index["counts"] == listed["counts"]
         counts = [len(bundle.level_gaussians(i)) for i in range(bundle.num_levels)]
-        # All in one chunk, which is halved further.
+        # Chunks are halved further, down to one gaussian in each.
         assert index["counts"][: len(counts)] == counts
-        assert index["counts"][-1] == 1
+        assert index["counts"][-1] == json.dumps(index["tree"]).count('"lods"')
     for level, name in ((0, "gaussians"), (-1, "coarsest")):
         counts = [listed["counts"][level] for listed in site["bundles"]]
         assert result[name] == sum(counts[b] for b in scene.instance_bundle)

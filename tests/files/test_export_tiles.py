@@ -128,13 +128,11 @@ def test_the_page_frames_the_finest_level(tmp_path):
     scene.add(bundle, [[5, 0, 0], [0, 9, 1]], [1, 0, 0, 0], [2, 1])
     write_tiles(scene, tmp_path / "tiles", up="z")
     document = json.loads((tmp_path / "tiles" / "tileset.json").read_text())
-    boxes = bundle.clusters.box[np.array(bundle.level_range(0))]
-    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
-    low, high = (
-        np.minimum(2 * low + [5, 0, 0], low + [0, 9, 1]),
-        np.maximum(2 * high + [5, 0, 0], high + [0, 9, 1]),
-    )
-    ball = [*(low + high) / 2, np.linalg.norm(high - low) / 2]
+    corners = bundle.clusters.box[np.array(bundle.level_range(0))].reshape(-1, 3)
+    placed = np.concatenate([2 * corners + np.array([5, 0, 0]), corners + np.array([0, 9, 1])])
+    low = placed.min(axis=0)
+    high = placed.max(axis=0)
+    ball = [*((low + high) / 2), np.linalg.norm(high - low) / 2]
     np.testing.assert_allclose(document["extras"]["ball"], ball, rtol=1e-5)
 
 
