@@ -308,8 +308,8 @@ class Plan:
         that one or, where the bundle has none there, the nearest finer one, else the
         nearest coarser one."""
         level = np.arange(self.top + 1)[:, None]
-        own = np.where(self._bundle_sizes > 0, level, -1)
-        finer = np.maximum.accumulate(own, axis=0)
+        present = np.where(self._bundle_sizes > 0, level, -1)
+        finer = np.maximum.accumulate(present, axis=0)
         coarser = np.where(self._bundle_sizes > 0, level, self.top + 1)
         coarser = np.minimum.accumulate(coarser[::-1], axis=0)[::-1]
         return np.where(finer >= 0, finer, np.minimum(coarser, self.top))
