@@ -262,14 +262,8 @@ def test_chunks_of_any_levels_are_one_picture_without_gaps(tmp_path, bundle):
     top = level_of_chunks(bundle, leaves)
     for step in (1, 2):
         mixed = alpha([top + step * (number % 2) for number in range(len(leaves))])
-        coarse = alpha([top + step] * len(leaves))
-        print(
-            step,
-            mixed[covered].mean(),
-            coarse[covered].mean(),
-            alpha([top] * len(leaves))[covered].mean(),
-        )
-        assert mixed[covered].mean() > coarse[covered].mean()
+        # Shares of groups of several chunks have 0.90 and 0.89 here.
+        assert mixed[covered].mean() > 0.91
 
 
 def test_many_chunks_share_a_folder_up_to_its_size(tmp_path, bundle, monkeypatch):
