@@ -121,6 +121,22 @@ def test_a_scene_is_a_tile_an_instance(tmp_path):
         assert below["extensionsRequired"] == ["3DTILES_content_gltf"]
 
 
+def test_the_page_frames_the_finest_level(tmp_path):
+    """Not the coarse gaussians, which reach far beyond it: at the start nothing would
+    be seen but a speck."""
+    bundle = random_bundle(3, num_levels=4)
+    scene = v3dg.Scene()
+    scene.add(bundle, [[5, 0, 0], [0, 9, 1]], [1, 0, 0, 0], [2, 1])
+    write_tiles(scene, tmp_path / "tiles", up="z")
+    document = json.loads((tmp_path / "tiles" / "tileset.json").read_text())
+    corners = bundle.clusters.box[np.array(bundle.level_range(0))].reshape(-1, 3)
+    placed = np.concatenate([2 * corners + np.array([5, 0, 0]), corners + np.array([0, 9, 1])])
+    low = placed.min(axis=0)
+    high = placed.max(axis=0)
+    ball = [*((low + high) / 2), np.linalg.norm(high - low) / 2]
+    np.testing.assert_allclose(document["extras"]["ball"], ball, rtol=1e-5)
+
+
 def test_up_is_up(tmp_path):
     write_tiles(random_bundle(3), tmp_path / "tiles", up="-y")
     root = json.loads((tmp_path / "tiles/tileset.json").read_text())["root"]
