@@ -245,6 +245,11 @@ def _by_name(path: AnyPath, formats: Mapping[str, Format]) -> Format:
     advice = ""
     if formats is not _WRITERS:
         advice = "; v3dg.open opens bundles (.v3dg) and scenes (.json)"
+        content = content_of(path)
+        if content is not None:
+            advice = f"; this is {content.text}"
+        if content is not None and content.suffix:
+            advice += ", so let its name end so"
     raise ValueError(
         f"{shown(path)}: expected a file name that ends in {', '.join(formats)}{advice}"
     )

@@ -342,6 +342,16 @@ def test_a_splat_that_begins_like_a_ksplat_is_a_splat(tmp_path):
     assert file.declared.notes == ()
 
 
+@pytest.mark.parametrize("name", ["a.zip", "a.gz", "a", "a.bin"])
+def test_files_of_unknown_names_are_named_by_what_they_are(tmp_path, name):
+    shutil.copyfile(FIXTURES / "sh3.sog", tmp_path / name)
+    with pytest.raises(ValueError, match=r"this is a \.sog, so let its name end so$"):
+        read(tmp_path / name)
+    (tmp_path / name).write_bytes(gzip.compress(b"ply\nformat ascii 1.0\n"))
+    with pytest.raises(ValueError, match=r"this is a gzip of a \.ply; unpack it$"):
+        read(tmp_path / name)
+
+
 def zip_of(*names):
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:

@@ -486,7 +486,6 @@ def test_particles_of_other_prims_are_read_by_their_kernel(tmp_path, kernel, dep
     prim = new_prim(stage, kind="ParticleField")
     for api in ("PositionAttribute", "OpacityAttribute", f"Kernel{kernel}"):
         prim.ApplyAPI(f"ParticleField{api}API")
-    prim.ApplyAPI("ParticleFieldSphericalHarmonicsAttributeAPI")
     prim.GetAttribute("positions").Set(POINTS)
     prim.GetAttribute("opacities").Set([0.25, 0.5])
     stage.GetRootLayer().Save()

@@ -348,8 +348,10 @@ def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]
 
 def _degree(usd: ModuleType, prim: Usd.Prim) -> int:
     """The SH degree of a prim, which is 3 by default."""
-    degree = int(prim.GetAttribute(f"{_SH}Degree").Get(usd.Usd.TimeCode.EarliestTime()))
-    if not 0 <= degree <= _MOST_DEGREE:
+    degree = _value(usd, prim, f"{_SH}Degree")
+    if degree is None:  # the prim has no coefficients either
+        return 0
+    if not isinstance(degree, int) or not 0 <= degree <= _MOST_DEGREE:
         raise ValueError(f"the SH degree {degree} in {prim.GetPath()}")
     return degree
 
@@ -357,19 +359,27 @@ def _degree(usd: ModuleType, prim: Usd.Prim) -> int:
 def _column(usd: ModuleType, prim: Usd.Prim, name: str, count: int | None) -> _Column:
     """The first `count` values of an attribute, in single precision or, if there are
     none of those, in half; the schema ignores one with fewer values."""
-    time = usd.Usd.TimeCode.EarliestTime()
-    stored = prim.GetAttribute(name).Get(time)
+    stored = _value(usd, prim, name)
     if stored is None:
-        stored = prim.GetAttribute(f"{name}h").Get(time)
+        stored = _value(usd, prim, f"{name}h")
     if stored is None:
         return _Column(None)
-    values = np.array(stored, np.float32)
+    values: NDArray[np.float32] = np.array(stored, np.float32)
     if count is None or len(values) == count:
         return _Column(values)
     lengths = f"{len(values)} values of {name} for {count} in {prim.GetPath()}"
     if len(values) < count:
         return _Column(None, f"{lengths} are too few, so the schema's default was used")
     return _Column(values[:count], f"{lengths} are too many, so the last ones were left out")
+
+
+def _value(usd: ModuleType, prim: Usd.Prim, name: str) -> object:
+    """The first value of an attribute; None if the prim has none, or no such
+    attribute."""
+    attribute = prim.GetAttribute(name)
+    if not attribute:
+        return None
+    return attribute.Get(usd.Usd.TimeCode.EarliestTime())
 
 
 def _notes_of(usd: ModuleType, prim: Usd.Prim) -> list[str]:
