@@ -134,7 +134,7 @@ def _open_by_content(path: AnyPath, reader: Callable[[AnyPath], AssetFile]) -> A
     is_readable = content.suffix not in ("", *usd.SUFFIXES)  # USD takes it from the name
     check(path, is_readable, f"a {ending}, got {content.text}")
     file = _READERS[content.suffix](path)
-    note = f"its name ends in {ending}, but it is {content.text}, and was read as such"
+    note = f"Its name ends in {ending}, but it is {content.text}, and was read as such."
     return replace(file, declared=replace(file.declared, notes=(note, *file.declared.notes)))
 
 

@@ -178,8 +178,7 @@ def _opened(path: AnyPath, expected: str) -> Iterator[tuple[ModuleType, Usd.Prim
         stage = usd.Usd.Stage.Open(os.fspath(path))
         root = stage.GetPseudoRoot()
         if not any(_prims(usd, root)):
-            notes = _left_out(usd, root)
-            raise ValueError("; ".join(["no ParticleField3DGaussianSplat", *notes]))
+            raise ValueError(" ".join(["no ParticleField3DGaussianSplat.", *_left_out(usd, root)]))
         yield usd, root
 
 
@@ -257,11 +256,13 @@ def _left_out(usd: ModuleType, root: Usd.Prim) -> list[str]:
             unread.append(path)
     notes = []
     if hidden:
-        notes.append(f"prims that are invisible or not for drawing were left out: {listed(hidden)}")
+        notes.append(
+            f"Prims that are invisible or not for drawing were left out: {listed(hidden)}."
+        )
     if particles:
-        notes.append(f"particles that are no gaussians were left out: {listed(particles)}")
+        notes.append(f"Particles that are no gaussians were left out: {listed(particles)}.")
     if unread:
-        notes.append(f"other geometry was left out: {listed(unread)}")
+        notes.append(f"Other geometry was left out: {listed(unread)}.")
     return notes
 
 
@@ -326,7 +327,7 @@ def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]
         scales = np.ones((count, 3), np.float32)
     if _kernel(usd, prim) is _Kernel.SURFLET:
         scales = scales * np.array([1, 1, 0], np.float32)
-        notes.append("flat gaussians (surflets) were read as ellipsoids of no thickness")
+        notes.append("Flat gaussians (surflets) were read as ellipsoids of no thickness.")
     opacities = columns["opacities"].values
     if opacities is None:
         opacities = np.ones(count, np.float32)
@@ -334,7 +335,7 @@ def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]
     if harmonics.values is not None:
         sh = harmonics.values.reshape(count, (degree + 1) ** 2, 3)
     if degree > _MAX_DEGREE:
-        notes.append(f"coefficients above SH degree {_MAX_DEGREE} were left out")
+        notes.append(f"Coefficients above SH degree {_MAX_DEGREE} were left out.")
         sh = sh[:, : (_MAX_DEGREE + 1) ** 2]
     gaussians = Gaussians(
         means=means,
@@ -369,8 +370,8 @@ def _column(usd: ModuleType, prim: Usd.Prim, name: str, count: int | None) -> _C
         return _Column(values)
     lengths = f"{len(values)} values of {name} for {count} in {prim.GetPath()}"
     if len(values) < count:
-        return _Column(None, f"{lengths} are too few, so the schema's default was used")
-    return _Column(values[:count], f"{lengths} are too many, so the last ones were left out")
+        return _Column(None, f"{lengths} are too few, so the schema's default was used.")
+    return _Column(values[:count], f"{lengths} are too many, so the last ones were left out.")
 
 
 def _value(usd: ModuleType, prim: Usd.Prim, name: str) -> object:
@@ -390,18 +391,18 @@ def _notes_of(usd: ModuleType, prim: Usd.Prim) -> list[str]:
         attribute.GetNumTimeSamples() > 1 for attribute in authored
     )
     if is_moving:
-        notes.append("values change with time, and were read at the first one")
+        notes.append("Values change with time, and were read at the first one.")
     for name in _HINTS:
         attribute = prim.GetAttribute(name)
         if attribute and attribute.HasAuthoredValue():
             value = str(attribute.Get())
             default = str(prim.GetPrimDefinition().GetAttributeFallbackValue(name))
             if value != default:
-                notes.append(f"the hint {name} is {value[:40]!a}, which was left out")
+                notes.append(f"The hint {name} is {value[:40]!a}, which was left out.")
     names = [attribute.GetName() for attribute in authored]
     unread = [name for name in names if name not in _KNOWN and not name.startswith("xformOp:")]
     if unread:
-        notes.append(f"attributes of gaussians were left out: {listed(unread)}")
+        notes.append(f"Attributes of gaussians were left out: {listed(unread)}.")
     return notes
 
 
