@@ -1086,7 +1086,7 @@ def test_gaussians_of_2dgs_trained_by_gsplat_are_flat(tmp_path):
     assert_same(read_quietly(tmp_path / "a.pt"), asset)
     along_rays, flat = open_asset(tmp_path / "a.pt").declared.notes
     assert along_rays.startswith("Gaussians were trained to be evaluated along rays")
-    assert flat.startswith("the gaussians are those of 2DGS")
+    assert flat.startswith("The gaussians are those of 2DGS")
 
 
 class Harmful:
