@@ -75,8 +75,8 @@ def read_asset(path: AnyPath) -> Gaussians:
       of PlayCanvas and SuperSplat, is recognised by its content.
     - `.glb`, glTF with KHR_gaussian_splatting, also compressed as `.spz`; the leaves of
       `.hier`, of H3DG.
-    - `.usd`, `.usda` and `.usdc`, OpenUSD, with the extra `usd`, whose library bounds
-      what is read.
+    - `.usd`, `.usda`, `.usdc` and `.usdz`, OpenUSD, with the extra `usd`, whose library
+      bounds what is read.
     - `.splat`, of antimatter15; `.ksplat`, of mkkellogg; `.spz`, of Niantic, version 1
       to 4; `.sog` of PlayCanvas, version 2, or the `meta.json` of one that is not in a
       zip; the finest level of streamed SOG, by its `lod-meta.json`.
@@ -202,8 +202,8 @@ def write_asset(
       order changes.
     - `.spz`: version 3, or another.
     - `.glb`: glTF 2.0 with KHR_gaussian_splatting, of float32 numbers.
-    - `.usd`, `.usda`, `.usdc`: OpenUSD, a ParticleField3DGaussianSplat of float32
-      numbers.
+    - `.usd`, `.usda`, `.usdc`, `.usdz`: OpenUSD, a ParticleField3DGaussianSplat of
+      float32 numbers.
     - `.sog`: version 2. The order changes.
 
     Args:
