@@ -4,6 +4,7 @@ Newer models have `rigs` and `frames`, too, of which the poses in `images` follo
 Source: COLMAP's documentation, Output Format, and its table of camera models.
 """
 
+import codecs
 import os
 import struct
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ from v3dg._numbers import Floats, check, refuse
 from v3dg.rotations import normalised, rotation_from_quaternion
 
 IMAGE_FILES = ("images.bin", "images.txt")
+LENS_FILES = ("cameras.bin", "cameras.txt")
 _USUAL_NAME_BYTES = 256
 _MAX_NAME_BYTES = 1 << 16
 _COUNT = struct.Struct("<Q")
@@ -227,9 +229,17 @@ def _bad_line(path: Path, number: int, expected: str, line: bytes) -> NoReturn:
     refuse(path, f"{expected} in line {number}, got {_text(line[:60])!a}")
 
 
+def _numbered_lines(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
+    """The lines of a text with their numbers, without a byte order mark."""
+    for number, line in enumerate(file, start=1):
+        if number == 1:
+            line = line.removeprefix(codecs.BOM_UTF8)
+        yield number, line
+
+
 def _text_lenses(path: Path, file: IO[bytes]) -> Iterator[tuple[int, Lens]]:
     models = {model.name: model for model in _MODELS}
-    for number, line in enumerate(file, start=1):
+    for number, line in _numbered_lines(file):
         words = line.split()
         if not words or words[0].startswith(b"#"):
             continue
@@ -244,7 +254,7 @@ def _text_lenses(path: Path, file: IO[bytes]) -> Iterator[tuple[int, Lens]]:
 
 
 def _text_images(path: Path, file: IO[bytes]) -> Iterator[_ImageEntry]:
-    lines = enumerate(file, start=1)
+    lines = _numbered_lines(file)
     for number, line in lines:
         words = line.split(maxsplit=_IMAGE_WORDS)
         if not words or words[0].startswith(b"#"):

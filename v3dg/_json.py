@@ -81,9 +81,9 @@ def read_json(path: str | os.PathLike[str]) -> Node:
     path = Path(path)
     with _files.naming_errors(path), open(_files.open_regular(path), "rb") as file:
         content = file.read()
-    if content.startswith(_UTF16_MARKS):
-        raise ValueError(f"{path.name}: expected JSON in UTF-8, got UTF-16; save it as UTF-8")
     try:
+        if content.startswith(_UTF16_MARKS):
+            raise ValueError("it is in UTF-16; save it as UTF-8")
         return Node(parse_json(content), path.name, "")
     except ValueError as error:
         raise ValueError(

@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from v3dg import _files
-from v3dg._colmap import IMAGE_FILES, read_model
+from v3dg._colmap import IMAGE_FILES, LENS_FILES, read_model
 from v3dg._json import Node, read_json, write_json
 from v3dg._numbers import check, one_of, refuse
 from v3dg.cameras import (
@@ -125,6 +125,8 @@ def _place_of(path: Path) -> _Place:
         folder = path.parent
     if (folder / _RUN).is_file():
         return _Place(_data_of(folder), folder / _TRAINING)
+    if path.name in LENS_FILES:
+        return _Place(path.with_name(f"images{path.suffix}"))
     if not path.is_dir():
         return _Place(path)
     file = _file_in(path)

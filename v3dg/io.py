@@ -106,8 +106,8 @@ def read_asset(path: AnyPath) -> Gaussians:
       of PlayCanvas and SuperSplat, is recognised by its content.
     - `.glb`, glTF with KHR_gaussian_splatting, also compressed as `.spz`; the leaves of
       `.hier`, of H3DG.
-    - `.usd`, `.usda` and `.usdc`, OpenUSD, with the extra `usd`, whose library bounds
-      what is read.
+    - `.usd`, `.usda`, `.usdc` and `.usdz`, OpenUSD, with the extra `usd`, whose library
+      bounds what is read.
     - `.splat`, of antimatter15; `.ksplat`, of mkkellogg; `.spz`, of Niantic, version 1
       to 4; `.sog` of PlayCanvas, version 2, or the `meta.json` of one that is not in a
       zip; the finest level of streamed SOG, by its `lod-meta.json`.
@@ -170,7 +170,7 @@ def _open_by_content(path: AnyPath, reader: Callable[[AnyPath], AssetFile]) -> A
     is_readable = content.suffix not in ("", *usd.SUFFIXES)  # USD takes it from the name
     check(path, is_readable, f"a {ending}, got {content.text}")
     file = _READERS[content.suffix](path)
-    note = f"its name ends in {ending}, but it is {content.text}, and was read as such"
+    note = f"Its name ends in {ending}, but it is {content.text}, and was read as such."
     return replace(file, declared=replace(file.declared, notes=(note, *file.declared.notes)))
 
 
@@ -239,8 +239,8 @@ def write_asset(
       order changes.
     - `.spz`: version 3, or another.
     - `.glb`: glTF 2.0 with KHR_gaussian_splatting, of float32 numbers.
-    - `.usd`, `.usda`, `.usdc`: OpenUSD, a ParticleField3DGaussianSplat of float32
-      numbers.
+    - `.usd`, `.usda`, `.usdc`, `.usdz`: OpenUSD, a ParticleField3DGaussianSplat of
+      float32 numbers.
     - `.sog`: version 2. The order changes.
 
     Gaussians are turned so that what is up is y in `.spz`, `.glb` and OpenUSD; the
@@ -321,6 +321,11 @@ def _by_name(path: AnyPath, formats: Mapping[str, Format]) -> Format:
     advice = ""
     if formats is not _WRITERS:
         advice = "; v3dg.open opens bundles (.v3dg) and scenes (.json)"
+        content = content_of(path)
+        if content is not None:
+            advice = f"; this is {content.text}"
+        if content is not None and content.suffix:
+            advice += ", so let its name end so"
     raise ValueError(
         f"{shown(path)}: expected a file name that ends in {', '.join(formats)}{advice}"
     )

@@ -257,7 +257,7 @@ def test_usd_is_turned_from_the_axis_of_its_stage(tmp_path, asset):
         assert up_of(found) == ("-y", reason)
     UsdGeom.SetStageMetersPerUnit(stage, 0.01)
     stage.GetRootLayer().Save()
-    with pytest.warns(v3dg.cleaning.AssetWarning, match=r"a\.usda: its unit is 0\.01 m"):
+    with pytest.warns(v3dg.cleaning.AssetWarning, match=r"a\.usda: Its unit is 0\.01 m"):
         read_asset(tmp_path / "a.usda")
 
 

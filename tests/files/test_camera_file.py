@@ -396,5 +396,5 @@ def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path):
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     assert list(read_cameras(path)) == list(wanted)
     path.write_bytes(json.dumps(CAPTURE).encode("utf-16"))
-    with pytest.raises(ValueError, match="expected JSON in UTF-8, got UTF-16; save it as UTF-8"):
+    with pytest.raises(ValueError, match="does not parse: it is in UTF-16; save it as UTF-8"):
         read_cameras(path)

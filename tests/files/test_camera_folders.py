@@ -51,8 +51,9 @@ def cameras():
 def test_models_of_colmap_are_read(tmp_path, cameras, text, place):
     write_model(tmp_path / "scene" / place, cameras, text=text)
     assert_same(read_cameras(tmp_path / "scene"), cameras)
-    file = "images.txt" if text else "images.bin"
-    assert_same(read_cameras(tmp_path / "scene" / place / file), cameras)
+    for file in ("images", "cameras"):
+        name = f"{file}.txt" if text else f"{file}.bin"
+        assert_same(read_cameras(tmp_path / "scene" / place / name), cameras)
 
 
 def test_distortion_is_refused_or_left_out(tmp_path, cameras):
@@ -115,6 +116,15 @@ def test_images_with_the_same_name_or_none_are_numbered(tmp_path, name, text):
         content = content.replace(f"x{number}".encode(), name.encode())
     path.write_bytes(content)
     assert_same(read_cameras(path), dict(zip("012", wanted.values(), strict=True)))
+
+
+def test_texts_may_have_a_byte_order_mark_and_carriage_returns(tmp_path, cameras):
+    write_model(tmp_path / "a", cameras, text=True)
+    for name in ("images.txt", "cameras.txt"):
+        path = tmp_path / "a" / name
+        lines = path.read_bytes().splitlines()
+        path.write_bytes(b"\xef\xbb\xbf" + b"\r\n".join(lines) + b"\r\n")
+    assert_same(read_cameras(tmp_path / "a"), cameras)
 
 
 def test_a_name_in_another_encoding_is_kept_by_its_bytes(tmp_path, cameras):

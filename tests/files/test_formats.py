@@ -979,9 +979,9 @@ def test_checkpoints_of_nerfstudio_are_read(tmp_path, degree):
     torch.save(content, tmp_path / "step-000029999.ckpt")
     assert_same(read_quietly(tmp_path / "step-000029999.ckpt"), asset)
     notes = open_asset(tmp_path / "step-000029999.ckpt").declared.notes
-    wanted = ["cameras were moved in training (camera_optimizer), so those of the data are not"]
+    wanted = ["Cameras were moved in training (camera_optimizer), so those of the data are not"]
     if degree == 0:
-        wanted.append("colours are stored as logits without view dependence, and were read as")
+        wanted.append("Colours are stored as logits without view dependence, and were read as")
     assert [note[: len(text)] for note, text in zip(notes, wanted, strict=True)] == wanted
 
 
@@ -994,8 +994,8 @@ def test_checkpoints_of_older_splatfacto_are_read(tmp_path):
     torch.save({"pipeline": pipeline | grids}, tmp_path / "a.ckpt")
     assert_same(read_quietly(tmp_path / "a.ckpt"), asset)
     first, second = open_asset(tmp_path / "a.ckpt").declared.notes
-    assert first.startswith("the bilateral grids of single photographs were left out")
-    assert second == "parts of the checkpoint were left out: 'new_net'"
+    assert first.startswith("The bilateral grids of single photographs were left out")
+    assert second == "Parts of the checkpoint were left out: 'new_net'."
 
 
 def test_colours_of_a_gsplat_with_appearance_are_those_without_it(tmp_path):
@@ -1011,9 +1011,9 @@ def test_colours_of_a_gsplat_with_appearance_are_those_without_it(tmp_path):
     file = open_asset(tmp_path / "a.pt")
     assert file.sh_degree == 0
     appearance, tensors_left_out, as_logits = file.declared.notes
-    assert appearance.startswith("the appearance of single photographs (app_module) was left out")
-    assert tensors_left_out == "tensors of splats were left out: 'motion'"
-    assert as_logits.startswith("colours are stored as logits")
+    assert appearance.startswith("The appearance of single photographs (app_module) was left out")
+    assert tensors_left_out == "Tensors of splats were left out: 'motion'."
+    assert as_logits.startswith("Colours are stored as logits")
 
 
 class Captured(torch.nn.Module):
@@ -1049,7 +1049,7 @@ def test_checkpoints_of_the_papers_code_are_read(tmp_path, num_scales):
     if num_scales == 2:
         asset.scales[:, 2] = 0
         assert notes == (
-            "the gaussians are those of 2DGS; they were read as ellipsoids of no thickness",
+            "The gaussians are those of 2DGS; they were read as ellipsoids of no thickness.",
         )
     assert_same(read_quietly(tmp_path / "chkpnt30000.pth"), asset)
     assert (notes == ()) == (num_scales == 3)
@@ -1092,7 +1092,7 @@ def test_settings_are_only_read_as_far_as_they_are_plain(tmp_path, monkeypatch):
     settings.write_bytes(b"antialiased: true\n" + b"#" * (1 << 20))
     declared = open_asset("a.pt").declared
     assert declared.antialiased is None
-    assert declared.notes == ("cfg.yml is too large to be that of a run and was not read",)
+    assert declared.notes == ("cfg.yml is too large to be that of a run and was not read.",)
     settings.write_bytes(b"\xff\xfe\0antialiased: [true\nstrategy:\n  antialiased: true\n")
     assert open_asset("a.pt").declared.antialiased is None
 
@@ -1104,8 +1104,8 @@ def test_gaussians_of_2dgs_trained_by_gsplat_are_flat(tmp_path):
     asset.scales[:, 2] = 0
     assert_same(read_quietly(tmp_path / "a.pt"), asset)
     along_rays, flat = open_asset(tmp_path / "a.pt").declared.notes
-    assert along_rays.startswith("gaussians were trained to be evaluated along rays")
-    assert flat.startswith("the gaussians are those of 2DGS")
+    assert along_rays.startswith("Gaussians were trained to be evaluated along rays")
+    assert flat.startswith("The gaussians are those of 2DGS")
 
 
 class Harmful:

@@ -98,7 +98,7 @@ def test_base_colours_stand_for_coefficients(tmp_path, kind, encoding):
     path = put(tmp_path / "a.ply", columns, encoding)
     assert_close(read(path), expected_gaussians(wanted))
     (note,) = open_asset(path).declared.notes
-    assert note == "red, green and blue were read as base colours, because f_dc_0 is missing"
+    assert note == "Red, green and blue were read as base colours, because f_dc_0 is missing."
 
 
 def test_floats_of_0_to_255_are_no_base_colours(tmp_path):
@@ -114,7 +114,7 @@ def test_coefficients_come_before_base_colours(tmp_path):
     path = put(tmp_path / "a.ply", columns | colors)
     assert_close(read(path), expected_gaussians(columns))
     assert open_asset(path).declared.notes == (
-        "properties of vertex that no gaussian has were left out: 'red', 'green', 'blue'",
+        "Properties of vertex that no gaussian has were left out: 'red', 'green', 'blue'.",
     )
 
 
@@ -144,7 +144,7 @@ def test_the_filter_of_mip_splatting_is_applied(tmp_path):
     assert_close(read(path), wanted)
     declared = open_asset(path).declared
     assert declared.antialiased is True
-    assert declared.notes == ("filter_3D of Mip-Splatting was applied to scales and opacities",)
+    assert declared.notes == ("filter_3D of Mip-Splatting was applied to scales and opacities.",)
 
 
 def test_coefficients_of_degree_4_are_left_out(tmp_path):
@@ -155,7 +155,7 @@ def test_coefficients_of_degree_4_are_left_out(tmp_path):
     assert_close(read(path), wanted)
     file = open_asset(path)
     assert file.sh_degree == 3
-    assert file.declared.notes == ("coefficients of SH degree 4 were left out",)
+    assert file.declared.notes == ("Coefficients of SH degree 4 were left out.",)
 
 
 def test_what_no_gaussian_has_is_told(tmp_path):
@@ -169,9 +169,9 @@ def test_what_no_gaussian_has_is_told(tmp_path):
     properties, elements = open_asset(path).declared.notes
     names = ", ".join(f"'semantic_{i}'" for i in range(8))
     assert properties == (
-        f"properties of vertex that no gaussian has were left out: {names} and 2 more"
+        f"Properties of vertex that no gaussian has were left out: {names} and 2 more."
     )
-    assert elements == "elements beside vertex were left out: 'delta_vertex_0'"
+    assert elements == "Elements beside vertex were left out: 'delta_vertex_0'."
 
 
 @pytest.mark.parametrize("dtype", ["f2", "i8", "u8"])
@@ -207,7 +207,7 @@ def test_what_a_compressed_ply_has_besides_is_told(tmp_path):
     content = content.replace(b"end_header\n", extra, 1) + bytes(2)
     (tmp_path / "b.ply").write_bytes(content)
     assert open_asset(tmp_path / "b.ply").declared.notes == (
-        "elements beside chunk, vertex and sh were left out: 'state'",
+        "Elements beside chunk, vertex and sh were left out: 'state'.",
     )
     found = read(tmp_path / "b.ply")
     np.testing.assert_array_equal(found.means, read(tmp_path / "a.compressed.ply").means)
@@ -233,10 +233,10 @@ SOG_FIELDS = {
     "splat-transform": ({"model": "antialiased"}, True, []),
     "splat-transform, not": ({"model": "default"}, False, []),
     "others": ({"antialias": True}, True, []),
-    "2DGS": ({"model": "2dgs"}, None, ["the gaussians are those of 2DGS; they were read as f"]),
-    "a later one": ({"model": "cubes"}, None, ['the model "cubes" is not known and was left out']),
-    "an object": ({"model": {}}, None, ["the model {} is not known and was left out"]),
-    "a camera": ({"camera": {"fov": 1}}, None, ["fields of meta.json were left out: 'camera'"]),
+    "2DGS": ({"model": "2dgs"}, None, ["The gaussians are those of 2DGS; they were read as f"]),
+    "a later one": ({"model": "cubes"}, None, ['The model "cubes" is not known and was left out.']),
+    "an object": ({"model": {}}, None, ["The model {} is not known and was left out."]),
+    "a camera": ({"camera": {"fov": 1}}, None, ["Fields of meta.json were left out: 'camera'."]),
 }
 
 
@@ -286,12 +286,12 @@ def test_a_streamed_sog_declares_what_its_folders_do(tmp_path):
         (tmp_path / "lod-meta.json").write_bytes(b"\xef\xbb\xbf" + json.dumps(document).encode())
         return open_asset(tmp_path / "lod-meta.json").declared
 
-    notes = ("fields of meta.json were left out: 'x'",)
-    notes += ("fields of lod-meta.json were left out: 'camera'",)
+    notes = ("Fields of meta.json were left out: 'x'.",)
+    notes += ("Fields of lod-meta.json were left out: 'camera'.",)
     assert declared([0, 1]).antialiased is True
     assert declared([0, 1]).notes == notes
     assert declared([0, 2]).antialiased is None
-    assert declared([0, 2]).notes[2].startswith("some folders were trained with antialiasing")
+    assert declared([0, 2]).notes[2].startswith("Some folders were trained with antialiasing")
 
 
 def test_a_newer_ksplat_is_told(tmp_path):
@@ -301,7 +301,7 @@ def test_a_newer_ksplat_is_told(tmp_path):
     content[1] = 2
     (tmp_path / "a.ksplat").write_bytes(content)
     assert open_asset(tmp_path / "a.ksplat").declared.notes == (
-        "version 0.2 was read as version 0.1",
+        "Version 0.2 was read as version 0.1.",
     )
 
 
@@ -322,7 +322,7 @@ def test_misnamed_files_are_recognised(tmp_path, file, suffix):
         assert found.declared == wanted.declared
         return
     named = suffix.removeprefix(".compressed")
-    note = f"its name ends in {named}, but it is a {own}, and was read as such"
+    note = f"Its name ends in {named}, but it is a {own}, and was read as such."
     assert found.declared.notes == (note, *wanted.declared.notes)
 
 
@@ -340,6 +340,16 @@ def test_a_splat_that_begins_like_a_ksplat_is_a_splat(tmp_path):
     file = open_asset(tmp_path / "a.splat")
     assert file.num_gaussians == 200
     assert file.declared.notes == ()
+
+
+@pytest.mark.parametrize("name", ["a.zip", "a.gz", "a", "a.bin"])
+def test_files_of_unknown_names_are_named_by_what_they_are(tmp_path, name):
+    shutil.copyfile(FIXTURES / "sh3.sog", tmp_path / name)
+    with pytest.raises(ValueError, match=r"this is a \.sog, so let its name end so$"):
+        read(tmp_path / name)
+    (tmp_path / name).write_bytes(gzip.compress(b"ply\nformat ascii 1.0\n"))
+    with pytest.raises(ValueError, match=r"this is a gzip of a \.ply; unpack it$"):
+        read(tmp_path / name)
 
 
 def zip_of(*names):

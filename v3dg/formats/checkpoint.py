@@ -46,14 +46,14 @@ _MIN_CAPTURE = 12  # values of that tuple; variants add some
 _GSPLAT_MEMBERS = ("step", "splats", "optimizers", "schedulers", "strategy_state")
 _NERFSTUDIO_MEMBERS = ("device_indicator_param", "background_color", "lpips", "psnr", "ssim")
 _NOT_GAUSSIANS = {
-    "app_module": "the appearance of single photographs (app_module) was left out: "
-    "colours are those without it",
-    "bil_grids": "the bilateral grids of single photographs were left out: "
-    "colours are those before them",
-    "pose_adjust": "cameras were moved in training (pose_adjust), so those of the data are "
-    "not exactly its cameras",
-    "camera_optimizer": "cameras were moved in training (camera_optimizer), so those of the "
-    "data are not exactly its cameras",
+    "app_module": "The appearance of single photographs (app_module) was left out: "
+    "colours are those without it.",
+    "bil_grids": "The bilateral grids of single photographs were left out: "
+    "colours are those before them.",
+    "pose_adjust": "Cameras were moved in training (pose_adjust), so those of the data are "
+    "not exactly its cameras.",
+    "camera_optimizer": "Cameras were moved in training (camera_optimizer), so those of the "
+    "data are not exactly its cameras.",
 }
 _NOT_GAUSSIANS["bilagrid"] = _NOT_GAUSSIANS["bil_grids"]
 _SETTINGS = ("cfg.yml", "config.yml")  # of gsplat, of nerfstudio
@@ -157,10 +157,10 @@ def open_file(path: AnyPath) -> AssetFile:
     notes = [*layout.notes, *settings.notes]
     if layout.num_scales == 2 or settings.is_flat:
         notes.append(
-            "the gaussians are those of 2DGS; they were read as ellipsoids of no thickness"
+            "The gaussians are those of 2DGS; they were read as ellipsoids of no thickness."
         )
     if layout.has_logits:
-        notes.append("colours are stored as logits without view dependence, and were read as such")
+        notes.append("Colours are stored as logits without view dependence, and were read as such.")
     declared = Declared(antialiased=settings.antialiased, notes=tuple(notes))
     return whole_file(path, count, DEGREES[num_higher], read, declared=declared)
 
@@ -252,7 +252,7 @@ def _settings_of(path: AnyPath) -> _Settings:
     with Claims().open(file) as opened:
         content = opened.read(_MAX_SETTINGS_BYTES + 1)
     if len(content) > _MAX_SETTINGS_BYTES:
-        note = f"{file.name} is too large to be that of a run and was not read"
+        note = f"{file.name} is too large to be that of a run and was not read."
         return _Settings(notes=(note,))
     # YAML with Python objects, of which lines of a name and a plain value are read.
     pattern = r"^[ ]*(\w+): +'?([\w.+-]+)'?[ ]*\r?$"
@@ -274,8 +274,8 @@ def _settings(values: Mapping[str, str]) -> _Settings:
     notes = []
     if values.get("with_eval3d") == "true":
         notes.append(
-            "gaussians were trained to be evaluated along rays (with_eval3d), so pictures of "
-            "their projections differ"
+            "Gaussians were trained to be evaluated along rays (with_eval3d), so pictures of "
+            "their projections differ."
         )
     return _Settings(antialiased, values.get("model_type", "").startswith("2dgs"), tuple(notes))
 
@@ -320,7 +320,7 @@ def _gsplat_layout(path: AnyPath, splats: dict[str, _Value], notes: tuple[str, .
         )
     unread = [name for name in splats if name not in used]
     if unread:
-        notes += (f"tensors of splats were left out: {listed(unread)}",)
+        notes += (f"Tensors of splats were left out: {listed(unread)}.",)
     return _Layout(_tensors(path, values), notes)
 
 
@@ -352,7 +352,7 @@ def _left_out(members: Iterable[str]) -> tuple[str, ...]:
     notes = [_NOT_GAUSSIANS[name] for name in names if name in _NOT_GAUSSIANS]
     unknown = [name for name in names if name not in _NOT_GAUSSIANS]
     if unknown:
-        notes.append(f"parts of the checkpoint were left out: {listed(unknown)}")
+        notes.append(f"Parts of the checkpoint were left out: {listed(unknown)}.")
     return tuple(notes)
 
 

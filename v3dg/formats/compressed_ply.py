@@ -101,10 +101,10 @@ def _notes(elements: Mapping[str, _Element]) -> tuple[str, ...]:
     for element, read_names in used.items():
         names = [name for name in elements[element].kinds if name not in read_names]
         if names:
-            notes.append(f"properties of {element} were left out: {listed(names)}")
+            notes.append(f"Properties of {element} were left out: {listed(names)}.")
     unread = [name for name in elements if name not in (*used, "sh")]
     if unread:
-        notes.append(f"elements beside chunk, vertex and sh were left out: {listed(unread)}")
+        notes.append(f"Elements beside chunk, vertex and sh were left out: {listed(unread)}.")
     return tuple(notes)
 
 

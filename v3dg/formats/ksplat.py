@@ -88,7 +88,7 @@ def _declared(start: bytes) -> Declared:
     minor = start[1]
     if minor <= _MINOR:
         return NOTHING
-    return Declared(notes=(f"version 0.{minor} was read as version 0.{_MINOR}",))
+    return Declared(notes=(f"Version 0.{minor} was read as version 0.{_MINOR}.",))
 
 
 def read(path: AnyPath) -> Gaussians:

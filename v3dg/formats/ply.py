@@ -72,7 +72,7 @@ def _vertical_axis(path: AnyPath) -> Declared:
     for axis in AXES:
         if match[1].lower() == axis:
             return Declared(up=axis, up_reason="as its header says")
-    return Declared(notes=(f"its header has an unknown vertical axis, {match[1][:20]!a}",))
+    return Declared(notes=(f"Its header has an unknown vertical axis, {match[1][:20]!a}.",))
 
 
 def _declared(path: AnyPath, elements: _Elements, used: set[str]) -> Declared:
@@ -84,23 +84,23 @@ def _declared(path: AnyPath, elements: _Elements, used: set[str]) -> Declared:
     if "scale_2" not in used:
         notes.append(
             "scale_2 is missing, so these are the gaussians of 2DGS; "
-            "they were read as ellipsoids of no thickness"
+            "they were read as ellipsoids of no thickness."
         )
     if "f_dc_0" not in used:
-        notes.append("red, green and blue were read as base colours, because f_dc_0 is missing")
+        notes.append("Red, green and blue were read as base colours, because f_dc_0 is missing.")
     antialiased = None
     if "filter_3D" in used:
         antialiased = True
-        notes.append("filter_3D of Mip-Splatting was applied to scales and opacities")
+        notes.append("filter_3D of Mip-Splatting was applied to scales and opacities.")
     high_coefficients = [name for name in unread if name.startswith("f_rest_")]
     if high_coefficients:
-        notes.append("coefficients of SH degree 4 were left out")
+        notes.append("Coefficients of SH degree 4 were left out.")
         unread = [name for name in unread if name not in high_coefficients]
     if unread:
-        notes.append(f"properties of vertex that no gaussian has were left out: {listed(unread)}")
+        notes.append(f"Properties of vertex that no gaussian has were left out: {listed(unread)}.")
     left_out = [name for name, count, _ in elements if name != "vertex" and count]
     if left_out:
-        notes.append(f"elements beside vertex were left out: {listed(left_out)}")
+        notes.append(f"Elements beside vertex were left out: {listed(left_out)}.")
     return replace(axis, antialiased=antialiased, notes=tuple(notes))
 
 

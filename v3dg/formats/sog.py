@@ -206,12 +206,12 @@ def _declared(meta: dict[str, Node]) -> Declared:
         model = meta["model"].value
         antialiased = {"default": False, "antialiased": True}.get(str(model), antialiased)
         if model == "2dgs":
-            notes.append("the gaussians are those of 2DGS; they were read as flat ellipsoids")
+            notes.append("The gaussians are those of 2DGS; they were read as flat ellipsoids.")
         elif model not in ("default", "antialiased"):
-            notes.append(f"the model {json_text(model)} is not known and was left out")
+            notes.append(f"The model {json_text(model)} is not known and was left out.")
     unread = [name for name in meta if name not in _FIELDS]
     if unread:
-        notes.append(f"fields of meta.json were left out: {listed(unread)}")
+        notes.append(f"Fields of meta.json were left out: {listed(unread)}.")
     return Declared(antialiased=antialiased, notes=tuple(notes))
 
 

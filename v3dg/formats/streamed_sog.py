@@ -68,11 +68,11 @@ def _declared(index: _Index, parts: list[Declared]) -> Declared:
     """What the index declares, and what all of its parts do."""
     notes = list(dict.fromkeys(note for part in parts for note in part.notes))
     if index.unread:
-        notes.append(f"fields of lod-meta.json were left out: {listed(index.unread)}")
+        notes.append(f"Fields of lod-meta.json were left out: {listed(index.unread)}.")
     antialiased = parts[0].antialiased
     if any(part.antialiased != antialiased for part in parts):
         antialiased = None
-        notes.append("some folders were trained with antialiasing, others not or not known")
+        notes.append("Some folders were trained with antialiasing, others not or not known.")
     return Declared(antialiased=antialiased, notes=tuple(notes))
 
 

@@ -127,7 +127,7 @@ def _declared(usd: ModuleType, stage: Usd.Stage, letter: str, notes: list[str]) 
     unit = usd.UsdGeom.GetStageMetersPerUnit(stage)
     distinct = list(dict.fromkeys(notes))
     if usd.UsdGeom.StageHasAuthoredMetersPerUnit(stage) and unit != 1:
-        distinct.append(f"its unit is {unit:g} m, and coordinates stay in that unit")
+        distinct.append(f"Its unit is {unit:g} m; coordinates stay in that unit.")
     reason = f"as its stage says ({letter} is up in the file)"
     return Declared(up=_axes.MEMORY_UP, up_reason=reason, notes=tuple(distinct))
 
@@ -194,8 +194,7 @@ def _opened(path: AnyPath, expected: str) -> Iterator[tuple[ModuleType, Usd.Prim
         stage = usd.Usd.Stage.Open(os.fspath(path))
         root = stage.GetPseudoRoot()
         if not any(_prims(usd, root)):
-            notes = _left_out(usd, root)
-            raise ValueError("; ".join(["no ParticleField3DGaussianSplat", *notes]))
+            raise ValueError(" ".join(["no ParticleField3DGaussianSplat.", *_left_out(usd, root)]))
         yield usd, root
 
 
@@ -273,11 +272,13 @@ def _left_out(usd: ModuleType, root: Usd.Prim) -> list[str]:
             unread.append(path)
     notes = []
     if hidden:
-        notes.append(f"prims that are invisible or not for drawing were left out: {listed(hidden)}")
+        notes.append(
+            f"Prims that are invisible or not for drawing were left out: {listed(hidden)}."
+        )
     if particles:
-        notes.append(f"particles that are no gaussians were left out: {listed(particles)}")
+        notes.append(f"Particles that are no gaussians were left out: {listed(particles)}.")
     if unread:
-        notes.append(f"other geometry was left out: {listed(unread)}")
+        notes.append(f"Other geometry was left out: {listed(unread)}.")
     return notes
 
 
@@ -342,7 +343,7 @@ def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]
         scales = np.ones((count, 3), np.float32)
     if _kernel(usd, prim) is _Kernel.SURFLET:
         scales = scales * np.array([1, 1, 0], np.float32)
-        notes.append("flat gaussians (surflets) were read as ellipsoids of no thickness")
+        notes.append("Flat gaussians (surflets) were read as ellipsoids of no thickness.")
     opacities = columns["opacities"].values
     if opacities is None:
         opacities = np.ones(count, np.float32)
@@ -350,7 +351,7 @@ def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]
     if harmonics.values is not None:
         sh = harmonics.values.reshape(count, (degree + 1) ** 2, 3)
     if degree > _MAX_DEGREE:
-        notes.append(f"coefficients above SH degree {_MAX_DEGREE} were left out")
+        notes.append(f"Coefficients above SH degree {_MAX_DEGREE} were left out.")
         sh = sh[:, : (_MAX_DEGREE + 1) ** 2]
     gaussians = Gaussians(
         means=means,
@@ -364,8 +365,10 @@ def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]
 
 def _degree(usd: ModuleType, prim: Usd.Prim) -> int:
     """The SH degree of a prim, which is 3 by default."""
-    degree = int(prim.GetAttribute(f"{_SH}Degree").Get(usd.Usd.TimeCode.EarliestTime()))
-    if not 0 <= degree <= _MOST_DEGREE:
+    degree = _value(usd, prim, f"{_SH}Degree")
+    if degree is None:  # the prim has no coefficients either
+        return 0
+    if not isinstance(degree, int) or not 0 <= degree <= _MOST_DEGREE:
         raise ValueError(f"the SH degree {degree} in {prim.GetPath()}")
     return degree
 
@@ -373,19 +376,27 @@ def _degree(usd: ModuleType, prim: Usd.Prim) -> int:
 def _column(usd: ModuleType, prim: Usd.Prim, name: str, count: int | None) -> _Column:
     """The first `count` values of an attribute, in single precision or, if there are
     none of those, in half; the schema ignores one with fewer values."""
-    time = usd.Usd.TimeCode.EarliestTime()
-    stored = prim.GetAttribute(name).Get(time)
+    stored = _value(usd, prim, name)
     if stored is None:
-        stored = prim.GetAttribute(f"{name}h").Get(time)
+        stored = _value(usd, prim, f"{name}h")
     if stored is None:
         return _Column(None)
-    values = np.array(stored, np.float32)
+    values: NDArray[np.float32] = np.array(stored, np.float32)
     if count is None or len(values) == count:
         return _Column(values)
     lengths = f"{len(values)} values of {name} for {count} in {prim.GetPath()}"
     if len(values) < count:
-        return _Column(None, f"{lengths} are too few, so the schema's default was used")
-    return _Column(values[:count], f"{lengths} are too many, so the last ones were left out")
+        return _Column(None, f"{lengths} are too few, so the schema's default was used.")
+    return _Column(values[:count], f"{lengths} are too many, so the last ones were left out.")
+
+
+def _value(usd: ModuleType, prim: Usd.Prim, name: str) -> object:
+    """The first value of an attribute; None if the prim has none, or no such
+    attribute."""
+    attribute = prim.GetAttribute(name)
+    if not attribute:
+        return None
+    return attribute.Get(usd.Usd.TimeCode.EarliestTime())
 
 
 def _notes_of(usd: ModuleType, prim: Usd.Prim) -> list[str]:
@@ -396,18 +407,18 @@ def _notes_of(usd: ModuleType, prim: Usd.Prim) -> list[str]:
         attribute.GetNumTimeSamples() > 1 for attribute in authored
     )
     if is_moving:
-        notes.append("values change with time, and were read at the first one")
+        notes.append("Values change with time, and were read at the first one.")
     for name in _HINTS:
         attribute = prim.GetAttribute(name)
         if attribute and attribute.HasAuthoredValue():
             value = str(attribute.Get())
             default = str(prim.GetPrimDefinition().GetAttributeFallbackValue(name))
             if value != default:
-                notes.append(f"the hint {name} is {value[:40]!a}, which was left out")
+                notes.append(f"The hint {name} is {value[:40]!a}, which was left out.")
     names = [attribute.GetName() for attribute in authored]
     unread = [name for name in names if name not in _KNOWN and not name.startswith("xformOp:")]
     if unread:
-        notes.append(f"attributes of gaussians were left out: {listed(unread)}")
+        notes.append(f"Attributes of gaussians were left out: {listed(unread)}.")
     return notes
 
 
