@@ -87,6 +87,8 @@ def read(path: AnyPath) -> tuple[Gaussians, Declared]:
                 gaussians = gaussians.transform(*_similarity(prim, matrix))
             parts.append(gaussians)
         letter = str(usd.UsdGeom.GetStageUpAxis(root.GetStage()))
+        if letter not in _AXES:
+            raise ValueError(f"the up axis {letter[:20]!a}; Y or Z is one")
         gaussians = _axes.turned(Gaussians.concatenate(parts), _AXES[letter], _axes.MEMORY)
         return gaussians, _declared(usd, root.GetStage(), letter)
 
@@ -98,6 +100,8 @@ def _declared(usd: ModuleType, stage: Usd.Stage, letter: str) -> Declared:
     if usd.UsdGeom.StageHasAuthoredMetersPerUnit(stage) and unit != 1:
         notes.append(f"Its unit is {unit:g} m; coordinates stay in that unit.")
     reason = f"as its stage says ({letter} is up in the file)"
+    if not stage.HasAuthoredMetadata("upAxis"):
+        reason = f"as in OpenUSD ({letter} is up in the file)"
     return Declared(up=_axes.MEMORY_UP, up_reason=reason, notes=tuple(notes))
 
 
