@@ -255,6 +255,12 @@ def test_usd_is_turned_from_the_axis_of_its_stage(tmp_path, asset):
         np.testing.assert_allclose(found.means, raw[:, columns] * signs, atol=1e-6)
         reason = f"as its stage says ({letter} is up in the file)"
         assert up_of(found) == ("-y", reason)
+    text = (tmp_path / "a.usda").read_text()
+    (tmp_path / "b.usda").write_text(text.replace('upAxis = "Z"', ""))
+    assert up_of(read_asset(tmp_path / "b.usda"))[1] == "as in OpenUSD (Y is up in the file)"
+    (tmp_path / "b.usda").write_text(text.replace('upAxis = "Z"', 'upAxis = "X"'))
+    with pytest.raises(ValueError, match=r"b\.usda: .* got the up axis 'X'; Y or Z is one"):
+        read_asset(tmp_path / "b.usda")
     UsdGeom.SetStageMetersPerUnit(stage, 0.01)
     stage.GetRootLayer().Save()
     with pytest.warns(v3dg.cleaning.AssetWarning, match=r"a\.usda: Its unit is 0\.01 m"):

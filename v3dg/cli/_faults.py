@@ -82,8 +82,10 @@ def _holds(output: Path, gaussians: Gaussians) -> bool:
 
 def _text(counts: Mapping[str, int]) -> str:
     """Counts of kinds in words."""
-    known = {kind: count for kind, count in counts.items() if kind != "quats_zero"}
-    texts = [describe(known)] * bool(known)
-    if "quats_zero" in counts:
-        texts.append(f"{counts['quats_zero']:,} {_NO_ROTATION}")
+    texts = []
+    for kind, count in counts.items():
+        if kind == "quats_zero":
+            texts.append(f"{count:,} {_NO_ROTATION}")
+        else:
+            texts.append(describe({kind: count}))
     return ", ".join(texts)

@@ -50,7 +50,7 @@ def run(options: Info) -> None:
     result, lines = description
     up, reason = up_of(subject, cameras)
     result = {**result, "up": up, "up_reason": reason}
-    lines = [*lines, f"{up} is up, {reason}"]
+    lines.insert(1, f"{up} is up, {reason}")
     _common.print_result(result, lines, as_json=options.json)
 
 

@@ -118,6 +118,8 @@ def read(path: AnyPath) -> tuple[Gaussians, Declared]:
         degree = max(part.sh_degree for part in parts)
         joined = Gaussians.concatenate([_padded(part, degree) for part in parts])
         letter = str(usd.UsdGeom.GetStageUpAxis(root.GetStage()))
+        if letter not in _AXES:
+            raise ValueError(f"the up axis {letter[:20]!a}; Y or Z is one")
         gaussians = _axes.turned(joined, _AXES[letter], _axes.MEMORY)
         return gaussians, _declared(usd, root.GetStage(), letter, notes)
 
@@ -129,6 +131,8 @@ def _declared(usd: ModuleType, stage: Usd.Stage, letter: str, notes: list[str]) 
     if usd.UsdGeom.StageHasAuthoredMetersPerUnit(stage) and unit != 1:
         distinct.append(f"Its unit is {unit:g} m; coordinates stay in that unit.")
     reason = f"as its stage says ({letter} is up in the file)"
+    if not stage.HasAuthoredMetadata("upAxis"):
+        reason = f"as in OpenUSD ({letter} is up in the file)"
     return Declared(up=_axes.MEMORY_UP, up_reason=reason, notes=tuple(distinct))
 
 
