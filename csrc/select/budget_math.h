@@ -1,7 +1,7 @@
 #pragma once
 
-// The tolerance of a budget: which tolerances there are to choose from, and how the choice moves
-// from frame to frame.
+// The tolerance of a budget: which tolerances there are to choose from, and how the
+// choice moves from frame to frame.
 
 #include <cmath>
 #include <cstdint>
@@ -12,8 +12,9 @@
 
 namespace v3dg {
 
-// A budget chooses from a list of tolerances, the bins: the rule's own, then 2048 an octave, and
-// infinity. A metric belongs to the first bin that it fits, and NaN to the bin after the last.
+// A budget chooses from a list of tolerances, the bins: the rule's own, then 2048 an
+// octave, and infinity. A metric belongs to the first bin that it fits, and NaN to the
+// bin after the last.
 constexpr int kLog2StepsPerOctave = 11, kOctaves = 32;
 constexpr uint32_t kNumBudgetBins = 2 + (kOctaves << kLog2StepsPerOctave);
 constexpr uint32_t kFirstStepBits = 0x3a800000u;  // the bits of the float 2^-10
@@ -37,11 +38,12 @@ V3DG_HD inline float tolerance_of_bin(uint32_t bin, float tolerance) {
     return value;
 }
 
-// In steps, the tolerance of a budget moves towards a goal, at which 1 / kHeadroomParts of the
-// budget stays free, so that what comes into view seldom makes it leap. In motion a step is 1 /
-// kStepParts of the distance to the goal, and at least kLeastStepBins. (The usual fade is 117 bins
-// wide.) Beyond kLeapBins the motion is not slow, and one step covers the whole distance. At rest
-// it arrives within kRestFrames, in steps of about the same size.
+// In steps, the tolerance of a budget moves towards a goal, at which 1 / kHeadroomParts
+// of the budget stays free, so that what comes into view seldom makes it leap. In
+// motion a step is 1 / kStepParts of the distance to the goal, and at least
+// kLeastStepBins. (The usual fade is 117 bins wide.) Beyond kLeapBins the motion is not
+// slow, and one step covers the whole distance. At rest it arrives within kRestFrames,
+// in steps of about the same size.
 constexpr uint64_t kHeadroomParts = 32;
 constexpr uint32_t kStepParts = 32, kLeastStepBins = 6, kLeapBins = 512;
 constexpr int32_t kRestFrames = 8;
@@ -49,9 +51,10 @@ constexpr uint32_t kNoBin = ~uint32_t(0);  // the bin of the frame before the fi
 
 V3DG_HD inline uint64_t goal_of_budget(uint64_t budget) { return budget - budget / kHeadroomParts; }
 
-// The tolerance of this frame. `least` and `goal` are the first bins from which on no cut exceeds
-// the budget and its goal; `goal` is kNumBudgetBins where there is none. The result is never below
-// the least bin, where a cut would exceed the budget. `last` becomes the bin of this frame.
+// The tolerance of this frame. `least` and `goal` are the first bins from which on no
+// cut exceeds the budget and its goal; `goal` is kNumBudgetBins where there is none.
+// The result is never below the least bin, where a cut would exceed the budget. `last`
+// becomes the bin of this frame.
 V3DG_HD inline float tolerance_of_budget(const SelectRule& rule, uint32_t least, uint32_t goal,
                                          uint32_t& last) {
     if (rule.pace == BudgetPace::at_once) return tolerance_of_bin(least, rule.tolerance_px2);
@@ -65,8 +68,8 @@ V3DG_HD inline float tolerance_of_budget(const SelectRule& rule, uint32_t least,
     if (way > kLeapBins) step = way;
     if (rule.pace == BudgetPace::again) step = 0;
     last = max_of(max_of(least, floor), goal > from ? from + step : from - step);
-    // The floor is rounded up, so its cut may fit the budget although the cut of the rule's
-    // tolerance does not.
+    // The floor is rounded up, so its cut may fit the budget although the cut of the
+    // rule's tolerance does not.
     return last == floor && least == 0 ? rule.tolerance_px2
                                        : tolerance_of_bin(last, rule.tolerance_px2);
 }

@@ -1,17 +1,17 @@
 // The cut of a scene on the device, in two kernels.
 //
-// place_kernel has a thread for each instance (place_instances.cuh). It places the camera in the
-// instance's frame and chooses the source of its cut: none, its tops, or its table. It deals the
-// work out as parts: 256 of those clusters of a table that bounds leave to be asked; or, for up to
-// 32 neighbouring instances, their tops, or the last clusters of their tables where bounds leave no
-// more than one lane asks.
+// place_kernel has a thread for each instance (place_instances.cuh). It places the
+// camera in the instance's frame and chooses the source of its cut: none, its tops, or
+// its table. It deals the work out as parts: 256 of those clusters of a table that
+// bounds leave to be asked; or, for up to 32 neighbouring instances, their tops, or the
+// last clusters of their tables where bounds leave no more than one lane asks.
 //
-// cut_kernel has a block for up to eight parts, one a warp. It asks which clusters are drawn
-// (cut_parts.cuh), records which pages they need (page_needs.cuh), and writes them to their places
-// in the list by a prefix sum (write_clusters.cuh).
+// cut_kernel has a block for up to eight parts, one a warp. It asks which clusters are
+// drawn (cut_parts.cuh), records which pages they need (page_needs.cuh), and writes
+// them to their places in the list by a prefix sum (write_clusters.cuh).
 //
-// For a budget, the kernels of budget_cuda.cu run in between, in two rounds with place_kernel
-// before each.
+// For a budget, the kernels of budget_cuda.cu run in between, in two rounds with
+// place_kernel before each.
 
 #include "select/select_cuda.h"
 
@@ -29,8 +29,8 @@
 namespace v3dg {
 namespace cuda {
 
-// Where the choice of a budget is written, and the pictures and placements of a frame. Pointers are
-// null where they are not wanted.
+// Where the choice of a budget is written, and the pictures and placements of a frame.
+// Pointers are null where they are not wanted.
 struct Cut::Target {
     EyeImages pictures;
     FrameImage* images;
@@ -84,7 +84,8 @@ __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
     if (num_tickets == 0 && blockIdx.x == 0 && threadIdx.x == 0) output.finish(0, 0);
     if (rule.budget != kNoBudget) rule.tolerance_px2 = choice->tolerance_px2;
     if (!Output::kFades) rule.fade = {};
-    // Where there are enough blocks, each of the first takes one ticket and the others none.
+    // Where there are enough blocks, each of the first takes one ticket and the others
+    // none.
     const bool is_enough = num_tickets <= gridDim.x;
     if (is_enough && blockIdx.x >= num_tickets) return;
     for (unsigned ticket = take_ticket(scratch.cut_ticket); ticket < num_tickets;

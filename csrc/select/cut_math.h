@@ -1,6 +1,7 @@
 #pragma once
 
-// The decision whether a cluster is drawn, and with which weight. select_math.h proves it exact.
+// The decision whether a cluster is drawn, and with which weight. select_math.h proves
+// it exact.
 
 #include <cstddef>
 #include <cstdint>
@@ -13,9 +14,9 @@
 
 namespace v3dg {
 
-// Whether the top clusters, which nothing replaces, are the cut at full weight, and no page is
-// wanted. With the paper's footprint that does not follow from their groups: it may decrease
-// towards the root, so a group may fail to fit below one that does.
+// Whether the top clusters, which nothing replaces, are the cut at full weight, and no
+// page is wanted. With the paper's footprint that does not follow from their groups: it
+// may decrease towards the root, so a group may fail to fit below one that does.
 V3DG_HD inline bool tops_fit(const ClusterTable& table, const InstanceView& view,
                              const SelectRule& rule) {
     if (rule.footprint == Footprint::paper) return false;
@@ -37,7 +38,8 @@ V3DG_HD inline bool is_hidden(const ClusterTable& table, const InstanceView& vie
     return rule.culls && is_outside(table.bounds, view);
 }
 
-// The source of an instance's cut. The tops are tried only where there are at most `most_tops`.
+// The source of an instance's cut. The tops are tried only where there are at most
+// `most_tops`.
 V3DG_HD inline CutSource source_of_cut(const ClusterTable& table, const InstanceView& view,
                                        const SelectRule& rule, size_t most_tops) {
     if (is_hidden(table, view, rule)) return CutSource::nowhere;
@@ -52,8 +54,9 @@ struct BinRange {
     V3DG_HD bool is_empty() const { return first >= end; }
 };
 
-// Answers the questions of the decision about a group by computing them each time. The bins of a
-// budget count as if all pages were resident, so that the tolerance does not depend on which are.
+// Answers the questions of the decision about a group by computing them each time. The
+// bins of a budget count as if all pages were resident, so that the tolerance does not
+// depend on which are.
 struct AskedGroups {
     const ClusterTable& table;
     const InstanceView& view;
@@ -63,7 +66,8 @@ struct AskedGroups {
         return min_of(v3dg::refinement(metric_px2(table, g, view, rule), rule),
                       arrival(table.pages, g, rule));
     }
-    // The first bins of a budget in which the group fits, and in which it is no longer refined.
+    // The first bins of a budget in which the group fits, and in which it is no longer
+    // refined.
     V3DG_HD uint32_t first_fitting(int32_t g) const {
         return bin_of_metric(wanted_metric_px2(table, g, view, rule) * rule.fade.factor,
                              rule.tolerance_px2);
@@ -74,8 +78,8 @@ struct AskedGroups {
     }
 };
 
-// The decision about each cluster of an instance's table. `Groups` is AskedGroups, or answers the
-// same questions from memory.
+// The decision about each cluster of an instance's table. `Groups` is AskedGroups, or
+// answers the same questions from memory.
 template <class Groups>
 struct InstanceCut {
     const ClusterTable& table;
@@ -86,8 +90,9 @@ struct InstanceCut {
 
     V3DG_HD bool is_culled(size_t c) const { return culls && is_outside(table.box[c], view); }
 
-    // The weight of the cluster before culling, out of kWhole: the refinement of the group above
-    // less that of its own group. The head of select_math.h says why the cut is exact.
+    // The weight of the cluster before culling, out of kWhole: the refinement of the
+    // group above less that of its own group. The head of select_math.h says why the
+    // cut is exact.
     V3DG_HD int32_t weight(size_t c) const {
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
         const int32_t below = own < 0 ? 0 : groups.refinement(own);

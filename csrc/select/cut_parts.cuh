@@ -1,6 +1,7 @@
 #pragma once
 
-// The parts of a scene's tables that warps work on, and the clusters of a part that a lane has.
+// The parts of a scene's tables that warps work on, and the clusters of a part that a
+// lane has.
 
 #include "base/launch.cuh"
 #include "select/select_cuda.h"
@@ -15,8 +16,9 @@ constexpr unsigned kPartSize = 32 * kLaneClusters;
 constexpr unsigned kCutThreads = 256, kCutWarps = kCutThreads / 32;
 static_assert(kLaneClusters == 8, "a byte says which of them are drawn");
 
-// Clusters [first, first + kPartSize) of one instance's table. Or, where `lanes` is not zero, one
-// lane for each of its bits k: the top clusters of instance + k, or the last clusters of its table.
+// Clusters [first, first + kPartSize) of one instance's table. Or, where `lanes` is not
+// zero, one lane for each of its bits k: the top clusters of instance + k, or the last
+// clusters of its table.
 struct CutPart {
     uint32_t instance, first, lanes;
 };
@@ -31,8 +33,8 @@ struct PlacedScene {
     const BundleOnDevice* bundles;
     InstanceTable instances;
     InstanceView* views;  // of instances whose tables are asked
-    // For instances that a single lane asks: a bit for each top that is drawn, or 0 where the lane
-    // asks the last clusters of the table.
+    // For instances that a single lane asks: a bit for each top that is drawn, or 0
+    // where the lane asks the last clusters of the table.
     uint8_t* tops;
     CutPart* parts;
 };
@@ -44,8 +46,9 @@ struct BudgetState {
     uint32_t last_bin = kNoBin;  // the state of tolerance_of_budget()
 };
 
-// A round of the search for the tolerance of a budget. The first round considers no tolerance below
-// the guess, the second all of them. Without a budget there is one round, and no state.
+// A round of the search for the tolerance of a budget. The first round considers no
+// tolerance below the guess, the second all of them. Without a budget there is one
+// round, and no state.
 struct BudgetRound {
     const BudgetState* state;
     bool is_second;
@@ -58,14 +61,15 @@ struct BudgetRound {
     }
 };
 
-// Enqueues the choice of the tolerance. `change` has kNumBudgetBins zeros before the first round.
-// `num_parts` is on the device, and becomes 0 where no cut fits the budget.
+// Enqueues the choice of the tolerance. `change` has kNumBudgetBins zeros before the
+// first round. `num_parts` is on the device, and becomes 0 where no cut fits the
+// budget.
 void choose_tolerance(const PlacedScene& scene, const SelectRule& rule, const BudgetRound& round,
                       unsigned num_blocks, unsigned* num_parts, Count* change, CutChoice* choice,
                       BudgetState* state, cudaStream_t stream);
 
-// Weights of a lane's clusters, at most kWhole each: 16 bits for each, from the lowest on. A weight
-// is read by shifting, because an index would put the words into memory.
+// Weights of a lane's clusters, at most kWhole each: 16 bits for each, from the lowest
+// on. A weight is read by shifting, because an index would put the words into memory.
 struct alignas(16) LaneWeights {
     uint64_t low, high;
 
@@ -79,8 +83,8 @@ struct alignas(16) LaneWeights {
 };
 static_assert(kLaneClusters == 8 && kWhole < 1 << 16, "two words hold the weights of a lane");
 
-// The clusters of a part that a lane has: those of one instance, and a bit for each that is drawn.
-// Weights are set in cuts with a fade alone.
+// The clusters of a part that a lane has: those of one instance, and a bit for each
+// that is drawn. Weights are set in cuts with a fade alone.
 struct LaneClusters {
     const BundleOnDevice* bundle;
     uint32_t instance;
@@ -124,11 +128,12 @@ __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const 
     return mine;
 }
 
-// Asks the clusters of the tables that the warps of a block have parts of. For the whole block. A
-// lane owns clusters to ask where their bounds do not show that none of them is drawn. All warps
-// ask together, a lane a cluster and four owners at a time, so that no warp waits long for one
-// whose part has more to ask. Each owner receives a bit for each of its clusters for which
-// ask(bundle, view, cluster) is positive, and with `kKeepsWeights` also the number itself.
+// Asks the clusters of the tables that the warps of a block have parts of. For the
+// whole block. A lane owns clusters to ask where their bounds do not show that none of
+// them is drawn. All warps ask together, a lane a cluster and four owners at a time, so
+// that no warp waits long for one whose part has more to ask. Each owner receives a bit
+// for each of its clusters for which ask(bundle, view, cluster) is positive, and with
+// `kKeepsWeights` also the number itself.
 template <bool kKeepsWeights, class Ask>
 __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
                              Tolerances tolerances, LaneClusters& mine, const Ask& ask) {

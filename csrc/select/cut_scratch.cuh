@@ -12,8 +12,8 @@ namespace cuda {
 // Of place_kernel: few, so that a few thousand instances spread over the device.
 constexpr unsigned kPlaceThreads = 64;
 
-// Memory of one round of a cut. It starts as zeros, except for the states of cut_kernel, which
-// place_kernel clears.
+// Memory of one round of a cut. It starts as zeros, except for the states of
+// cut_kernel, which place_kernel clears.
 struct CutScratch {
     unsigned *place_ticket, *cut_ticket;
     unsigned* num_parts;
@@ -21,19 +21,21 @@ struct CutScratch {
     Count *unit_state, *count_state;  // a word for each ticket of cut_kernel
     unsigned num_places;              // how many blocks of cut_kernel run at once
 
-    // How many parts a block takes together: one a warp, or fewer where that spreads them over all
-    // blocks, because warps without a part help the others to ask.
+    // How many parts a block takes together: one a warp, or fewer where that spreads
+    // them over all blocks, because warps without a part help the others to ask.
     __device__ unsigned parts_at_once(unsigned parts) const {
         return min(max(blocks_for(parts, num_places), 1u), kCutWarps);
     }
 };
 
-// The number of blocks of place_kernel. At least one, because an empty scene has a picture, too.
+// The number of blocks of place_kernel. At least one, because an empty scene has a
+// picture, too.
 inline unsigned place_blocks(size_t num_instances) {
     return std::max(1u, blocks_for(num_instances, kPlaceThreads));
 }
 
-// How many zeros a CutScratch needs: for three counters and the states of place_kernel's blocks.
+// How many zeros a CutScratch needs: for three counters and the states of
+// place_kernel's blocks.
 inline size_t zeros_of_round(size_t num_instances) { return 2 + place_blocks(num_instances); }
 
 // `states` has two words a ticket.

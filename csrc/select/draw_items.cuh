@@ -1,7 +1,8 @@
 #pragma once
 
-// The lists that a cut is written to: pairs, or the items of a frame. A lane first counts what it
-// will write for its clusters, and writes once it knows how much is before it.
+// The lists that a cut is written to: pairs, or the items of a frame. A lane first
+// counts what it will write for its clusters, and writes once it knows how much is
+// before it.
 
 #include "select/cut_parts.cuh"
 
@@ -46,8 +47,9 @@ struct PairOutput {
     }
 };
 
-// Neighbouring clusters that are drawn together for the lane's instance; or one cluster that is
-// drawn for all instances of `sharers`, whose bits count from the first instance of the part.
+// Neighbouring clusters that are drawn together for the lane's instance; or one cluster
+// that is drawn for all instances of `sharers`, whose bits count from the first
+// instance of the part.
 struct DrawnRun {
     unsigned k, num_clusters;
     uint32_t sharers;
@@ -56,15 +58,16 @@ struct DrawnRun {
     __device__ unsigned gaussians_an_item() const { return kItemSize / num_instances; }
 };
 
-// Whether a warp is faster when it takes a cluster's gaussians one by one, each for all instances
-// at once, than when it takes the instances one by one. An item costs as much as two more rounds.
+// Whether a warp is faster when it takes a cluster's gaussians one by one, each for all
+// instances at once, than when it takes the instances one by one. An item costs as much
+// as two more rounds.
 __device__ inline bool is_worth_sharing(unsigned num_gaussians, unsigned num_instances) {
     return num_instances > 1 &&
            num_gaussians <= num_instances * (blocks_for(num_gaussians, 32) + 2);
 }
 
-// Calls visit(DrawnRun) in the lane that writes the run. For the whole warp. With a fade, clusters
-// of different weights are not drawn together.
+// Calls visit(DrawnRun) in the lane that writes the run. For the whole warp. With a
+// fade, clusters of different weights are not drawn together.
 template <bool kFades, class Visit>
 __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
     if (!mine.is_alone) {
@@ -96,8 +99,9 @@ __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
     }
 }
 
-// Selected clusters as items. Neighbouring clusters share items, and so do coarse clusters that
-// neighbouring instances have in common. Each item is written for every picture.
+// Selected clusters as items. Neighbouring clusters share items, and so do coarse
+// clusters that neighbouring instances have in common. Each item is written for every
+// picture.
 template <bool kHasFade>
 struct ItemOutput {
     static constexpr bool kFades = kHasFade;

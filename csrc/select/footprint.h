@@ -1,11 +1,11 @@
 #pragma once
 
-// The footprint of a ball on the screen, and the metric of a group, which is its footprint times
-// its weight.
+// The footprint of a ball on the screen, and the metric of a group, which is its
+// footprint times its weight.
 //
-// A decision depends on every bit of it, so it is compiled without contraction, and it never
-// decreases when a ball grows (math/solid_angle.h). The density px2_per_steradian is one number a
-// camera: an upper bound over any ball (camera/camera.h).
+// A decision depends on every bit of it, so it is compiled without contraction, and it
+// never decreases when a ball grows (math/solid_angle.h). The density px2_per_steradian
+// is one number a camera: an upper bound over any ball (camera/camera.h).
 
 #include <cmath>
 
@@ -34,7 +34,8 @@ V3DG_HD inline float footprint_at(float radius, float distance2, const InstanceV
     return x2 < 1.0f ? area : INFINITY;
 }
 
-// Screen area that the ball covers, px2. +inf where the eye is inside or the result would be NaN.
+// Screen area that the ball covers, px2. +inf where the eye is inside or the result
+// would be NaN.
 V3DG_HD inline float footprint_px2(const Ball& ball, const InstanceView& view,
                                    Footprint footprint) {
     if (footprint == Footprint::solid_angle)
@@ -47,18 +48,18 @@ V3DG_HD inline float footprint_px2(const Ball& ball, const InstanceView& view,
     return area >= 0.0f ? area : INFINITY;
 }
 
-// The metric of group g: the screen area, px2, that one gaussian of the clusters made by it stands
-// for, whichever pages are resident. 0 where nothing finer may be drawn, so that the group always
-// fits.
+// The metric of group g: the screen area, px2, that one gaussian of the clusters made
+// by it stands for, whichever pages are resident. 0 where nothing finer may be drawn,
+// so that the group always fits.
 V3DG_HD inline float wanted_metric_px2(const ClusterTable& table, int32_t g,
                                        const InstanceView& view, const SelectRule& rule) {
     const float metric = footprint_px2(table.ball[g], view, rule.footprint) * table.weight[g];
     return table.level[g] <= rule.min_level ? 0.0f : metric;
 }
 
-// The metric that the cut compares: also 0 where the finer clusters are not resident. Both the
-// groups that are wanted and those that are resident are closed towards the root, so their
-// intersection is, too, and the cut stays exact.
+// The metric that the cut compares: also 0 where the finer clusters are not resident.
+// Both the groups that are wanted and those that are resident are closed towards the
+// root, so their intersection is, too, and the cut stays exact.
 V3DG_HD inline float metric_px2(const ClusterTable& table, int32_t g, const InstanceView& view,
                                 const SelectRule& rule) {
     return table.pages.is_resident(g) ? wanted_metric_px2(table, g, view, rule) : 0.0f;

@@ -10,9 +10,9 @@ namespace v3dg {
 // Planes that bound what a camera sees.
 constexpr int kNumPlanes = Intrinsics<double>::kNumPlanes;
 
-// A camera, or two eyes, in the frame and the units of one instance. With two eyes the nearer one
-// counts, and the planes hold both frusta. Aligned, so that a thread reads and writes it in few
-// instructions.
+// A camera, or two eyes, in the frame and the units of one instance. With two eyes the
+// nearer one counts, and the planes hold both frusta. Aligned, so that a thread reads
+// and writes it in few instructions.
 struct alignas(16) InstanceView {
     float eye[3], other_eye[3];
     bool has_other_eye;
@@ -21,7 +21,8 @@ struct alignas(16) InstanceView {
     Plane plane[kNumPlanes];  // what lies outside of one is not drawn
 };
 
-// The planes of both eyes in camera coordinates, the same for all instances of a bundle.
+// The planes of both eyes in camera coordinates, the same for all instances of a
+// bundle.
 using CameraSides = Intrinsics<double>::Sides;
 
 // They lie pad_px outside of the part of the image that is wanted.
@@ -29,9 +30,9 @@ V3DG_HD inline CameraSides sides_of_eyes(const Eyes& eyes, double pad_px) {
     return Intrinsics<double>::sides_of(eyes.camera, eyes.count(), pad_px);
 }
 
-// Places the cameras in front of an instance. `in` are the axes of the first eye, `sides` those of
-// the instance's bundle. Both halves compile it without contraction, so that both give the same
-// bits.
+// Places the cameras in front of an instance. `in` are the axes of the first eye,
+// `sides` those of the instance's bundle. Both halves compile it without contraction,
+// so that both give the same bits.
 V3DG_HD inline InstanceView view_from_instance(const Eyes& eyes, const CameraSides& sides,
                                                const InstanceAxes& in, const Pose& pose,
                                                float importance) {

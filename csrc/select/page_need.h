@@ -1,6 +1,7 @@
 #pragma once
 
-// Which pages a cut needs, where only some pages of a bundle are resident, and how urgently.
+// Which pages a cut needs, where only some pages of a bundle are resident, and how
+// urgently.
 
 #include <cfloat>
 #include <cmath>
@@ -12,8 +13,9 @@
 
 namespace v3dg {
 
-// How urgently the page of a group is wanted: above 1 if this cut would refine the group, at most 1
-// if only a cut of a smaller tolerance would. With a fade it is wanted earlier.
+// How urgently the page of a group is wanted: above 1 if this cut would refine the
+// group, at most 1 if only a cut of a smaller tolerance would. With a fade it is wanted
+// earlier.
 V3DG_HD inline float priority_of(float metric_px2, const SelectRule& rule) {
     const float ratio = metric_px2 * rule.fade.factor / rule.tolerance_px2;
     if (fits(metric_px2, rule)) return ratio <= 1.0f ? ratio : 0.0f;
@@ -28,13 +30,13 @@ struct PageNeed {
     float priority;
 };
 
-// The page that an instance needs because of a cluster that is not culled; the pages above it are
-// needed with it. `priority` maps a group to the priority of its page. Once all pages of a priority
-// above 1, and the pages above those, are resident, the cut is the same as with every page
-// resident: each cluster of that cut has its page, and a cluster that stands in for finer ones
-// requests theirs. It goes on requesting them once they are resident, because all of the finer
-// clusters may be culled, and a page that is needed only while it is absent would come and go
-// without end.
+// The page that an instance needs because of a cluster that is not culled; the pages
+// above it are needed with it. `priority` maps a group to the priority of its page.
+// Once all pages of a priority above 1, and the pages above those, are resident, the
+// cut is the same as with every page resident: each cluster of that cut has its page,
+// and a cluster that stands in for finer ones requests theirs. It goes on requesting
+// them once they are resident, because all of the finer clusters may be culled, and a
+// page that is needed only while it is absent would come and go without end.
 template <class Priority>
 V3DG_HD inline PageNeed page_need(const ClusterTable& table, size_t c, const Priority& priority) {
     const int32_t own = table.own_group[c], parent = table.parent_group[c];

@@ -25,8 +25,8 @@ __device__ inline void tell_need(const InstanceCut<AskedGroups>& cut, int32_t c,
             .bundle = bundle, .page = static_cast<uint32_t>(need.page), .priority = 0.0f};
 }
 
-// Writes the pages that are needed to the host. A thread has a page; a warp writes consecutive
-// words, because scattered writes to the host are slow.
+// Writes the pages that are needed to the host. A thread has a page; a warp writes
+// consecutive words, because scattered writes to the host are slow.
 __device__ inline void report_needs(const NeedList& needs, const SelectRule& rule,
                                     const CutChoice* choice) {
     constexpr unsigned kWords = sizeof(PageRequest) / sizeof(uint32_t);

@@ -1,7 +1,7 @@
 #pragma once
 
-// Places instances in front of the cameras, chooses the source of each one's cut, and deals out the
-// tables that have to be asked as parts. A thread has an instance.
+// Places instances in front of the cameras, chooses the source of each one's cut, and
+// deals out the tables that have to be asked as parts. A thread has an instance.
 
 #include "base/scan.cuh"
 #include "select/cut_scratch.cuh"
@@ -10,12 +10,13 @@ namespace v3dg {
 namespace cuda {
 
 constexpr unsigned kFewBundles = 8;
-// Parts are kept small where there are few instances, so that they spread over the device, too.
+// Parts are kept small where there are few instances, so that they spread over the
+// device, too.
 constexpr unsigned kFewInstances = 8192, kFewLanes = 8;
 
-// The sides of the frustum for each bundle, which would cost every instance eight divisions of
-// doubles. They are an argument of the kernel where there are few bundles, and in memory where
-// there are more.
+// The sides of the frustum for each bundle, which would cost every instance eight
+// divisions of doubles. They are an argument of the kernel where there are few bundles,
+// and in memory where there are more.
 struct BundleSides {
     CameraSides few[kFewBundles];
     const CameraSides* many;  // null where there are few
@@ -26,8 +27,8 @@ struct BundleSides {
     }
 };
 
-// The placement of an instance in front of an eye. Of n instances, instance i has placement eye * n
-// + i.
+// The placement of an instance in front of an eye. Of n instances, instance i has
+// placement eye * n + i.
 __device__ inline Placement placement_of(const InstanceAxes& axes, const Pose& pose, int32_t bundle,
                                          unsigned eye) {
     return {.view = model_view_from_instance(axes, pose),
@@ -35,14 +36,16 @@ __device__ inline Placement placement_of(const InstanceAxes& axes, const Pose& p
             .image = eye};
 }
 
-// One record for each lane of a warp, in shared memory on the way from registers to memory.
+// One record for each lane of a warp, in shared memory on the way from registers to
+// memory.
 template <class Record>
 struct RecordRow {
     Record* records;
 
     __device__ void set(const Record& mine) const { records[threadIdx.x % 32] = mine; }
-    // Writes the records of the lanes that have one to their places, which are consecutive from
-    // `first` on, as whole rows of memory. All lanes of the warp take part.
+    // Writes the records of the lanes that have one to their places, which are
+    // consecutive from `first` on, as whole rows of memory. All lanes of the warp take
+    // part.
     __device__ void write(bool has_one, Record* first) const {
         constexpr unsigned kVectors = sizeof(Record) / sizeof(uint4);
         static_assert(sizeof(Record) % sizeof(uint4) == 0 && alignof(Record) % sizeof(uint4) == 0,
@@ -68,8 +71,8 @@ struct Placed {
     bool is_alone;       // whether a single lane asks them
 };
 
-// Places instance i, if there is one, and writes its view, its placements and its tops. All lanes
-// of the warp take part, with consecutive instances.
+// Places instance i, if there is one, and writes its view, its placements and its tops.
+// All lanes of the warp take part, with consecutive instances.
 __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, const Eyes& eyes,
                                         const BundleSides& sides, const SelectRule& rule,
                                         Placement* placements) {
@@ -94,8 +97,8 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
             const InstanceAxes axes = axes_of_instance(eyes.camera[0], pose);
             view =
                 view_from_instance(eyes, sides[bundle], axes, pose, scene.instances.importance[i]);
-            // Set before it is known whether the instance is seen, so that the axes need not be
-            // kept until then.
+            // Set before it is known whether the instance is seen, so that the axes
+            // need not be kept until then.
             if (placements != nullptr) placement_row.set(placement_of(axes, pose, bundle, 0));
         }
         source = source_of_cut(table, view, rule, kLaneClusters);
@@ -132,11 +135,12 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
     return {.source = source, .asked = asked, .is_alone = is_alone};
 }
 
-// Writes the parts of a block's instances behind those of the blocks before, and clears the states
-// of cut_kernel. For the whole block. Returns how many parts there are up to here.
+// Writes the parts of a block's instances behind those of the blocks before, and clears
+// the states of cut_kernel. For the whole block. Returns how many parts there are up to
+// here.
 //
-// Neighbours that a single lane asks each, with no other table in between, make one part, which the
-// first of them writes.
+// Neighbours that a single lane asks each, with no other table in between, make one
+// part, which the first of them writes.
 __device__ inline unsigned write_parts(const PlacedScene& scene, const Placed& placed, size_t block,
                                        size_t i, const CutScratch& scratch) {
     const unsigned lane = threadIdx.x % 32, below = (1u << lane) - 1;
@@ -174,8 +178,8 @@ __device__ inline unsigned write_parts(const PlacedScene& scene, const Placed& p
                        .first = placed.asked.first + p * kPartSize,
                        .lanes = 0};
     }
-    // Together, the blocks clear as many tickets as there are places. This block also clears those
-    // whose first part is its own where tickets have kCutWarps parts.
+    // Together, the blocks clear as many tickets as there are places. This block also
+    // clears those whose first part is its own where tickets have kCutWarps parts.
     const auto clear = [&](unsigned first, unsigned end, unsigned step) {
         for (unsigned t = first; t < end; t += step)
             scratch.unit_state[t] = scratch.count_state[t] = 0;

@@ -17,8 +17,8 @@ enum class Footprint {
 // The budget of a rule without one.
 constexpr uint64_t kNoBudget = ~uint64_t(0);
 
-// Where a metric is within this factor of the tolerance, both of two levels are drawn, with
-// weights.
+// Where a metric is within this factor of the tolerance, both of two levels are drawn,
+// with weights.
 struct Fade {
     float factor = 1.0f, inverse = 1.0f;
 

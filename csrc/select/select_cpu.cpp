@@ -1,6 +1,6 @@
-// Selection on the CPU. Threads work on chunks of instances. Each question about a group is
-// answered once for an instance, and its clusters look the answer up; so the decision is composed
-// in two passes (select_math.h).
+// Selection on the CPU. Threads work on chunks of instances. Each question about a
+// group is answered once for an instance, and its clusters look the answer up; so the
+// decision is composed in two passes (select_math.h).
 
 #include "select/select.h"
 
@@ -17,7 +17,8 @@ namespace {
 
 constexpr size_t kChunk = 16;
 constexpr size_t kBudgetParts = 16;
-// Runs of a bundle are found where it has this many instances; they cost about as much as one.
+// Runs of a bundle are found where it has this many instances; they cost about as much
+// as one.
 constexpr size_t kManyInstances = 16;
 
 // Answers for the groups of one instance: how far each is refined, and its bins.
@@ -102,8 +103,8 @@ struct SeenInstance {
                     {0, static_cast<uint32_t>(table.ball.size)}};
         if (runs.count == 0 || !table.pages.is_whole()) return asked;
         asked.clusters = clusters_to_ask(table, runs, view, rule, tolerances);
-        // Most clusters have most of the groups, and then finding the range costs more than asking
-        // all groups.
+        // Most clusters have most of the groups, and then finding the range costs more
+        // than asking all groups.
         if (asked.clusters.end - asked.clusters.first > table.num_clusters() / 2) return asked;
         int32_t first = static_cast<int32_t>(table.ball.size), last = -1;
         for (uint32_t c = asked.clusters.first; c < asked.clusters.end; ++c) {
@@ -129,9 +130,10 @@ struct Scratch {
           priority(view.in.needs.empty() ? 0 : view.most_groups) {}
 };
 
-// Answers for the groups of an instance. The inputs are copies, which no write can alias, so that
-// the compiler vectorises the first loop. Which pages are resident would prevent that, so the
-// second loop lowers the answers for groups that are absent or still fade in.
+// Answers for the groups of an instance. The inputs are copies, which no write can
+// alias, so that the compiler vectorises the first loop. Which pages are resident would
+// prevent that, so the second loop lowers the answers for groups that are absent or
+// still fade in.
 template <Footprint footprint, bool kFades>
 void ask_groups(ClusterTable table, const InstanceView view, SelectRule rule,
                 const ClusterRange asked, uint16_t* __restrict refinement) {
@@ -159,7 +161,8 @@ void ask_groups(const SeenInstance& seen, const SelectRule& rule, const ClusterR
         ask_groups<Footprint::solid_angle, false>(seen.table, seen.view, rule, asked, refinement);
 }
 
-// The first pass of the decision: writes the clusters of positive weight, and returns their number.
+// The first pass of the decision: writes the clusters of positive weight, and returns
+// their number.
 size_t find_sufficient(const ClusterTable table, const InstanceView view, const SelectRule rule,
                        const ClusterRange asked, const uint16_t* __restrict refinement,
                        int32_t* __restrict cluster) {
@@ -226,8 +229,8 @@ void select_instance(const View& view, const SelectRule& rule, size_t i, Scratch
     });
 }
 
-// Adds to `change`, for each bin of a budget, by how many gaussians the cut of instance i differs
-// from that of the bin before. `bins` has room for those of its groups.
+// Adds to `change`, for each bin of a budget, by how many gaussians the cut of instance
+// i differs from that of the bin before. `bins` has room for those of its groups.
 void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins,
                     std::vector<int64_t>& change) {
     const SelectRule& rule = view.in.rule;
@@ -258,7 +261,8 @@ void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins,
 // `least_count` is the number of gaussians of the coarsest cut.
 bool meet_budget(const View& view, SelectRule& rule, int64_t& least_count) {
     const size_t num_instances = view.in.instances.bundle.size;
-    // Each part has every kBudgetParts-th instance, because neighbours cost about the same.
+    // Each part has every kBudgetParts-th instance, because neighbours cost about the
+    // same.
     std::vector<std::vector<int64_t>> changes(std::min(kBudgetParts, num_instances));
     parallel_for(changes.size(), 1, [&](size_t part) {
         changes[part].assign(kNumBudgetBins + 1, 0);

@@ -8,16 +8,16 @@
 namespace v3dg {
 namespace cuda {
 
-// Appends the clusters that the threads of a block draw to a list, in the order of the tickets and
-// then of the threads. For the whole block.
+// Appends the clusters that the threads of a block draw to a list, in the order of the
+// tickets and then of the threads. For the whole block.
 template <class Output>
 __device__ void write_clusters(const LaneClusters& mine, unsigned ticket, bool is_last,
                                Count* unit_state, Count* count_state, const Output& output) {
     __shared__ Count before_units, before_gaussians;
     const WriteCount count = output.count(mine);
-    // Both numbers are in one word. An item has up to 256 gaussians, so the 28 bits of units
-    // suffice as long as the 36 bits of gaussians do. Overflow of these is lost and never counts as
-    // a unit.
+    // Both numbers are in one word. An item has up to 256 gaussians, so the 28 bits of
+    // units suffice as long as the 36 bits of gaussians do. Overflow of these is lost
+    // and never counts as a unit.
     constexpr unsigned kUnitBits = 28, kUnits = (1u << kUnitBits) - 1;
     Count in_block;
     const Count before_in_block =
