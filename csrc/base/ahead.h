@@ -1,6 +1,6 @@
 #pragma once
 
-// Makes things on threads of their own before they are needed.
+// Produces items on background threads before they are needed.
 
 #include <omp.h>
 
@@ -16,9 +16,9 @@
 
 namespace v3dg {
 
-// Makes things number 0 to count - 1, which are used in that order. Thread i % num_threads makes
-// number i, and OpenMP gives it one thread. Number i alone occupies place i % num_places until it
-// was used.
+// Produces items 0 to count - 1, which are consumed in that order. Thread i %
+// num_threads produces item i, with a single OpenMP thread. Item i is stored in slot i
+// % num_places until it has been consumed.
 class Ahead {
   public:
     Ahead(uint64_t count, unsigned num_threads, unsigned num_places,
@@ -39,14 +39,15 @@ class Ahead {
     Ahead(const Ahead&) = delete;
     Ahead& operator=(const Ahead&) = delete;
 
-    // Waits for the next thing and returns its place. Rethrows what was thrown while it was made.
+    // Waits for the next item and returns its slot. Rethrows an exception thrown while
+    // the item was produced.
     size_t wait_for_next() {
         std::unique_lock<std::mutex> lock(busy_);
         changed_.wait(lock, [&] { return is_made_[used_ % num_places_] || error_; });
         if (error_) std::rethrow_exception(error_);
         return used_ % num_places_;
     }
-    // Releases the place of the next thing for another one.
+    // Releases the slot of the next item for reuse.
     void next_is_used() {
         const std::lock_guard<std::mutex> lock(busy_);
         is_made_[used_++ % num_places_] = false;

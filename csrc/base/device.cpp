@@ -1,4 +1,4 @@
-// Devices, and the pool that their stream-ordered memory comes from.
+// Devices, and the memory pool for stream-ordered allocations.
 
 #include "base/device.h"
 
@@ -63,7 +63,7 @@ void allow_shared_memory(const void* kernel, size_t bytes, const char* name) {
 }
 
 bool can_start_early(const void* kernel) {
-    // The first architecture whose kernels can wait for the one before them.
+    // The first architecture whose kernels can wait for their predecessor.
     constexpr int kFirst = 90;
     static std::mutex mutex;
     static std::map<std::pair<int, const void*>, bool> known;
@@ -79,7 +79,8 @@ bool can_start_early(const void* kernel) {
     return found->second;
 }
 
-// The package has a pool of its own, so that no other library decides how long memory is kept.
+// The package has its own pool, so that no other library decides how long memory is
+// kept.
 static cudaMemPool_t pool_of_current_device() {
     static std::mutex mutex;
     static std::vector<cudaMemPool_t> pools;
@@ -93,8 +94,8 @@ static cudaMemPool_t pool_of_current_device() {
         properties.location.id = device;
         cudaMemPool_t pool;
         check(cudaMemPoolCreate(&pool, &properties), "cudaMemPoolCreate");
-        // Memory that was given back is kept until some allocation fails, because mapping it anew
-        // costs milliseconds.
+        // Freed memory stays in the pool until an allocation fails, because mapping it
+        // again costs milliseconds.
         uint64_t keep = uint64_t(1) << 30;
         check(cudaMemPoolSetAttribute(pool, cudaMemPoolAttrReleaseThreshold, &keep),
               "cudaMemPoolSetAttribute");
@@ -111,8 +112,8 @@ void* allocate(size_t bytes, cudaStream_t stream) {
     void* pointer = nullptr;
     cudaError_t error = cudaMallocFromPoolAsync(&pointer, bytes, pool, stream);
     if (error == cudaErrorMemoryAllocation) {
-        // The pool's free memory may be fragmented, and other streams may be about to give memory
-        // back.
+        // The free memory of the pool may be fragmented, and pending work on other
+        // streams may soon free more.
         cudaGetLastError();
         check(cudaDeviceSynchronize(), "cudaDeviceSynchronize");
         check(cudaMemPoolTrimTo(pool, 0), "cudaMemPoolTrimTo");
@@ -134,7 +135,7 @@ void release(void* pointer, int device, cudaStream_t stream) noexcept {
     int current = device;
     const bool is_elsewhere = cudaGetDevice(&current) == cudaSuccess && current != device &&
                               cudaSetDevice(device) == cudaSuccess;
-    // At exit the driver may be gone already, and then so is the memory.
+    // At exit the driver may already be unloaded, which has freed the memory.
     if (cudaFreeAsync(pointer, stream) != cudaSuccess) cudaGetLastError();
     if (is_elsewhere && cudaSetDevice(current) != cudaSuccess) cudaGetLastError();
 }
@@ -168,12 +169,12 @@ StreamMutex::StreamMutex() {
 
 StreamMutex::~StreamMutex() {
     if (cudaEventDestroy(done_) != cudaSuccess)
-        cudaGetLastError();  // the driver may be gone at exit
+        cudaGetLastError();  // the driver may be unloaded at exit
 }
 
 void StreamMutex::wait() const noexcept {
     if (cudaEventSynchronize(done_) != cudaSuccess)
-        cudaGetLastError();  // the driver may be gone at exit
+        cudaGetLastError();  // the driver may be unloaded at exit
 }
 
 StreamLock::StreamLock(StreamMutex& mutex, cudaStream_t stream)
@@ -186,7 +187,7 @@ StreamLock::~StreamLock() {
     if (is_captured_) return;
     mutex_.last_ = stream_;
     if (cudaEventRecord(mutex_.done_, stream_) != cudaSuccess)
-        cudaGetLastError();  // the next lock will see it
+        cudaGetLastError();  // the next lock reports it
 }
 
 void trim_pool(cudaStream_t stream) {

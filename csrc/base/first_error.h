@@ -8,8 +8,8 @@
 
 namespace v3dg {
 
-// Carries an exception out of a parallel loop: of all that were thrown, the one of the lowest
-// index.
+// Carries an exception out of a parallel loop: if several were thrown, the one with the
+// lowest index.
 class FirstError {
   public:
     template <class Body>

@@ -1,5 +1,5 @@
-// Each block ranks the gaussians of one cell, of which the median split makes eight a group; the
-// rows that are kept are then compacted in ascending order.
+// Each block ranks the gaussians of one cell, one of the eight into which the median
+// split divides a group. Then the surviving rows are compacted in ascending order.
 
 #include <cub/device/device_select.cuh>
 
@@ -17,7 +17,8 @@ namespace {
 
 constexpr unsigned kBlockSize = 128;
 
-// A cell of the split, as positions in `order`, and how many of its gaussians are kept.
+// A cell of the split, as a range of positions in `order`, and how many of its
+// gaussians survive.
 struct Cell {
     int64_t first, last, share;
 };
@@ -37,7 +38,7 @@ __global__ void keep_kernel(const Cell* cells, const int64_t* order, const doubl
     for (int64_t i = cell.first + threadIdx.x; i < cell.last; i += kBlockSize) {
         const double score = score_at[i];
         int64_t rank = 0;
-        // Rows ascend within a cell, so of equal scores the first has the lower index.
+        // Rows ascend within a cell, so the first of equal scores has the lowest index.
         for (int64_t k = cell.first; k < cell.last; ++k) {
             const double other = score_at[k];
             rank += other > score || (other == score && k < i);
