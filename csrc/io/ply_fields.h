@@ -1,6 +1,7 @@
 #pragma once
 
-// Which number in a row of a .ply file goes where in a gaussian, and how it is converted.
+// The mapping from the numbers in a row of a .ply file to a gaussian, and their
+// conversion.
 
 #include <algorithm>
 #include <cmath>
@@ -11,35 +12,36 @@
 
 namespace v3dg {
 
-// Bytes that all threads convert together when one thread has to cut the rows.
+// Bytes that all threads convert together if a single thread has to separate the rows.
 constexpr size_t kPlyChunkBytes = size_t(1) << 22;
 
-// The slots of a gaussian, in the order of its numbers; after kSh they are in memory's order.
+// The slots of a gaussian, in the order of its numbers; from kSh on in the order of
+// memory.
 enum PlySlot : size_t { kMean = 0, kQuat = 3, kScale = 7, kOpacity = 10, kSh = 11 };
 
-// Where in a row the number for a slot is.
+// The position in a row of the number for a slot.
 struct PlyField {
-    size_t property;  // among the properties of the vertex element
+    size_t property;  // index among the properties of the vertex element
     size_t offset;    // bytes from the start of the row, without lists
     PlyType type;
 };
 
-// K of the vertex element. Throws PlyError.
+// Returns K of the vertex element. Throws PlyError.
 size_t num_sh_of(const PlyElement& vertex);
 
-// [kSh + 3 * K] the field of each slot. Throws PlyError if a property is missing, there twice or a
-// list.
+// Returns [kSh + 3 * K] the field of each slot. Throws PlyError if a property is
+// missing, occurs twice or is a list.
 std::vector<PlyField> fields_of(const PlyElement& vertex, size_t num_sh);
 
-// The range of numbers whose squares doubles hold to the last digit.
+// The smallest number whose square a double represents with full precision.
 constexpr double kLeastSquared = 1e-140;
 constexpr double kMostSquared = 1e140;
 
-// Of a squared length: a rounded unit quaternion is off by 3e-7.
+// For squared lengths: that of a rounded unit quaternion differs from 1 by 3e-7.
 constexpr double kUnitTolerance = 1e-6;
 
-// Multiplies a quaternion by a power of two if doubles cannot hold its squares. Quaternions that
-// are zero or not finite stay unchanged.
+// Multiplies a quaternion by a power of two if doubles cannot represent its squares.
+// Quaternions that are zero or not finite stay unchanged.
 inline void scale_extreme(double quat[4]) {
     double largest = 0;
     for (size_t j = 0; j < 4; ++j) largest = std::max(largest, std::abs(quat[j]));
@@ -49,7 +51,7 @@ inline void scale_extreme(double quat[4]) {
     for (size_t j = 0; j < 4; ++j) quat[j] = std::ldexp(quat[j], -exponent);
 }
 
-// Converts and stores gaussian i; load(slot) returns the number that the file holds for a slot.
+// Converts and stores gaussian i; load(slot) returns the number in the file for a slot.
 template <class Load>
 void store_gaussian(const Load& load, size_t i, size_t num_sh, const PlyGaussians<float>& out) {
     for (size_t j = 0; j < 3; ++j) out.means[3 * i + j] = static_cast<float>(load(kMean + j));
