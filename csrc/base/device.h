@@ -7,12 +7,12 @@
 
 #include <cuda_runtime.h>
 
-#include <mutex>
 #include <new>
 #include <stdexcept>
 #include <string>
 #include <utility>
 
+#include "base/mutex.h"
 #include "base/span.h"
 
 namespace v3dg {
@@ -86,24 +86,26 @@ class StreamMutex {
 
   private:
     friend class StreamLock;
-    std::mutex busy_;
+    void acquire(cudaStream_t stream, bool is_captured) V3DG_ACQUIRE(busy_);
+    void release(cudaStream_t stream, bool is_captured) noexcept V3DG_RELEASE(busy_);
+
+    Mutex busy_;
     cudaEvent_t done_ = nullptr;
-    cudaStream_t last_ = nullptr;
+    cudaStream_t last_ V3DG_GUARDED_BY(busy_) = nullptr;
 };
 
 // Holds a StreamMutex. Meanwhile the memory belongs to one thread, and work that this
 // thread enqueues on the stream runs after the work that was enqueued under the
 // previous lock. The lock does not order captured work; the code that replays the graph
 // has to do so.
-class StreamLock {
+class V3DG_SCOPED_CAPABILITY StreamLock {
   public:
-    StreamLock(StreamMutex& mutex, cudaStream_t stream);
-    ~StreamLock();
+    StreamLock(StreamMutex& mutex, cudaStream_t stream) V3DG_ACQUIRE(mutex.busy_);
+    ~StreamLock() V3DG_RELEASE();
     StreamLock(const StreamLock&) = delete;
     StreamLock& operator=(const StreamLock&) = delete;
 
   private:
-    const std::lock_guard<std::mutex> lock_;
     StreamMutex& mutex_;
     cudaStream_t stream_;
     bool is_captured_;
