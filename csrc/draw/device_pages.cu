@@ -55,7 +55,7 @@ Pinned<T> pinned(size_t count) {
     if (error == cudaErrorMemoryAllocation) {
         cudaGetLastError();
         throw OutOfMemory("cuda: out of memory: the host has no " + std::to_string(bytes) +
-                          " bytes that a device can read");
+                          " bytes of pinned memory");
     }
     check(error, "cudaMallocHost");
     return Pinned<T>(static_cast<T*>(memory));
@@ -335,9 +335,8 @@ void DevicePages::note_arrivals(Flight& flight, cudaStream_t stream) {
 PartlyResident DevicePages::begin_frame(bool is_bounded, Arrive arrive, cudaStream_t stream) {
     if (is_capturing(stream))
         throw std::runtime_error(
-            "memory: expected no CUDA graph of a pool, whose pages come and go; capture a renderer "
-            "without "
-            "memory");
+            "memory: a renderer with a pool cannot be captured in a CUDA graph, because its pages "
+            "change; capture a renderer without memory");
     if (under_way_.size() == kMostFlights)
         check(cudaEventSynchronize(under_way_.front()->done), "a frame");
     note_flights(false);

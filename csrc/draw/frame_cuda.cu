@@ -317,9 +317,8 @@ const FrameCounters& Drawing::finish() {
     if (is_captured_) {
         if (!was_drawn())
             throw std::runtime_error(
-                "frame: a captured graph met more than it has room for; draw once outside of the "
-                "capture "
-                "what it will meet, and capture it again");
+                "frame: a captured graph exceeded its buffers; draw the largest frame once outside "
+                "of a capture, then capture again");
         return *slot_->counters;
     }
     settle();

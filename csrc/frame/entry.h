@@ -13,9 +13,9 @@ namespace v3dg {
 constexpr int kBlockSize = 4;  // px
 constexpr int kTileBlocks = kTileSize / kBlockSize;
 
-// Tables from the columns, or the rows, of a box in a tile to the blocks of the tile. An
-// index has the first column in its lower 3 bits and the last one in the upper 3. The
-// result is a mask with a bit per block, row by row.
+// Tables from the columns, or the rows, of a box in a tile to the blocks of the tile.
+// An index has the first column in its lower 3 bits and the last one in the upper 3.
+// The result is a mask with a bit per block, row by row.
 struct BlocksOfBox {
     uint64_t columns[64] = {}, rows[64] = {};
     constexpr BlocksOfBox() {

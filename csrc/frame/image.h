@@ -31,8 +31,8 @@ struct StopsBehind {
     T transmittance;
 };
 
-// The value of `min_transmittance` that selects StopsBefore. It is negative; other values
-// select StopsBehind.
+// The value of `min_transmittance` that selects StopsBefore. It is negative; other
+// values select StopsBehind.
 constexpr float kStopsBefore = -1.0f;
 template <class T, class Draw>
 V3DG_INLINE void with_stop(float min_transmittance, const Draw& draw) {

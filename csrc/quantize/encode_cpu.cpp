@@ -64,8 +64,9 @@ void check_is_finite(const GaussianRows<const float>& in, size_t row) {
     for (int k = 0; k < 4; ++k) sum += in.quats[4 * row + k] * 0;
     for (int k = 0; k < num_sh; ++k) sum += in.sh[num_sh * row + k] * 0;
     if (!(sum == 0))
-        throw std::invalid_argument("gaussians: expected finite values, got others at " +
-                                    std::to_string(row));
+        throw std::invalid_argument(
+            "gaussians: expected finite values, got infinite or NaN ones at " +
+            std::to_string(row));
 }
 
 // Sets the scales, as bits of floats, and the quaternion's x, y and z. The axes stay as

@@ -30,7 +30,7 @@ ClusterRanges valid_ranges(const uint32_t* words, int sh_degree, size_t cluster,
     const CodedRanges coded = ranges_at(words, sh_degree);
     if (!are_valid(coded.code, coded.sh_steps, sh_degree))
         throw std::invalid_argument("cluster " + std::to_string(cluster) + whose +
-                                    ": expected ranges of finite numbers, got others");
+                                    ": expected finite ranges, got infinite or NaN ones");
     return decoded(coded, sh_degree);
 }
 

@@ -124,11 +124,10 @@ void PagePolicy::plan_memory(const PoolMemory& memory) {
     const size_t slot = memory.bytes_of(plan_.slot_rows, plan_.slot_clusters);
     const size_t least = roots + (num_pages > 0 ? bundles_.size() * slot : 0);
     if (memory.num_bytes < least || memory.most_rows < plan_.num_rows())
-        throw std::invalid_argument(
-            "memory: expected room for at least " + std::to_string(least) +
-            " bytes of gaussians, the coarsest of all bundles and a page more of "
-            "each, got room for " +
-            std::to_string(memory.num_bytes));
+        throw std::invalid_argument("memory: expected room for at least " + std::to_string(least) +
+                                    " bytes of gaussians, which are the coarsest pages of all "
+                                    "bundles and one more page of each, got room for " +
+                                    std::to_string(memory.num_bytes));
     plan_.num_slots =
         std::min({(memory.num_bytes - roots) / slot,
                   (memory.most_rows - plan_.first_slot_row) / plan_.slot_rows, num_pages});

@@ -62,7 +62,7 @@ static void read_one(const PosixFile& file, Span<const int64_t> places, PageRead
     const auto size = static_cast<size_t>(places[page + 1] - places[page]);
     try {
         if (file.read_at(places[page], reinterpret_cast<char*>(reading.bytes), size) < size)
-            reading.error.emplace(name_of(page) + " is not there; the file was truncated", true);
+            reading.error.emplace(name_of(page) + " is missing; the file was truncated", true);
     } catch (const std::system_error& error) {
         reading.error.emplace(name_of(page) + ": " + error.code().message(), false,
                               error.code().value());
