@@ -110,7 +110,8 @@ def render(
     one_of(color_by, "color_by", get_args(ColorBy))
     frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     cut_request = CutRequest(tolerance, budget, min_level, fade)
-    shade = shade_of(background, min_transmittance, isinstance(opened_subject, Gaussians), depth)
+    is_asset = isinstance(opened_subject, Gaussians)
+    shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=depth)
 
     def picture(view: Camera | StereoCamera) -> Picture:
         check_camera(view)

@@ -92,10 +92,11 @@ class AutoFrame:
     def chosen(self, subject: Subject) -> SceneFrame | PoolFrame:
         """Return the frame that currently draws the subject."""
         with residency.turn(self.device):
-            resident = residency.scene(subject, self.device, self._resident)
-            self._resident = resident
-            if self._references is not resident.references:
-                self._choose(resident)
+            if self._resident is None or not self._resident.is_of(subject):
+                resident = residency.scene(subject, self.device)
+                self._resident = resident
+                if self._references is not resident.references:
+                    self._choose(resident)
             return self._frame
 
     def _choose(self, resident: ResidentScene) -> None:
@@ -129,7 +130,11 @@ def frame_of(
     one_of(color_by, "color_by", get_args(ColorBy))
     if isinstance(subject, Gaussians):
         is_without = memory is None or memory == "auto"
-        check("memory", is_without, f"None for an asset, without pages, got {memory}; leave it out")
+        check(
+            "memory",
+            is_without,
+            f"None for an asset, which has no pages, got {memory}; leave it out",
+        )
         return AssetFrame(subject, color_by, device)
     frame: SceneFrame | PoolFrame | AutoFrame
     if memory is None:

@@ -189,4 +189,4 @@ def _finish(picture: Picture) -> None:
 
 def _refuse_given_cut(request: FrameRequest) -> None:
     is_selected = request.selection is None
-    check("cut", is_selected, "none for a pool, which has its own, got one; give memory=None")
+    check("cut", is_selected, "none for a pool, which selects its own, got one; give memory=None")

@@ -131,7 +131,8 @@ class Renderer:
         """Draw as `v3dg.render` does, using what is resident."""
         check_camera(camera)
         subject = self._subject
-        shade = shade_of(background, min_transmittance, isinstance(subject, Gaussians), depth)
+        is_asset = isinstance(subject, Gaussians)
+        shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=depth)
         cut_request = CutRequest(tolerance, budget, min_level, fade)
         request = FrameRequest(camera, cut_request, shade, cut)
         return self._frame.chosen(subject).draw(subject, request, self._steps)

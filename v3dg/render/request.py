@@ -132,7 +132,7 @@ class FrameRequest(NamedTuple):
 
 
 def shade_of(
-    background: Sequence[float], min_transmittance: float | None, is_asset: bool, depth: bool
+    background: Sequence[float], min_transmittance: float | None, *, is_asset: bool, depth: bool
 ) -> _core.Shade:
     """Return the shade of a picture for the core; the arguments are those of
     `v3dg.render`.
@@ -141,12 +141,12 @@ def shade_of(
     default for assets.
     """
     if background is BLACK and min_transmittance is None:
-        return _known_shade(is_asset, bool(depth))
-    return _shade(background, min_transmittance, is_asset, bool(depth))
+        return _known_shade(is_asset=is_asset, depth=bool(depth))
+    return _shade(background, min_transmittance, is_asset=is_asset, depth=bool(depth))
 
 
 def _shade(
-    background: Sequence[float], min_transmittance: float | None, is_asset: bool, depth: bool
+    background: Sequence[float], min_transmittance: float | None, *, is_asset: bool, depth: bool
 ) -> _core.Shade:
     if min_transmittance is not None:
         stop = real(min_transmittance, "min_transmittance", "a share of light, 0 to 0.99", 0, 0.99)
@@ -161,7 +161,7 @@ def _shade(
 
 
 @lru_cache(4)
-def _known_shade(is_asset: bool, depth: bool) -> _core.Shade:
+def _known_shade(*, is_asset: bool, depth: bool) -> _core.Shade:
     """Return the shade of a picture with default arguments, which most pictures
     have."""
-    return _shade(BLACK, None, is_asset, depth)
+    return _shade(BLACK, None, is_asset=is_asset, depth=depth)

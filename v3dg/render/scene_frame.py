@@ -150,7 +150,7 @@ def _check_cut(
     arguments besides a cut."""
     check_type("cut", cut, Selection, "a Selection of v3dg.select")
     for name, value in request._asdict().items():
-        check(name, not value, f"nothing beside a cut, which has been chosen, got {value}")
+        check(name, not value, f"no value besides a cut, got {value}")
     is_from_bundle = isinstance(subject, Bundle) and cut.scene.bundles == (subject,)
     check(
         "cut",
