@@ -116,7 +116,7 @@ def _pick_from_pool(
     check("renderer", _draws(renderer, scene), expected)
     pool = renderer.pool_frame
     if pool is None or pool.device.is_cuda:
-        refuse("renderer", f"one with a pool on the CPU, got {renderer}")
+        refuse("renderer", f"a renderer with a pool on the CPU, got {renderer}")
     return pool.pick(renderer.subject, pixel, rule)
 
 

@@ -149,7 +149,7 @@ def write_picture(path: str | os.PathLike[str], image: Array) -> None:
     pixels = checked("image", image)
     if pixels.dtype != np.uint8:
         check("image", pixels.dtype.kind == "f", f"uint8, or floats in [0,1], got {pixels.dtype}")
-        check("image", not np.isnan(pixels).any(), "colours, got some that are no numbers (nan)")
+        check("image", not np.isnan(pixels).any(), "colours, got NaN")
         pixels = to_8bit(pixels)
     kind = "JPEG"
     if path.suffix.lower() == ".png":

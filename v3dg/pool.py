@@ -101,8 +101,8 @@ class Pool:
                 last_arrival = time_of_step
             elif time_of_step - last_arrival > timeout:
                 raise TimeoutError(
-                    f"settle: {step.num_absent} pages are missing and none came in for {timeout:g} "
-                    "s; is the disk or the server at work?"
+                    f"settle: {step.num_absent} pages are missing and none arrived for {timeout:g} "
+                    "s; does the disk or the server respond?"
                 )
             core.wait(_WAIT_SECONDS)
 

@@ -82,7 +82,7 @@ def run_fit(
     if failure:
         raise failure[0]
     if not has_ended.is_set():
-        raise MemoryError("a thread that had started ended at once")
+        raise MemoryError("a new thread ended at once, for lack of memory")
     show(state)
     return result[0]
 
