@@ -21,7 +21,7 @@ from v3dg.gaussians import Gaussians
 from v3dg.image import Image, RenderedImage, Stats
 from v3dg.io import read_asset, write_asset
 from v3dg.levels import BuildConfig, build_bundle
-from v3dg.opening import open as open  # not in __all__: with `*` it would hide the one of Python
+from v3dg.opening import open as open  # not in __all__: `import *` would hide Python's own `open`
 from v3dg.opening import read_usd_scene
 from v3dg.pick import Pick, pick
 from v3dg.rasterize import rasterize

@@ -8,7 +8,7 @@ from typing import NamedTuple
 class Extra(NamedTuple):
     """An optional package."""
 
-    requirement: str  # in the syntax of pip
+    requirement: str  # in pip's syntax
     purpose: str
 
 
@@ -26,7 +26,7 @@ EXTRAS = {
 
 
 def missing(module: str) -> str:
-    """The message for a package that is not installed, or too old."""
+    """Return the message about a package that is not installed, or too old."""
     extra = EXTRAS[module]
     packages = [package for package in EXTRAS.values() if package.purpose == extra.purpose]
     needed = " ".join(f"'{package.requirement}'" for package in packages)
@@ -37,7 +37,7 @@ def missing(module: str) -> str:
 
 
 def load(module: str) -> ModuleType:
-    """Import a module; ImportError says how to install its package."""
+    """Import a module; the ImportError says how to install its package."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -16,12 +16,12 @@ and a text."""
 
 _LOG = logging.getLogger("v3dg")
 _LOG.addHandler(logging.NullHandler())
-_LINES = 4  # lines that a log gets for one piece of work
+_LINES = 4  # number of log lines for one piece of work
 _LEAST_SCALED = 10_000  # from this total on, a bar counts in thousands and millions
 
 
 class Bar:
-    """The display of the work that is done of a total.
+    """The display of how much of a total is done.
 
     Raises:
         TypeError: ``progress`` is neither a boolean nor a function.
@@ -66,7 +66,7 @@ class Bar:
     __exit__ = close
 
     def update(self, count: int, text: str = "") -> None:
-        """Add `count` to the work done, and show `text` about the work in progress."""
+        """Add `count` to the finished work, and show `text` about the current work."""
         self.num_done += count
         if text:
             self._text = f"{self._name}, {text}"
@@ -84,7 +84,7 @@ class Bar:
 
 
 def counted(items: Iterable[T], total: int, name: str, progress: Progress) -> Iterator[T]:
-    """The items, each counted when the next one is asked for."""
+    """Yield the items; each counts as done when the next one is requested."""
     with Bar(total, name, progress) as bar:
         for item in items:
             yield item

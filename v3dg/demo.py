@@ -1,9 +1,9 @@
-"""A demonstration without a download: builds a bundle, places it 2,000 times, and draws
-it from near to far.
+"""A demonstration without a download: it builds a bundle, places it 2,000 times, and
+draws it from near to far.
 
-The result is one picture: the full asset above, the selected cut below, with a column
-for each distance. Every picture has the number of gaussians, the time, and the error
-against the full asset at twice the resolution.
+The result is one picture with a column per distance: the full asset above, the selected
+cut below. Every panel states the number of gaussians, the time, and the error against
+the full asset at twice the resolution.
 """
 
 import math
@@ -25,10 +25,10 @@ from v3dg.render import render
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
 
-# Distance from the eye to the donut in the middle, in radii of a donut, and height of
-# the view in radians.
+# Distance from the eye to the central donut, in radii of a donut, and elevation in
+# radians.
 VIEWS = ((3.3, 0.36), (8.0, 0.36), (20.0, 0.36), (46.0, 0.38), (95.0, 0.42))
-_AZIMUTH = 0.80  # rad; the sun is then behind the camera
+_AZIMUTH = 0.80  # radians; the sun is then behind the camera
 _SKY = (0.6, 0.73, 0.85)
 
 
@@ -44,11 +44,11 @@ def run_demo(
     progress: Progress = True,
     device: str = "auto",
 ) -> JsonObject:
-    """Make an asset, build and place it, draw and measure every distance, and write the
-    picture.
+    """Make an asset, build and place it, draw and measure it at every distance, and
+    write the picture.
 
     Args:
-        num_gaussians: Number of gaussians of the asset.
+        num_gaussians: Number of gaussians in the asset.
         size: Width and height of one panel in px.
         views: Distance and elevation of every column.
         device: The device that builds and draws: "auto", "cpu" or "cuda".
@@ -98,8 +98,8 @@ def _field(bundle: Bundle, count: int, seed: int) -> Scene:
 
 
 def _camera(distance: float, elevation: float, size: tuple[int, int]) -> Camera:
-    """A camera that looks at the middle of the field: at a donut from near, at the
-    whole hill from far."""
+    """Return a camera that looks at the middle of the field: at one donut from near, at
+    the whole hill from far."""
     horizontal = distance * math.cos(elevation)
     target = 0.42 / (1 + (distance / 12) ** 2)
     x = math.sin(_AZIMUTH) * horizontal
@@ -109,7 +109,7 @@ def _camera(distance: float, elevation: float, size: tuple[int, int]) -> Camera:
 
 
 class _Panel(NamedTuple):
-    """One picture of the result, with its measurements."""
+    """One panel of the result, with its measurements."""
 
     numbers: JsonObject
     text: str
@@ -119,7 +119,7 @@ class _Panel(NamedTuple):
 def _panels(
     scene: Scene, camera: Camera, tolerance: float, device: Device
 ) -> tuple[_Panel, _Panel]:
-    """The pictures of the full asset and of the selected cut."""
+    """Return the pictures of the full asset and of the selected cut."""
     truth = draw_truth(scene, camera, device, background=_SKY)
     full = _drawn(scene, camera, 0.0, truth, device)
     selected = _drawn(scene, camera, tolerance, truth, device)

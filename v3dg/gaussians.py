@@ -21,11 +21,11 @@ Array: TypeAlias = (
     Any  # numpy.ndarray or torch.Tensor; a union would make every use of a field a type error
 )
 
-_NUM_SH = {1: 0, 4: 1, 9: 2, 16: 3}  # coefficients a channel -> degree
+_NUM_SH = {1: 0, 4: 1, 9: 2, 16: 3}  # coefficients per channel -> degree
 
 
 def _is_tensor(value: object) -> bool:
-    """Whether `value` is a torch tensor; does not import torch."""
+    """Return whether `value` is a torch tensor, without importing torch."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(value, torch.Tensor)
 
@@ -43,14 +43,14 @@ class Gaussians:
     """N 3D Gaussians: NumPy arrays or torch tensors, float32, C-contiguous, all of one
     kind on one device.
 
-    Torch tensors may all be float64 instead, which `rasterize` then computes in; all
-    else takes float32.
+    Torch tensors may all be float64 instead; `rasterize` then computes in float64,
+    other functions require float32.
 
     Args:
         means: (N, 3) centres, in world units of the asset's own frame.
-        quats: (N, 4) rotations as w, x, y, z; need not have length one.
+        quats: (N, 4) rotations as w, x, y, z; they need not be normalised.
         scales: (N, 3) standard deviations along the rotated axes, in world units; not
-            their logs.
+            logarithms.
         opacities: (N,) in [0, 1]; not logits.
         sh: (N, K, 3) spherical harmonics of RGB, K = (degree + 1)², degree 0 to 3;
             colour is their value in the view direction plus ½.
@@ -102,7 +102,8 @@ class Gaussians:
 
     @property
     def rows(self) -> _core.Rows:
-        """The arrays for the compiled operations, without gradients; they share memory.
+        """The arrays for the compiled operations, without gradients; they share
+        memory.
 
         Tensors on a CUDA device that are not aligned to 16 bytes are copied.
         """
@@ -114,19 +115,20 @@ class Gaussians:
         return _core.Rows(*map(_aligned, tensors))
 
     def subset(self, index: slice | Sequence[int] | Array) -> Gaussians:
-        """Take the gaussians that a slice, an array of M indices or a mask of N
-        booleans names, in its order.
+        """Return the gaussians selected by a slice, an array of M indices or a mask of
+        N booleans, in its order.
 
-        A slice of step 1 shares memory with this object; everything else is copied.
+        A slice with step 1 shares memory with this object; all other results are
+        copies.
 
         Raises:
             TypeError: the index is a single number, or not made of integers or
                 booleans.
             ValueError: the index has more than one dimension.
-            IndexError: out of range, or a mask of another length.
+            IndexError: an index is out of range, or a mask has another length.
         """
         if isinstance(index, slice):
-            if index.step not in (None, 1):  # torch knows no negative steps
+            if index.step not in (None, 1):  # torch does not support negative steps
                 index = np.arange(*index.indices(len(self)))
         else:
             index = _checked_index(index)
@@ -136,7 +138,7 @@ class Gaussians:
                 rows = rows.cpu().numpy()
             if isinstance(rows, slice) or rows.dtype == bool:
                 return self._map(lambda array: np.ascontiguousarray(array[rows]))
-            # Unlike [rows], releases the GIL.
+            # take() releases the GIL, unlike [rows].
             return self._map(lambda array: array.take(rows, axis=0))
         if not isinstance(index, slice):
             import torch
@@ -152,10 +154,10 @@ class Gaussians:
         position: Array | npt.ArrayLike = (0.0, 0.0, 0.0),
         scale: float = 1.0,
     ) -> Gaussians:
-        """Return the gaussians in another frame: p goes to scale * rotation p +
-        position; colours rotate.
+        """Return the gaussians transformed by p -> scale * rotation p + position, with
+        rotated colours.
 
-        The result is of the same kind and on the same device, without gradients.
+        The result has the same kind and device, without gradients.
 
         Args:
             quaternion: (4,) w x y z of any length but zero.
@@ -163,11 +165,11 @@ class Gaussians:
             scale: > 0.
 
         Raises:
-            ValueError: A shape or a value is not as above.
+            ValueError: A shape or a value is invalid.
         """
         rotation = vector(quaternion, "quaternion", (4,))
         check("quaternion", rotation.any(), "a rotation, got a quaternion of zeros")
-        rotation /= np.abs(rotation).max()  # squares neither overflow nor underflow
+        rotation /= np.abs(rotation).max()  # so that squares neither overflow nor underflow
         rotation /= np.linalg.norm(rotation)
         translation = vector(position, "position")
         moved = Gaussians(
@@ -211,15 +213,15 @@ class Gaussians:
         return self._map(lambda tensor: tensor.detach().cpu().numpy())
 
     def torch(self, device: str | int | torch.device | None = None) -> Gaussians:
-        """Return the same gaussians as torch tensors on `device`; None: on theirs,
-        NumPy arrays on the CPU.
+        """Return the same gaussians as torch tensors on `device`; with None, on their
+        device, and NumPy arrays on the CPU.
 
-        Copied only when they move or when a NumPy array is read-only; gradients flow
-        through a move.
+        Arrays are copied only if they move or if a NumPy array is read-only; gradients
+        propagate through a move.
 
         Raises:
-            ValueError: torch knows no such device.
-            RuntimeError: The device is not there.
+            ValueError: torch does not know the device.
+            RuntimeError: The device does not exist.
         """
         import torch
 
@@ -248,30 +250,31 @@ class Gaussians:
 
 
 def _aligned(tensor: Array) -> Array:
-    """The tensor, or a copy if it is not aligned to 16 bytes."""
+    """Return the tensor, or a copy if it is not aligned to 16 bytes."""
     if tensor.data_ptr() % 16 == 0:
         return tensor
     return tensor.clone()
 
 
 def shapes_of(count: int, sh_degree: int) -> list[tuple[int, ...]]:
-    """Shapes of the arrays of ``count`` gaussians, in the order of the fields."""
+    """Return the shapes of the arrays of ``count`` gaussians, in the order of the
+    fields."""
     return [(count, 3), (count, 4), (count, 3), (count,), (count, (sh_degree + 1) ** 2, 3)]
 
 
 def empty(count: int, sh_degree: int) -> Gaussians:
-    """Uninitialised gaussians on the host."""
+    """Return uninitialised gaussians on the host."""
     return Gaussians(*(np.empty(shape, np.float32) for shape in shapes_of(count, sh_degree)))
 
 
 def gaussian_bytes(sh_degree: int) -> int:
-    """Size of one gaussian in memory."""
+    """Return the size of one gaussian in memory."""
     return 4 * sum(map(math.prod, shapes_of(1, sh_degree)))
 
 
 def put(part: Gaussians, out: Gaussians, row: int) -> None:
-    """Copy gaussians on the host into others of the same SH degree or a higher one,
-    from ``row`` on."""
+    """Copy gaussians on the host into others of the same or a higher SH degree, from
+    ``row`` on."""
     for name, values in vars(part).items():
         target = getattr(out, name)[row : row + len(part)]
         if name == "sh":
@@ -285,8 +288,8 @@ def _dtype_name(array: Array) -> str:
 
 
 def _check_kind(name: str, array: Array, first: Array) -> None:
-    """Raise unless `array` is contiguous, float32 (tensors: or float64), of kind and
-    device of `first`."""
+    """Raise unless `array` is contiguous, float32 (tensors: or float64), and of the
+    kind and device of `first`."""
     if not isinstance(array, np.ndarray) and not _is_tensor(array):
         raise TypeError(f"{name}: expected a NumPy array or a torch tensor, got {_kind(array)}")
     if _is_tensor(array) != _is_tensor(first):
@@ -310,7 +313,7 @@ def _check_kind(name: str, array: Array, first: Array) -> None:
 
 
 def _checked_index(index: Array) -> Array:
-    """A mask or int64 indices; a tensor if ``index`` is one, otherwise a NumPy
+    """Return a mask or int64 indices; a tensor if ``index`` is one, otherwise a NumPy
     array."""
     array: Array
     if _is_tensor(index):
@@ -338,8 +341,8 @@ def _checked_index(index: Array) -> Array:
 
 
 def _check_range(index: Array, count: int) -> None:
-    """Raise for a tensor of indices out of range, because on a CUDA device indexing
-    would end the context."""
+    """Raise IndexError for a tensor with indices out of range; on a CUDA device,
+    indexing with them would destroy the context."""
     if str(index.dtype) == "torch.bool" or len(index) == 0:
         return
     for number in (int(index.max()), int(index.min())):

@@ -1,4 +1,4 @@
-// Reading and writing of .ply files as Python has them; the work is that of io/ply_*.h.
+// Reading and writing of .ply files for Python; io/ply_*.h do the work.
 
 #include <cerrno>
 #include <cmath>
@@ -12,14 +12,14 @@ namespace v3dg {
 
 namespace {
 
-// A name as text that can be shown; bytes that are no ASCII become question marks.
+// Returns a name as printable text, with question marks for bytes that are not ASCII.
 std::string printable(std::string name) {
     for (char& c : name)
         if (c < ' ' || c > '~') c = '?';
     return name;
 }
 
-// The name of a file as the system takes it, and as messages show it.
+// The name of a file, as the system needs it and as messages show it.
 struct Path {
     explicit Path(py::object path) : shown(path) {
         PyObject* bytes = nullptr;
@@ -30,7 +30,7 @@ struct Path {
     py::bytes encoded;
 };
 
-// Calls body(path) without the interpreter lock and gives what goes wrong the file's name.
+// Calls body(path) without Python's lock, and adds the file's name to errors.
 template <class Body>
 auto with_path(const Path& path, const Body& body) {
     const char* name = PyBytes_AS_STRING(path.encoded.ptr());
@@ -48,7 +48,7 @@ auto with_path(const Path& path, const Body& body) {
     }
 }
 
-// A file that is read in runs of rows; it remembers where the last one ended.
+// A file that is read in runs of rows; it remembers where the last run ended.
 class BoundPlyFile {
   public:
     explicit BoundPlyFile(const py::object& path)
@@ -77,7 +77,7 @@ class BoundPlyFile {
             opacities({}, {n}), sh({}, {n, k, 3});
         const PlyGaussians<float> out = {means.span, quats.span, scales.span, opacities.span,
                                          sh.span};
-        // Read and set under the interpreter's lock, so that several threads may read.
+        // Read and written with Python's lock held, so that several threads may read.
         const PlyPlace known = next_;
         next_ = with_path(path_, [&](const char*) {
             return read_ply(ply_, static_cast<size_t>(first), known, out);
@@ -148,8 +148,8 @@ void bind_ply(py::module_& m) {
                                "Names of the properties that are read.")
         .def("read", &BoundPlyFile::read, "first"_a, "last"_a);
     m.def("ply_header", &ply_header, "path"_a,
-          "Encoding, bytes of the header, and elements: name, count, and properties' names and "
-          "types.");
+          "Returns the encoding, the bytes of the header, and the elements: name, count, and names "
+          "and types of properties.");
     m.def("ply_write", ply_write, "path"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a,
           "encoding"_a);
 }

@@ -1,4 +1,4 @@
-// Values that cross between Python and the core: cameras, rules, instances and rows.
+// Values that Python passes to the core: cameras, rules, instances and rows.
 
 #include <algorithm>
 #include <cmath>
@@ -68,7 +68,7 @@ py::array_t<double> intrinsics_of(const BoundCamera& bound) {
 
 BoundEyes make_eyes(const BoundCamera& left, const BoundCamera& right) {
     if (!std::equal(left.camera.rotation, left.camera.rotation + 9, right.camera.rotation))
-        throw py::value_error("left, right: expected cameras of the same rotation");
+        throw py::value_error("left, right: expected cameras with the same rotation");
     return {Eyes(left.camera, right.camera)};
 }
 
@@ -125,7 +125,7 @@ Rows::Rows(py::object means, py::object quats, py::object scales, py::object opa
     remember(rows);
     for (const float* start : {rows.quats, rows.sh})
         if (reinterpret_cast<uintptr_t>(start) % traits.row_alignment != 0)
-            throw py::value_error("quats, sh: expected memory that begins at a multiple of " +
+            throw py::value_error("quats, sh: expected memory aligned to " +
                                   std::to_string(traits.row_alignment) + " bytes");
 }
 
@@ -163,7 +163,7 @@ void Instances::check_bundles(size_t num_bundles) const {
 void check_instance_bundles(Span<const int32_t> bundle, size_t num_bundles) {
     for (const int32_t b : bundle)
         if (b < 0 || static_cast<size_t>(b) >= num_bundles)
-            throw py::value_error("bundle: expected a bundle below " + std::to_string(num_bundles) +
+            throw py::value_error("bundle: expected an index below " + std::to_string(num_bundles) +
                                   ", got " + std::to_string(b));
 }
 
@@ -185,21 +185,22 @@ Window window_of(const Camera& c) {
 
 void bind_types(py::module_& m) {
     py::class_<BoundCamera>(
-        m, "Camera", "A pinhole camera, or a window of its image, as every operation takes it.")
+        m, "Camera", "A pinhole camera, or a window of its image; the input of every operation.")
         .def(py::init(&make_camera), py::kw_only(), "viewmat"_a, "K"_a, "width"_a, "height"_a,
              "near"_a)
         .def("window", &window_of_camera, "x0"_a, "y0"_a, "x1"_a, "y1"_a,
-             "The same camera, of whose image only the pixels [x0, x1) x [y0, y1) are wanted.")
-        .def_property_readonly("position", &position_of, "Where it is in the world: (3,).")
-        .def_property_readonly("K", &intrinsics_of, "In px: (3, 3).")
+             "Returns the same camera restricted to the pixels [x0, x1) x [y0, y1) of its image.")
+        .def_property_readonly("position", &position_of, "Position in the world: (3,).")
+        .def_property_readonly("K", &intrinsics_of, "Camera matrix in px: (3, 3).")
         .def_property_readonly("width", &BoundCamera::width)
         .def_property_readonly("height", &BoundCamera::height);
-    py::class_<BoundEyes>(m, "Eyes",
-                          "Two cameras that look the same way and share a cut; or a camera.")
+    py::class_<BoundEyes>(
+        m, "Eyes", "Two cameras with the same rotation that share a cut; or a single camera.")
         .def(py::init([](const BoundCamera& only) { return BoundEyes{only.camera}; }), "camera"_a)
         .def(py::init(&make_eyes), "left"_a, "right"_a);
     py::implicitly_convertible<BoundCamera, BoundEyes>();
-    py::class_<SelectRule>(m, "Rule", "What a selection chooses.")
+    py::class_<SelectRule>(m, "Rule",
+                           "The rule of a selection: tolerance, footprint, budget and fade.")
         .def(py::init(&make_rule), py::kw_only(), "tolerance_px2"_a, "budget"_a, "min_level"_a,
              "footprint"_a, "culls"_a, "fade"_a = 1.0, "frame"_a = 0)
         .def_readonly("tolerance_px2", &SelectRule::tolerance_px2);
@@ -213,7 +214,7 @@ void bind_types(py::module_& m) {
         .def("__len__", &Rows::size)
         .def_property_readonly(
             "device", [](const Rows& rows) { return rows.device().number; },
-            "Number of the CUDA device; -1 on the host.")
+            "Index of the CUDA device; -1 on the host.")
         .def_property_readonly("sh_degree", &Rows::sh_degree);
 }
 

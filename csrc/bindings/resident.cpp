@@ -7,7 +7,7 @@
 namespace v3dg {
 
 BoundModel::BoundModel(const Rows& rows) : device_(rows.device()), size_(rows.size()) {
-    static_cast<void>(rows.read<float>());  // which checks the precision
+    static_cast<void>(rows.read<float>());  // this checks the precision
     const Work work(device_);
     model_ = work.backend().make_model(rows, work);
 }
@@ -24,7 +24,8 @@ BoundModel::BoundModel(const py::object& codes, int device) : device_{device}, i
 }
 
 py::tuple BoundModel::decode(const py::array& cluster_ids) const {
-    if (!has_codes()) throw py::value_error("decode: expected a model of codes, got one of rows");
+    if (!has_codes())
+        throw py::value_error("decode: expected a model of codes, got a model of rows");
     const Span<const int32_t> cluster = span_of<const int32_t>(cluster_ids, "cluster_ids", {-1});
     std::vector<int64_t> offset{0};
     for (const int32_t c : cluster) {

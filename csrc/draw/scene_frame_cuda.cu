@@ -1,4 +1,5 @@
-// Frames of a scene on a CUDA device: which cut writes the items, and of which models the batch is.
+// Frames of a scene on a CUDA device: they choose the cut that writes the items, and
+// the models of the batch.
 
 #include "draw/scene_frame_cuda.h"
 
@@ -179,7 +180,8 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
             cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items,
                            on, &resident);
             next = drawn_again(next);
-            // A frame that is drawn again tells nothing: another one may be telling.
+            // A frame that is drawn again reports no needs, because another frame may
+            // be reporting its own.
             if (resident.needs.report != nullptr) pages.end_frame(on);
             resident.needs = {};
         },
@@ -210,7 +212,7 @@ std::vector<std::pair<const char*, size_t>> SceneFrame::bytes() const {
 
 constexpr unsigned kModelThreads = 128;
 
-// A thread an item.
+// One thread per item.
 static __global__ void model_kernel(ModelTables tables, ModelTables* on_device,
                                     Appearance<float> appearance, ItemList items) {
     const unsigned long long i =

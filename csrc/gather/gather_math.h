@@ -1,6 +1,6 @@
 #pragma once
 
-// Formulas of gather(), for both halves; all are in double precision.
+// Formulas of gather(), for the CPU and CUDA, all in double precision.
 
 #include <vector>
 
@@ -14,17 +14,17 @@ namespace v3dg {
 // Rotations of instances, and of their SH bands.
 struct Rotations {
     const double* rotation;  // [I * 9] rows
-    const double* bands;     // [I * kBandsSize]; empty where the result has SH degree 0
+    const double* bands;     // [I * kBandsSize]; empty if the result has SH degree 0
 };
 
-// Owns such rotations on the host.
+// Owns these rotations on the host.
 struct RotationTables {
     std::vector<double> rotation, bands;
 
     RotationTables(const GatherInput& in, int sh_degree);
 };
 
-// Writes the gaussian `within` cluster s except its SH coefficients.
+// Writes a gaussian, except its SH coefficients; `within` is its index in cluster s.
 V3DG_HD inline void gather_shape(const GatherInput& in, const Rotations& rotations, size_t s,
                                  int64_t within, const GaussianRows<float>& out) {
     const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;
@@ -53,8 +53,8 @@ V3DG_HD inline void gather_shape(const GatherInput& in, const Rotations& rotatio
     out.opacities[to] = in.weight.size == 0 ? opacity : opacity * in.weight[s];
 }
 
-// Writes the three coefficients of one SH basis of that gaussian, rotated into the world with its
-// band.
+// Writes the three coefficients of one SH basis of that gaussian, rotated into the
+// world.
 V3DG_HD inline void gather_sh(const GatherInput& in, const Rotations& rotations, size_t s,
                               int64_t within, int basis, const GaussianRows<float>& out) {
     const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;

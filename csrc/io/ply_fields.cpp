@@ -1,5 +1,5 @@
-// Finds the properties of a vertex that make a gaussian, in the files of the 3DGS code and in those
-// of other trainers, and says what a file is that has too few.
+// Finds the properties of a vertex that make a gaussian, in the files of the 3DGS code
+// and in those of other trainers, and says what a file is that has too few.
 
 #include "io/ply_fields.h"
 
@@ -51,7 +51,8 @@ size_t num_stored_sh(const PlyElement& vertex) {
                    std::to_string(num_rest));
 }
 
-// The names of the properties for base colours; none if the file has coefficients or neither.
+// The names of the properties for base colours; none if the file has coefficients or
+// neither.
 std::vector<std::string> base_color_names(const Fields& fields) {
     if (fields.has("f_dc_0")) return {};
     for (const std::vector<std::string>& names :

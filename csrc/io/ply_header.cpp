@@ -1,5 +1,5 @@
-// Parses the header of a .ply file. Nothing that it claims about sizes is used here: the callers
-// compare it with the size of the file.
+// Parses the header of a .ply file. The sizes that it claims are not used here; the
+// callers compare them with the size of the file.
 
 #include "io/ply_header.h"
 
@@ -10,8 +10,9 @@ namespace v3dg {
 
 namespace {
 
-constexpr size_t kMaxHeaderBytes = size_t(1) << 20;  // real ones have a few kilobytes
-constexpr size_t kMaxElements = 64;  // real ones have one or two; each one is skipped in turn
+constexpr size_t kMaxHeaderBytes = size_t(1) << 20;  // real headers have a few kilobytes
+// Real files have one or two elements; each one is skipped in sequence.
+constexpr size_t kMaxElements = 64;
 
 std::vector<std::string> words_of(const std::string& line) {
     const char* kSpace = " \t\r\v\f";
@@ -84,7 +85,7 @@ PlyProperty parse_property(const std::vector<std::string>& words) {
     return property;
 }
 
-// Takes the lines of one header in turn, and makes the header.
+// Parses the lines of one header one by one.
 struct HeaderParser {
     PlyHeader header;
     bool has_format = false;

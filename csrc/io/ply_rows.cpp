@@ -1,5 +1,5 @@
-// Binary rows: RowDecoder converts rows of fixed size. Rows with lists are walked over by a
-// ByteReader and packed to such rows.
+// Binary rows: RowDecoder converts rows of fixed size. A ByteReader parses rows with
+// lists and packs them to rows of fixed size.
 
 #include "io/ply_rows.h"
 
@@ -22,7 +22,8 @@ namespace v3dg {
 
 namespace {
 
-// What one thread reads and converts at a time: it fits into the cache of a core.
+// The bytes that one thread reads and converts at a time; they fit into the cache of a
+// core.
 constexpr size_t kBlockBytes = size_t(1) << 18;
 
 template <class T>
@@ -69,7 +70,7 @@ bool is_swapped(PlyEncoding encoding) {
     return (encoding == PlyEncoding::binary_big_endian) == (first == 1);
 }
 
-// Converts rows of binary numbers of fixed size, which have no lists or have lost them.
+// Converts rows of binary numbers of fixed size, from which lists were removed.
 class RowDecoder {
   public:
     RowDecoder(const PlyFile& ply, const PlyGaussians<float>& out)
@@ -82,7 +83,7 @@ class RowDecoder {
     }
     size_t row_bytes() const { return row_bytes_; }
 
-    // Converts `count` rows into gaussians `first` and on.
+    // Converts `count` rows into the gaussians from `first` on.
     void decode(const char* rows, size_t count, size_t first) const {
         const PlyField* fields = layout_.fields.data();
         for (size_t r = 0; r < count; ++r) {
@@ -151,7 +152,8 @@ class ByteReader {
     size_t buffer_size_ = 0;
 };
 
-// Walks over one row. Copies the numbers that are not in lists to `packed`, unless that is null.
+// Parses one row. Copies the numbers that are not in lists to `packed`, unless that is
+// null.
 void walk_row(ByteReader& reader, const PlyElement& element, uint64_t row, bool is_swapped,
               char* packed) {
     for (const PlyProperty& property : element.properties) {
@@ -183,7 +185,8 @@ PlyPlace read_fixed_rows(const PlyFile& ply, PlyPlace begin, const PlyGaussians<
     const size_t num_rows = out.opacities.size;
     const size_t num_blocks = (num_rows + block_rows - 1) / block_rows;
     const int num_threads = static_cast<int>(std::min<size_t>(most_threads(), num_blocks));
-    // Not value-initialised: a thread without a block then touches no memory.
+    // The array is not value-initialised, so that a thread without a block touches no
+    // memory.
     const std::unique_ptr<char[]> buffers(new char[num_threads * block_rows * row_bytes]);
     FirstError error;
 #pragma omp parallel for schedule(dynamic, 1) num_threads(num_threads)

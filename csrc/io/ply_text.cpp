@@ -1,4 +1,4 @@
-// Text: LineReader cuts lines, NumberReader reads the numbers of one.
+// Text: LineReader separates lines, NumberReader reads the numbers of a line.
 
 #include "io/ply_text.h"
 
@@ -27,10 +27,11 @@ struct Line {
 
 bool is_space(char c) { return c == ' ' || c == '\t' || c == '\r' || c == '\v' || c == '\f'; }
 
-// Reads the lines of a text that are not blank.
+// Reads the lines of a text, without blank ones.
 class LineReader {
   public:
-    // The buffer has one byte more than the rest of the file, so that a read meets the end of it.
+    // The buffer has one byte more than the rest of the file, so that reading detects
+    // the end of the file.
     LineReader(const PosixFile& file, size_t offset, size_t file_bytes)
         : file_(file),
           offset_(offset),
@@ -38,8 +39,8 @@ class LineReader {
 
     size_t offset() const { return offset_ - (end_ - begin_); }
 
-    // Returns some of the next lines, at least one and at most `max_lines`, or none at the end of
-    // the file. Valid until the next call.
+    // Returns some of the next lines, at least one and at most `max_lines`; none at the
+    // end of the file. Valid until the next call.
     const std::vector<Line>& next(uint64_t max_lines) {
         lines_.clear();
         bool at_end = false;
@@ -77,14 +78,14 @@ class LineReader {
     }
 
     const PosixFile& file_;
-    size_t offset_;  // of the first byte after the buffer
+    size_t offset_;  // offset of the first byte behind the buffer
     std::vector<char> buffer_;
     size_t begin_ = 0;
     size_t end_ = 0;
     std::vector<Line> lines_;
 };
 
-// Reads the numbers of one line in turn.
+// Reads the numbers of one line one by one.
 class NumberReader {
   public:
     struct EndOfLine {};
@@ -131,7 +132,8 @@ class NumberReader {
     size_t num_read_ = 0;
 };
 
-// The shortest text of a float, read as a double, is another number: so it is rounded to float.
+// The shortest text of a float denotes another number when it is read as a double, so
+// the number is rounded to float.
 double rounded_to(PlyType type, double value) {
     return type == PlyType::float32 ? static_cast<double>(static_cast<float>(value)) : value;
 }

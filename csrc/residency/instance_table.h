@@ -1,6 +1,6 @@
 #pragma once
 
-// The instances of a scene: which bundle, where, and how important.
+// The instances of a scene: bundle, pose and importance of each.
 
 #include <cstdint>
 
@@ -9,10 +9,10 @@
 
 namespace v3dg {
 
-// I similarity transforms p -> scale * rotation p + position. An instance is not drawn if its
-// pose is not finite, its scale not positive, or its quaternion zero.
+// I similarity transforms p -> scale * rotation p + position. An instance is not drawn
+// if its pose is not finite, its scale is not positive, or its quaternion is zero.
 struct InstanceTable {
-    Span<const int32_t> bundle;     // [I] number among the bundles of the scene
+    Span<const int32_t> bundle;     // [I] index of the bundle in the scene
     Span<const double> position;    // [I * 3]
     Span<const double> quaternion;  // [I * 4] w x y z
     Span<const double> scale;       // [I]

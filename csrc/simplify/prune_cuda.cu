@@ -1,5 +1,6 @@
-// A block finds the median of a group along one axis; then each block ranks gaussians of one group
-// within their octants, and the rows that are kept are compacted in ascending order.
+// A block finds the median of a group along one axis; then each block ranks gaussians
+// of one group within their octants, and the rows that are kept are compacted in
+// ascending order.
 
 #include <cub/device/device_select.cuh>
 
@@ -27,8 +28,8 @@ __device__ float value_of_bits(uint32_t ascending) {
     return __uint_as_float(ascending ^ (ascending >> 31 ? 0x80000000u : 0xffffffffu));
 }
 
-// Finds the median of one axis of a group bit by bit, from the highest: of the values that share
-// the bits found so far, those whose next bit is 0 come first.
+// Finds the median of one axis of a group bit by bit, from the highest: of the values
+// that share the bits found so far, those whose next bit is 0 come first.
 __global__ void median_kernel(const float* means, const int64_t* in_offset, float* medians) {
     const int64_t first = in_offset[blockIdx.x];
     const int64_t last = in_offset[blockIdx.x + 1];

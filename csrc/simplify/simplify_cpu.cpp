@@ -70,7 +70,8 @@ void cpu::prune(const GaussianRows<const float>& in, Span<const int64_t> in_offs
 
 namespace {
 
-// Merges rows first .. first + count to `wanted` rows, which are written from row `to` on.
+// Merges rows first .. first + count to `wanted` rows, which are written from row `to`
+// on.
 void merge_segment(const GaussianRows<const float>& in, int64_t first, int count, int64_t wanted,
                    const GaussianRows<float>& out, int64_t to) {
     // A node is identified by its first row; its other rows follow in a linked list.
@@ -90,7 +91,8 @@ void merge_segment(const GaussianRows<const float>& in, int64_t first, int count
     }
     const double inverse_spacing2 = inverse_spacing2_of(low, high, wanted);
 
-    // In each round every node finds its cheapest partner, and the cheapest disjoint pairs join.
+    // In each round every node finds its cheapest partner, and the cheapest disjoint
+    // pairs join.
     std::vector<MergeFeature> features(count);
     std::vector<MergePair> pairs;
     std::vector<char> is_used;

@@ -834,7 +834,9 @@ def test_a_bundle_is_rounded_when_it_is_made():
 def test_values_that_have_no_code_are_refused():
     bundle = random_bundle(3)
     bundle.gaussians.scales[4, 1] = np.inf
-    with pytest.raises(ValueError, match="gaussians: expected finite values, got others at 4"):
+    with pytest.raises(
+        ValueError, match="gaussians: expected finite values, got infinite or NaN ones at 4"
+    ):
         Bundle(bundle.clusters, bundle.groups, bundle.gaussians, codec="quantized")
 
 

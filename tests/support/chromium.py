@@ -4,7 +4,7 @@ import shutil
 
 PROGRAM = shutil.which("chromium") or shutil.which("google-chrome")
 
-# WebGL in software, and nothing that asks the network.
+# These draw WebGL in software, and prevent requests to the network.
 ARGUMENTS = [
     "--no-sandbox",
     "--use-angle=swiftshader",

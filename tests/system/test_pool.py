@@ -519,7 +519,7 @@ def test_truncated_file_is_an_error_and_not_a_crash(path, device):
     os.truncate(path, int(bundle._file.places[2]))
     draws_coarser(renderer)
     with pytest.raises(
-        ValueError, match=r"asset\.v3dg: page \d+ is not there; the file was truncated"
+        ValueError, match=r"asset\.v3dg: page \d+ is missing; the file was truncated"
     ):
         renderer.settle(CAMERA, tolerance=0.0)
 

@@ -51,6 +51,22 @@ def size_of(path, device):
     return residency.bytes_to_add([Bundle.open(path)], _device.resolve(device))
 
 
+def test_a_picture_asks_once_for_the_scene(path, device, monkeypatch):
+    renderer = Renderer(Bundle.open(path), device=device)
+    renderer.render(CAMERA)
+    num_calls = 0
+    scene_of = residency.scene
+
+    def counted(*arguments):
+        nonlocal num_calls
+        num_calls += 1
+        return scene_of(*arguments)
+
+    monkeypatch.setattr(residency, "scene", counted)
+    renderer.render(CAMERA)
+    assert num_calls == 1
+
+
 def test_all_is_resident_where_it_fits(path, device):
     renderer = Renderer(Bundle.open(path), device=device)
     assert renderer.memory is None

@@ -43,29 +43,28 @@ def build_file(
     codec: Literal["float32", "quantized"] = "float32",
     up: Axis | None = None,
 ) -> tuple[Bundle, bool]:
-    """Build the bundle of an asset's file, or of several that make one asset, straight
-    into a file.
+    """Build the bundle of an asset from its file, or from several files that form one
+    asset, and write it to a file.
 
     The unfinished bundle is at `levels_path`. An asset that does not fit in memory is
-    sorted in a scratch folder beside it.
+    sorted in a scratch folder beside that file.
 
     Args:
-        asset: The content of the asset's file, if it is in memory already.
-        resume: Keep a bundle whose config says that it was made of these gaussians with
-            these settings, and continue from the levels of a build that was
-            interrupted; otherwise everything is built again.
-        memory: Memory of the host that the build may use in addition to what the
-            process uses already: bytes, or text like "8GiB". Default: half of the free
-            memory.
-        up: The axis that is up in the asset, which the bundle records for viewers and
-            exports.
+        asset: The content of the asset's file, if it is already in memory.
+        resume: Keep an existing bundle if its config says that it was built from these
+            gaussians with these settings, and continue from the levels of an
+            interrupted build. If false, everything is built again.
+        memory: Host memory that the build may use in addition to the current use of the
+            process: bytes, or text like "8GiB". Default: half of the free memory.
+        up: The axis of the asset that points up, which the bundle stores for viewers
+            and exports.
         config, seed, progress, device, unusable, executor, codec: See `build_bundle`.
 
     Returns:
         The bundle, opened from its file, and whether it was built.
 
     Raises:
-        ValueError: The memory is too small (the message says how much is needed), or
+        ValueError: The memory is too small (the message states the required amount), or
             the file name does not end in .v3dg.
         ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: See
             `read_asset` and `build_bundle`.
@@ -104,7 +103,7 @@ def _checked_config(config: BuildConfig | None) -> BuildConfig:
 
 
 def _check_output(bundle_path: Path) -> None:
-    """Refuse, before long work, a path to which no bundle can be written."""
+    """Raise an error early if no bundle can be written to this path."""
     _files.check_bundle_name(bundle_path)
     _files.check_folder(bundle_path)
     _files.status_of_replaced(bundle_path)
@@ -118,7 +117,7 @@ def _paths_of(asset_path: AssetPath | Sequence[AssetPath]) -> list[AssetPath]:
 
 @dataclass(frozen=True, eq=False)
 class _FileBuild:
-    """The arguments of `build_file`, checked."""
+    """The checked arguments of `build_file`."""
 
     paths: Sequence[AssetPath]
     bundle_path: Path
@@ -127,7 +126,7 @@ class _FileBuild:
     progress: Progress
     devices: Sequence[Device]
     unusable: Literal["drop", "refuse"]
-    num_bytes: int  # memory of the host
+    num_bytes: int  # host memory
     executor: Executor | None
     codec: str
     up: Axis | None
@@ -137,9 +136,9 @@ class _FileBuild:
         return levels_path(self.bundle_path)
 
     def leaves_on_disk(self) -> AbstractContextManager[Leaves]:
-        """The leaves in the files of the asset."""
+        """Return the leaves, read from the files of the asset."""
         most_in_memory = MOST_GAUSSIANS
-        if self.executor is not None:  # its workers cannot read the memory of this process
+        if self.executor is not None:  # other processes cannot read the memory of this one
             most_in_memory = 0
         return leaves_on_disk(
             self.paths,
@@ -154,10 +153,10 @@ class _FileBuild:
         )
 
     def run(self, source: AbstractContextManager[Leaves], *, resume: bool) -> tuple[Bundle, bool]:
-        """Keep or build the bundle; returns it, and whether it was built."""
+        """Keep or build the bundle; return it, and whether it was built."""
         with source as leaves:
             if resume and self._is_finished(leaves):
-                with suppress(RuntimeError):  # another build has begun to write there
+                with suppress(RuntimeError):  # another build is writing there
                     discard_levels(self.levels_path)
                 return Bundle.open(self.bundle_path), False
             bundle = build_into(
@@ -176,19 +175,19 @@ class _FileBuild:
             return bundle, True
 
     def _is_finished(self, leaves: Leaves) -> bool:
-        """Whether the bundle exists, was made of these leaves with these settings, and
-        was not converted to another codec since."""
+        """Return whether the bundle exists, was built from these leaves with these
+        settings, and has not been converted to another codec."""
         config = made_with(leaves, self.config, self.seed, self.codec, self.up)
         try:
             bundle = Bundle.open(self.bundle_path)
             return bundle.config == config and bundle.codec == self.codec
-        except (ValueError, OSError):  # missing, damaged, or of another version: build it
+        except (ValueError, OSError):  # missing, damaged, or of another version: build it again
             return False
 
 
 @contextmanager
 def _naming_asset(path: AssetPath) -> Iterator[None]:
-    """Begin the messages of errors of an asset with the name of its file."""
+    """Prefix errors about an asset with the name of its file."""
     try:
         yield
     except ValueError as error:
@@ -199,9 +198,9 @@ def _naming_asset(path: AssetPath) -> Iterator[None]:
 
 
 def levels_path(bundle_path: str | os.PathLike[str]) -> Path:
-    """The file in which `build_file` makes the bundle, and from which an interrupted
-    build continues."""
+    """Return the file in which `build_file` builds the bundle, and from which an
+    interrupted build continues."""
     path = Path(bundle_path)
-    if path.is_symlink():  # the file is beside the target of the link, which it will replace
+    if path.is_symlink():  # the file is beside the link's target, which it will replace
         path = Path(os.path.realpath(path))
     return path.with_name(path.name + ".partial")

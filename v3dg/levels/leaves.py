@@ -39,12 +39,12 @@ class Leaves(ABC):
 
     @abstractmethod
     def read(self, first: int, last: int) -> Gaussians:
-        """Leaves `first` to `last`, in arrays of their own."""
+        """Return leaves `first` to `last`, in newly allocated arrays."""
 
 
 class MemoryLeaves(Leaves):
-    """The leaves of an asset in memory, on any device; the first `read` splits them, on
-    `device`."""
+    """The leaves of an asset in memory, on any device. The first call of `read` splits
+    them, on `device`."""
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class MemoryLeaves(Leaves):
         self._lock = threading.Lock()
 
     def read(self, first: int, last: int) -> Gaussians:
-        """Leaves `first` to `last`, on the device of the asset."""
+        """Return leaves `first` to `last`, on the device of the asset."""
         with self._lock:
             if self._order is None:
                 means = _device.place_rows(self._asset.means, self._drawable, self._device)
@@ -93,7 +93,7 @@ class MemoryLeaves(Leaves):
 def made_with(
     leaves: Leaves, config: BuildConfig, seed: int, codec: str, up: Axis | None
 ) -> JsonObject:
-    """The config of a bundle: the asset and the settings that it was made with."""
+    """Return the config of a bundle: the asset and the settings it is built from."""
     seed = whole_number(seed, "seed")
     check("seed", 0 <= seed < 2**58, f"0 to 2^58 - 1, got {value_text(seed)}")
     result: JsonObject = {
@@ -112,7 +112,7 @@ def made_with(
 
 
 class Tally:
-    """Counts of the gaussians of an asset, which is examined one part after another."""
+    """Counts the gaussians of an asset, which is examined in parts."""
 
     def __init__(self) -> None:
         self.num_gaussians = 0
@@ -121,7 +121,7 @@ class Tally:
         self._counts: Counter[str] = Counter()
 
     def add(self, part: Gaussians) -> npt.NDArray[np.bool_]:
-        """Count the gaussians of a part; (N,) whether each can be drawn."""
+        """Count the gaussians of a part; return (N,) whether each can be drawn."""
         findings = cleaning.examine(part)
         self.num_gaussians += len(part)
         self.num_drawable += int(findings.drawable.sum())
@@ -134,8 +134,8 @@ class Tally:
         return {kind: self._counts[kind] for kind in cleaning.KINDS if kind in self._counts}
 
     def check(self, unusable: Unusable) -> None:
-        """Refuse an asset that cannot be built, and warn of gaussians that are left
-        out."""
+        """Raise ValueError for an asset that cannot be built, and warn about gaussians
+        that are left out."""
         text = cleaning.summary(
             self.num_gaussians - self.num_drawable, self.num_gaussians, self.counts
         )

@@ -1,9 +1,9 @@
-"""The leaves of an asset in files, one or many, that need not fit in memory.
+"""The leaves of an asset in one or many files, which need not fit in memory.
 
 An asset that does not fit in memory is read twice, in blocks. The first pass writes its
 means to scratch files, where they are split (`external_split`) down to *buckets*: nodes
 that are small enough to be sorted when they are read. The second pass writes every
-gaussian to its bucket. docs/results.md counts the bytes.
+gaussian to its bucket. docs/results.md has the amounts of data.
 """
 
 import math
@@ -40,9 +40,10 @@ from v3dg.levels.scratch import RowFile, scratch_folder
 MOST_GAUSSIANS = 1 << 32
 """An asset must have fewer gaussians than this."""
 
-_MOST_IN_BUCKET = 1 << 18  # a quarter of a unit of a build, so that few unneeded gaussians are read
-_MOST_IN_BLOCK_BYTES = 1 << 28  # a larger block is not faster: its rows are read in random order
-_SENT_AT_ONCE = 1 << 12  # gaussians that a thread writes to a bucket at a time
+_MOST_IN_BUCKET = 1 << 18  # a quarter of a build unit, so that few unneeded gaussians are read
+# Larger blocks are not faster, because their rows are read in random order.
+_MOST_IN_BLOCK_BYTES = 1 << 28
+_SENT_AT_ONCE = 1 << 12  # gaussians that a thread writes to a bucket together
 _OVERHEAD_BYTES = 24 << 20
 _CHANGED = "a file that does not change while it is read, got another content; build again"
 _NAMES = ("points", "spare", "order", "rows")
@@ -52,8 +53,8 @@ _Blocks = Iterator[tuple[int, Gaussians]]
 
 @dataclass(eq=False)
 class DiskLeaves(Leaves):
-    """Leaves in a scratch folder, while that exists; can be pickled, and read by
-    several threads at once."""
+    """Leaves in a scratch folder, valid while the folder exists. They can be pickled,
+    and read by several threads at once."""
 
     path: Path
     bucket_offset: npt.NDArray[np.int64]
@@ -92,16 +93,16 @@ def leaves_on_disk(
     progress: Progress = False,
     most_in_memory: int = MOST_GAUSSIANS,
 ) -> Iterator[Leaves]:
-    """The leaves of the asset that consists of the gaussians of some files, within
-    `memory` bytes.
+    """Return the leaves of the asset that consists of the gaussians in some files,
+    using at most `memory` bytes.
 
     Their order is that of the median split of all of them and does not depend on the
-    memory. `reserved` says how much of it other work needs, from the number of
+    memory. `reserved` returns the memory that other work needs, given the number of
     gaussians and the SH degree. An asset of more than `most_in_memory` gaussians is
-    sorted on disk even if it fits in memory. The scratch folder is made only if it is
+    sorted on disk even if it fits in memory. The scratch folder is created only if
     needed, and removed at the end.
     """
-    files = map(open_asset, paths)  # lazily, so that few files are open at once
+    files = map(open_asset, paths)  # lazy, so that few files are open at once
     tiles = [
         _Tile(file.path, file.num_gaussians, file.sh_degree, file.whole_bytes, file.declared.up)
         for file in files
@@ -113,7 +114,7 @@ def leaves_on_disk(
     folder = Path(folder)
     fits = count <= min(sizes.in_memory, most_in_memory)
     scratch: AbstractContextManager[None] = nullcontext()
-    # A folder that a killed build left is removed in any case.
+    # A folder that a killed build has left is removed in any case.
     if not fits or os.path.lexists(folder):
         scratch = scratch_folder(folder, _NAMES)
     if fits:
@@ -133,7 +134,7 @@ def leaves_on_disk(
 
 
 def _check_disk(folder: Path, num_bytes: int) -> None:
-    """Refuse, with OSError, a folder whose disk has less than `num_bytes` free."""
+    """Raise OSError if the disk of a folder has less than `num_bytes` free."""
     free = shutil.disk_usage(folder).free
     if free < num_bytes:
         raise OSError(
@@ -159,8 +160,8 @@ class _Tile(NamedTuple):
 
 
 class _Sizes(NamedTuple):
-    """Maximum number of gaussians: in memory at once, in a block, in a node that is
-    split, in a bucket."""
+    """The maximum number of gaussians: in memory at once, in a block, in a node that is
+    split, and in a bucket."""
 
     in_memory: int
     in_block: int
@@ -169,7 +170,8 @@ class _Sizes(NamedTuple):
 
     @staticmethod
     def of(memory: int, reserved: int, degree: int, tiles: Sequence[_Tile]) -> "_Sizes":
-        """The sizes for `memory` bytes; ValueError if they are too few."""
+        """Return the sizes for `memory` bytes; raise ValueError if the memory is too
+        small."""
         gaussian = gaussian_bytes(degree)
         # A piece of a block is decoded in double precision, in addition to the block.
         overhead = _OVERHEAD_BYTES + 8 * PIECE * gaussian
@@ -193,25 +195,25 @@ class _Sizes(NamedTuple):
         )
 
     def blocks(self, tiles: Sequence[_Tile], bar: Bar) -> "_Blocks":
-        """The asset in blocks of this size."""
+        """Return the asset in blocks of this size."""
         degree = max(tile.sh_degree for tile in tiles)
         return _blocks(tiles, Codec(degree).empty(self.in_block), bar)
 
 
 def _bytes_in_bucket(degree: int) -> int:
-    """Memory for each gaussian of a bucket that is sorted: two copies of it, and the
-    split."""
+    """Return the memory per gaussian of a bucket that is being sorted: two copies of
+    the gaussian, and the split."""
     return 2 * gaussian_bytes(degree) + external_split.FITTING_BYTES
 
 
 def scratch_bytes(count: int, degree: int) -> int:
-    """An upper bound of the size on disk of the scratch for `count` gaussians."""
+    """Return an upper bound of the scratch files' size for `count` gaussians."""
     return count * (4 + max(gaussian_bytes(degree), 2 * 16))
 
 
 def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Bar) -> _Blocks:
-    """The asset in blocks that fill the buffer, each with its first row; one is valid
-    until the next."""
+    """Yield the asset in blocks that fill the buffer, each with its first row. A block
+    is valid until the next one."""
     first = 0
     filled = 0
     for tile in tiles:
@@ -227,7 +229,7 @@ def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Bar) -> _Blocks:
                 yield first, buffer
                 first += filled
                 filled = 0
-        del file  # a file that was read whole is freed before the next one is opened
+        del file  # free a completely read file before the next one is opened
     if filled:
         yield first, buffer.subset(slice(0, filled))
 
@@ -291,20 +293,20 @@ def _remove(*paths: Path) -> None:
 
 
 def _new_words(path: Path, width: int) -> external_split.WordFile:
-    """A new file of rows of words."""
+    """Return a new file of rows of 32-bit integers."""
     return RowFile(path, width, np.uint32, must_be_new=True)
 
 
 def _name_of(tiles: Sequence[_Tile]) -> str:
-    """The name of the asset in messages."""
+    """Return the name of the asset for messages."""
     if len(tiles) == 1:
         return shown(tiles[0].path)
     return f"one of {len(tiles)} files"
 
 
 def _write_points(blocks: _Blocks, points: external_split.WordFile, tally: Tally) -> str:
-    """The first pass: write the means of the drawable gaussians, with their rows in the
-    asset; the digest."""
+    """Run the first pass: write the means of the drawable gaussians with their rows in
+    the asset; return the digest."""
     hashes: list[bytes] = []
     with new_pool() as pool:
         for first, block in blocks:
@@ -325,8 +327,8 @@ def _write_rows(
     ends: npt.NDArray[np.int64],
     rows: RowFile[np.float32],
 ) -> str:
-    """The second pass: write every gaussian to its bucket, in the order of the asset;
-    the digest."""
+    """Run the second pass: write every gaussian to its bucket, in the order of the
+    asset; return the digest."""
     hashes: list[bytes] = []
     with new_pool() as pool:
         for number, (first, block) in enumerate(blocks):
@@ -343,7 +345,7 @@ def _write_rows(
                     index = (
                         order.read(start, min(start + _SENT_AT_ONCE, end)).astype(np.int64) - first
                     )
-                    # Unlike an index in brackets, take() releases the GIL.
+                    # take() releases the GIL, unlike indexing with brackets.
                     rows.write(
                         start,
                         np.concatenate([array.take(index, axis=0) for array in arrays], axis=1),
@@ -359,8 +361,8 @@ def _ends_in_buckets(
     block: int,
     asset_gaussians: int,
 ) -> npt.NDArray[np.int64]:
-    """(B, blocks + 1) places in the order: the start of each bucket, then its end in
-    each block."""
+    """Return (B, blocks + 1) positions in the order: the start of each bucket, then its
+    end in each block."""
     counts = np.zeros((len(offset) - 1, 1 - (-asset_gaussians // block)), np.int64)
     for bucket, (begin, end) in enumerate(
         zip(offset[:-1].tolist(), offset[1:].tolist(), strict=True)

@@ -1,4 +1,4 @@
-"""`v3dg.render`: single pictures, each settled."""
+"""`v3dg.render`: single pictures, each with all pages that it needs."""
 
 from __future__ import annotations
 
@@ -67,50 +67,51 @@ def render(
 ) -> RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 
-    Clusters whose gaussians each stand for at most `tolerance` px² are drawn in place
-    of finer ones; level 0 with the asset's own filter, coarser levels with the filter
-    they were made for (V3DG, section 3.4; our metric is in docs/levels.md). An asset is
-    drawn whole, without a filter.
+    Clusters whose gaussians each cover at most `tolerance` px² replace finer ones.
+    Level 0 is drawn with the asset's own filter, coarser levels with the filter that
+    they were made for (V3DG, section 3.4; docs/levels.md defines the metric). An asset
+    is drawn completely, without a filter.
 
     Args:
-        subject: What to draw, in world space; or the file of it, which is then opened
-            anew by every call.
+        subject: What to draw, in world space; or its file, which every call opens
+            again.
         camera: Pinhole camera. With several, each has its own cut and its own picture,
-            as if drawn alone. The eyes of a stereo camera share one cut, and one frame:
-            two pictures, whose statistics are those of both together but for the
-            gaussians that were selected.
+            as if drawn alone. The two eyes of a stereo camera share one cut and one
+            frame. Their two pictures have common statistics, which are sums, except for
+            the number of selected gaussians.
         tolerance: As in `v3dg.select`; so are `budget` and `min_level`.
-        fade: As in `v3dg.select`; weights multiply opacities. Give `v3dg.DEFAULT_FADE`
+        fade: As in `v3dg.select`; weights multiply opacities. Use `v3dg.DEFAULT_FADE`
             for a film.
-        cut: Draw what was selected before from this scene, whatever the camera: a cut
-            to walk around. Takes the place of `tolerance`, `budget`, `min_level` and
-            `fade`.
-        color_by: "level" or "cluster" colours gaussians by their own, "residency" where
-            pages are missing.
+        cut: A cut that was selected earlier from this scene, which is drawn for any
+            camera, so that it can be inspected from all sides. Replaces `tolerance`,
+            `budget`, `min_level` and `fade`.
+        color_by: "level" or "cluster" colours gaussians by their level or cluster,
+            "residency" shows where pages are missing.
         background: Three numbers.
-        min_transmittance: A pixel stops behind the gaussian that lets no more than this
-            share of light through, 0 to 0.99, and gives that light to what it has
-            blended: no channel is off by more than this times the difference to what
-            lies behind. None is 0.001 for scenes and bundles, and draws assets as
-            `v3dg.rasterize` does.
+        min_transmittance: A pixel stops behind the gaussian that leaves this
+            transmittance or less, 0 to 0.99, and distributes the rest over the
+            gaussians that it has blended. So the error of a channel is at most this
+            fraction of the difference to what lies behind. None means 0.001 for scenes
+            and bundles; assets are then drawn as by `v3dg.rasterize`.
         depth: Draw the expected depth, too.
-        device: "cpu" draws NumPy arrays; "cuda", or a certain one as "cuda:1", draws
-            torch tensors there, on the stream that is torch's current one, and keeps on
-            the device what the next picture of the same scene or bundle needs. Use a
-            `Renderer` to say how long. "auto" is "cuda" where that works.
+        device: "cpu" draws NumPy arrays. "cuda", or one device such as "cuda:1", draws
+            torch tensors there on torch's current stream, and keeps on the device what
+            the next picture of the same scene or bundle needs; a `Renderer` controls
+            how long. "auto" means "cuda" if it works.
         memory: As in `Renderer`; each picture is settled.
 
     Raises:
-        ValueError: An argument is not as above, or the coarsest cut has more gaussians
-            than the budget; on CUDA that is raised where the picture is looked at.
-        RuntimeError: `device` is "cuda" and something is missing for it.
+        ValueError: An argument is invalid, or the coarsest cut has more gaussians than
+            the budget; on CUDA the latter is raised when the picture is used.
+        RuntimeError: `device` is "cuda", and something that CUDA needs is missing.
     """
     chosen_device = _device.resolve(device)
     opened_subject = opened(subject)
     one_of(color_by, "color_by", get_args(ColorBy))
     frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     cut_request = CutRequest(tolerance, budget, min_level, fade)
-    shade = shade_of(background, min_transmittance, isinstance(opened_subject, Gaussians), depth)
+    is_asset = isinstance(opened_subject, Gaussians)
+    shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=depth)
 
     def picture(view: Camera | StereoCamera) -> Picture:
         check_camera(view)
@@ -126,10 +127,11 @@ def render(
 def _still_frame(
     subject: Subject, color_by: ColorBy, device: Device, memory: int | Literal["auto"] | None
 ) -> FrameSource:
-    """The frame that stills of a subject are drawn with, which is kept with a scene or
-    a bundle.
+    """Return the frame for single pictures of a subject, which is stored with a scene
+    or a bundle.
 
-    All colours share a pool. Of pools of a given size, only the last one is kept.
+    All colours share a pool. If the size of the pool is given, only the last pool is
+    kept.
     """
     if isinstance(subject, Gaussians):
         return frame_of(subject, color_by, device, memory, PoolSlot())

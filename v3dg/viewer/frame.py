@@ -1,4 +1,5 @@
-"""One picture of the viewer: a scene, a view and settings become pixels and figures."""
+"""One picture of the viewer: a scene, a view and settings become pixels and
+statistics."""
 
 import threading
 import time
@@ -35,29 +36,29 @@ Shows: TypeAlias = Literal[
     "appearance", "level", "cluster", "error", "residency", "depth", "alpha", "count", "difference"
 ]
 
-# Gaussians in a pixel that get the brightest colour.
+# Number of gaussians in a pixel that gets the brightest colour.
 MOST_COUNTED = 256
 _MODES_OF_POOLS_ON_CUDA: tuple[Shows, ...] = ("appearance", "depth", "alpha")
-# At most so many gaussians are all drawn while the camera moves, too.
+# Up to this number, all gaussians are drawn even while the camera moves.
 _FEW_GAUSSIANS = 500_000
 _SHADE = shade_of((0.0, 0.0, 0.0), None, is_asset=False, depth=True)
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a picture shows, and how finely.
+    """The content and quality of a picture.
 
     Attributes:
-        shows: The colours, those of a level or a cluster, the error, which is the
-            screen area that a gaussian of a coarser cluster stands for, expected depth,
-            alpha, how many gaussians a pixel is blended of, or the difference to the
+        shows: The gaussians' colours; the colours of levels or clusters; the error,
+            which is the screen area per gaussian of a coarser cluster; expected depth;
+            alpha; the number of gaussians blended in a pixel; or the difference to the
             picture of all gaussians.
-        tolerance, budget, min_level, fade: As in `v3dg.render`, but that a tolerance is
-            always given.
-        gain: What a difference is multiplied by.
-        split: Share of the width, from the left, that shows all gaussians; 0 for none.
-        frozen: The view that the cut is chosen for; None for the one that is looked
-            from.
+        tolerance, budget, min_level, fade: As in `v3dg.render`, but a tolerance is
+            always set.
+        gain: Factor of differences.
+        split: Fraction of the width, from the left, that shows all gaussians; 0 for
+            none.
+        frozen: The view that the cut is selected for; None for the view of the picture.
     """
 
     shows: Shows = "appearance"
@@ -76,14 +77,14 @@ class Frame:
 
     Attributes:
         pixels: (H, W, 3).
-        figures: What it cost; times are those of the whole picture, all else is the
-            cut's.
+        figures: Its statistics; times are those of the whole picture, everything else
+            is of the cut.
         shows: As in its settings.
-        value_range: The values of the darkest and the brightest colour, where colours
-            are values.
-        view: From where it is seen.
-        distance: How deep what is in its middle mostly is, world units; None where
-            nothing is, or not known.
+        value_range: The values of the darkest and the brightest colour, if colours
+            represent values.
+        view: The viewpoint of the picture.
+        distance: Median depth around the middle, world units; None if nothing is there,
+            or if it is unknown.
     """
 
     pixels: Pixels
@@ -102,8 +103,8 @@ class _Job(NamedTuple):
     """How a picture is drawn.
 
     Attributes:
-        chooser: The camera that the cut is selected for; None for the one that the
-            picture is seen from.
+        chooser: The camera that the cut is selected for; None for the camera of the
+            picture.
         edge: The column at which the picture is split, px.
     """
 
@@ -121,8 +122,8 @@ class _Planes(NamedTuple):
     Attributes:
         color: (H, W, 3).
         alpha: (H, W).
-        depth: (H, W), or how many gaussians each pixel is blended of.
-        gaussians_in_frustum: Those of the whole picture.
+        depth: (H, W), or the number of gaussians blended in each pixel.
+        gaussians_in_frustum: Number in the whole picture.
     """
 
     color: _Float32
@@ -132,13 +133,13 @@ class _Planes(NamedTuple):
 
 
 class _Drawn(NamedTuple):
-    """What a picture is painted from.
+    """The input of painting a picture.
 
     Attributes:
-        color, alpha, depth: As in `_Planes`, of the part to the right of the split.
-        whole: Colours of all gaussians, from the left edge on, to compare with; None if
+        color, alpha, depth: As in `_Planes`, for the part to the right of the split.
+        whole: Colours of all gaussians, from the left edge on, for comparison; None if
             nothing is compared.
-        figures: What drawing cost.
+        figures: The statistics of drawing.
     """
 
     color: _Float32
@@ -149,7 +150,7 @@ class _Drawn(NamedTuple):
 
 
 class _Painting(NamedTuple):
-    """The colours to the right of the split; the other two are as in `Frame`."""
+    """The colours to the right of the split; the other two fields are as in `Frame`."""
 
     colors: _Float32
     value_range: tuple[float, float] | None
@@ -157,7 +158,7 @@ class _Painting(NamedTuple):
 
 
 class Stopped(Exception):
-    """A picture was given up because another one is wanted."""
+    """A picture was abandoned because another one was requested."""
 
 
 class SceneView:
@@ -166,16 +167,17 @@ class SceneView:
     Args:
         subject: A scene, a bundle, or an asset, which is split into clusters but gets
             no coarser levels.
-        device: Where to draw: "cpu", "cuda", or "auto", which is CUDA where that works.
-        memory: As in `v3dg.Renderer`. With a pool, one picture is drawn at a time, and
-            what is compared with is the finest that it has room for, of the cut's
-            camera; on CUDA nothing is.
+        device: The device that draws: "cpu", "cuda", or "auto", which is CUDA if it
+            works.
+        memory: As in `v3dg.Renderer`. With a pool, one picture is drawn at a time.
+            Comparisons are then with the finest cut that fits into the pool, for the
+            cut's camera; on CUDA there are no comparisons.
 
     Attributes:
         scene: The subject as a scene.
-        near: As in `v3dg.Camera`, to suit the scene's size.
-        center, radius: A ball that holds nearly all of it, world units.
-        pool: What draws where not all is resident, or None.
+        near: As in `v3dg.Camera`, chosen by the scene's size.
+        center, radius: A ball that contains nearly all of it, world units.
+        pool: Draws if not everything is resident; otherwise None.
     """
 
     def __init__(
@@ -202,12 +204,12 @@ class SceneView:
 
     @property
     def draws_all_while_moving(self) -> bool:
-        """Whether all gaussians are few enough to be drawn in every picture."""
+        """Whether there are so few gaussians that every picture draws all of them."""
         return self.device.is_cuda or self.num_gaussians <= _FEW_GAUSSIANS
 
     def explain(self, error: Exception) -> str:
-        """Return an error's line, in which bundles go by names, not paths: the tab may
-        be somebody else's."""
+        """Return the line about an error. It contains names of bundles, not their
+        paths, because the tab may belong to another user."""
         text = " ".join(str(error).split())
         for path in (bundle.path for bundle in self.scene.bundles):
             if path:
@@ -217,7 +219,7 @@ class SceneView:
 
     @property
     def modes(self) -> tuple[Shows, ...]:
-        """What can be shown."""
+        """The available display modes."""
         if self.pool is not None and self.device.is_cuda:
             return _MODES_OF_POOLS_ON_CUDA
         return tuple(
@@ -226,8 +228,8 @@ class SceneView:
 
     @property
     def shows_cuts(self) -> bool:
-        """Whether cuts can be frozen, split and picked from: a pool on CUDA draws its
-        own as they are."""
+        """Whether freezing, splitting and picking are available. A pool on CUDA only
+        draws its own cut."""
         return self.pool is None or not self.device.is_cuda
 
     def frame(
@@ -239,10 +241,10 @@ class SceneView:
         steps: _core.BudgetSteps | None = None,
         patience: float = 0.0,
     ) -> Frame:
-        """Draw a picture of ``size`` (width, height) px; with ``steps``, one that
-        follows others.
+        """Draw a picture of ``size`` (width, height) px; with ``steps``, the next one
+        of a sequence.
 
-        It waits so many seconds for pages that a pool lacks.
+        It waits up to this many seconds for pages that a pool lacks.
 
         Raises:
             Stopped: ``stop`` was requested; it is raised soon after.
@@ -250,7 +252,7 @@ class SceneView:
                 is damaged.
         """
         _check(stop)
-        if self.pool is not None and self.device.is_cuda:  # the settings of a link may ask for more
+        if self.pool is not None and self.device.is_cuda:  # the settings of a link may request more
             shows = settings.shows
             if shows not in self.modes:
                 shows = "appearance"
@@ -283,8 +285,8 @@ class SceneView:
     def pick(
         self, view: View, size: tuple[int, int], x: int, y: int, settings: Settings
     ) -> Pick | None:
-        """Return what a pixel of a picture shows most of, of what is resident where
-        there is a pool."""
+        """Return the gaussian with the largest weight in a pixel of a picture, from
+        what is resident if there is a pool."""
         camera = view.camera(*size, self.near)
         with self._drawing:
             return pick(
@@ -299,10 +301,10 @@ class SceneView:
             )
 
     def _draw_pool(self, job: _Job, pool: Renderer, patience: float) -> _Drawn:
-        """Draw from a pool, and what is compared with: the finest cut that the pool has
-        room for.
+        """Draw from a pool, and draw the picture to compare with: the finest cut that
+        fits into the pool.
 
-        Both are drawn from the pages of the finer cut.
+        Both pictures are drawn from the pages of the finer cut.
         """
         settings = job.settings
         pool_frame = pool.pool_frame
@@ -345,7 +347,7 @@ class SceneView:
         )
 
     def _draw_resident(self, job: _Job) -> _Drawn:
-        """Draw where all gaussians are resident, and all of them to compare with."""
+        """Draw if all gaussians are resident, and draw all of them for comparison."""
         camera = job.camera
         settings = job.settings
         budget = settings.budget
@@ -377,8 +379,8 @@ class SceneView:
     def _draw(
         self, cut: Selection, camera: Camera, window: Window, shows: Shows, stop: _core.Stop | None
     ) -> _Planes:
-        """Draw a window of the picture of a cut on the device, or on the CPU what only
-        that draws."""
+        """Draw a window of a cut's picture on the device, or on the CPU if only the CPU
+        supports it."""
         if not self.device.is_cuda or shows in ("count", "error"):
             return self._draw_on_cpu(cut, camera, window, shows, stop)
         image = render(
@@ -403,7 +405,7 @@ class SceneView:
     ) -> _Planes:
         frame = _core.SceneFrame(CPU.number)
         resident = residency.scene(self.scene, CPU)
-        cut.check(resident.revision)  # the scene still has the instances of the cut
+        cut.check(resident.revision)  # raises unless the scene still has the instances of the cut
         residency.set_models(frame, resident.bundles, CPU, _color_by(shows))
         request = _core.FrameRequest(
             camera.core.window(*window),
@@ -419,15 +421,15 @@ class SceneView:
 
 
 def _color_by(shows: Shows) -> ColorBy:
-    """The colours that gaussians are drawn with, from which `_paint` makes those of the
-    other modes."""
+    """Return the colours that gaussians are drawn with, from which `_paint` computes
+    the other modes."""
     if shows in ("level", "cluster", "residency"):
         return shows
     return "appearance"
 
 
 def _look_of(shows: Shows) -> ColorBy | Literal["error", "count"]:
-    """What `Look` calls a mode."""
+    """Return the name of a mode in `Look`."""
     if shows in ("error", "count"):
         return shows
     return _color_by(shows)
@@ -461,8 +463,8 @@ def _paint(drawn: _Drawn, settings: Settings) -> _Painting:
 
 
 def _distance_in_middle(alpha: _Float32, depth: _Float32) -> float | None:
-    """The median depth of the covered pixels around the middle; None if there are
-    none."""
+    """Return the median depth of the covered pixels around the middle; None if there
+    are none."""
     middle = tuple(slice(side * 3 // 8, side * 5 // 8 + 1) for side in alpha.shape)
     covered = depth[middle][alpha[middle] > 0.5]
     if not covered.size:
@@ -471,8 +473,8 @@ def _distance_in_middle(alpha: _Float32, depth: _Float32) -> float | None:
 
 
 def _depth_range(alpha: _Float32, depth: _Float32) -> tuple[float, float]:
-    """The depths of the nearest and the farthest colour; percentiles, which few far
-    gaussians do not move."""
+    """Return the depths of the nearest and the farthest colour; they are percentiles,
+    so that few distant gaussians have no influence."""
     covered = depth[alpha > 0.5]
     if not covered.size:
         return 0.0, 1.0
@@ -486,8 +488,8 @@ def _check(stop: _core.Stop | None) -> None:
 
 
 def _bounds(scene: Scene) -> tuple[npt.NDArray[np.floating], float]:
-    """Centre and radius of a ball around nearly all of the scene: trained assets have a
-    few far outliers."""
+    """Return the centre and radius of a ball around nearly all of the scene: trained
+    assets have a few distant outliers."""
     corners: list[Floats] = [np.zeros((0, 3))]
     for number, bundle in enumerate(scene.bundles):
         is_of_bundle = scene.instance_bundle == number

@@ -1,5 +1,5 @@
-"""The viewer's web server: serves the page, and gives every browser tab a connection of
-its own."""
+"""The viewer's web server: it serves the page, and connects every browser tab
+separately."""
 
 from __future__ import annotations
 
@@ -34,24 +34,25 @@ if TYPE_CHECKING:
     from v3dg.viewer.tab import Tab
 
 _FOV_Y = math.radians(45)
-# Threads that are still at work after so long are not waited for.
+# The end of the server does not wait longer than this for threads.
 _CLOSE_SECONDS = 1.0
-# The longer side of photographs at most, by the folder in which the page asks for them.
+# The largest longer side of photographs, by the folder in which the page requests them.
 _PHOTOGRAPH_PIXELS = {"photograph": 1600, "thumbnail": 240}
-# Errors of a connection are its client's fault: they are logged, and not printed in the
-# terminal.
+# Errors of a connection are caused by its client: they are logged, and not printed in
+# the terminal.
 _LOG = logging.getLogger(__name__)
 _LOG.addHandler(logging.NullHandler())
-# Media types of the files that are served; other files of the page's folder are not.
+# Media types of the files that are served; other files in the page's folder are not
+# served.
 _MEDIA_TYPES = {
     ".html": "text/html",
     ".css": "text/css",
     ".js": "text/javascript",
     ".svg": "image/svg+xml",
 }
-# Headers of every answer, of refusals and errors too. No other page can frame this one;
-# it runs only its own files and talks to no other server. Other pages cannot show what
-# is served, nor get hold of the window.
+# Headers of every answer, including refusals and errors. No other page can frame this
+# page; it runs only its own files and talks to no other server. Other pages cannot show
+# what is served, nor get access to the window.
 _HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -72,19 +73,19 @@ class Site:
     Args:
         name: Title of the tabs, and name of the files that they save.
         cameras: Named cameras to jump to.
-        photographs: Files of the pictures that cameras took, by the cameras' names.
+        photographs: Files of the cameras' photographs, by the cameras' names.
         host, port: As for `Gate`.
-        tolerance, budget: Settings that a tab begins with.
+        tolerance, budget: Initial settings of a tab.
         up: (3,) direction in the world that is up.
-        asks_up: Whether ``up`` is only assumed, so that the page asks.
+        asks_up: Whether ``up`` is only assumed, so that the page asks the user.
 
     Attributes:
-        port, url, is_secret: As of `Gate`.
+        port, url, is_secret: See `Gate`.
 
     Raises:
         ImportError: The extra is not installed.
         TypeError: ``cameras`` is not a mapping of names to cameras.
-        ValueError: As of `Gate`.
+        ValueError: See `Gate`.
     """
 
     def __init__(
@@ -140,9 +141,9 @@ class Site:
         is_serving.wait()
 
     def close(self) -> bool:
-        """End all tabs and the server in about two seconds; returns whether all their
-        threads have ended."""
-        with contextlib.suppress(RuntimeError):  # the loop is closed already
+        """End all tabs and the server within about two seconds; return whether all
+        their threads have ended."""
+        with contextlib.suppress(RuntimeError):  # the loop is already closed
             self._loop.call_soon_threadsafe(self._closing.set)
         self._thread.join(3 * _CLOSE_SECONDS)
         return not self._thread.is_alive() and not self._tabs
@@ -161,9 +162,9 @@ class Site:
             sock=self._gate.socket,
             logger=_LOG,
             max_size=MOST_BYTES,
-            compression=None,  # pictures are compressed already
-            close_timeout=0.5,  # the end does not wait for a client that does not answer
-            server_header=None,  # clients are not told versions
+            compression=None,  # pictures are already compressed
+            close_timeout=0.5,  # an unresponsive client must not delay the end
+            server_header=None,  # clients need not know versions
             process_request=self._answer,
             process_response=_add_headers,
         )
@@ -173,7 +174,7 @@ class Site:
         await asyncio.to_thread(self._end_tabs)
 
     def _end_tabs(self) -> None:
-        """End the threads of all tabs, also of those whose connection is closed."""
+        """End the threads of all tabs, including those whose connection is closed."""
         end = time.monotonic() + _CLOSE_SECONDS
         self._tabs = {tab for tab in self._tabs if not tab.close(max(end - time.monotonic(), 0.0))}
 
@@ -203,7 +204,7 @@ class Site:
             await connection.send(encode(self._greeting))
             await connection.send(encode(tab.describe_scene()))
             async for data in connection:
-                # A wrong message is ignored, whatever is wrong with it.
+                # An invalid message is ignored, for whatever reason.
                 with contextlib.suppress(Exception):
                     tab.take(data)
         finally:
@@ -211,7 +212,8 @@ class Site:
                 self._tabs.discard(tab)
 
     async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Answer a request for a file of the page; None if it opens a connection."""
+        """Return the answer to a request for a file of the page; None for a request
+        that opens a connection."""
         refusal = self._gate.refusal(request)
         if refusal is not None:
             return connection.respond(http.HTTPStatus.FORBIDDEN, refusal)
@@ -235,8 +237,8 @@ class Site:
         return response
 
     def _photograph(self, place: str, side: int) -> bytes | None:
-        """Return the photograph of the camera of that number as JPEG; None if there is
-        none that can be read."""
+        """Return the photograph of the camera with that number as JPEG; None if there
+        is none, or if it cannot be read."""
         try:
             if not place.isdecimal():
                 return None
@@ -248,7 +250,7 @@ class Site:
                 file = io.BytesIO()
                 picture.convert("RGB").save(file, "jpeg", quality=85)
                 return file.getvalue()
-        except Exception:  # Pillow raises errors of many kinds for damaged files
+        except Exception:  # for damaged files, Pillow raises errors of many kinds
             return None
 
 
@@ -292,15 +294,15 @@ def _read_page() -> dict[str, bytes]:
 
 
 def _add_headers(_connection: ServerConnection, _request: Request, response: Response) -> None:
-    """Give an answer the headers that all answers have."""
+    """Add the headers that all answers have."""
     response.headers.update(_HEADERS)
 
 
 def start_view(scene_view: SceneView, up: VectorLike, aspect: float = 16 / 9) -> View:
-    """Return the view that a tab begins with: all of the scene, from a little above."""
+    """Return the initial view of a tab: the whole scene, from a little above."""
     axis = np.asarray(up, np.float64)
     axis = axis / np.linalg.norm(axis)
-    # The world's axis after the one that is nearest to `up`, so that the two are not
+    # The world's axis after the one that is closest to `up`, so that the two are not
     # parallel.
     aside = np.roll(np.eye(3)[int(np.abs(axis).argmax())], 1)
     aside = aside - (aside @ axis) * axis

@@ -1,4 +1,4 @@
-"""A browser tab: does what its page asks for, and tells the page what came of it."""
+"""A browser tab: it does what its page requests, and sends the results to the page."""
 
 import contextlib
 import copy
@@ -37,11 +37,12 @@ from v3dg.viewer.pacing import RenderLoop
 # Qualities of JPEG.
 _DRAFT_QUALITY = 75
 _FINAL_QUALITY = 94
-# Pillow's numbers for JPEG whose colours have half the resolution, and the whole one.
+# Pillow's codes for JPEG with colours of half the resolution, and of full resolution.
 _HALF_COLORS = 2
 _WHOLE_COLORS = 0
 _FPS = 30
-# Share of a pixel's colour from which a click means a gaussian: less is hardly seen.
+# The least weight in a pixel for a gaussian to be picked by a click; less is hardly
+# visible.
 _LEAST_WEIGHT = 0.05
 _SECONDS_BETWEEN_PROGRESS = 0.2
 
@@ -54,8 +55,8 @@ class Tab:
     Args:
         scene_view: The scene that is shown until a file is dropped onto the page.
         name: Name of the files that the page saves.
-        send: Sends text or bytes to the page; waits until they are away, but not in the
-            server's thread.
+        send: Sends text or binary data to the page; waits until they are sent, except
+            in the server's thread.
         moved: Called with a scene view after one of its instances was moved.
     """
 
@@ -75,7 +76,7 @@ class Tab:
         self._missing_bytes = 0
 
     def close(self, seconds: float) -> bool:
-        """Stop drawing and saving; waits for each thread at most so long, and returns
+        """Stop drawing and saving; wait at most this long for each thread, and return
         whether all have ended."""
         has_ended = all([self._loop.close(seconds), self._exporter.close(seconds)])
         if has_ended and self._folder is not None:
@@ -83,15 +84,15 @@ class Tab:
         return has_ended
 
     def ask_again(self) -> None:
-        """Draw again, because what is shown has changed."""
+        """Draw again, because the subject has changed."""
         if self._look is not None:
             self._loop.ask(self._look.request())
 
     def take(self, data: str | bytes) -> None:
-        """Do what a message of the page says.
+        """Execute a message of the page.
 
         Raises:
-            ValueError: It is none of `messages`.
+            ValueError: The message is not one of `messages`.
         """
         if isinstance(data, bytes):
             self._take_bytes(data)
@@ -113,7 +114,7 @@ class Tab:
                 self._begin_file(message)
 
     def describe_scene(self) -> answers.Scene:
-        """Return what the page has to know of what it shows."""
+        """Return what the page needs to know about the subject."""
         scene_view = self.scene_view
         bundles = scene_view.scene.bundles
         num_missing = np.arange(4)
@@ -181,8 +182,8 @@ class Tab:
         self._moved(self.scene_view)
 
     def _begin_picking(self, message: messages.Pick) -> None:
-        """Answer in a thread of its own, unless an earlier question is not answered
-        yet."""
+        """Answer in a separate thread, unless an earlier question is still
+        unanswered."""
         if self._picking.acquire(blocking=False):
             threading.Thread(
                 target=self._pick, args=(message,), name="v3dg pick", daemon=True
@@ -198,7 +199,7 @@ class Tab:
             self._picking.release()
 
     def _find(self, message: messages.Pick) -> answers.Picked:
-        """Return the instance that a page asks about, or that is at a place of its
+        """Return the instance that a page asks about, or that is at a point of its
         picture."""
         if message.instance is not None:
             return self._describe_instance(message.instance)
@@ -284,8 +285,8 @@ class Tab:
         self._exporter.save("transforms.json", lambda file: write_cameras(file, cameras))
 
     def _save_scene(self, message: messages.Save) -> None:
-        """Save the instances as they are now, the axis that is up, and the cameras of
-        the path."""
+        """Save the current instances, the axis that is up, and the cameras of the
+        path."""
         width, height = message.look.request().size
         path = message.camera_path()
         cameras: dict[str, Camera] = {}
@@ -299,8 +300,8 @@ class Tab:
         )
 
     def _begin_file(self, message: messages.Open) -> None:
-        """Create the file that the next bytes are written to, in a folder that is
-        removed with the tab."""
+        """Create the file for the binary data that follows, in a folder that is removed
+        with the tab."""
         self._folder = self._folder or tempfile.TemporaryDirectory(prefix="v3dg_")
         if self._dropped is not None:
             self._dropped.close()
@@ -326,7 +327,7 @@ class Tab:
                 subject = Bundle.open(path)
             else:
                 subject = read_asset(path)
-        except (OSError, ValueError) as error:  # no page is told the folders of this machine
+        except (OSError, ValueError) as error:  # no page may learn the folders of this machine
             raise ValueError(str(error).replace(f"{path.parent}{os.sep}", "")) from None
         scene_view = SceneView(subject, device=self.scene_view.device)
         old_loop = self._loop
@@ -347,8 +348,7 @@ def _colors(colors: npt.NDArray[np.float32]) -> list[answers.Color]:
 
 
 def _resident_bytes(statm_path: str = "/proc/self/statm") -> int:
-    """Return the memory that this process holds; without /proc, the most that it has
-    held."""
+    """Return the memory of this process; without /proc, its maximum so far."""
     try:
         with open(statm_path, encoding="ascii") as file:
             return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")

@@ -1,5 +1,5 @@
-"""The page of `pairs`: tables of our error by the best other tool's at equal counts,
-and plots."""
+"""The page of `pairs`: tables of our error relative to the best other tool's at equal
+counts, and plots."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ class Report:
 
 
 def best_others(rows: Sequence[Row], which: str = "ours") -> list[Row]:
-    """One row for each pair of a count and a size that others have, too: which of ours,
-    the best other."""
+    """Return one row for each pair of a count and a size that others have, too: ours,
+    and the best other."""
     pairs: dict[tuple[Any, ...], dict[str, Row]] = {}
     for row in rows:
         pairs.setdefault((row["asset"], row["level"], row["factor"]), {})[row["method"]] = row
@@ -94,8 +94,8 @@ def _ratio(ours: float, theirs: float) -> float:
 
 
 def overview(rows: Sequence[Row], which: str = "ours") -> str:
-    """A line for each asset, and of all of them one, one from half the size on, and one
-    for each size."""
+    """Return a line for each asset, and for all assets: one in total, one from half the
+    size on, and one for each size."""
     pairs = best_others(rows, which)
     names = list(dict.fromkeys(row["asset"] for row in pairs))
     lines = [_line(name, [row for row in pairs if row["asset"] == name]) for name in names]
@@ -150,8 +150,8 @@ def _level(row: Row) -> str:
 
 
 def table(pairs: Sequence[Row]) -> str:
-    """Of one asset: counts down, sizes across, FLIP of ours and of the best other, and
-    their ratio."""
+    """Return the table of one asset: counts down, sizes across, FLIP of ours and of the
+    best other, and their ratio."""
     factors = sorted({row["factor"] for row in pairs})
     lines: dict[Any, Row] = {}
     for row in sorted(pairs, key=lambda row: -row["count"]):
@@ -171,8 +171,8 @@ def table(pairs: Sequence[Row]) -> str:
 
 
 def rows_of(recorded: Row) -> list[Row]:
-    """The rows of a result, which has them as written, or as lists beside the names of
-    their columns."""
+    """Return the rows of a result, which stores them as dicts, or as lists with
+    separate names of columns."""
     columns = recorded.get("columns")
     if columns is None:
         return list(recorded["rows"])
@@ -211,7 +211,7 @@ def report(options: Report) -> None:
 
 
 def plot(rows: Sequence[Row], path: Path) -> None:
-    """Count against FLIP, and below it PSNR, for each size: three sizes side by side,
+    """Plot count against FLIP, and PSNR below, for each size: three sizes side by side,
     as wide as a page."""
     import matplotlib
 
@@ -259,8 +259,7 @@ def plot(rows: Sequence[Row], path: Path) -> None:
 
 
 def _draw(panel: Any, rows: Sequence[Row], key: str) -> None:
-    """The points of each method, at one size, where others' levels of as many gaussians
-    are."""
+    """Plot the points of each method, at one size, at the counts of others' levels."""
     counts = {
         row["level"]: row["gaussians"] for row in rows if row["method"] not in (*_OURS, "all")
     }

@@ -187,7 +187,7 @@ def test_instances_of_no_bundle_are_refused(bundle):
         "offset": np.zeros(1, np.int64),
     }
     rows = scenes.gaussians([[0, 0, 1]]).rows
-    with pytest.raises(ValueError, match=f"bundle: expected a bundle below 1, got {bundle}"):
+    with pytest.raises(ValueError, match=f"bundle: expected an index below 1, got {bundle}"):
         _core.gather(bundles=[rows], instances=instances, device=-1, **arguments)
 
 
@@ -323,7 +323,7 @@ def test_frame_refuses_a_scene_of_other_bundles():
             assert not frame.draw(*arguments).alpha.any()
             continue
         with pytest.raises(
-            ValueError, match="scene: expected one of the bundles that the frame has the"
+            ValueError, match="scene: expected a scene of the bundles whose gaussians the frame has"
         ):
             frame.draw(*arguments)
 
