@@ -53,7 +53,6 @@ class Hello(msgspec.Struct, tag="hello"):
         version: Version of the viewer; a page of another one loads itself anew.
         up: The direction that is up, in the world.
         asks_up: Whether `up` is only assumed, so that the page asks.
-        home: A view of all of the scene.
         settings: What a tab begins with.
         defaults: What a setting is that nobody has asked for.
     """
@@ -61,11 +60,21 @@ class Hello(msgspec.Struct, tag="hello"):
     version: str
     up: Vector
     asks_up: bool
-    home: View
     settings: Settings
     defaults: Settings
     limits: Limits
     cameras: list[FileCamera]
+
+
+class Home(msgspec.Struct):
+    """What a tab first shows, in a window of a certain aspect.
+
+    Attributes:
+        focus: The point that orbits go around.
+    """
+
+    view: View
+    focus: Vector
 
 
 class Scene(msgspec.Struct, tag="scene"):
@@ -74,6 +83,7 @@ class Scene(msgspec.Struct, tag="scene"):
     Attributes:
         center, radius: A ball that holds nearly all of it, world units.
         near: Distance of the near plane, world units.
+        homes: First views, from narrow windows to wide ones.
         instances: How many there are.
         has_files: Whether all its bundles are files, so that it can be saved.
         level_colors: Colour of each level.
@@ -89,6 +99,7 @@ class Scene(msgspec.Struct, tag="scene"):
     center: Vector
     radius: float
     near: float
+    homes: list[Home]
     instances: int
     has_files: bool
     level_colors: list[Color]

@@ -69,6 +69,7 @@ class _Settings(msgspec.Struct, forbid_unknown_fields=True):
     gain: Annotated[float, msgspec.Meta(ge=1, le=MOST_GAIN)] = _DEFAULTS.gain
     split: _Share = _DEFAULTS.split
     frozen: _View | None = None
+    background: tuple[_Share, _Share, _Share] = _DEFAULTS.background
 
     def settings(self) -> Settings:
         frozen: View | None = None
@@ -83,6 +84,7 @@ class _Settings(msgspec.Struct, forbid_unknown_fields=True):
             gain=self.gain,
             split=self.split,
             frozen=frozen,
+            background=self.background,
         )
 
 
