@@ -10,13 +10,13 @@ import tyro
 from v3dg import _files
 from v3dg._device import CPU
 from v3dg._numbers import check
+from v3dg._progress import waiting
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cli import _common
 from v3dg.cli._views import ViewOptions, Views, choose_cameras
 from v3dg.gaussians import Gaussians
 from v3dg.io import WRITE_SUFFIXES, write_asset
-from v3dg.opening import open_with_cameras
 from v3dg.scene import Scene
 from v3dg.scene.file import is_scene
 from v3dg.select import select
@@ -63,7 +63,7 @@ def run(options: Convert) -> None:
     expected = "no scene, camera, tolerance or budget with it; leave out one or the other"
     _common.check_usage("--level", options.level is None or not is_cut, expected)
     start = time.perf_counter()
-    subject, own_cameras = open_with_cameras(options.subject)
+    subject, own_cameras = _common.open_subject(options.subject, show=not options.quiet)
     output = options.output
     if _is_bundle(output):
         if not isinstance(subject, Bundle) or part_options:
@@ -82,7 +82,7 @@ def run(options: Convert) -> None:
             part = _level(options, subject)
         else:
             part = _cut(options, subject, own_cameras)
-        write_asset(output, part.gaussians, version=options.spz_version)
+        _write(options, part.gaussians)
     num_bytes = output.stat().st_size
     result = {
         "output": str(output),
@@ -95,6 +95,11 @@ def run(options: Convert) -> None:
     text = f"{output}: {len(part.gaussians):,} gaussians, SH degree {part.gaussians.sh_degree}"
     line = f"{text}, {_common.bytes_text(num_bytes)}"
     _common.print_result(result, [line], as_json=options.json)
+
+
+def _write(options: Convert, gaussians: Gaussians) -> None:
+    with waiting(f"writing {options.output}", show=not options.quiet):
+        write_asset(options.output, gaussians, version=options.spz_version)
 
 
 def _is_bundle(path: Path) -> bool:
@@ -112,8 +117,8 @@ def _check_output(options: Convert) -> None:
     _common.check_usage("--codec", fits, f"an output that ends in .v3dg, got {output}")
     fits = not options.spz_version or name.endswith(".spz")
     _common.check_usage("--spz-version", fits, f"a .spz to write, got {output}; leave it out")
-    _files.check_folder(output)
     _common.check_output(output, options.subject)
+    _files.make_folder(output)
 
 
 def _part_options(options: Convert) -> list[str]:
