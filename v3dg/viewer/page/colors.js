@@ -6,7 +6,11 @@
  * @param {number[]} color Red, green and blue, 0 to 1.
  */
 export function hexOf(color) {
-  const digits = color.map((part) => Math.round(255 * part).toString(16).padStart(2, "0"));
+  const digits = color.map((part) =>
+    Math.round(255 * part)
+      .toString(16)
+      .padStart(2, "0"),
+  );
   return `#${digits.join("")}`;
 }
 
