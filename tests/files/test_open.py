@@ -92,8 +92,6 @@ def test_files_of_another_kind_are_named(bundle, camera, tmp_path):
 
 def test_no_camera_and_no_bundle_are_named(bundle, tmp_path):
     with pytest.raises(TypeError, match=r"camera: expected .*, got NoneType"):
-        v3dg.render(bundle, None)
-    with pytest.raises(TypeError, match=r"camera: expected .*, got NoneType"):
         v3dg.select(bundle, None)
     with pytest.raises(ValueError, match="n: expected 0 cameras or more, got -3"):
         v3dg.turntable((0, 0, 0), 1, -3)
