@@ -12,9 +12,10 @@ from collections.abc import Callable
 import numpy as np
 
 from v3dg._device import to_host
-from v3dg._numbers import Floats, check
+from v3dg._numbers import Floats, check, vector, whole
 from v3dg.cameras import Camera, VectorLike, rigid
 from v3dg.image import Image
+from v3dg.pictures import MOST_SIDE
 
 # Tangents of half a side's field of view, 64 degrees, and of the angle from which on a
 # side is blended with its neighbours.
@@ -58,9 +59,10 @@ def draw_panorama(
     Raises:
         ValueError: The width is odd or below 8, or the camera looks along `up`.
     """
-    check("width", width >= 8 and width % 2 == 0, f"an even number of px from 8 on, got {width}")
+    width = whole(width, "width", "an even number of px from 8 to 65,500", 8, MOST_SIDE)
+    check("width", width % 2 == 0, f"an even number of px from 8 to 65,500, got {width}")
     height = width // 2
-    frame = _level_frame(camera, up)
+    frame = _level_frame(camera, vector(up, "up"))
     focal = _DENSITY * width / (2 * math.pi)
     side_px = 2 * math.ceil(_REACH * focal)
     K = np.array([[focal, 0, side_px / 2], [0, focal, side_px / 2], [0, 0, 1.0]])
@@ -90,14 +92,15 @@ def _side(longitude: float, latitude: float) -> Floats:
     return np.stack([right, np.cross(forward, right), forward])
 
 
-def _level_frame(camera: Camera, up: VectorLike) -> Floats:
+def _level_frame(camera: Camera, up: Floats) -> Floats:
     """(3, 3) rotation from the world to the panorama's frame, whose -y is up and whose
     z is where the camera looks, as seen from above."""
-    axis = np.asarray(up, np.float64)
-    axis = axis / np.linalg.norm(axis)
+    check("up", up.any(), "a direction, got (0, 0, 0)")
+    axis = up / np.abs(up).max()  # squares neither overflow nor underflow
+    axis /= np.linalg.norm(axis)
     forward = camera.viewmat[2, :3] - axis * (camera.viewmat[2, :3] @ axis)
     length = np.linalg.norm(forward)
-    check("camera", length > 1e-6, "a direction that is not along up, got one that is")
+    check("up, camera", length > 1e-6, "directions that are not along each other, got such ones")
     forward = forward / length
     return np.stack([np.cross(forward, axis), -axis, forward])
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal, cast, get_args, overload
 
 from v3dg import _device
 from v3dg._device import Device
-from v3dg._numbers import check, one_of, vector
+from v3dg._numbers import check, one_of, vector, whole
 from v3dg.cameras import AXES, Axis, Camera, StereoCamera, VectorLike, check_camera, for_each
 from v3dg.false_color import ColorBy
 from v3dg.framing import frame_subject
@@ -153,6 +153,8 @@ def first_camera(
     Raises:
         ValueError: An argument is not as above.
     """
+    width = whole(width, "width", "a positive whole number", 1)
+    height = whole(height, "height", "a positive whole number", 1)
     path = Path()
     if isinstance(subject, str | os.PathLike):
         path = Path(subject)
