@@ -23,10 +23,11 @@ from v3dg.io import read_asset, write_asset
 from v3dg.levels import BuildConfig, build_bundle
 from v3dg.opening import open as open  # not in __all__: `import *` would hide Python's own `open`
 from v3dg.opening import read_usd_scene
+from v3dg.panorama import draw_panorama
 from v3dg.pick import Pick, pick
 from v3dg.rasterize import rasterize
 from v3dg.refine import refine_bundle
-from v3dg.render import Renderer, render
+from v3dg.render import Renderer, first_camera, render
 from v3dg.scene import Scene
 from v3dg.scene.file import read_scene, write_scene
 from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, select
@@ -52,5 +53,6 @@ __all__ += [
     "Renderer",
     "Stats",
 ]
+__all__ += ["draw_panorama", "first_camera"]
 __all__ += ["Selection", "StereoCamera", "pick", "rasterize", "render", "select", "view"]
 __all__ += ["read_usd_scene", "write_site", "write_streamed_sog", "write_tiles", "write_usd"]

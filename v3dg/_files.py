@@ -156,9 +156,19 @@ def read_at(descriptor: int, out: npt.NDArray[np.generic], offset: int) -> bool:
     return True
 
 
-def check_folder(path: Path) -> None:
-    """Raise ValueError for an output whose folder does not exist."""
-    check(path, path.parent.is_dir(), f"an existing folder, got {path.parent}; create it first")
+def make_folder(path: str | os.PathLike[str]) -> None:
+    """Create the folder of an output, with the folders above it, unless it exists.
+
+    Raises:
+        OSError: It cannot be created, such as NotADirectoryError for one below a file.
+    """
+    folder = Path(path).parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise NotADirectoryError(
+            errno.ENOTDIR, os.strerror(errno.ENOTDIR), os.fspath(folder)
+        ) from None
 
 
 def check_bundle_name(path: str | os.PathLike[str]) -> None:

@@ -1,8 +1,11 @@
 """Progress of long work: a bar in a terminal, a few lines in a log, or calls of a
 function."""
 
+import contextlib
 import logging
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
@@ -18,6 +21,7 @@ _LOG = logging.getLogger("v3dg")
 _LOG.addHandler(logging.NullHandler())
 _LINES = 4  # number of log lines for one piece of work
 _LEAST_SCALED = 10_000  # from this total on, a bar counts in thousands and millions
+_PATIENCE_SECONDS = 2.0  # work that is done by then shows nothing
 
 
 class Bar:
@@ -89,3 +93,37 @@ def counted(items: Iterable[T], total: int, name: str, progress: Progress) -> It
         for item in items:
             yield item
             bar.update(1)
+
+
+@contextlib.contextmanager
+def waiting(text: str, *, show: bool) -> Iterator[None]:
+    """Show that work of an unknown amount goes on, from two seconds on: the seconds
+    that it has taken in a terminal, elsewhere one line."""
+    if not show:
+        yield
+        return
+    is_done = threading.Event()
+    thread = threading.Thread(target=_show_waiting, args=(text, is_done), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        is_done.set()
+        thread.join()
+
+
+def _show_waiting(text: str, is_done: threading.Event) -> None:
+    start = time.monotonic()
+    if is_done.wait(_PATIENCE_SECONDS):
+        return
+    is_terminal = sys.stderr.isatty()
+    if not is_terminal:
+        print(f"{text} ...", file=sys.stderr, flush=True)
+        return
+    while True:
+        seconds = time.monotonic() - start
+        print(f"\r{text} ... {seconds:.0f} s", end="", file=sys.stderr, flush=True)
+        if is_done.wait(1.0):
+            # Erases the line.
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+            return

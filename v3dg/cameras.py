@@ -21,6 +21,11 @@ Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 AXES: tuple[Axis, ...] = get_args(Axis)
 
 DEFAULT_FOV_X = 0.785398163397448  # 45 degrees
+# The near plane as a share of the distance to the subject, and its bounds in world
+# units; float32 holds the inverse of the smaller one.
+_NEAR_SHARE = 0.01
+_MOST_NEAR = 0.01
+_LEAST_NEAR = 1e-30
 _MAX_TURNTABLE_CAMERAS = 1_000_000  # more would take minutes and is most likely a typo
 # Largest deviation of the rows of a rotation from orthonormal: matrices are often
 # stored as float32 text.
@@ -95,7 +100,7 @@ class Camera:
         *,
         width: int,
         height: int,
-        near: float = 0.01,
+        near: float | None = None,
     ) -> "Camera":
         """Make a camera at ``eye`` that has ``target`` at the image's centre and ``up``
         upwards.
@@ -105,6 +110,8 @@ class Camera:
             target: (3,) point in the world, not at the eye.
             up: (3,) direction in the world, not along the view.
             fov_x: Horizontal field of view in radians; pixels are square.
+            near: See `Camera`; None is a hundredth of the distance to the target, and
+                at most 0.01, so that small subjects are seen from near, too.
 
         Raises:
             ValueError: The target is at the eye, or ``up`` lies along the view
@@ -132,6 +139,8 @@ class Camera:
         )
         right /= length
         rotation = np.stack([right, np.cross(forward, right), forward])
+        if near is None:
+            near = near_of(float(distance))
         return cls(
             rigid(rotation, position), intrinsics(fov_x, None, width, height), width, height, near
         )
@@ -263,7 +272,7 @@ def turntable(
     fov_x: float = DEFAULT_FOV_X,
     width: int = 800,
     height: int = 800,
-    near: float = 0.01,
+    near: float | None = None,
 ) -> list[Camera]:
     """Make ``n`` cameras evenly spaced on a circle around ``center``, all looking at
     it.
@@ -275,6 +284,7 @@ def turntable(
             and π/2.
         up: (3,) axis of the turntable.
         fov_x: Horizontal field of view in radians.
+        near: As in `Camera.look_at`.
     """
     middle = vector(center, "center")
     axis = vector(up, "up")
@@ -303,6 +313,11 @@ def turntable(
             Camera.look_at(eye, middle, axis, fov_x, width=width, height=height, near=near)
         )
     return cameras
+
+
+def near_of(distance: float) -> float:
+    """The near plane of a camera that looks at something at a distance."""
+    return max(min(_MOST_NEAR, _NEAR_SHARE * distance), _LEAST_NEAR)
 
 
 def rigid(rotation: Floats, eye: Floats) -> Floats:

@@ -9,20 +9,26 @@ the full asset at twice the resolution.
 import math
 import os
 import time
+from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
-from v3dg import _device
+from v3dg import _device, _files
 from v3dg._device import Device
 from v3dg._json import JsonObject
+from v3dg._numbers import check
 from v3dg._progress import Progress, counted
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.donut import make_donut, place_field
+from v3dg.gaussians import Gaussians
+from v3dg.io import write_asset
 from v3dg.levels import build_bundle
 from v3dg.metrics import draw_truth, errors_of
 from v3dg.pictures import Picture, check_picture_path, contact_sheet, to_8bit, write_picture
 from v3dg.render import render
 from v3dg.scene import Scene
+from v3dg.scene.file import write_scene
 from v3dg.select import DEFAULT_TOLERANCE
 
 # Distance from the eye to the central donut, in radii of a donut, and elevation in
@@ -43,6 +49,7 @@ def run_demo(
     views: tuple[tuple[float, float], ...] = VIEWS,
     progress: Progress = True,
     device: str = "auto",
+    keep: str | os.PathLike[str] | None = None,
 ) -> JsonObject:
     """Make an asset, build and place it, draw and measure it at every distance, and
     write the picture.
@@ -52,6 +59,8 @@ def run_demo(
         size: Width and height of one panel in px.
         views: Distance and elevation of every column.
         device: The device that builds and draws: "auto", "cpu" or "cuda".
+        keep: Folder for the asset, its bundle and the scene with the cameras of the
+            columns, which is created if needed; None keeps nothing.
 
     Returns:
         Sizes, times and errors, as JSON values.
@@ -61,23 +70,22 @@ def run_demo(
             of range.
     """
     path = check_picture_path(output)
+    files = _Files.new(keep)
     chosen_device = _device.resolve(device)
     start = time.perf_counter()
     asset = make_donut(num_gaussians, seed=seed)
     bundle = build_bundle(asset, seed=seed, progress=progress, device=chosen_device)
     build_seconds = time.perf_counter() - start
     scene = _field(bundle, instances, seed)
-    columns: list[JsonObject] = []
-    rows: list[list[tuple[str, Picture]]] = [[], []]
-    for distance, elevation in counted(views, len(views), "draw", progress):
-        camera = _camera(distance, elevation, size)
-        full, selected = _panels(scene, camera, tolerance, chosen_device)
-        rows[0].append((f"full, distance {distance:g}: {full.text}", full.picture))
-        rows[1].append((f"bundle, distance {distance:g}: {selected.text}", selected.picture))
-        columns.append({"distance": distance, "full": full.numbers, "bundle": selected.numbers})
-    write_picture(path, contact_sheet(rows))
+    if files is not None:
+        scene = files.write(asset, scene, views, size)
+    panels = []
+    for camera in counted(_cameras(views, size), len(views), "draw", progress):
+        panels.append(_panels(scene, camera, tolerance, chosen_device))
+    write_picture(path, contact_sheet(_rows(views, panels)))
     return {
         "picture": str(path),
+        "kept": list(map(str, files or ())),
         "asset_gaussians": len(asset),
         "instances": instances,
         "levels": bundle.num_levels,
@@ -86,8 +94,80 @@ def run_demo(
         "device": str(chosen_device),
         "build_seconds": build_seconds,
         "seconds": time.perf_counter() - start,
-        "columns": columns,
+        "columns": _columns(views, panels),
     }
+
+
+def _columns(
+    views: Sequence[tuple[float, float]], panels: Sequence[tuple["_Panel", "_Panel"]]
+) -> list[JsonObject]:
+    columns: list[JsonObject] = []
+    for (distance, _), (full, selected) in zip(views, panels, strict=True):
+        columns.append({"distance": distance, "full": full.numbers, "bundle": selected.numbers})
+    return columns
+
+
+def _rows(
+    views: Sequence[tuple[float, float]], panels: Sequence[tuple["_Panel", "_Panel"]]
+) -> list[list[tuple[str, Picture]]]:
+    """The rows of the result: the full asset above, the selected cut below."""
+    rows: list[list[tuple[str, Picture]]] = [[], []]
+    for (distance, _), pair in zip(views, panels, strict=True):
+        for row, kind, panel in zip(rows, ("full", "bundle"), pair, strict=True):
+            row.append((f"{kind}, distance {distance:g}: {panel.text}", panel.picture))
+    return rows
+
+
+def _cameras(views: Sequence[tuple[float, float]], size: tuple[int, int]) -> list[Camera]:
+    """The cameras of the columns."""
+    return [_camera(distance, elevation, size) for distance, elevation in views]
+
+
+class _Files(NamedTuple):
+    """Files to go on with."""
+
+    asset: Path
+    bundle: Path
+    scene: Path
+
+    @classmethod
+    def new(cls, keep: str | os.PathLike[str] | None) -> "_Files | None":
+        """The files in a folder, which is created, and none of which may exist; None
+        without a folder."""
+        if keep is None:
+            return None
+        folder = Path(keep)
+        files = cls(folder / "donut.ply", folder / "donut.v3dg", folder / "donuts.json")
+        for file in files:
+            check(file, not os.path.lexists(file), "a new file, got one that exists; remove it")
+        _files.make_folder(files.asset)
+        return files
+
+    def write(
+        self,
+        asset: Gaussians,
+        scene: Scene,
+        views: Sequence[tuple[float, float]],
+        size: tuple[int, int],
+    ) -> Scene:
+        """Write the asset, its bundle, and the scene with the cameras of the columns;
+        returns the scene of the file."""
+        write_asset(self.asset, asset)
+        scene.bundles[0].write(self.bundle)
+        placed = Scene()
+        placed.add(
+            Bundle.open(self.bundle),
+            positions=scene.positions,
+            quaternions=scene.quaternions,
+            scales=scene.scales,
+        )
+        cameras = {}
+        for number, (camera, (distance, _)) in enumerate(
+            zip(_cameras(views, size), views, strict=True)
+        ):
+            cameras[f"{number}, distance {distance:g}"] = camera
+        write_scene(self.scene, placed, cameras=cameras)
+        return placed
 
 
 def _field(bundle: Bundle, count: int, seed: int) -> Scene:

@@ -11,7 +11,7 @@ from typing import Literal, TypeVar, get_args
 
 from v3dg import _core
 from v3dg._numbers import check, check_type, one_of
-from v3dg._urls import FileAtUrl, beside, in_parts, reading, shown
+from v3dg._urls import FileAtUrl, beside, folder_of, in_parts, reading, shown
 from v3dg.cameras import AXES, Axis
 from v3dg.cleaning import AssetWarning
 from v3dg.formats import (
@@ -91,6 +91,17 @@ SUFFIXES = tuple(_READERS)
 
 WRITE_SUFFIXES = tuple(_WRITERS)
 """Ends of the names of files that `write_asset` writes."""
+
+
+def subject_name(path: AnyPath) -> str:
+    """The name of the subject in a file or at a URL: the file's without its suffix, or
+    the folder's for a file that is always called alike, such as `lod-meta.json`."""
+    file = beside(path)
+    if file.name.lower() in ("lod-meta.json", "meta.json"):
+        folder = folder_of(path)
+        if folder:
+            return folder
+    return file.stem
 
 
 def read_asset(path: AnyPath) -> Gaussians:

@@ -80,15 +80,17 @@ def contact_sheet(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
 
 
 def check_picture_path(path: str | os.PathLike[str]) -> Path:
-    """Check, before long work, that a picture can be written to a path.
+    """Check, before long work, that a picture can be written to a path, and create its
+    folder.
 
     Raises:
-        ValueError: The suffix is not one of ``SUFFIXES``, or the folder does not exist.
+        ValueError: The suffix is not one of ``SUFFIXES``.
+        OSError: Its folder cannot be created.
     """
     path = Path(path)
     is_known = path.suffix.lower() in SUFFIXES
     check(path, is_known, f"a file name ending in {', '.join(SUFFIXES)}; choose one of them")
-    _files.check_folder(path)
+    _files.make_folder(path)
     return path
 
 
@@ -140,13 +142,32 @@ def encode_png(image: Array) -> bytes:
     return stream.getvalue()
 
 
-def write_picture(path: str | os.PathLike[str], image: Array) -> None:
-    """Write (H,W,3) floats in [0,1] or 8-bit values as PNG or JPEG; the file appears
-    when it is complete."""
+def write_picture(
+    path: str | os.PathLike[str], image: Array, *, alpha: Array | None = None
+) -> None:
+    """Write a picture as PNG or JPEG; the file appears when it is complete.
+
+    Args:
+        path: Its folder is created if needed.
+        image: (H, W, 3) floats in [0, 1], or 8-bit values.
+        alpha: (H, W) coverage in [0, 1], for a transparent PNG; `image` is then the
+            premultiplied colours of a picture that was drawn on black, as floats. The
+            file
+            has straight alpha: colours divided by alpha, as PNG demands.
+
+    Raises:
+        TypeError, ValueError: A shape, a type or a value is not as above, or the suffix
+            is not that of a PNG or a JPEG, or with `alpha` of a PNG.
+        OSError: The file cannot be written.
+    """
     from PIL import Image
 
     path = check_picture_path(path)
     pixels = checked("image", image)
+    if alpha is not None:
+        is_png = path.suffix.lower() == ".png"
+        check(path, is_png, "a file name ending in .png for a transparent picture")
+        pixels = _straight(pixels, alpha)
     if pixels.dtype != np.uint8:
         check("image", pixels.dtype.kind == "f", f"uint8, or floats in [0,1], got {pixels.dtype}")
         check("image", not np.isnan(pixels).any(), "colours, got NaN")
@@ -155,4 +176,19 @@ def write_picture(path: str | os.PathLike[str], image: Array) -> None:
     if path.suffix.lower() == ".png":
         kind = "PNG"
     with _files.replacing(path) as temporary:
-        Image.fromarray(pixels).save(temporary, kind, quality=90)  # quality for JPEG
+        Image.fromarray(pixels).save(temporary, kind, quality=90)  # for JPEG
+
+
+def _straight(premultiplied: NDArray[np.generic], alpha: Array) -> NDArray[np.generic]:
+    """(H, W, 4) straight colours and alpha."""
+    if hasattr(alpha, "detach"):
+        alpha = alpha.detach().cpu().numpy()
+    coverage = np.asarray(alpha)
+    shape = premultiplied.shape[:2]
+    check("alpha", coverage.shape == shape, f"shape {shape}, got {coverage.shape}")
+    check("image", premultiplied.dtype.kind == "f", f"floats, got {premultiplied.dtype}")
+    colors = np.asarray(premultiplied, np.float32)
+    is_on_black = not (colors[coverage == 0] != 0).any()
+    check("image", is_on_black, "a picture drawn on black, got one on another background")
+    divided = colors / np.maximum(coverage, np.float32(1e-6))[..., None]
+    return np.concatenate([divided, coverage[..., None].astype(np.float32)], axis=2)

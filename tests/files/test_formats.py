@@ -1299,3 +1299,19 @@ def test_half_of_the_ranges_of_colour_is_refused(tmp_path, gone):
     assert_refused_cheaply(
         tmp_path / "a.ply", f"expected 'property float {gone.split()[0]}' in element chunk"
     )
+
+
+def test_small_sog_keeps_the_harmonics_of_every_gaussian(tmp_path):
+    """Palettes of a quarter of the gaussians lost 5 to 30 dB of small assets."""
+    rng = np.random.default_rng(0)
+    gaussians = random_gaussians(4000, 3)
+    sh = gaussians.sh.copy()
+    sh[:, 1:] = rng.normal(0, 0.1, sh[:, 1:].shape)
+    asset = replace(gaussians, sh=sh)
+    write_asset(tmp_path / "a.sog", asset)
+    back = read_asset(tmp_path / "a.sog")
+    order = np.argsort(back.means @ (1.0, 1e3, 1e6))
+    expected = sh[np.argsort(asset.means @ (1.0, 1e3, 1e6)), 1:]
+    errors = back.sh[order, 1:] - expected
+    # A few neighbours change places in the rounding of their means.
+    assert np.median(np.abs(errors)) < 2e-3

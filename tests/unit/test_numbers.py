@@ -43,6 +43,12 @@ def exported(write, **given):
 
 # Each function with arguments that are right; those that are numbers, or arrays of
 # them, are tried.
+def drawn_small(camera):
+    """A picture for panoramas of any width, which costs nothing."""
+    shape = (min(camera.height, 64), min(camera.width, 64))
+    return v3dg.Image(np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32), None)
+
+
 CALLS = {
     "refine_bundle": (
         lambda **numbers: v3dg.refine_bundle(BUNDLE, device="cpu", progress=False, **numbers),
@@ -72,6 +78,14 @@ CALLS = {
             **{"center": (0, 0, 0), "radius": 2.0, "n": 2, "elevation": 0.1, "up": (0, 0, 1)},
             **{"fov_x": 0.9, "width": 8, "height": 8, "near": 0.1},
         },
+    ),
+    "first_camera": (
+        lambda **given: v3dg.first_camera(BUNDLE, **given),
+        {"width": 8, "height": 6, "up": (0, 0, 1)},
+    ),
+    "draw_panorama": (
+        lambda **given: v3dg.draw_panorama(drawn_small, CAMERA, **given),
+        {"up": (0.1, 0.9, 0.3), "width": 8},
     ),
     "Scene.add": (
         lambda **given: v3dg.Scene().add(BUNDLE, **given),

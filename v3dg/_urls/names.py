@@ -42,6 +42,13 @@ def beside(path: str | os.PathLike[str]) -> Path:
     return Path(os.path.basename(unquote(_place_of(full(path))[1])))
 
 
+def folder_of(path: str | os.PathLike[str]) -> str:
+    """The name of the folder that a local file or a URL is in; empty for the top."""
+    if not is_url(path):
+        return Path(path).resolve().parent.name
+    return os.path.basename(os.path.dirname(unquote(_place_of(full(path))[1])))
+
+
 def _with_slashes(match: re.Match[str]) -> str:
     scheme = match[1]
     if scheme == "file":

@@ -23,7 +23,7 @@ from v3dg.cleaning import AssetWarning, describe
 from v3dg.cli import _common
 from v3dg.cli._views import ask_up, is_at_terminal
 from v3dg.gaussians import Gaussians
-from v3dg.io import SUFFIXES, open_asset, run_files
+from v3dg.io import SUFFIXES, open_asset, run_files, subject_name
 from v3dg.levels import BuildConfig, build_file, levels_path
 from v3dg.levels.scheduler import SchedulerError
 from v3dg.upright import ASSUMED, up_of
@@ -67,6 +67,9 @@ class Build(_common.OnDevice):
     resume: _common.Flag = False
     """Continue after the last finished level, and keep finished bundles of these
     gaussians and settings."""
+    overwrite: _common.Flag = False
+    """Replace the bundles of many assets that exist already. The bundle of one asset is
+    always replaced."""
     memory: Annotated[str | None, _common.option("SIZE")] = None
     """Memory of the host for the build, such as 8GiB; by default half of the free
     memory. An asset that does not fit is sorted on the disk of the output."""
@@ -177,6 +180,8 @@ def _greet(address: str) -> None:
 
 def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor | None) -> None:
     outputs = _outputs(list(assets), options.output)
+    if not options.overwrite and not options.resume:
+        _check_new(list(outputs.values()))
     start = time.perf_counter()
     results: list[JsonObject] = []
     for asset, output in outputs.items():
@@ -261,7 +266,7 @@ def _output_of(asset: Path, folder: Path | None) -> Path:
         stem = place.name
     else:
         place = beside(asset)
-        stem = place.stem
+        stem = subject_name(asset)
     return (folder or place.parent) / f"{stem}.v3dg"
 
 
@@ -281,6 +286,17 @@ def _outputs(assets: Sequence[Path], folder: Path | None) -> dict[Path, Path]:
     return {asset: output for output, asset in asset_from_output.items()}
 
 
+def _check_new(outputs: Sequence[Path]) -> None:
+    """Refuse to replace bundles that nobody named."""
+    existing = [output for output in outputs if output.exists()]
+    if existing:
+        ending = ""
+        if len(existing) > 1:
+            ending = f", and {len(existing) - 1} more"
+        advice = "--resume keeps finished bundles, --overwrite replaces them"
+        raise _common.UsageError(f"{existing[0]}: exists already{ending}; {advice}")
+
+
 def _build(
     options: Build, paths: Sequence[Path], output: Path, executor: Executor | None
 ) -> JsonObject:
@@ -289,7 +305,7 @@ def _build(
         _common.require_file(path, *SUFFIXES)
     advice = ""
     if output.is_dir():
-        advice = f", got a folder; {output / paths[0].stem}.v3dg is one"
+        advice = f", got a folder; {output / subject_name(paths[0])}.v3dg is one"
     check(output, output.suffix == ".v3dg", f"a file name ending in .v3dg{advice}")
     _common.check_output(output, *paths)
     start = time.perf_counter()

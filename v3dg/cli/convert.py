@@ -10,6 +10,7 @@ import tyro
 from v3dg import _files
 from v3dg._device import CPU
 from v3dg._numbers import check
+from v3dg._progress import waiting
 from v3dg._urls import shown
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Camera
@@ -20,7 +21,6 @@ from v3dg.cli._views import ViewOptions, choose_cameras
 from v3dg.formats._declared import declared_of
 from v3dg.gaussians import Gaussians
 from v3dg.io import WRITE_SUFFIXES, losses_of, turned_up, write_asset
-from v3dg.opening import open_with_cameras
 from v3dg.scene import Scene, Subject
 from v3dg.scene.file import is_scene
 from v3dg.select import select
@@ -86,7 +86,7 @@ def run(options: Convert) -> None:
     expected = "no scene, camera, tolerance or budget with it; leave out one or the other"
     _common.check_usage("--level", options.level is None or not is_cut, expected)
     start = time.perf_counter()
-    subject, own_cameras = open_with_cameras(options.subject)
+    subject, own_cameras = _common.open_subject(options.subject, show=not options.quiet)
     output = options.output
     notes: list[str] = []
     if _is_bundle(output):
@@ -131,11 +131,12 @@ def _written(options: Convert, subject: Subject, part: _Part, notes: list[str]) 
     if remaining.note:
         notes.append(remaining.note)
     gaussians = remaining.gaussians
-    try:
-        write_asset(output, gaussians, up=up, version=options.spz_version)
-    except ValueError as error:
-        raise ValueError(f"{name}: cannot be written to {output}: {error}") from None
-    losses = losses_of(output, gaussians, up=up)
+    with waiting(f"writing {output}", show=not options.quiet):
+        try:
+            write_asset(output, gaussians, up=up, version=options.spz_version)
+        except ValueError as error:
+            raise ValueError(f"{name}: cannot be written to {output}: {error}") from None
+        losses = losses_of(output, gaussians, up=up)
     description: dict[str, object] = dict(part.description)
     description |= {"up": up, "up_reason": reason, "dropped": remaining.dropped}
     if losses is not None:
@@ -184,8 +185,8 @@ def _check_output(options: Convert) -> None:
     _common.check_usage("--codec", fits, f"an output that ends in .v3dg, got {output}")
     fits = not options.spz_version or name.endswith(".spz")
     _common.check_usage("--spz-version", fits, f"a .spz to write, got {output}; leave it out")
-    _files.check_folder(output)
     _common.check_output(output, options.subject)
+    _files.make_folder(output)
 
 
 def _part_options(options: Convert) -> list[str]:

@@ -11,18 +11,18 @@ import numpy as np
 import tyro
 
 from v3dg._json import Json, JsonObject
-from v3dg._urls import shown
+from v3dg._urls import is_url, shown
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cleaning import OUTLIER_DISTANCE, describe, examine, outliers
 from v3dg.cli import _common
 from v3dg.formats._declared import declared_of
+from v3dg.framing import frame_subject
 from v3dg.gaussians import Array, Gaussians
 from v3dg.io import asset_bytes
 from v3dg.levels import BuildConfig
-from v3dg.opening import open_with_cameras
-from v3dg.scene import Scene
-from v3dg.upright import up_of
+from v3dg.scene import Scene, Subject
+from v3dg.upright import direction_of, up_of
 
 # JSON values, and lines of text.
 _Description: TypeAlias = tuple[JsonObject, list[str]]
@@ -40,7 +40,7 @@ class Info(_common.Common):
 
 def run(options: Info) -> None:
     _common.require_subject(options.file)
-    subject, cameras = open_with_cameras(options.file)
+    subject, cameras = _common.open_subject(options.file, show=not options.quiet)
     if isinstance(subject, Scene):
         description = _scene_info(options.file, subject, cameras or {})
     elif isinstance(subject, Bundle):
@@ -51,7 +51,28 @@ def run(options: Info) -> None:
     up, reason = up_of(subject, cameras)
     result = {**result, "up": up, "up_reason": reason}
     lines.insert(1, f"{up} is up, {reason}")
+    if not cameras and not is_url(options.file):
+        first_view, line = _first_view(options.file, subject)
+        result["first_view"] = first_view
+        lines.append(line)
     _common.print_result(result, lines, as_json=options.json)
+
+
+def _first_view(path: Path, subject: Subject) -> tuple[JsonObject | None, str]:
+    """The camera that first shows a subject, in `v3dg render` and the viewer, too; None
+    if the pages that it needs are damaged."""
+    try:
+        framing = frame_subject(subject)
+    except (OSError, ValueError) as error:
+        return None, f"first view unknown: {error}"
+    camera = framing.camera(direction_of(up_of(subject, path=path)[0]), 800, 800)
+    eye = camera.position.tolist()
+    target = framing.focus(camera).tolist()
+    side = "outside"
+    if framing.is_inside:
+        side = "inside, as a room"
+    view: JsonObject = {"eye": eye, "target": target, "is_inside": framing.is_inside}
+    return view, f"first seen from {side}, from {_point(eye)} to {_point(target)}"
 
 
 def _asset_info(path: Path, asset: Gaussians) -> _Description:

@@ -23,13 +23,16 @@ from v3dg.cameras import Axis, Camera, Floats, check_cameras
 from v3dg.export import _common
 from v3dg.export._folder import NewFiles, check_outside, replacing_export
 from v3dg.export.streamed_sog import DEFAULT_CHUNK, INDEX, SETTINGS, Export, Plan, write_levels
+from v3dg.framing import frame_subject
 from v3dg.opening import File, open_with_cameras
 from v3dg.scene import Scene, Subject
 from v3dg.select import DEFAULT_TOLERANCE
-from v3dg.upright import up_of
+from v3dg.upright import direction_of, up_of
 
 SITE = "site.json"
 ENGINE = "playcanvas.min.mjs"
+# Width over height of windows for which first views are framed.
+_START_ASPECTS = (0.4, 0.5, 0.6, 0.75, 1.0, 4 / 3, 16 / 9, 2.4)
 SITE_NEEDS = "npm install playcanvas@2.23.3", f"cp node_modules/playcanvas/build/{ENGINE} {{}}/"
 """Commands that bring PlayCanvas's engine, in the version that the page is tested with,
 to a folder."""
@@ -165,7 +168,18 @@ def _document(
         "bundles": bundles,
         "instances": _instances(scene),
         "cameras": [_camera(name, camera) for name, camera in cameras.items()],
+        "start": _start_views(scene, axes.cameras),
     }
+
+
+def _start_views(scene: Scene, up: Axis) -> list[dict[str, object]]:
+    """What the page first shows without cameras, in windows from narrow to wide."""
+    framing = frame_subject(scene)
+    views = []
+    for aspect in _START_ASPECTS:
+        camera = framing.camera(direction_of(up), round(1000 * aspect), 1000)
+        views.append({"aspect": aspect, **_camera("start", camera)})
+    return views
 
 
 def _bundle(name: str, plan: Plan, levels: Export) -> dict[str, object]:

@@ -55,7 +55,7 @@ def write_usd(
     Source: Pixar, OpenUSD 26.11, UsdVol and UsdLod.
     """
     one_of(Path(path).suffix.lower(), "path", usd.SUFFIXES)
-    _files.check_folder(Path(path))
+    _files.make_folder(Path(path))
     content = opened(subject)
     pxr = usd.pxr()
     scene = Scene.of(content)

@@ -44,6 +44,9 @@ _MAX_GAUSSIANS = 1 << 28  # pixels of the largest WebP
 # round up differently, and a constant.
 _MAX_PIXELS_FACTOR = 4
 _FREE_PIXELS = 1 << 16
+_LEAST_PALETTE = 1024
+_FULL_PALETTE = 32768
+_MOST_PALETTE = 65536  # labels have 16 bits
 _PALETTE_COLUMNS = 64  # entries of the palette side by side in its picture
 _MAX_LOG = 88.0  # about the log of the largest float32
 
@@ -299,7 +302,10 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     """Write a `.sog` file; gaussians are put in an order that keeps neighbours
     together."""
     host = _packing.check_writable(gaussians)
-    contents = encode(host.subset(_core.morton_order(host.means)))
+    # A small asset keeps the higher SH of every gaussian, and a larger one many: half
+    # the palette would halve its bytes and cost 5 to 30 dB.
+    size = max(len(host) // 4, min(len(host), _FULL_PALETTE))
+    contents = encode(host.subset(_core.morton_order(host.means)), palette_size=size)
     # Readers refuse files that are too small for what they claim; equal gaussians
     # compress to almost nothing.
     missing = least_bytes(len(host)) - sum(map(len, contents.values()))
@@ -311,9 +317,15 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
             bundle.writestr(zipfile.ZipInfo(name), content)
 
 
-def encode(gaussians: Gaussians) -> dict[str, bytes]:
+def encode(gaussians: Gaussians, *, palette_size: int | None = None) -> dict[str, bytes]:
     """The files of a SOG by name; ``gaussians`` have passed `check_writable`, and their
-    order stays."""
+    order stays.
+
+    Args:
+        palette_size: Number of sets of higher SH, at most 65,536 of which are made;
+            None is a quarter of the gaussians and at least 1024, for chunks that are
+            fetched.
+    """
     count = len(gaussians)
     width = 4 * max(1, math.ceil(math.sqrt(count) / 4))
     height = 4 * max(1, math.ceil(count / width / 4))
@@ -350,7 +362,7 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
         "sh0": {"codebook": color_table.tolist(), "files": ["sh0.webp"]},
     }
     if gaussians.sh_degree:
-        part, centroids, labels = _encoded_palette(gaussians)
+        part, centroids, labels = _encoded_palette(gaussians, palette_size)
         meta["shN"] = part
         contents["shN_centroids.webp"] = centroids
         contents["shN_labels.webp"] = picture(labels & 255, labels >> 8, np.zeros(count, np.uint8))
@@ -373,16 +385,17 @@ def _encoded_means(
     return _packing.to_integers(fractions * 65535.0, 65535), low, high
 
 
-def _encoded_palette(gaussians: Gaussians) -> tuple[dict[str, object], bytes, _packing.Integers]:
+def _encoded_palette(
+    gaussians: Gaussians, palette_size: int | None
+) -> tuple[dict[str, object], bytes, _packing.Integers]:
     """The part of meta.json for higher SH, the picture of its palette, and a label for
     each gaussian."""
     count = len(gaussians)
     num_coefficients = (gaussians.sh_degree + 1) ** 2 - 1
-    # A quarter of the gaussians; at least 1024, so that a small asset loses nothing,
-    # and at most 16 bits.
-    size = min(max(1024, count // 4), 65536)
     vectors = np.ascontiguousarray(gaussians.sh[:, 1:]).reshape(count, 3 * num_coefficients)
-    palette, labels = _core.palette_of(vectors, size)
+    if palette_size is None:
+        palette_size = max(_LEAST_PALETTE, count // 4)
+    palette, labels = _core.palette_of(vectors, min(palette_size, _MOST_PALETTE))
     table = _table_of(palette)
     num_rows = -(-len(palette) // _PALETTE_COLUMNS)
     colors = _nearest(table, palette).reshape(-1, 3)

@@ -105,7 +105,7 @@ def _checked_config(config: BuildConfig | None) -> BuildConfig:
 def _check_output(bundle_path: Path) -> None:
     """Raise an error early if no bundle can be written to this path."""
     _files.check_bundle_name(bundle_path)
-    _files.check_folder(bundle_path)
+    _files.make_folder(bundle_path)
     _files.status_of_replaced(bundle_path)
 
 

@@ -6,7 +6,7 @@ of an asset (`asset_frame.py`), of a scene whose gaussians are all resident
 frames and chooses one. `request.py` defines the requests.
 """
 
-from v3dg.render.api import render
+from v3dg.render.api import first_camera, render
 from v3dg.render.frame import Frame, FrameSource, frame_of
 from v3dg.render.pool_frame import PoolFrame
 from v3dg.render.renderer import Renderer
@@ -27,6 +27,7 @@ __all__ = [
     "Look",
     "PoolFrame",
     "Renderer",
+    "first_camera",
     "frame_of",
     "render",
     "shade_of",

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast, get_args, overload
 
 from v3dg import _device
 from v3dg._device import Device
-from v3dg._numbers import one_of
-from v3dg.cameras import Camera, StereoCamera, check_camera, for_each
+from v3dg._numbers import check, one_of, vector, whole
+from v3dg.cameras import AXES, Axis, Camera, StereoCamera, VectorLike, check_camera, for_each
 from v3dg.false_color import ColorBy
+from v3dg.framing import frame_subject
 from v3dg.gaussians import Gaussians
 from v3dg.image import RenderedImage
 from v3dg.levels.memory import pool_bytes
-from v3dg.opening import File, opened
+from v3dg.opening import File, open_with_cameras, opened
 from v3dg.pool import PoolSlot
 from v3dg.render.frame import FrameSource, frame_of
 from v3dg.render.picture import Picture
@@ -20,6 +23,7 @@ from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.residency import residency
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
+from v3dg.upright import direction_of, up_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,7 +43,7 @@ class _Options(CutOptions, total=False):
 
 @overload
 def render(
-    subject: Subject | File, camera: Camera, **options: Unpack[_Options]
+    subject: Subject | File, camera: Camera | None = None, **options: Unpack[_Options]
 ) -> RenderedImage: ...
 @overload
 def render(
@@ -51,7 +55,7 @@ def render(
 ) -> list[RenderedImage]: ...
 def render(
     subject: Subject | File,
-    camera: Camera | StereoCamera | Sequence[Camera],
+    camera: Camera | StereoCamera | Sequence[Camera] | None = None,
     *,
     tolerance: float | None = None,
     budget: int | None = None,
@@ -78,7 +82,8 @@ def render(
         camera: Pinhole camera. With several, each has its own cut and its own picture,
             as if drawn alone. The two eyes of a stereo camera share one cut and one
             frame. Their two pictures have common statistics, which are sums, except for
-            the number of selected gaussians.
+            the number of selected gaussians. None means the first camera of a scene's
+            file, else the camera of `first_camera`.
         tolerance: As in `v3dg.select`; so are `budget` and `min_level`.
         fade: As in `v3dg.select`; weights multiply opacities. Use `v3dg.DEFAULT_FADE`
             for a film.
@@ -106,7 +111,10 @@ def render(
         RuntimeError: `device` is "cuda", and something that CUDA needs is missing.
     """
     chosen_device = _device.resolve(device)
-    opened_subject = opened(subject)
+    if camera is None:
+        opened_subject, camera = _with_first_camera(subject)
+    else:
+        opened_subject = opened(subject)
     one_of(color_by, "color_by", get_args(ColorBy))
     frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     cut_request = CutRequest(tolerance, budget, min_level, fade)
@@ -122,6 +130,55 @@ def render(
     return cast(
         "RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]", pictures
     )
+
+
+def first_camera(
+    subject: Subject | File,
+    width: int = 800,
+    height: int = 800,
+    *,
+    up: Axis | VectorLike | None = None,
+) -> Camera:
+    """Return the camera that first shows a subject, the same as in the viewer and of
+    `v3dg render`: all of an object, from its front and a little above; the middle of a
+    room, from inside.
+
+    The field of view is 45 degrees across the shorter side, 65 degrees inside.
+
+    Args:
+        subject: A scene, a bundle or an asset, or the file of it.
+        width, height: Size of the picture in px.
+        up: The axis or direction that is up; None uses the axis of
+            `v3dg.upright.up_of`.
+
+    Raises:
+        ValueError: An argument is not as above.
+    """
+    width = whole(width, "width", "a positive whole number", 1)
+    height = whole(height, "height", "a positive whole number", 1)
+    path = Path()
+    if isinstance(subject, str | os.PathLike):
+        path = Path(subject)
+    content: Subject = opened(subject)
+    if up is None:
+        up = up_of(content, path=path)[0]
+    if isinstance(up, str):
+        one_of(up, "up", AXES)
+        up = direction_of(up)
+    direction = vector(up, "up")
+    check("up", direction.any(), "a direction, got (0, 0, 0)")
+    return frame_subject(content).camera(direction, width, height)
+
+
+def _with_first_camera(subject: Subject | File) -> tuple[Subject, Camera]:
+    """A subject, and the camera that it is seen from if none is asked for."""
+    if not isinstance(subject, str | os.PathLike):
+        return subject, first_camera(subject)
+    path = Path(subject)
+    content, cameras = open_with_cameras(path)
+    if cameras:
+        return content, next(iter(cameras.values()))
+    return content, first_camera(content, up=up_of(content, path=path)[0])
 
 
 def _still_frame(

@@ -54,7 +54,6 @@ class Hello(msgspec.Struct, tag="hello"):
         version: Version of the viewer; a page of another version reloads itself.
         up: The direction that is up, in the world.
         asks_up: Whether `up` is only assumed, so that the page asks the user.
-        home: A view of the whole scene.
         settings: The initial settings of a tab.
         defaults: The default of each setting.
     """
@@ -62,11 +61,21 @@ class Hello(msgspec.Struct, tag="hello"):
     version: str
     up: Vector
     asks_up: bool
-    home: View
     settings: Settings
     defaults: Settings
     limits: Limits
     cameras: list[FileCamera]
+
+
+class Home(msgspec.Struct):
+    """What a tab first shows, in a window of a certain aspect.
+
+    Attributes:
+        focus: The point that orbits go around.
+    """
+
+    view: View
+    focus: Vector
 
 
 class Scene(msgspec.Struct, tag="scene"):
@@ -75,6 +84,7 @@ class Scene(msgspec.Struct, tag="scene"):
     Attributes:
         center, radius: A ball that contains nearly all of it, world units.
         near: Distance of the near plane, world units.
+        homes: First views, from narrow windows to wide ones.
         instances: Number of instances.
         has_files: Whether all its bundles are in files, so that the scene can be saved.
         level_colors: Colour of each level.
@@ -91,6 +101,7 @@ class Scene(msgspec.Struct, tag="scene"):
     center: Vector
     radius: float
     near: float
+    homes: list[Home]
     instances: int
     has_files: bool
     level_colors: list[Color]

@@ -1,6 +1,7 @@
 """One picture of the viewer: a scene, a view and settings become pixels and
 statistics."""
 
+import functools
 import threading
 import time
 from dataclasses import dataclass, replace
@@ -13,9 +14,10 @@ from v3dg import _core, _device
 from v3dg._device import CPU, Device
 from v3dg._numbers import Floats
 from v3dg._urls import beside, cleaned, shown
-from v3dg.cameras import Camera
+from v3dg.cameras import Camera, VectorLike
 from v3dg.cleaning import ball_of_most
 from v3dg.false_color import ColorBy
+from v3dg.framing import Framing, frame_subject
 from v3dg.gaussians import Gaussians
 from v3dg.image import RenderedImage, Stats
 from v3dg.levels import BuildConfig, build_bundle
@@ -41,6 +43,8 @@ MOST_COUNTED = 256
 _MODES_OF_POOLS_ON_CUDA: tuple[Shows, ...] = ("appearance", "depth", "alpha")
 # Up to this number, all gaussians are drawn even while the camera moves.
 _FEW_GAUSSIANS = 500_000
+# Height of the picture for which a first view is framed; only its aspect counts.
+_FIRST_PIXELS = 1000
 _SHADE = shade_of((0.0, 0.0, 0.0), None, is_asset=False, depth=True)
 
 
@@ -59,6 +63,8 @@ class Settings:
         split: Fraction of the width, from the left, that shows all gaussians; 0 for
             none.
         frozen: The view that the cut is selected for; None for the view of the picture.
+        background: Red, green and blue, 0 to 1, behind colours of gaussians; the other
+            modes are drawn on black.
     """
 
     shows: Shows = "appearance"
@@ -69,6 +75,7 @@ class Settings:
     gain: float = 5.0
     split: float = 0.0
     frozen: View | None = None
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -202,6 +209,17 @@ class SceneView:
         ]
         self.num_gaussians = int(np.array(sizes, np.int64)[self.scene.instance_bundle].sum())
 
+    @functools.cached_property
+    def framing(self) -> Framing:
+        """Where the scene is, and from where it is first looked at."""
+        return frame_subject(self.scene)
+
+    def first_view(self, up: VectorLike, aspect: float) -> tuple[View, Floats]:
+        """The view that a tab begins with, and the (3,) point that orbits go around."""
+        height = _FIRST_PIXELS
+        camera = self.framing.camera(up, max(round(aspect * height), 1), height)
+        return replace(View.of_camera(camera), aspect=aspect), self.framing.focus(camera)
+
     @property
     def draws_all_while_moving(self) -> bool:
         """Whether there are so few gaussians that every picture draws all of them."""
@@ -329,7 +347,8 @@ class SceneView:
 
         whole: _Float32 | None = None
         if compares:
-            whole = draw(finest, Look(chooser=job.chooser), None).color
+            finest_image = draw(finest, Look(chooser=job.chooser), None)
+            whole = _on_background(finest_image.color, finest_image.alpha, settings)
         look = Look(_look_of(settings.shows), job.chooser, aside=compares)
         image = draw(request, look, job.steps)
         first = min(job.edge, job.camera.width - 1)
@@ -363,7 +382,8 @@ class SceneView:
         if end_of_whole > 0:
             finest = select(self.scene, camera, tolerance=0.0, device=self.device)
             window = (0, 0, end_of_whole, camera.height)
-            whole = self._draw(finest, camera, window, "appearance", job.stop).color
+            finest_planes = self._draw(finest, camera, window, "appearance", job.stop)
+            whole = _on_background(finest_planes.color, finest_planes.alpha, settings)
         level = cut.per_pair(lambda clusters: clusters.level)
         size = cut.per_pair(lambda clusters: np.diff(clusters.offset))
         figures = Stats(
@@ -457,9 +477,19 @@ def _paint(drawn: _Drawn, settings: Settings) -> _Painting:
         return _Painting(colors, (float(far), float(near)), distance)
     if shows == "difference":
         assert drawn.whole is not None
-        difference = np.abs(drawn.color - drawn.whole[:, -alpha.shape[1] :])
+        colors = _on_background(drawn.color, alpha, settings)
+        difference = np.abs(colors - drawn.whole[:, -alpha.shape[1] :])
         return _Painting(np.minimum(settings.gain * difference, np.float32(1)), None, distance)
-    return _Painting(drawn.color, None, distance)
+    return _Painting(_on_background(drawn.color, alpha, settings), None, distance)
+
+
+def _on_background(color: _Float32, alpha: _Float32, settings: Settings) -> _Float32:
+    """(H, W, 3) premultiplied colours over the background."""
+    colors = np.asarray(_device.to_host(color))
+    if not any(settings.background):
+        return colors
+    uncovered = 1 - np.asarray(_device.to_host(alpha))[..., None]
+    return np.asarray(colors + uncovered * np.asarray(settings.background, np.float32))
 
 
 def _distance_in_middle(alpha: _Float32, depth: _Float32) -> float | None:

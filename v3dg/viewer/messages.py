@@ -70,6 +70,7 @@ class _Settings(msgspec.Struct, forbid_unknown_fields=True):
     gain: Annotated[float, msgspec.Meta(ge=1, le=MOST_GAIN)] = _DEFAULTS.gain
     split: _Share = _DEFAULTS.split
     frozen: _View | None = None
+    background: tuple[_Share, _Share, _Share] = _DEFAULTS.background
 
     def settings(self) -> Settings:
         frozen: View | None = None
@@ -84,6 +85,7 @@ class _Settings(msgspec.Struct, forbid_unknown_fields=True):
             gain=self.gain,
             split=self.split,
             frozen=frozen,
+            background=self.background,
         )
 
 

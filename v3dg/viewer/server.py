@@ -8,7 +8,6 @@ import contextlib
 import http
 import io
 import logging
-import math
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -20,11 +19,12 @@ import numpy as np
 from PIL import Image
 
 from v3dg import _extras
+from v3dg._numbers import check, color
 from v3dg._version import __version__
 from v3dg.cameras import Camera, VectorLike, check_cameras
 from v3dg.select import DEFAULT_TOLERANCE
 from v3dg.viewer.frame import SceneView, Settings
-from v3dg.viewer.view import View, look_at
+from v3dg.viewer.view import View
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from v3dg.viewer.answers import Hello
     from v3dg.viewer.tab import Tab
 
-_FOV_Y = math.radians(45)
 # The end of the server does not wait longer than this for threads.
 _CLOSE_SECONDS = 1.0
 # The largest longer side of photographs, by the folder in which the page requests them.
@@ -75,7 +74,7 @@ class Site:
         cameras: Named cameras to jump to.
         photographs: Files of the cameras' photographs, by the cameras' names.
         host, port: As for `Gate`.
-        tolerance, budget: Initial settings of a tab.
+        tolerance, budget, background: Initial settings of a tab.
         up: (3,) direction in the world that is up.
         asks_up: Whether ``up`` is only assumed, so that the page asks the user.
 
@@ -99,6 +98,7 @@ class Site:
         port: int = 8080,
         tolerance: float = DEFAULT_TOLERANCE,
         budget: int | None = None,
+        background: Sequence[float] = (0.0, 0.0, 0.0),
         up: VectorLike = (0.0, 0.0, 1.0),
         asks_up: bool = False,
     ) -> None:
@@ -112,12 +112,12 @@ class Site:
         self._name = name
         cameras = cameras or {}
         check_cameras(cameras)
+        shade = _checked_color(background)
         self._photographs = [dict(photographs or {}).get(camera) for camera in cameras]
         self._greeting = _greeting(
-            scene_view,
             cameras,
             self._photographs,
-            settings=Settings(tolerance=tolerance, budget=budget),
+            settings=Settings(tolerance=tolerance, budget=budget, background=shade),
             up=up,
             asks_up=asks_up,
         )
@@ -198,7 +198,7 @@ class Site:
                 if open_tab.scene_view is scene_view:
                     open_tab.ask_again()
 
-        tab = self._make_tab(self._scene_view, self._name, send, moved)
+        tab = self._make_tab(self._scene_view, self._name, send, moved, self._greeting.up)
         self._tabs.add(tab)
         try:
             await connection.send(encode(self._greeting))
@@ -254,8 +254,14 @@ class Site:
             return None
 
 
+def _checked_color(values: Sequence[float]) -> tuple[float, float, float]:
+    red, green, blue = color(values, "background")
+    fits = all(0 <= part <= 1 for part in (red, green, blue))
+    check("background", fits, f"three numbers from 0 to 1, got {(red, green, blue)}")
+    return red, green, blue
+
+
 def _greeting(
-    scene_view: SceneView,
     cameras: Mapping[str, Camera],
     photographs: Sequence[Path | None],
     *,
@@ -275,7 +281,6 @@ def _greeting(
         version=__version__,
         up=(x, y, z),
         asks_up=asks_up,
-        home=start_view(scene_view, up),
         settings=settings,
         defaults=Settings(),
         limits=LIMITS,
@@ -299,15 +304,5 @@ def _add_headers(_connection: ServerConnection, _request: Request, response: Res
 
 
 def start_view(scene_view: SceneView, up: VectorLike, aspect: float = 16 / 9) -> View:
-    """Return the initial view of a tab: the whole scene, from a little above."""
-    axis = np.asarray(up, np.float64)
-    axis = axis / np.linalg.norm(axis)
-    # The world's axis after the one that is closest to `up`, so that the two are not
-    # parallel.
-    aside = np.roll(np.eye(3)[int(np.abs(axis).argmax())], 1)
-    aside = aside - (aside @ axis) * axis
-    direction = math.cos(0.45) * aside / np.linalg.norm(aside) + math.sin(0.45) * axis
-    distance = 0.95 * scene_view.radius / math.sin(_FOV_Y / 2)
-    return look_at(
-        scene_view.center + distance * direction, scene_view.center, axis, _FOV_Y, aspect
-    )
+    """Return the initial view of a tab: that of `v3dg.first_camera`."""
+    return scene_view.first_view(up, aspect)[0]

@@ -23,9 +23,9 @@ from v3dg import _core
 from v3dg._urls import beside
 from v3dg.bundle import Bundle
 from v3dg.camera_file import write_cameras
-from v3dg.cameras import Camera
+from v3dg.cameras import Camera, VectorLike
 from v3dg.gaussians import Gaussians
-from v3dg.io import read_asset
+from v3dg.io import read_asset, subject_name
 from v3dg.pictures import to_8bit
 from v3dg.scene.file import write_scene
 from v3dg.video import write_video
@@ -34,6 +34,8 @@ from v3dg.viewer.exports import Exporter, bundle_names
 from v3dg.viewer.frame import MOST_COUNTED, Frame, Pixels, SceneView
 from v3dg.viewer.pacing import RenderLoop
 
+# Width over height of windows for which first views are framed.
+_HOME_ASPECTS = (0.4, 0.5, 0.6, 0.75, 1.0, 4 / 3, 16 / 9, 2.4)
 # Qualities of JPEG.
 _DRAFT_QUALITY = 75
 _FINAL_QUALITY = 94
@@ -61,9 +63,15 @@ class Tab:
     """
 
     def __init__(
-        self, scene_view: SceneView, name: str, send: _Send, moved: Callable[[SceneView], None]
+        self,
+        scene_view: SceneView,
+        name: str,
+        send: _Send,
+        moved: Callable[[SceneView], None],
+        up: VectorLike = (0.0, 0.0, 1.0),
     ) -> None:
         self.scene_view = scene_view
+        self._up = up
         self._name = name
         self._send = send
         self._moved = moved
@@ -123,6 +131,7 @@ class Tab:
             center=_vector(scene_view.center),
             radius=scene_view.radius,
             near=scene_view.near,
+            homes=self._homes(),
             instances=len(scene_view.scene),
             has_files=self._folder is None and all(bundle.path for bundle in bundles),
             level_colors=_colors(_core.level_colors(scene_view.num_levels)),
@@ -132,6 +141,14 @@ class Tab:
             shows_cuts=scene_view.shows_cuts,
             missing_colors=_colors(_core.missing_colors(4.0**num_missing)),
         )
+
+    def _homes(self) -> list[answers.Home]:
+        """First views for windows from narrow to wide."""
+        homes = []
+        for aspect in _HOME_ASPECTS:
+            view, focus = self.scene_view.first_view(self._up, aspect)
+            homes.append(answers.Home(view, _vector(focus)))
+        return homes
 
     def _tell(self, answer: answers.Answer, data: bytes = b"") -> None:
         self._send(answers.encode(answer, data))
@@ -332,7 +349,7 @@ class Tab:
         scene_view = SceneView(subject, device=self.scene_view.device)
         old_loop = self._loop
         self.scene_view = scene_view
-        self._name = path.stem
+        self._name = subject_name(path)
         self._loop = RenderLoop(scene_view, self._show, self._fail)
         old_loop.close(0.0)
         self._tell(self.describe_scene())

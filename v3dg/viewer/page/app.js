@@ -152,7 +152,7 @@ export class App {
 
   openFirst() {
     this.camera.put(this.places.home);
-    this.camera.focus = this.scene.center;
+    this.camera.focus = this.places.homeFocus;
     this.panel.build();
     const { hash } = location;
     this.toolbar.showQuestion(this.greeting.asks_up && !/[#&]up=/.test(hash));

@@ -67,7 +67,6 @@ export interface FileCamera {
  *     version: Version of the viewer; a page of another version reloads itself.
  *     up: The direction that is up, in the world.
  *     asks_up: Whether `up` is only assumed, so that the page asks the user.
- *     home: A view of the whole scene.
  *     settings: The initial settings of a tab.
  *     defaults: The default of each setting.
  */
@@ -76,11 +75,21 @@ export interface Hello {
   version: string;
   up: [number, number, number];
   asks_up: boolean;
-  home: View;
   settings: Settings;
   defaults: Settings;
   limits: Limits;
   cameras: FileCamera[];
+}
+
+/**
+ * What a tab first shows, in a window of a certain aspect.
+ *
+ * Attributes:
+ *     focus: The point that orbits go around.
+ */
+export interface Home {
+  view: View;
+  focus: [number, number, number];
 }
 
 /**
@@ -239,6 +248,7 @@ export interface Save {
  * Attributes:
  *     center, radius: A ball that contains nearly all of it, world units.
  *     near: Distance of the near plane, world units.
+ *     homes: First views, from narrow windows to wide ones.
  *     instances: Number of instances.
  *     has_files: Whether all its bundles are in files, so that the scene can be saved.
  *     level_colors: Colour of each level.
@@ -256,6 +266,7 @@ export interface Scene {
   center: [number, number, number];
   radius: number;
   near: number;
+  homes: Home[];
   instances: number;
   has_files: boolean;
   level_colors: [number, number, number][];
@@ -280,6 +291,8 @@ export interface Scene {
  *     split: Fraction of the width, from the left, that shows all gaussians; 0 for
  *         none.
  *     frozen: The view that the cut is selected for; None for the view of the picture.
+ *     background: Red, green and blue, 0 to 1, behind colours of gaussians; the other
+ *         modes are drawn on black.
  */
 export interface Settings {
   shows: Shows;
@@ -290,6 +303,7 @@ export interface Settings {
   gain: number;
   split: number;
   frozen: View | null;
+  background: [number, number, number];
 }
 
 /** Ends the work that `Save` started. */
