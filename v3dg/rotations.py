@@ -1,5 +1,7 @@
 """Rotations and quaternions."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,3 +64,17 @@ def quaternion_from_rotation(rotation: Floats) -> tuple[float, float, float, flo
     if w < 0:
         return -w, -x, -y, -z
     return w, x, y, z
+
+
+def quaternion_from_angles(degrees: Sequence[float]) -> tuple[float, float, float, float]:
+    """Unit quaternion w x y z of turns about the fixed axes x, then y, then z; angles
+    (3,) in degrees."""
+    x, y, z = np.radians(np.asarray(degrees, np.float64)) / 2
+    cos_x, cos_y, cos_z = np.cos([x, y, z]).tolist()
+    sin_x, sin_y, sin_z = np.sin([x, y, z]).tolist()
+    return (
+        cos_x * cos_y * cos_z + sin_x * sin_y * sin_z,
+        sin_x * cos_y * cos_z - cos_x * sin_y * sin_z,
+        cos_x * sin_y * cos_z + sin_x * cos_y * sin_z,
+        cos_x * cos_y * sin_z - sin_x * sin_y * cos_z,
+    )

@@ -13,11 +13,12 @@ from v3dg._numbers import check
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cli import _common
+from v3dg.cli._editing import EditOptions, Editor, Edits
 from v3dg.cli._views import ViewOptions, Views, choose_cameras
 from v3dg.gaussians import Gaussians
 from v3dg.io import WRITE_SUFFIXES, write_asset
 from v3dg.opening import open_with_cameras
-from v3dg.scene import Scene
+from v3dg.scene import Scene, Subject
 from v3dg.scene.file import is_scene
 from v3dg.select import select
 
@@ -45,6 +46,7 @@ class Convert(_common.Cut, _common.Common):
     spz_version: Annotated[Literal[2, 3, 4] | None, _common.option("{2,3,4}")] = None
     """Version of a .spz; 3 by default."""
     view: Views = field(default_factory=ViewOptions)
+    edits: Edits = field(default_factory=EditOptions)
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,8 @@ class _Part:
 
 def run(options: Convert) -> None:
     options.view.check(options.subject)
+    options.edits.check()
+    editor = Editor(options.edits)
     _check_output(options)
     part_options = _part_options(options)
     is_cut = is_scene(options.subject) or any(name != "--level" for name in part_options)
@@ -66,22 +70,10 @@ def run(options: Convert) -> None:
     subject, own_cameras = open_with_cameras(options.subject)
     output = options.output
     if _is_bundle(output):
-        if not isinstance(subject, Bundle) or part_options:
-            raise _common.UsageError(
-                f"{output}: expected a bundle as the input, without options that choose a part "
-                "of it; v3dg build makes a bundle from an asset"
-            )
-        part = _Part(subject.gaussians, {"codec": options.codec or subject.codec})
-        _write_bundle(options, subject)
+        part = _write_bundle(options, subject, part_options)
     else:
-        if isinstance(subject, Gaussians):
-            expected = "a bundle or a scene; build one first"
-            _common.check_usage(", ".join(part_options), not part_options, expected)
-            part = _Part(subject, {})
-        elif isinstance(subject, Bundle) and not is_cut:
-            part = _level(options, subject)
-        else:
-            part = _cut(options, subject, own_cameras)
+        part = _part(options, subject, own_cameras, part_options)
+        part = _Part(editor.trimmed(editor.joined(part.gaussians)), part.description)
         write_asset(output, part.gaussians, version=options.spz_version)
     num_bytes = output.stat().st_size
     result = {
@@ -91,10 +83,11 @@ def run(options: Convert) -> None:
         "bytes": num_bytes,
         "seconds": time.perf_counter() - start,
         **part.description,
+        **editor.result(),
     }
     text = f"{output}: {len(part.gaussians):,} gaussians, SH degree {part.gaussians.sh_degree}"
     line = f"{text}, {_common.bytes_text(num_bytes)}"
-    _common.print_result(result, [line], as_json=options.json)
+    _common.print_result(result, [line, *editor.lines()], as_json=options.json)
 
 
 def _is_bundle(path: Path) -> bool:
@@ -113,7 +106,7 @@ def _check_output(options: Convert) -> None:
     fits = not options.spz_version or name.endswith(".spz")
     _common.check_usage("--spz-version", fits, f"a .spz to write, got {output}; leave it out")
     _files.check_folder(output)
-    _common.check_output(output, options.subject)
+    _common.check_output(output, options.subject, *options.edits.added_paths())
 
 
 def _part_options(options: Convert) -> list[str]:
@@ -128,11 +121,34 @@ def _part_options(options: Convert) -> list[str]:
     return [name for name, value in values.items() if value is not None]
 
 
-def _write_bundle(options: Convert, bundle: Bundle) -> None:
-    codec = options.codec or bundle.codec
-    Bundle(bundle.clusters, bundle.groups, bundle.gaussians, bundle.config, codec).write(
+def _write_bundle(options: Convert, subject: Subject, part_options: list[str]) -> _Part:
+    if not isinstance(subject, Bundle) or part_options or options.edits.option_names():
+        raise _common.UsageError(
+            f"{options.output}: expected a bundle as the input, without options that choose a part "
+            "of it; v3dg build makes a bundle from an asset"
+        )
+    codec = options.codec or subject.codec
+    Bundle(subject.clusters, subject.groups, subject.gaussians, subject.config, codec).write(
         options.output
     )
+    return _Part(subject.gaussians, {"codec": codec})
+
+
+def _part(
+    options: Convert,
+    subject: Subject,
+    own_cameras: dict[str, Camera] | None,
+    part_options: list[str],
+) -> _Part:
+    """The asset, a level of the bundle, or a cut."""
+    if isinstance(subject, Gaussians):
+        expected = "a bundle or a scene; build one first"
+        _common.check_usage(", ".join(part_options), not part_options, expected)
+        return _Part(subject, {})
+    is_cut = any(name != "--level" for name in part_options)
+    if isinstance(subject, Bundle) and not is_cut:
+        return _level(options, subject)
+    return _cut(options, subject, own_cameras)
 
 
 def _level(options: Convert, bundle: Bundle) -> _Part:
