@@ -96,8 +96,8 @@ def outliers(
     means: npt.NDArray[np.float32], reference: npt.NDArray[np.float32] | None = None
 ) -> npt.NDArray[np.bool_]:
     """(N,) whether each of the finite positions (N, 3) lies far from all others: at
-    more than 20 times the median distance from the median of ``reference``, all of them if
-    None."""
+    more than 20 times the median distance from the median of ``reference``, of all of
+    them if None."""
     if reference is None:
         reference = means
     if len(means) == 0 or len(reference) == 0:

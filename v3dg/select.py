@@ -100,7 +100,9 @@ class Selection:
 
         Spherical harmonics are rotated into the world's frame, which is exact. The
         degree is the highest of the bundles that are selected from. Opacities are
-        multiplied by the weights of their clusters, so that every rasterizer fades.
+        multiplied by the weights of their clusters, so that every rasterizer fades, and
+        by the opacities of their instances; tints are in the spherical harmonics, which
+        is exact.
 
         Args:
             origin: (3,) point in the world that means are relative to; use the camera's
@@ -114,6 +116,9 @@ class Selection:
         scene = copy.copy(self.scene)  # other threads may change the original meanwhile
         ids, instance = np.unique(self.instance_ids, return_inverse=True)
         bundle_ids, bundle = np.unique(scene.instance_bundle[ids], return_inverse=True)
+        factors = scene.factors
+        if factors is not None:
+            factors = factors[ids]
         rows = []
         first_row = np.empty(len(self), np.int64)
         self.check(scene.revision)
@@ -134,6 +139,7 @@ class Selection:
                     quaternions=scene.quaternions[ids],
                     scales=scene.scales[ids],
                     importance=scene.importance[ids],
+                    factors=factors,
                 ),
                 instance=instance.astype(np.int32),
                 first_row=first_row,

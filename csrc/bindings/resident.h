@@ -52,7 +52,8 @@ class BoundPalette {
 // another.
 struct SceneState {
     py::list bundles;
-    py::tuple arrays;  // bundle, importance, positions, quaternions and scales of the instances
+    // Bundle, importance, positions, quaternions, scales and factors of the instances.
+    py::tuple arrays;
     std::vector<ClusterTable> tables;
     std::vector<size_t> num_gaussians;  // of each bundle
     InstanceTable instances;            // poses only where the host reads the arrays
@@ -73,7 +74,7 @@ class BoundScene {
     void set_bundles(const py::list& bundles);
     void set_instances(const py::array& bundle, const py::array& importance,
                        const py::object& positions, const py::object& quaternions,
-                       const py::object& scales);
+                       const py::object& scales, const py::object& factors);
     // New poses of the same instances.
     void set_poses(const py::object& positions, const py::object& quaternions,
                    const py::object& scales);

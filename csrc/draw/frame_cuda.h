@@ -29,6 +29,8 @@ struct FrameBatch {
     bool has_shared_items = false;  // whether there may be any; a frame that keeps a tape has none
     float min_transmittance = kStopsBefore;  // of the images
     bool has_faded_items = false;  // the same as of shared ones; these are of scenes and not shared
+    const InstanceFactors* factors = nullptr;
+    uint32_t num_factors = 0;
     // Where the models change from frame to frame: what guards them. Whoever draws has it locked.
     StreamMutex* guards_models = nullptr;
     size_t num_zeros = 0;  // that ItemList is to have

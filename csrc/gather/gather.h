@@ -7,6 +7,7 @@
 #include "base/span.h"
 #include "base/stream.h"
 #include "math/gaussian.h"
+#include "math/instance_factors.h"
 
 namespace v3dg {
 
@@ -18,6 +19,7 @@ struct GatherInput {
     Span<const double> position;    // [I * 3]
     Span<const double> quaternion;  // [I * 4] w x y z, of any length but zero
     Span<const double> scale;
+    Span<const InstanceFactors> factors;  // empty where all are 1
     // [S] clusters
     Span<const int32_t> instance;
     Span<const int64_t> first_row;  // row in the bundle
@@ -26,8 +28,8 @@ struct GatherInput {
 };
 
 // Writes the gaussians of all clusters in the world, in order. Spherical harmonics are rotated into
-// the world's frame, which is exact; the coefficients that a bundle lacks are 0. Results are
-// computed in double precision; both halves give the same bits.
+// the world's frame and tinted, which is exact; the coefficients that a bundle lacks are 0. Results
+// are computed in double precision; both halves give the same bits.
 namespace cpu { void gather(const GatherInput& in, const GaussianRows<float>& out); }
 // Rows of bundles and `out` are on the device, all else on the host. Work is queued on the stream.
 // Throws std::runtime_error when CUDA reports an error.

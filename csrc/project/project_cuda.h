@@ -5,6 +5,7 @@
 #include "base/device.h"
 #include "frame/draw_list.h"
 #include "frame/tile_list.h"
+#include "math/instance_factors.h"
 #include "quantize/quantize.h"
 
 namespace v3dg {
@@ -27,6 +28,15 @@ struct ProjectInput {
     ItemList items;         // sets in_frustum, records and large of its counters, which start at 0
     bool has_shared_items;  // whether some items may be shared
     bool has_faded_items;   // whether some may have weights below 1; faded items are not shared
+    // [num_factors] of the instances, of which placement p has those at p modulo num_factors; null
+    // where all are 1.
+    const InstanceFactors* factors;
+    uint32_t num_factors;
+
+    // Those of the first placement of an item; those of its sharers follow. Precondition: not null.
+    V3DG_HD const InstanceFactors* factors_of(const DrawItem& item) const {
+        return factors + item.placement % num_factors;
+    }
 };
 
 struct ProjectOutput {

@@ -6,7 +6,7 @@
 // A source computes a gaussian in steps, because most gaussians reach no pixel centre. fetch()
 // loads early what its sphere follows from; sphere() returns its mean and its reach; project() its
 // ellipse and its colour, for a Projection whose p is set; shade() replaces the colour, for models
-// for which has_shade() is true.
+// for which has_shade() is true. The factors of instances apply after that.
 
 #include "base/launch.cuh"
 #include "project/project_cuda.h"
@@ -59,6 +59,7 @@ struct OfRows {
     using Fetched = float4;
     struct Place {};  // the row alone is the place
     static constexpr bool kFades = false;
+    static constexpr bool kTints = false;
 
     static __device__ Place start(const ItemTables<Model>&) { return {}; }
     static __device__ void prepare() {}
@@ -119,6 +120,7 @@ struct RowSource : OfRows<GaussianRows<const float>> {
 // Gaussians as PackedGaussian, which are the quickest to project.
 struct PackedSource : OfRows<PackedPlanes> {
     static __device__ bool has(const Model& m) { return m.plane[0] != nullptr; }
+    static __device__ bool has_palette(const Model& m) { return m.palette.sh != nullptr; }
     static __device__ bool has_shade(const Model& m) {
         return m.palette.sh != nullptr || m.sh_degree > 0;
     }
@@ -151,6 +153,7 @@ struct CodeSource {
     using Model = CodedGaussians;
     using Fetched = uint4;
     static constexpr bool kFades = false;
+    static constexpr bool kTints = false;
     struct Place {
         uint32_t cluster, end;  // the cluster of a row, and the end of the cluster's rows
     };
@@ -160,6 +163,7 @@ struct CodeSource {
     };
 
     static __device__ bool has(const Model& m) { return m.codes.records != nullptr; }
+    static __device__ bool has_palette(const Model& m) { return m.palette.sh != nullptr; }
     static __device__ bool has_shade(const Model& m) {
         return m.palette.sh != nullptr || m.codes.sh_degree > 0;
     }
@@ -264,6 +268,12 @@ struct CodeSource {
         decode_sh<float>(words, step, kDegree, sh + 3);
         color_of<kDegree>([&](int k) { return sh[k]; }, gaussian.mean, view, color);
     }
+};
+
+// A source for frames in which some instances have factors of colours or opacities.
+template <class Source>
+struct Tinted : Source {
+    static constexpr bool kTints = true;
 };
 
 // A source for frames in which some items have weights below 1.

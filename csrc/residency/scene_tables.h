@@ -39,9 +39,9 @@ class SceneTables {
     // device.
     void set_bundles(std::vector<std::shared_ptr<const BundleTables>> bundles, cudaStream_t stream);
     // Replaces all instances; set_poses() has to follow. The memory of the host may be reused on
-    // return.
+    // return. `factors` is empty where all are 1.
     void set_instances(Span<const int32_t> bundle, Span<const float> importance,
-                       cudaStream_t stream);
+                       Span<const InstanceFactors> factors, cudaStream_t stream);
     // Each part is either in memory of the host, which may be reused on return, or in memory of the
     // device, which has to stay as it is.
     void set_poses(const PoseSpan& position, const PoseSpan& quaternion, const PoseSpan& scale,
@@ -68,6 +68,8 @@ class SceneTables {
     DeviceBuffer<BundleOnDevice> bundles_on_device_;
     DeviceBuffer<int32_t> bundle_;
     DeviceBuffer<float> importance_;
+    DeviceBuffer<InstanceFactors> factors_;
+    size_t num_factors_ = 0;
     DeviceBuffer<double> uploaded_[3];
     const double *position_ = nullptr, *quaternion_ = nullptr, *scale_ = nullptr;
 };

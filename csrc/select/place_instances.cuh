@@ -87,7 +87,7 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
     bool is_alone = false;
     int32_t bundle = 0;
     InstanceView view;
-    if (i < num_instances && is_placed(pose)) {
+    if (i < num_instances && scene.instances.is_drawn(i)) {
         bundle = scene.instances.bundle[i];
         const ClusterTable& table = scene.bundles[bundle].table;
         {

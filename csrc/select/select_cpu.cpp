@@ -66,25 +66,25 @@ struct Asked {
     ClusterRange clusters, groups;
 };
 
-// An instance in front of the camera. One without a pose is hidden.
+// An instance in front of the camera, unless it is not drawn.
 struct SeenInstance {
     const ClusterTable& table;
     InstanceView view;
-    bool is_placed;
+    bool is_drawn;
 
     V3DG_INLINE SeenInstance(const View& of, size_t i)
-        : table(of.in.bundles[of.in.instances.bundle[i]]), view(), is_placed(false) {
+        : table(of.in.bundles[of.in.instances.bundle[i]]), view(), is_drawn(false) {
         const InstanceTable& instances = of.in.instances;
         const Pose pose = instances.pose(i);
-        is_placed = v3dg::is_placed(pose);
-        if (is_placed)
+        is_drawn = instances.is_drawn(i);
+        if (is_drawn)
             view = view_from_instance(of.in.eyes, of.sides[instances.bundle[i]],
                                       axes_of_instance(of.in.eyes.camera[0], pose), pose,
                                       instances.importance[i]);
     }
 
     CutSource source(const SelectRule& rule) const {
-        return is_placed ? source_of_cut(table, view, rule, SIZE_MAX) : CutSource::nowhere;
+        return is_drawn ? source_of_cut(table, view, rule, SIZE_MAX) : CutSource::nowhere;
     }
 
     // The decision by answers that are filled in before it is asked.
@@ -333,7 +333,7 @@ void cpu::pair_metrics(const SelectInput& in, const GivenCut& given, Span<float>
     parallel_for(metric.size, kChunk, [&](size_t s) {
         const SeenInstance seen(view, given.instance[s]);
         const int32_t group = seen.table.own_group[given.cluster[s]];
-        const bool is_coarse = seen.is_placed && group >= 0;
+        const bool is_coarse = seen.is_drawn && group >= 0;
         metric[s] = is_coarse ? wanted_metric_px2(seen.table, group, seen.view, in.rule) : 0.0f;
     });
 }
@@ -350,7 +350,7 @@ void cpu::bounds_may_draw(const SelectInput& in, Tolerances tolerances, Span<con
     std::fill(may_draw.begin(), may_draw.end(), uint8_t(0));
     parallel_for(in.instances.bundle.size, kChunk, [&](size_t i) {
         const SeenInstance seen(view, i);
-        if (!seen.is_placed) return;
+        if (!seen.is_drawn) return;
         const int32_t bundle = in.instances.bundle[i];
         const ClusterRange asked =
             clusters_to_ask(seen.table, runs[bundle], seen.view, in.rule, tolerances);

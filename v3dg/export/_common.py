@@ -1,9 +1,11 @@
 """Shared code of the exports: the axis that is up, rotations, names of bundles,
 documents."""
 
+import copy
 import json
 import math
 import re
+import warnings
 from collections.abc import Collection, Iterable, Mapping
 from importlib.resources import files
 from pathlib import Path
@@ -12,26 +14,23 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg._numbers import one_of
+from v3dg import _core
 from v3dg._urls import beside
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Floats
-from v3dg.rotations import rotation_from_quaternion
+from v3dg.rotations import rotation_from_quaternion, turn_upright
 from v3dg.scene import Scene
+
+_MIN_OPACITY = float(np.float32(_core.min_alpha))
+"""Instances of a smaller opacity are not drawn."""
+
+
+class ExportWarning(UserWarning):
+    """A property of instances is left out, because a format cannot hold it."""
+
 
 _OTHER_LETTERS = re.compile("[^A-Za-z0-9]")  # than names of folders have
 
-# Quaternions w x y z that turn an axis to -y, which is up where y is down, as viewers
-# take it.
-_HALF = math.sqrt(0.5)
-_TO_UPRIGHT: dict[Axis, tuple[float, float, float, float]] = {
-    "x": (_HALF, 0.0, 0.0, -_HALF),
-    "y": (0.0, 1.0, 0.0, 0.0),
-    "z": (_HALF, _HALF, 0.0, 0.0),
-    "-x": (_HALF, 0.0, 0.0, _HALF),
-    "-y": (1.0, 0.0, 0.0, 0.0),
-    "-z": (_HALF, -_HALF, 0.0, 0.0),
-}
 # Rotations from that frame to one with y up, as in WebGL, and to one with z up, as on a
 # globe.
 _FROM_UPRIGHT = {
@@ -40,16 +39,28 @@ _FROM_UPRIGHT = {
 }
 
 
-def turn_upright(up: Axis) -> Floats:
-    """(4,) w x y z that turns what is up in an asset to -y; ValueError for another
-    name."""
-    one_of(up, "up", tuple(_TO_UPRIGHT))
-    return np.array(_TO_UPRIGHT[up])
-
-
 def rotation_to(up: Axis, frame: Literal["y", "z"]) -> Floats:
     """(3, 3) rotation that turns what is up to an axis."""
     return np.asarray(_FROM_UPRIGHT[frame] @ rotation_from_quaternion(turn_upright(up))) + 0.0
+
+
+def exported(scene: Scene, format_name: str) -> Scene:
+    """The instances of a scene that are drawn, for a format that holds neither opacity
+    nor tint; warns if any is left out."""
+    if scene.factors is None:
+        return scene
+    visible = copy.copy(scene)
+    visible.remove(np.flatnonzero(visible.opacity < _MIN_OPACITY))
+    factors = visible.factors
+    if factors is not None:
+        count = int((factors != 1).any(axis=1).sum())
+        warnings.warn(
+            f"{format_name} cannot hold the opacity and tint of instances; those of {count:,} are "
+            "left out",
+            ExportWarning,
+            stacklevel=3,
+        )
+    return visible
 
 
 def names_of(scene: Scene, reserved: Collection[str] = ()) -> list[str]:
