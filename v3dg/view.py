@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypedDict
 
 from v3dg._device import Device
 from v3dg._numbers import one_of
-from v3dg._urls import beside
+from v3dg._urls import beside, is_url
 from v3dg.cameras import AXES, Axis, Camera, VectorLike
 from v3dg.opening import File, open_with_cameras
 from v3dg.scene import Subject
@@ -32,6 +32,7 @@ class _SiteOptions(TypedDict, total=False):
     tolerance: float
     budget: int | None
     asks_up: bool
+    edits_folder: Path | None
 
 
 def view(
@@ -69,6 +70,8 @@ def view(
         subject, cameras = open_with_cameras(path)
         options.setdefault("name", beside(path).stem)
         options.setdefault("cameras", cameras)
+        if not is_url(path):
+            options.setdefault("edits_folder", path.absolute().parent)
     if up is None:
         up, reason = up_of(subject, options.get("cameras"), path)
         options.setdefault("asks_up", reason == ASSUMED)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from v3dg._start import SIGNALS
-from v3dg._urls import beside, shown
+from v3dg._urls import beside, is_url, shown
 from v3dg.cameras import Axis
 from v3dg.cli._common import (
     Cut,
@@ -93,6 +93,7 @@ def run(options: View) -> None:
             budget=options.budget,
             up=direction_of(up),
             asks_up=reason == ASSUMED,
+            edits_folder=_folder_of(options.subject),
         )
         try:
             _announce(options, site, lines_of_up(options.subject, up, reason))
@@ -101,6 +102,13 @@ def run(options: View) -> None:
         finally:
             site.close()
     raise KeyboardInterrupt
+
+
+def _folder_of(subject: Path) -> Path | None:
+    """The folder of a file that is here."""
+    if is_url(subject):
+        return None
+    return subject.absolute().parent
 
 
 def _tolerance_of(options: View) -> float:

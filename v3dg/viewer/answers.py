@@ -76,6 +76,8 @@ class Scene(msgspec.Struct, tag="scene"):
         near: Distance of the near plane, world units.
         instances: How many there are.
         has_files: Whether all its bundles are files, so that it can be saved.
+        writes_files: Whether the server writes new assets, beside the file that is
+            shown; otherwise the browser saves them.
         level_colors: Colour of each level.
         ramp: Colours from the smallest value to the largest.
         most_counted: Gaussians in a pixel that get the last colour of the ramp.
@@ -91,6 +93,7 @@ class Scene(msgspec.Struct, tag="scene"):
     near: float
     instances: int
     has_files: bool
+    writes_files: bool
     level_colors: list[Color]
     ramp: list[Color]
     most_counted: int
