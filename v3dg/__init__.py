@@ -16,6 +16,14 @@ from v3dg._version import __version__
 from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.camera_file import read_cameras, write_cameras
 from v3dg.cameras import Camera, StereoCamera, turntable
+from v3dg.editing import (
+    crop_box,
+    crop_sphere,
+    drop_outliers,
+    drop_transparent,
+    join,
+    to_degree,
+)
 from v3dg.export import write_site, write_streamed_sog, write_tiles, write_usd
 from v3dg.gaussians import Gaussians
 from v3dg.image import Image, RenderedImage, Stats
@@ -35,6 +43,7 @@ from v3dg.view import view
 
 __all__ = ["BuildConfig", "Bundle", "Clusters", "Gaussians", "Groups"]
 __all__ += ["__version__", "build_bundle", "read_asset", "refine_bundle", "write_asset"]
+__all__ += ["crop_box", "crop_sphere", "drop_outliers", "drop_transparent", "join", "to_degree"]
 __all__ += [
     "Camera",
     "Scene",

@@ -79,6 +79,7 @@ class Instances:
         quaternions: Float64,
         scales: Float64,
         importance: Float32,
+        factors: Float32 | None = None,
     ) -> None: ...
 
 class Rows:
@@ -481,6 +482,7 @@ class ResidentScene:
         positions: Array,
         quaternions: Array,
         scales: Array,
+        factors: Float32 | None = None,
     ) -> None: ...
     def set_poses(self, positions: Array, quaternions: Array, scales: Array) -> None: ...
     def select(

@@ -96,14 +96,21 @@ def examine(asset: Gaussians) -> Findings:
     return Findings(drawable=faults == 0, counts=counts, wrong=(faults & _WRONG) != 0)
 
 
-def outliers(means: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+def outliers(
+    means: npt.NDArray[np.float32], reference: npt.NDArray[np.float32] | None = None
+) -> npt.NDArray[np.bool_]:
     """(N,) whether each of the finite positions (N, 3) lies far from all others: at
-    more than 20 times the median distance."""
-    if len(means) == 0:
-        return np.zeros(0, bool)
-    exact = means.astype(np.float64)
-    distance = np.linalg.norm(exact - np.median(exact, axis=0), axis=1)
-    return np.asarray(distance > OUTLIER_DISTANCE * np.median(distance))
+    more than 20 times the median distance from the median of ``reference``, of all of
+    them if None."""
+    if reference is None:
+        reference = means
+    if len(means) == 0 or len(reference) == 0:
+        return np.zeros(len(means), bool)
+    typical = reference.astype(np.float64)
+    center = np.median(typical, axis=0)
+    median_distance = np.median(np.linalg.norm(typical - center, axis=1))
+    distance = np.linalg.norm(means.astype(np.float64) - center, axis=1)
+    return np.asarray(distance > OUTLIER_DISTANCE * median_distance)
 
 
 def ball_of_most(points: npt.NDArray[np.floating]) -> tuple[npt.NDArray[np.floating], float]:

@@ -118,7 +118,15 @@ class ResidentScene:
         if self.revision[0] == scene.revision[0]:
             self.core.set_poses(*poses)
         else:
-            self.core.set_instances(scene.instance_bundle, scene.importance, *poses)
+            positions, quaternions, scales = poses
+            self.core.set_instances(
+                scene.instance_bundle,
+                scene.importance,
+                positions,
+                quaternions,
+                scales,
+                scene.factors,
+            )
         self.revision = scene.revision
 
     def add_drawing(self, drawing: _core.Drawing) -> None:

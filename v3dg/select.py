@@ -98,9 +98,10 @@ class Selection:
         """Return the selected gaussians in the world, N in the order of the selection,
         for any rasterizer.
 
-        Spherical harmonics are rotated into the world, which is exact. The SH degree is
-        the highest of the bundles in the selection. Opacities are multiplied by the
-        weights of their clusters, so that fades work in every rasterizer.
+        Spherical harmonics are rotated into the world and multiplied by the tints of
+        the instances, which is exact. The SH degree is the highest of the bundles in
+        the selection. Opacities are multiplied by the weights of their clusters, so
+        that fades work in every rasterizer, and by the opacities of their instances.
 
         Args:
             origin: (3,) point in the world that means are relative to. Use the camera's
@@ -114,6 +115,9 @@ class Selection:
         scene = copy.copy(self.scene)  # other threads may change the original meanwhile
         ids, instance = np.unique(self.instance_ids, return_inverse=True)
         bundle_ids, bundle = np.unique(scene.instance_bundle[ids], return_inverse=True)
+        factors = scene.factors
+        if factors is not None:
+            factors = factors[ids]
         rows = []
         first_row = np.empty(len(self), np.int64)
         self.check(scene.revision)
@@ -134,6 +138,7 @@ class Selection:
                     quaternions=scene.quaternions[ids],
                     scales=scene.scales[ids],
                     importance=scene.importance[ids],
+                    factors=factors,
                 ),
                 instance=instance.astype(np.int32),
                 first_row=first_row,

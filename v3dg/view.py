@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypedDict
 
 from v3dg._device import Device
 from v3dg._numbers import one_of
+from v3dg._urls import is_url
 from v3dg.cameras import AXES, Axis, Camera, VectorLike
 from v3dg.io import subject_name
 from v3dg.opening import File, open_with_cameras
@@ -33,6 +34,7 @@ class _SiteOptions(TypedDict, total=False):
     budget: int | None
     background: Sequence[float]
     asks_up: bool
+    edits_folder: Path | None
 
 
 def view(
@@ -69,6 +71,8 @@ def view(
         subject, cameras = open_with_cameras(path)
         options.setdefault("name", subject_name(path))
         options.setdefault("cameras", cameras)
+        if not is_url(path):
+            options.setdefault("edits_folder", path.absolute().parent)
     if up is None:
         up, reason = up_of(subject, options.get("cameras"))
         options.setdefault("asks_up", reason == ASSUMED)

@@ -55,6 +55,7 @@ py::tuple gather(const std::vector<std::reference_wrapper<const Rows>>& bundles,
     in.position = placed.position;
     in.quaternion = placed.quaternion;
     in.scale = placed.scale;
+    in.factors = placed.factors;
     in.instance = span_of<const int32_t>(instance, "instance", {-1});
     const auto num_clusters = static_cast<py::ssize_t>(in.instance.size);
     in.first_row = span_of<const int64_t>(first_row, "first_row", {num_clusters});

@@ -146,14 +146,22 @@ NewRows::NewRows(Device device, size_t size, int sh_degree)
       sh_degree(sh_degree) {}
 
 Instances::Instances(py::array bundle, py::array positions, py::array quaternions, py::array scales,
-                     py::array importance)
-    : arrays_{bundle, positions, quaternions, scales, importance} {
+                     py::array importance, py::object factors)
+    : arrays_{bundle, positions, quaternions, scales, importance, factors} {
     table_.bundle = span_of<const int32_t>(bundle, "bundle", {-1});
     const auto count = static_cast<py::ssize_t>(table_.bundle.size);
     table_.position = span_of<const double>(positions, "positions", {count, 3});
     table_.quaternion = span_of<const double>(quaternions, "quaternions", {count, 4});
     table_.scale = span_of<const double>(scales, "scales", {count});
     table_.importance = span_of<const float>(importance, "importance", {count});
+    table_.factors = factors_of(factors, count);
+}
+
+Span<const InstanceFactors> factors_of(const py::object& factors, py::ssize_t count) {
+    static_assert(sizeof(InstanceFactors) == 4 * sizeof(float), "a row of four numbers");
+    if (factors.is_none()) return {};
+    const Span<const float> rows = span_of<const float>(factors, "factors", {count, 4});
+    return {reinterpret_cast<const InstanceFactors*>(rows.data), static_cast<size_t>(count)};
 }
 
 void Instances::check_bundles(size_t num_bundles) const {
@@ -206,8 +214,9 @@ void bind_types(py::module_& m) {
         .def_readonly("tolerance_px2", &SelectRule::tolerance_px2);
     py::class_<Instances>(m, "Instances",
                           "Instances of bundles; borrows the arrays, which are on the host.")
-        .def(py::init<py::array, py::array, py::array, py::array, py::array>(), py::kw_only(),
-             "bundle"_a, "positions"_a, "quaternions"_a, "scales"_a, "importance"_a);
+        .def(py::init<py::array, py::array, py::array, py::array, py::array, py::object>(),
+             py::kw_only(), "bundle"_a, "positions"_a, "quaternions"_a, "scales"_a, "importance"_a,
+             "factors"_a = py::none());
     py::class_<Rows>(m, "Rows", "The arrays of gaussians, on the host or on a CUDA device.")
         .def(py::init<py::object, py::object, py::object, py::object, py::object>(), "means"_a,
              "quats"_a, "scales"_a, "opacities"_a, "sh"_a)

@@ -57,7 +57,8 @@ class BackendScene final : public backend::Scene {
     }
     void set_instances(SceneState& state, const Work& work) override {
         const Poses poses(state);
-        tables_.set_instances(state.instances.bundle, state.instances.importance, stream_of(work));
+        tables_.set_instances(state.instances.bundle, state.instances.importance,
+                              state.instances.factors, stream_of(work));
         poses.give_to(tables_, work);
     }
     void set_poses(SceneState& state, const Work& work) override {

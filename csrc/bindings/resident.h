@@ -53,7 +53,8 @@ class BoundPalette {
 // every change makes another object.
 struct SceneState {
     py::list bundles;
-    py::tuple arrays;  // bundle, importance, positions, quaternions and scales of the instances
+    // Bundle, importance, positions, quaternions, scales and factors of the instances.
+    py::tuple arrays;
     std::vector<ClusterTable> tables;
     std::vector<size_t> num_gaussians;  // per bundle
     InstanceTable instances;            // with poses only if the host can read the arrays
@@ -74,7 +75,7 @@ class BoundScene {
     void set_bundles(const py::list& bundles);
     void set_instances(const py::array& bundle, const py::array& importance,
                        const py::object& positions, const py::object& quaternions,
-                       const py::object& scales);
+                       const py::object& scales, const py::object& factors);
     // Sets new poses of the same instances.
     void set_poses(const py::object& positions, const py::object& quaternions,
                    const py::object& scales);

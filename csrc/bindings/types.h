@@ -104,15 +104,17 @@ int degree_of_bases(py::ssize_t bases, const std::string& shape);
 class Instances {
   public:
     Instances(py::array bundle, py::array positions, py::array quaternions, py::array scales,
-              py::array importance);
+              py::array importance, py::object factors);
     const InstanceTable& table() const { return table_; }
     // Throws unless the bundle of every instance is below `num_bundles`.
     void check_bundles(size_t num_bundles) const;
 
   private:
-    std::array<py::array, 5> arrays_;
+    std::array<py::object, 6> arrays_;
     InstanceTable table_;
 };
+// (I, 4) factors of red, green, blue and opacity; empty for None.
+Span<const InstanceFactors> factors_of(const py::object& factors, py::ssize_t count);
 void check_instance_bundles(Span<const int32_t> bundle, size_t num_bundles);
 
 // Returns boundaries of segments: ascending from 0 to `last`.

@@ -31,6 +31,8 @@ struct FrameBatch {
     float min_transmittance = kStopsBefore;  // of the images
     // Whether any may be faded; only items of scenes, which are not shared.
     bool has_faded_items = false;
+    const InstanceFactors* factors = nullptr;  // [num_factors], or null
+    uint32_t num_factors = 0;
     // The mutex that guards the models, if these change from frame to frame. The caller
     // holds it while it draws.
     StreamMutex* guards_models = nullptr;

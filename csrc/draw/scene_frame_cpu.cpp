@@ -88,7 +88,7 @@ class CutDraws {
         end_of_pair_.push_back(num_gaussians_);
         if (i != last_instance_) {
             const Pose pose = scene_.instances.pose(i);
-            if (!is_placed(pose)) return;
+            if (!scene_.instances.is_drawn(i)) return;
             view_ = model_view_from_instance(axes_of_instance(camera_, pose), pose);
         }
         end_of_pair_.back() = num_gaussians_ += count;
@@ -96,8 +96,16 @@ class CutDraws {
         const Palette palette = tint == nullptr ? model.palette : Palette{tint, nullptr, 1};
         const Appearance<float> appearance =
             fades_ ? model.appearance.faded(table, c) : model.appearance[c];
-        const Draw<float> next{model.planes, first,   count,       view_,
-                               appearance,   palette, model.codes, weight};
+        const Span<const InstanceFactors>& factors = scene_.instances.factors;
+        const Draw<float> next{.model = model.planes,
+                               .first = first,
+                               .count = count,
+                               .view = view_,
+                               .appearance = appearance,
+                               .palette = palette,
+                               .codes = model.codes,
+                               .weight = factors.empty() ? weight : weight * factors[i].opacity,
+                               .color_factors = factors.empty() ? nullptr : factors[i].color};
         if (i == last_instance_ && joins(draws_.back(), next))
             draws_.back().count += count;
         else

@@ -116,6 +116,7 @@ EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_tra
 FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures,
                              const SelectRule& rule, cudaStream_t stream) {
     const FrameImage& last = pictures.image[pictures.count - 1];
+    const Span<const InstanceFactors> factors = scene.on_device().instances.factors;
     return {.models = rows_.data(),
             .placements = placements_.reserve(pictures.count * scene.num_instances(), stream),
             .images = images_.reserve(pictures.count, stream),
@@ -126,6 +127,8 @@ FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures
             .has_shared_items = scene.num_instances() > 1,
             .min_transmittance = pictures.min_transmittance,
             .has_faded_items = rule.fade.is_on(),
+            .factors = factors.empty() ? nullptr : factors.data,
+            .num_factors = static_cast<uint32_t>(factors.size),
             .guards_models = nullptr,
             .num_zeros = Cut::num_zeros(scene, rule),
             .has_depth = false};

@@ -35,7 +35,8 @@ struct Draw {
     Appearance<T> appearance;
     Palette palette{};
     const Codes* codes = nullptr;
-    T weight = 1;  // factor of opacities, below 1 in a fade
+    T weight = 1;                          // factor of opacities: of an instance, and in a fade
+    const float* color_factors = nullptr;  // [3] of colours that are not a palette's; null: none
 };
 
 namespace cuda {

@@ -7,6 +7,7 @@
 #include "base/span.h"
 #include "base/stream.h"
 #include "math/gaussian.h"
+#include "math/instance_factors.h"
 
 namespace v3dg {
 
@@ -18,6 +19,7 @@ struct GatherInput {
     Span<const double> position;    // [I * 3]
     Span<const double> quaternion;  // [I * 4] w x y z, of any length but zero
     Span<const double> scale;
+    Span<const InstanceFactors> factors;  // empty where all are 1
     // [S] clusters
     Span<const int32_t> instance;
     Span<const int64_t> first_row;  // row in the bundle
@@ -26,9 +28,9 @@ struct GatherInput {
 };
 
 // Writes the gaussians of all clusters in world coordinates, in order. Spherical
-// harmonics are rotated into the world, which is exact; coefficients that a bundle does
-// not have are 0. Results are computed in double precision; the CPU and CUDA give the
-// same bits.
+// harmonics are rotated into the world and multiplied by the tint, which is exact;
+// coefficients that a bundle does not have are 0. Results are computed in double
+// precision; the CPU and CUDA give the same bits.
 namespace cpu { void gather(const GatherInput& in, const GaussianRows<float>& out); }
 // The rows of bundles and `out` are on the device, all other arrays on the host. Work
 // is queued on the stream. Throws std::runtime_error if CUDA reports an error.

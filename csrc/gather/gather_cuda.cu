@@ -73,6 +73,7 @@ void gather(const GatherInput& host, const GaussianRows<float>& out, Stream stre
         bands({tables.bands.data(), tables.bands.size()}, stream);
     const Rotations rotations{rotation.data(), bands.data()};
     const Copy<float> weight(in.weight, stream);
+    const Copy<InstanceFactors> factors(in.factors, stream);
     const Copy<int64_t> first_row(in.first_row, stream), offset(in.offset, stream);
     launch("gather", gather_kernel, blocks_for(num_items, kBlockSize), kBlockSize, 0, stream, in,
            rotations, out, num_sh_bases(out.sh_degree));

@@ -6,6 +6,7 @@
 
 #include <algorithm>
 
+#include "math/instance_factors.h"
 #include "quantize/quantize_math.h"
 
 namespace v3dg {
@@ -104,6 +105,7 @@ static V3DG_INLINE void write_records(const Source& from, const Draw<T>& draw, u
     } else {
         const int sh_degree = from.load_sh(at, count, sh);
         color_of_sh(sh_degree, direction, sh, color);
+        if (draw.color_factors != nullptr) tint(draw.color_factors, color);
     }
     for (Record<T>* r = records; lanes != 0; lanes &= lanes - 1, ++r) {
         const int i = __builtin_ctz(lanes);

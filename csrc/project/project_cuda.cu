@@ -36,11 +36,13 @@ constexpr unsigned kManySmall = 4;
 // tested, as long as at least kMany of 32 become records.
 constexpr unsigned kNearlyAll = 22, kMany = 12;
 
-// Projects the item whose tables the warp has loaded. Returns its number of records.
+// Projects the item whose tables the warp has loaded. `factors` are those of its
+// placement, or of all placements that share the item; null unless the source has
+// factors. Returns its number of records.
 template <class Source, bool kIsShared>
 __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const Placement* sharers,
-                                 FrameCounters& counters, const ProjectOutput& out,
-                                 unsigned& num_in_frustum) {
+                                 const InstanceFactors* factors, FrameCounters& counters,
+                                 const ProjectOutput& out, unsigned& num_in_frustum) {
     constexpr unsigned kRound = kIsShared ? 1 : 32;  // gaussians per iteration
     const auto& tables = space.tables;
     const unsigned lane = threadIdx.x % 32, count = tables.item.count;
@@ -49,6 +51,9 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
     ModelView<float> of_sharer;
     if (kIsShared && sees) of_sharer = sharers[lane].view;
     const ModelView<float>& view = kIsShared ? of_sharer : tables.placement.view;
+    bool is_faint = false;
+    if constexpr (Source::kTints)
+        if (sees) is_faint = factors[kIsShared ? lane : 0].opacity < 1;
     const auto reach_scale_of = [&] {
         const float* linear = view.linear;
         return tables.image.camera.sphere_scale(
@@ -77,7 +82,8 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
             const float mean[3] = {sphere.x, sphere.y, sphere.z};
             to_view(view, mean, mine.p);
             if (are_tested) {
-                const SphereTest told = test_sphere<Source>(tables, mine.p, sphere.w, reach_scale);
+                const SphereTest told =
+                    test_sphere<Source>(tables, mine.p, sphere.w, reach_scale, is_faint);
                 may_reach = told.may_reach;
                 is_small = may_reach && told.half < kSmall;
                 num_in_frustum += told.misses_centers;
@@ -105,8 +111,9 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
             waiting -= taken;
             are_tested = !are_nearly_all || waiting > 0;
         }
-        const unsigned num_records = write_records<Source, kIsShared>(
-            space, sharers, start, traits, may_reach, mine, record, counters, out, num_in_frustum);
+        const unsigned num_records =
+            write_records<Source, kIsShared>(space, sharers, factors, start, traits, may_reach,
+                                             mine, record, counters, out, num_in_frustum);
         record += num_records;
         are_tested = are_tested || num_records < kMany;
         __syncwarp();  // the queue and the records are written next
@@ -135,6 +142,14 @@ __device__ void report_counts(FrameCounters& counters, unsigned num_in_frustum,
 }
 
 template <class Source>
+__device__ const InstanceFactors* factors_for(const ProjectInput& in, const DrawItem& item) {
+    if constexpr (Source::kTints)
+        return in.factors_of(item);
+    else
+        return nullptr;
+}
+
+template <class Source>
 __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     project_kernel(ProjectInput in, const typename Source::Model* models, ProjectOutput out,
                    unsigned* taken) {
@@ -159,8 +174,9 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
         __syncwarp();
         store_tables(space.tables, item_word, placement_word, in, models, loaded);
         if (space.tables.item.sharers == 0 && Source::has(space.tables.model)) {
-            const unsigned written = project_item<Source, false>(space, nullptr, *in.items.counters,
-                                                                 out, num_in_frustum);
+            const unsigned written = project_item<Source, false>(
+                space, nullptr, factors_for<Source>(in, space.tables.item), *in.items.counters, out,
+                num_in_frustum);
             num_records += written;
             report_item(space.tables, i, written, out);
         }
@@ -201,7 +217,8 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
                          in, models, loaded);
             if (!Source::has(space.tables.model)) continue;
             const unsigned written =
-                project_item<Source, true>(space, sharers, *in.items.counters, out, num_in_frustum);
+                project_item<Source, true>(space, sharers, factors_for<Source>(in, item),
+                                           *in.items.counters, out, num_in_frustum);
             num_records += written;
             report_item(space.tables, i, written, out);
         }
@@ -225,12 +242,21 @@ static void project_from(const typename Source::Model* models, const ProjectInpu
 }
 
 template <class Source>
-static void project_scene(const typename Source::Model* models, const ProjectInput& in,
-                          const ProjectOutput& out, int taken, cudaStream_t stream) {
+static void project_instances(const typename Source::Model* models, const ProjectInput& in,
+                              const ProjectOutput& out, int taken, cudaStream_t stream) {
     if (in.has_faded_items)
         project_from<Faded<Source>, Source>(models, in, out, taken, stream);
     else
         project_from<Source, Source>(models, in, out, taken, stream);
+}
+
+template <class Source>
+static void project_scene(const typename Source::Model* models, const ProjectInput& in,
+                          const ProjectOutput& out, int taken, cudaStream_t stream) {
+    if (in.factors != nullptr)
+        project_instances<Tinted<Source>>(models, in, out, taken, stream);
+    else
+        project_instances<Source>(models, in, out, taken, stream);
 }
 
 void project(const ProjectInput& in, const ProjectOutput& out, cudaStream_t stream) {

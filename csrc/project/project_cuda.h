@@ -6,6 +6,7 @@
 #include "base/device.h"
 #include "frame/draw_list.h"
 #include "frame/tile_list.h"
+#include "math/instance_factors.h"
 #include "quantize/quantize.h"
 
 namespace v3dg {
@@ -29,6 +30,16 @@ struct ProjectInput {
     bool has_shared_items;  // whether some items may be shared
     // Whether some items may have weights below 1; faded items are not shared.
     bool has_faded_items;
+    // [num_factors] of the instances: placement p has those at p modulo num_factors.
+    // Null if all factors are 1.
+    const InstanceFactors* factors;
+    uint32_t num_factors;
+
+    // Returns the factors of the first placement of an item; those of the placements
+    // that share it follow. Precondition: `factors` is not null.
+    V3DG_HD const InstanceFactors* factors_of(const DrawItem& item) const {
+        return factors + item.placement % num_factors;
+    }
 };
 
 struct ProjectOutput {

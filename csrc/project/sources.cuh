@@ -6,7 +6,8 @@
 // A source computes a gaussian in steps, because most gaussians reach no pixel centre.
 // fetch() loads what the bounding sphere depends on; sphere() returns mean and reach;
 // project() returns ellipse and colour, for a Projection whose p is set; shade()
-// replaces the colour, for models for which has_shade() is true.
+// replaces the colour, for models for which has_shade() is true. The factors of
+// instances are applied afterwards.
 
 #include "base/launch.cuh"
 #include "project/project_cuda.h"
@@ -60,6 +61,7 @@ struct OfRows {
     using Fetched = float4;
     struct Place {};  // a row needs no further state
     static constexpr bool kFades = false;
+    static constexpr bool kTints = false;
 
     static __device__ Place start(const ItemTables<Model>&) { return {}; }
     static __device__ void prepare() {}
@@ -120,6 +122,7 @@ struct RowSource : OfRows<GaussianRows<const float>> {
 // PackedGaussian, which is fastest to project.
 struct PackedSource : OfRows<PackedPlanes> {
     static __device__ bool has(const Model& m) { return m.plane[0] != nullptr; }
+    static __device__ bool has_palette(const Model& m) { return m.palette.sh != nullptr; }
     static __device__ bool has_shade(const Model& m) {
         return m.palette.sh != nullptr || m.sh_degree > 0;
     }
@@ -153,6 +156,7 @@ struct CodeSource {
     using Model = CodedGaussians;
     using Fetched = uint4;
     static constexpr bool kFades = false;
+    static constexpr bool kTints = false;
     struct Place {
         uint32_t cluster, end;  // cluster of a row, and end of the cluster's rows
     };
@@ -162,6 +166,7 @@ struct CodeSource {
     };
 
     static __device__ bool has(const Model& m) { return m.codes.records != nullptr; }
+    static __device__ bool has_palette(const Model& m) { return m.palette.sh != nullptr; }
     static __device__ bool has_shade(const Model& m) {
         return m.palette.sh != nullptr || m.codes.sh_degree > 0;
     }
@@ -266,6 +271,12 @@ struct CodeSource {
         decode_sh<float>(words, step, kDegree, sh + 3);
         color_of<kDegree>([&](int k) { return sh[k]; }, gaussian.mean, view, color);
     }
+};
+
+// A source for frames in which some instances have factors of colours or opacities.
+template <class Source>
+struct Tinted : Source {
+    static constexpr bool kTints = true;
 };
 
 // A source for frames in which some items have weights below 1.

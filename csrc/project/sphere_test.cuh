@@ -16,11 +16,12 @@ struct SphereTest {
     float half;           // upper bound on its reach from the centre, px
 };
 
-// Tests a gaussian at p in view space. It has no branches, because in a warp some lane
-// would take each of them.
+// Tests a gaussian at p in view space; `is_faint` says whether its instance has an
+// opacity below 1. It has no branches, because in a warp some lane would take each of
+// them.
 template <class Source>
 __device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, const float p[3],
-                                  float reach, float reach_scale) {
+                                  float reach, float reach_scale, bool is_faint) {
     const Intrinsics<float>& cam = in.image.camera;
     const auto [u, v, half] =
         cam.image_of_sphere(p, reach, reach_scale, in.item.appearance.filter_px2);
@@ -29,8 +30,8 @@ __device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, 
     const bool is_outside = !(cam.depth_of(p) >= cam.near_depth) | (reach < 0) |
                             (from_x - half >= middle_x) | (from_y - half >= middle_y);
     // If its centre is in the image, it certainly is in the frustum, unless
-    // antialiasing or a fade makes it too faint.
-    const bool is_faded = Source::kFades && in.item.weight < 1;
+    // antialiasing, a fade or its instance makes it too faint.
+    const bool is_faded = (Source::kFades && in.item.weight < 1) || is_faint;
     const bool is_inside =
         (from_x < middle_x) & (from_y < middle_y) & !in.item.appearance.antialiased & !is_faded;
     const bool misses = is_inside & (misses_centers(u, half) | misses_centers(v, half));

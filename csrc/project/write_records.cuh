@@ -26,10 +26,12 @@ template <class Source>
 __device__ bool project_one(const ItemTables<typename Source::Model>& in,
                             const ModelView<float>& view, typename Source::Place place, uint32_t g,
                             const float p[3], bool is_one, const ItemTraits& traits,
-                            Record<float>& r, PixelBox<int>& box, unsigned& num_in_frustum) {
+                            const InstanceFactors* factors, Record<float>& r, PixelBox<int>& box,
+                            unsigned& num_in_frustum) {
     Projection<float> s;
     for (int i = 0; i < 3; ++i) s.p[i] = p[i];
-    const Ellipse<float> e = Source::project(in, view, place, g, s, r.color);
+    Ellipse<float> e = Source::project(in, view, place, g, s, r.color);
+    if constexpr (Source::kTints) fade(factors->opacity, e);
     float half_x, half_y;
     const Intrinsics<float>& cam = in.image.camera;
     // The sphere test has shown that the gaussian is not too faint.
@@ -41,16 +43,21 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in,
     set_ellipse(e, r);
     const bool reaches_pixel = is_in_frustum & box.holds_pixels();
     if (reaches_pixel && traits.have_shade) Source::shade(in.model, view, place, g, r.color);
+    if constexpr (Source::kTints)
+        if (!Source::has_palette(in.model)) tint(factors->color, r.color);
     return reaches_pixel;
 }
 
 // Writes the records of the lanes' gaussians, in lane order, and counts them in tiles.
-// Returns the number of records. `sharers` are the placements of a shared item.
+// Returns the number of records. `sharers` are the placements of a shared item, and
+// `factors` those of these placements; for other items, those of its placement. They
+// are null unless the source has factors.
 template <class Source, bool kIsShared>
 __device__ unsigned write_records(WarpSpace<typename Source::Model>& space,
-                                  const Placement* sharers, const typename Source::Place& start,
-                                  const ItemTraits& traits, bool has_one, const Queued& mine,
-                                  uint32_t first, FrameCounters& counters, const ProjectOutput& out,
+                                  const Placement* sharers, const InstanceFactors* factors,
+                                  const typename Source::Place& start, const ItemTraits& traits,
+                                  bool has_one, const Queued& mine, uint32_t first,
+                                  FrameCounters& counters, const ProjectOutput& out,
                                   unsigned& num_in_frustum) {
     const auto& in = space.tables;
     const unsigned lane = threadIdx.x % 32;
@@ -60,8 +67,9 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space,
     const ModelView<float>& view = kIsShared ? sharers[place % 32].view : in.placement.view;
     Record<float> r;
     PixelBox<int> box;
-    const bool reaches_pixel =
-        project_one<Source>(in, view, start, g, mine.p, has_one, traits, r, box, num_in_frustum);
+    const bool reaches_pixel = project_one<Source>(
+        in, view, start, g, mine.p, has_one, traits,
+        Source::kTints && kIsShared ? factors + place % 32 : factors, r, box, num_in_frustum);
     const unsigned kept = __ballot_sync(kAllLanes, reaches_pixel);
     if (kept == 0) return 0;
     const unsigned rank = __popc(kept & ((1u << lane) - 1));

@@ -40,9 +40,9 @@ class SceneTables {
     // std::invalid_argument if tables are on another device.
     void set_bundles(std::vector<std::shared_ptr<const BundleTables>> bundles, cudaStream_t stream);
     // Replaces all instances; the caller must call set_poses() afterwards. The host
-    // memory may be reused on return.
+    // memory may be reused on return. `factors` is empty if all are 1.
     void set_instances(Span<const int32_t> bundle, Span<const float> importance,
-                       cudaStream_t stream);
+                       Span<const InstanceFactors> factors, cudaStream_t stream);
     // Sets the poses. Each component is either in host memory, which may be reused on
     // return, or in device memory, which must stay unchanged.
     void set_poses(const PoseSpan& position, const PoseSpan& quaternion, const PoseSpan& scale,
@@ -70,6 +70,8 @@ class SceneTables {
     DeviceBuffer<BundleOnDevice> bundles_on_device_;
     DeviceBuffer<int32_t> bundle_;
     DeviceBuffer<float> importance_;
+    DeviceBuffer<InstanceFactors> factors_;
+    size_t num_factors_ = 0;
     DeviceBuffer<double> uploaded_[3];
     const double *position_ = nullptr, *quaternion_ = nullptr, *scale_ = nullptr;
 };

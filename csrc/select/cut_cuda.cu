@@ -118,14 +118,14 @@ __global__ void place_all_kernel(PlacedScene scene, Camera camera, FrameImage im
         placement_of(axes_of_instance(camera, pose), pose, scene.instances.bundle[i], 0);
 }
 
-// One thread per pair. Pairs whose instance has no valid pose are left out.
+// One thread per pair. Pairs whose instance is not drawn are left out.
 template <class Output>
 __global__ void __launch_bounds__(kCutThreads)
     given_kernel(PlacedScene scene, GivenCut given, CutScratch scratch, Output output) {
     const unsigned ticket = take_ticket(scratch.cut_ticket);
     const size_t p = size_t(ticket) * kCutThreads + threadIdx.x;
     LaneClusters mine{};
-    if (p < given.instance.size && is_placed(scene.instances.pose(given.instance[p]))) {
+    if (p < given.instance.size && scene.instances.is_drawn(given.instance[p])) {
         const int32_t i = given.instance[p];
         mine = {.bundle = &scene.bundles[scene.instances.bundle[i]],
                 .instance = static_cast<uint32_t>(i),

@@ -29,8 +29,8 @@ V3DG_HD inline bool tops_fit(const ClusterTable& table, const InstanceView& view
 // The set of clusters that contains the cut of an instance.
 enum class CutSource {
     nowhere,  // no clusters: the instance is hidden
-    tops,  // the top clusters
-    table,  // all clusters
+    tops,     // the top clusters
+    table,    // all clusters
 };
 
 // Whether the whole instance is culled.

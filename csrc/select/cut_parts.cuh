@@ -42,7 +42,7 @@ struct PlacedScene {
 
 // The state that one search for the tolerance of a budget leaves for the next search.
 struct BudgetState {
-    float guess = 0.0f;          // a tolerance that is probably below the next choice
+    float guess = 0.0f;  // a tolerance that is probably below the next choice
     unsigned again = 0;  // nonzero if the guess was too high, so that the second round has to run
     uint32_t last_bin = kNoBin;  // the state of tolerance_of_budget()
 };
@@ -91,7 +91,7 @@ struct LaneClusters {
     const BundleOnDevice* bundle;
     uint32_t instance;
     uint32_t first;  // index in the table
-    bool is_alone;  // whether this lane alone has the instance; else all lanes of the warp have it
+    bool is_alone;   // whether this lane alone has the instance; else all lanes of the warp have it
     bool are_tops;
     unsigned drawn;
     LaneWeights weights;
@@ -149,7 +149,7 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
     __shared__ Table tables[kCutWarps];
     __shared__ unsigned num_owners[kCutWarps];
     __shared__ uint8_t owners[kCutThreads];  // threads that own clusters
-    __shared__ uint8_t drawn[kCutThreads];  // a bit for each of a thread's clusters
+    __shared__ uint8_t drawn[kCutThreads];   // a bit for each of a thread's clusters
     __shared__ LaneWeights weights[kKeepsWeights ? kCutThreads : 1];
     static_assert(kCutThreads <= 256, "a byte says which thread");
     const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;

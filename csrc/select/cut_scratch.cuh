@@ -18,9 +18,9 @@ constexpr unsigned kPlaceThreads = 64;
 struct CutScratch {
     unsigned *place_ticket, *cut_ticket;
     unsigned* num_parts;
-    Count* place_state;  // one element per block of place_kernel
+    Count* place_state;               // one element per block of place_kernel
     Count *unit_state, *count_state;  // one element per ticket of cut_kernel
-    unsigned num_places;  // number of cut_kernel's blocks that run at once
+    unsigned num_places;              // number of cut_kernel's blocks that run at once
 
     // Returns how many parts a block processes together: one per warp, or fewer where
     // that spreads the parts over all blocks, because warps without a part help with

@@ -68,7 +68,7 @@ struct RecordRow {
 struct Placed {
     CutSource source;
     ClusterRange asked;  // the clusters to test, if the source is the table
-    bool is_alone;  // whether a single lane tests them
+    bool is_alone;       // whether a single lane tests them
 };
 
 // Places instance i, if it exists, and writes its view, its placements and its top
@@ -90,7 +90,7 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
     bool is_alone = false;
     int32_t bundle = 0;
     InstanceView view;
-    if (i < num_instances && is_placed(pose)) {
+    if (i < num_instances && scene.instances.is_drawn(i)) {
         bundle = scene.instances.bundle[i];
         const ClusterTable& table = scene.bundles[bundle].table;
         {

@@ -11,7 +11,7 @@ namespace v3dg {
 // How the screen area of a ball is measured.
 enum class Footprint {
     solid_angle,  // the solid angle of the ball, so turning the camera changes nothing
-    paper,  // pi r^2 fx fy / depth^2, for pinholes only; Yang et al., SIGGRAPH 2025
+    paper,        // pi r^2 fx fy / depth^2, for pinholes only; Yang et al., SIGGRAPH 2025
 };
 
 // The budget of a rule without one.
@@ -30,7 +30,7 @@ struct Fade {
 
 // How the tolerance that meets a budget is chosen.
 enum class BudgetPace {
-    at_once,   // from one view alone
+    at_once,  // from one view alone
     // also from the tolerance of the frame before, so that slow motion causes no leaps
     // (budget_steps.h)
     in_steps,
@@ -41,8 +41,8 @@ enum class BudgetPace {
 struct SelectRule {
     float tolerance_px2;
     Footprint footprint = Footprint::solid_angle;
-    bool culls = true;  // leave out what lies outside of the frustum
-    int32_t min_level = 0;  // finer levels are not drawn
+    bool culls = true;            // leave out what lies outside of the frustum
+    int32_t min_level = 0;        // finer levels are not drawn
     uint64_t budget = kNoBudget;  // most gaussians; the tolerance is raised until the cut fits
     BudgetPace pace = BudgetPace::at_once;
     int32_t frames_at_rest = 0;  // in steps: number of frames, including this one, without motion

@@ -42,7 +42,7 @@ struct KnownBins {
 struct View {
     const SelectInput& in;
     std::vector<CameraSides> sides;  // one per bundle
-    std::vector<ClusterRuns> runs;  // one per bundle after find_runs(); empty for few instances
+    std::vector<ClusterRuns> runs;   // one per bundle after find_runs(); empty for few instances
     size_t most_groups = 0, most_clusters = 0;  // largest numbers in any bundle
 
     explicit View(const SelectInput& input) : in(input) {
@@ -69,25 +69,25 @@ struct Asked {
     ClusterRange clusters, groups;
 };
 
-// An instance in front of the camera. An instance without a valid pose is hidden.
+// An instance in front of the camera. An instance that is not drawn is hidden.
 struct SeenInstance {
     const ClusterTable& table;
     InstanceView view;
-    bool is_placed;
+    bool is_drawn;
 
     V3DG_INLINE SeenInstance(const View& of, size_t i)
-        : table(of.in.bundles[of.in.instances.bundle[i]]), view(), is_placed(false) {
+        : table(of.in.bundles[of.in.instances.bundle[i]]), view(), is_drawn(false) {
         const InstanceTable& instances = of.in.instances;
         const Pose pose = instances.pose(i);
-        is_placed = v3dg::is_placed(pose);
-        if (is_placed)
+        is_drawn = instances.is_drawn(i);
+        if (is_drawn)
             view = view_from_instance(of.in.eyes, of.sides[instances.bundle[i]],
                                       axes_of_instance(of.in.eyes.camera[0], pose), pose,
                                       instances.importance[i]);
     }
 
     CutSource source(const SelectRule& rule) const {
-        return is_placed ? source_of_cut(table, view, rule, SIZE_MAX) : CutSource::nowhere;
+        return is_drawn ? source_of_cut(table, view, rule, SIZE_MAX) : CutSource::nowhere;
     }
 
     // Returns the decision that looks its answers up in `groups`, which is filled in
@@ -124,8 +124,8 @@ struct SeenInstance {
 // Scratch memory of a thread.
 struct Scratch {
     std::vector<uint16_t> refinement;  // one element per group
-    std::vector<int32_t> chosen;  // selected clusters
-    std::vector<float> priority;  // one element per group, if needs are requested
+    std::vector<int32_t> chosen;       // selected clusters
+    std::vector<float> priority;       // one element per group, if needs are requested
 
     explicit Scratch(const View& view)
         : refinement(view.most_groups),
@@ -342,7 +342,7 @@ void cpu::pair_metrics(const SelectInput& in, const GivenCut& given, Span<float>
     parallel_for(metric.size, kChunk, [&](size_t s) {
         const SeenInstance seen(view, given.instance[s]);
         const int32_t group = seen.table.own_group[given.cluster[s]];
-        const bool is_coarse = seen.is_placed && group >= 0;
+        const bool is_coarse = seen.is_drawn && group >= 0;
         metric[s] = is_coarse ? wanted_metric_px2(seen.table, group, seen.view, in.rule) : 0.0f;
     });
 }
@@ -359,7 +359,7 @@ void cpu::bounds_may_draw(const SelectInput& in, Tolerances tolerances, Span<con
     std::fill(may_draw.begin(), may_draw.end(), uint8_t(0));
     parallel_for(in.instances.bundle.size, kChunk, [&](size_t i) {
         const SeenInstance seen(view, i);
-        if (!seen.is_placed) return;
+        if (!seen.is_drawn) return;
         const int32_t bundle = in.instances.bundle[i];
         const ClusterRange asked =
             clusters_to_ask(seen.table, runs[bundle], seen.view, in.rule, tolerances);

@@ -13,27 +13,24 @@
 //
 // refinement(g) says how far g is refined: from 0, if g fits the tolerance and its
 // coarser clusters suffice, to kWhole, if they do not. The cut gives the cluster c the
-// weight
-//   weight(c) = refinement(parent(c)) - refinement(own(c)),
-// where nothing is refined below a leaf (0) and everything is refined above a top
-// cluster (kWhole).
+// weight weight(c) = refinement(parent(c)) - refinement(own(c)), where nothing is
+// refined below a leaf (0) and everything is refined above a top cluster (kWhole).
 //
-// 1. On every path from a leaf to its root the weights add up to kWhole: the sum telescopes,
-//    and weights are integers, so nothing is rounded.
-// 2. No weight is negative where refinement never decreases towards the root. The balls of
-//    groups nest, and the factors of their footprints never decrease towards the root, so
-//    metrics do not decrease (footprint.h). refinement() is a monotonic function of the
-//    metric (fade_math.h). It is limited by how far the page of the group has faded in, and
-//    is 0 if that page is not resident. Pages are resident before those below them, so
-//    neither limit decreases towards the root.
-// 3. Without a fade refinement is 0 or kWhole, since fits() and is_refined() are then each
-//    other's opposite. By 1 and 2 exactly one cluster on each path is drawn.
-// 4. Hence clusters may be tested in any order and on any device: each decision depends on
-//    two metrics and on how far two pages have faded in, and two neighbours on a path
-//    compare the same bits. Every comparison of a metric with the tolerance is in fits(),
-//    is_refined() or refinement(). The comparisons of bounds_math.h only skip clusters that
-//    are not drawn, and leave a margin.
-// 5. Culling drops clusters of the cut that cannot touch a pixel, and changes no weight.
+// 1. On every path from a leaf to its root the weights add up to kWhole: the sum
+// telescopes, and weights are integers, so nothing is rounded. 2. No weight is negative
+// where refinement never decreases towards the root. The balls of groups nest, and the
+// factors of their footprints never decrease towards the root, so metrics do not
+// decrease (footprint.h). refinement() is a monotonic function of the metric
+// (fade_math.h). It is limited by how far the page of the group has faded in, and is 0
+// if that page is not resident. Pages are resident before those below them, so neither
+// limit decreases towards the root. 3. Without a fade refinement is 0 or kWhole, since
+// fits() and is_refined() are then each other's opposite. By 1 and 2 exactly one
+// cluster on each path is drawn. 4. Hence clusters may be tested in any order and on
+// any device: each decision depends on two metrics and on how far two pages have faded
+// in, and two neighbours on a path compare the same bits. Every comparison of a metric
+// with the tolerance is in fits(), is_refined() or refinement(). The comparisons of
+// bounds_math.h only skip clusters that are not drawn, and leave a margin. 5. Culling
+// drops clusters of the cut that cannot touch a pixel, and changes no weight.
 //
 // InstanceCut::drawn_weight() (cut_math.h) is the decision about a cluster. If the top
 // clusters of an instance suffice (source_of_cut()), they have the weight kWhole, and

@@ -734,3 +734,44 @@ def test_camera_goes_to_one_of_the_file_and_back(tab):
     tab.press("Show all")
     tab.page.wait_for_timeout(900)
     assert differ(first, tab.settled()) < 0.01
+
+
+def test_a_box_is_drawn_dragged_and_saved_as_a_new_asset(browser, site, tmp_path):
+    bundle = site.scene_view.scene.bundles[0]
+    alone = Site(SceneView(bundle, device="cpu"), name="blob", port=0, edits_folder=tmp_path)
+    try:
+        with Tab(browser, alone.url) as tab:
+            before = tab.settled()
+            tab.open("Crop")
+            tab.press("Draw a box")
+            tab.page.wait_for_function("() => viewer.crop.isOn")
+            assert differ(before, tab.settled()) > 0.002
+            face = "viewer.crop.inWorld(viewer.crop.middleOf({ axis: 0, end: 1 }))"
+            place = f"viewer.overlay.projection.place({face})"
+            handle = tab.page.evaluate(place)
+            low, high = tab.page.evaluate("viewer.crop.box")
+            target = [(low[0] + high[0]) / 2, *(np.add(low, high) / 2)[1:].tolist()]
+            end = tab.page.evaluate(f"viewer.overlay.projection.place({target})")
+            tab.drag(handle, end)
+            dragged = tab.page.evaluate("viewer.crop.box")
+            # The face is where the pointer let go of it, and no other has moved.
+            np.testing.assert_allclose(dragged[1][0], target[0], atol=0.02 * (high[0] - low[0]))
+            assert dragged[0] == low
+            assert dragged[1][1:] == high[1:]
+            assert tab.page.evaluate("viewer.crop.text").startswith("box:")
+            tab.page.get_by_label("Part").select_option("outside")
+            tab.page.get_by_label("New file").fill("rest.ply")
+            tab.press("Save as a new asset")
+            tab.page.wait_for_function(
+                "() => document.body.innerText.includes('rest.ply was written')"
+            )
+            whole = bundle.level_gaussians(0)
+            expected = v3dg.crop_box(whole, *dragged, keep="outside")
+            assert 0 < len(expected) < len(whole)
+            written = v3dg.read_asset(tmp_path / "rest.ply")
+            np.testing.assert_array_equal(written.means, expected.means)
+            tab.page.locator("#overlay").focus()
+            tab.page.keyboard.press("Escape")
+            assert differ(before, tab.settled()) < 0.002
+    finally:
+        alone.close()

@@ -146,7 +146,7 @@ def choose_cameras(
     if options.link is not None:
         cameras = {"link": _linked(options.link, options.size)}
     elif options.eye is not None:
-        cameras = {"eye": _placed(options, subject, path)}
+        cameras = {"eye": _placed(options, subject)}
     else:
         cameras = options.read(options.size)
         if not cameras and own_cameras:
@@ -155,7 +155,7 @@ def choose_cameras(
     if not cameras:
         refuse_without = "a scene with cameras to take it from; leave it out"
         check_usage("--camera", options.camera is None, refuse_without)
-        cameras = _around(subject, options, options.views or views, path)
+        cameras = _around(subject, options, options.views or views)
     if options.camera is not None:
         name = _camera_name(options.camera, list(cameras))
         cameras = {name: cameras[name]}
@@ -176,10 +176,10 @@ def _linked(link: str, size: tuple[int, int]) -> Camera:
     return replace(place.view, aspect=size[0] / size[1]).camera(*size, near)
 
 
-def _placed(options: ViewOptions, subject: Subject, path: Path) -> Camera:
+def _placed(options: ViewOptions, subject: Subject) -> Camera:
     """The camera of --eye."""
     assert options.eye is not None
-    up = direction_of(options.up or up_of(subject, path=path)[0])
+    up = direction_of(options.up or up_of(subject)[0])
     target = options.target
     if target is None:
         x, y, z = frame_subject(subject).center.tolist()
@@ -206,12 +206,12 @@ def _camera_name(text: str, names: Sequence[str]) -> str:
     raise ValueError(f"--camera: expected one of {choices}, or 0 to {len(names) - 1}, got {text}")
 
 
-def _around(subject: Subject, options: ViewOptions, views: int, path: Path) -> dict[str, Camera]:
+def _around(subject: Subject, options: ViewOptions, views: int) -> dict[str, Camera]:
     """First views of a subject, from around an object or inside a room."""
     elevation = DEFAULT_ELEVATION
     if options.elevation is not None:
         elevation = math.radians(options.elevation)
-    up = direction_of(options.up or up_of(subject, path=path)[0])
+    up = direction_of(options.up or up_of(subject)[0])
     cameras = frame_subject(subject).turntable(up, views, *options.size, elevation=elevation)
     digits = len(str(views - 1))
     return {f"{i:0{digits}}": camera for i, camera in enumerate(cameras)}

@@ -15,6 +15,7 @@ from v3dg._urls import shown
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Camera
 from v3dg.cli import _common
+from v3dg.cli._editing import EditOptions, Editor, Edits
 from v3dg.cli._faults import FaultOptions, Faults, checked
 from v3dg.cli._moving import MoveOptions, Moves
 from v3dg.cli._views import ViewOptions, choose_cameras
@@ -63,6 +64,7 @@ class Convert(_common.Cut, _common.Common):
     spz_version: Annotated[Literal[2, 3, 4] | None, _common.option("{2,3,4}")] = None
     """Version of a .spz; 3 by default."""
     moves: Moves = field(default_factory=MoveOptions)
+    edits: Edits = field(default_factory=EditOptions)
     faults: Faults = field(default_factory=FaultOptions)
     view: _Views = field(default_factory=ConvertViews)
 
@@ -79,7 +81,9 @@ def run(options: Convert) -> None:
     # What is up is an option for every input, not only for the turntable.
     replace(options.view, up=None).check(options.subject)
     options.moves.check()
+    options.edits.check()
     options.faults.check()
+    editor = Editor(options.edits)
     _check_output(options)
     part_options = _part_options(options)
     is_cut = is_scene(options.subject) or any(name != "--level" for name in part_options)
@@ -93,7 +97,7 @@ def run(options: Convert) -> None:
         part = _write_bundle(options, subject, part_options)
     else:
         part = _part(options, subject, own_cameras, part_options)
-        part = _written(options, subject, part, notes)
+        part = _written(options, subject, part, editor, notes)
     num_bytes = output.stat().st_size
     result = {
         "output": str(output),
@@ -103,17 +107,20 @@ def run(options: Convert) -> None:
         "seconds": time.perf_counter() - start,
         **part.description,
         "notes": notes,
+        **editor.result(),
     }
     text = f"{output}: {len(part.gaussians):,} gaussians, SH degree {part.gaussians.sh_degree}"
     line = f"{text}, {_common.bytes_text(num_bytes)}"
     for note in notes:
         _common.tell(note)
-    _common.print_result(result, [line], as_json=options.json)
+    _common.print_result(result, [line, *editor.lines()], as_json=options.json)
 
 
-def _written(options: Convert, subject: Subject, part: _Part, notes: list[str]) -> _Part:
-    """Move, check and write a part; adds lines about what was turned and lost, and
-    returns what was written."""
+def _written(
+    options: Convert, subject: Subject, part: _Part, editor: Editor, notes: list[str]
+) -> _Part:
+    """Join, move, trim, check and write a part; adds lines about what was turned and
+    lost, and returns what was written."""
     output = options.output
     name = shown(options.subject)
     notes += _lines_of_file(name, subject)
@@ -123,11 +130,11 @@ def _written(options: Convert, subject: Subject, part: _Part, notes: list[str]) 
         gaussians = turned_upright(gaussians, options.view.up)
         reason = f"turned from {options.view.up}, as --up says"
         up = "-y"
-    gaussians = options.moves.moved(gaussians)
+    gaussians = options.moves.moved(editor.joined(gaussians))
     if options.moves.rotate is not None and "guessed" in reason:
         up, reason = up_of(gaussians)
     notes += _lines_of_up(name, output, up, reason)
-    remaining = checked(options.faults, gaussians, options.subject, output)
+    remaining = checked(options.faults, editor.trimmed(gaussians), options.subject, output)
     if remaining.note:
         notes.append(remaining.note)
     gaussians = remaining.gaussians
@@ -185,7 +192,7 @@ def _check_output(options: Convert) -> None:
     _common.check_usage("--codec", fits, f"an output that ends in .v3dg, got {output}")
     fits = not options.spz_version or name.endswith(".spz")
     _common.check_usage("--spz-version", fits, f"a .spz to write, got {output}; leave it out")
-    _common.check_output(output, options.subject)
+    _common.check_output(output, options.subject, *options.edits.added_paths())
     _files.make_folder(output)
 
 
@@ -202,13 +209,13 @@ def _part_options(options: Convert) -> list[str]:
 
 
 def _write_bundle(options: Convert, subject: Subject, part_options: list[str]) -> _Part:
-    changes = [*part_options, *options.moves.option_names()]
+    changes = [*part_options, *options.moves.option_names(), *options.edits.option_names()]
     if options.view.up is not None:
         changes.append("--up")
     if not isinstance(subject, Bundle) or changes:
         raise _common.UsageError(
             f"{options.output}: expected a bundle as the input, without options that choose a part "
-            "of it or move it; v3dg build makes a bundle from an asset"
+            "of it or change it; v3dg build makes a bundle from an asset"
         )
     codec = options.codec or subject.codec
     Bundle(subject.clusters, subject.groups, subject.gaussians, subject.config, codec).write(

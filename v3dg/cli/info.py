@@ -52,20 +52,20 @@ def run(options: Info) -> None:
     result = {**result, "up": up, "up_reason": reason}
     lines.insert(1, f"{up} is up, {reason}")
     if not cameras and not is_url(options.file):
-        first_view, line = _first_view(options.file, subject)
+        first_view, line = _first_view(subject)
         result["first_view"] = first_view
         lines.append(line)
     _common.print_result(result, lines, as_json=options.json)
 
 
-def _first_view(path: Path, subject: Subject) -> tuple[JsonObject | None, str]:
+def _first_view(subject: Subject) -> tuple[JsonObject | None, str]:
     """The camera that first shows a subject, in `v3dg render` and the viewer, too; None
     if the pages that it needs are damaged."""
     try:
         framing = frame_subject(subject)
     except (OSError, ValueError) as error:
         return None, f"first view unknown: {error}"
-    camera = framing.camera(direction_of(up_of(subject, path=path)[0]), 800, 800)
+    camera = framing.camera(direction_of(up_of(subject)[0]), 800, 800)
     eye = camera.position.tolist()
     target = framing.focus(camera).tolist()
     side = "outside"

@@ -93,7 +93,7 @@ def run(options: Refine) -> None:
 def _compared(bundle: Bundle, refined: Bundle, options: Refine) -> Iterator[JsonObject]:
     """How near pictures of the asset are before and after, from large to small ones."""
     cameras = list(options.read().values())[:_MOST_CAMERAS]
-    up = direction_of(up_of(bundle, path=options.bundle)[0])
+    up = direction_of(up_of(bundle)[0])
     framing = frame_subject(bundle)
     for width in _WIDTHS:
         views = framing.turntable(up, _MOST_CAMERAS, width, width)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from v3dg._start import SIGNALS
-from v3dg._urls import shown
+from v3dg._urls import is_url, shown
 from v3dg.cameras import Axis
 from v3dg.cli._common import (
     Color,
@@ -102,6 +102,7 @@ def run(options: View) -> None:
             background=background,
             up=direction_of(up),
             asks_up=reason == ASSUMED,
+            edits_folder=_folder_of(options.subject),
         )
         try:
             _announce(options, site, lines_of_up(options.subject, up, reason))
@@ -123,6 +124,13 @@ def _background_of(options: View) -> Color:
     if background is None:
         raise UsageError("--background: expected a colour, got none")
     return background
+
+
+def _folder_of(subject: Path) -> Path | None:
+    """The folder of a local file."""
+    if is_url(subject):
+        return None
+    return subject.absolute().parent
 
 
 def _tolerance_of(options: View) -> float:

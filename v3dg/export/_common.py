@@ -1,9 +1,11 @@
 """Shared code of the exports: the axis that is up, rotations, names of bundles,
 documents."""
 
+import copy
 import json
 import math
 import re
+import warnings
 from collections.abc import Collection, Iterable, Mapping
 from importlib.resources import files
 from pathlib import Path
@@ -12,12 +14,20 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from v3dg import _core
 from v3dg._urls import beside
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Floats
 from v3dg.formats import _axes
-from v3dg.rotations import quaternion_from_rotation
 from v3dg.scene import Scene
+
+_MIN_OPACITY = float(np.float32(_core.min_alpha))
+"""Instances of a smaller opacity are not drawn."""
+
+
+class ExportWarning(UserWarning):
+    """A property of instances is left out, because a format cannot hold it."""
+
 
 _OTHER_LETTERS = re.compile("[^A-Za-z0-9]")  # than names of folders have
 
@@ -25,15 +35,28 @@ _OTHER_LETTERS = re.compile("[^A-Za-z0-9]")  # than names of folders have
 _WORLDS = {"y": _axes.GLTF, "z": _axes.Z_UP}
 
 
-def turn_upright(up: Axis) -> Floats:
-    """(4,) w x y z that turns what is up in an asset to -y, which viewers take for up;
-    ValueError for another name."""
-    return np.array(quaternion_from_rotation(_axes.turn(_axes.axes_of_up(up), _axes.MEMORY)))
-
-
 def rotation_to(up: Axis, frame: Literal["y", "z"]) -> Floats:
     """(3, 3) rotation that turns what is up to an axis."""
     return _axes.turn(_axes.axes_of_up(up), _WORLDS[frame])
+
+
+def exported(scene: Scene, format_name: str) -> Scene:
+    """The instances of a scene that are drawn, for a format that holds neither opacity
+    nor tint; warns if any is left out."""
+    if scene.factors is None:
+        return scene
+    visible = copy.copy(scene)
+    visible.remove(np.flatnonzero(visible.opacity < _MIN_OPACITY))
+    factors = visible.factors
+    if factors is not None:
+        count = int((factors != 1).any(axis=1).sum())
+        warnings.warn(
+            f"{format_name} cannot hold the opacity and tint of instances; those of {count:,} are "
+            "left out",
+            ExportWarning,
+            stacklevel=3,
+        )
+    return visible
 
 
 def names_of(scene: Scene, reserved: Collection[str] = ()) -> list[str]:

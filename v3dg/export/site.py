@@ -25,6 +25,7 @@ from v3dg.export._folder import NewFiles, check_outside, replacing_export
 from v3dg.export.streamed_sog import DEFAULT_CHUNK, INDEX, SETTINGS, Export, Plan, write_levels
 from v3dg.framing import frame_subject
 from v3dg.opening import File, open_with_cameras
+from v3dg.rotations import turn_upright
 from v3dg.scene import Scene, Subject
 from v3dg.select import DEFAULT_TOLERANCE
 from v3dg.upright import direction_of, up_of
@@ -74,8 +75,9 @@ def write_site(
     once all is written.
 
     The levels of a bundle alone are in the folder itself, those of a scene's bundles in
-    folders of their own. PlayCanvas's engine is that of the folder, or taken from
-    `node_modules` here or above.
+    folders of their own. Opacity and tint of instances are left out with a warning.
+    PlayCanvas's engine is that of the folder, or taken from `node_modules` here or
+    above.
 
     Args:
         subject: A scene or a bundle, or its file; the file of a scene may also have
@@ -103,9 +105,10 @@ def write_site(
     cameras = cameras or {}
     check_cameras(cameras)
     scene = Scene.of(cast(Scene | Bundle, content))  # refuses anything else
+    scene = _common.exported(scene, "the web page")
     is_scene = isinstance(content, Scene)
     axes = _axes(up or up_of(cast(Subject, content), cameras)[0], is_scene=is_scene)
-    turn = _common.turn_upright(axes.asset)
+    turn = turn_upright(axes.asset)
     check("scene", len(scene), "instances to export, got none")
     plans = [Plan.of(bundle, chunk) for bundle in scene.bundles]
     names = ["."]

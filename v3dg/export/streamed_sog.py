@@ -37,7 +37,7 @@ from v3dg.formats import sog
 from v3dg.formats._packing import check_writable
 from v3dg.gaussians import Gaussians
 from v3dg.opening import File, opened
-from v3dg.rotations import rotation_from_quaternion
+from v3dg.rotations import rotation_from_quaternion, turn_upright
 from v3dg.scene import Scene
 from v3dg.upright import up_of
 
@@ -150,7 +150,7 @@ def write_streamed_sog(
     """
     content = opened(bundle)
     plan = Plan.of(content, chunk)
-    turn = _common.turn_upright(up or up_of(content)[0])
+    turn = turn_upright(up or up_of(content)[0])
     certain = (INDEX, SETTINGS)
     with (
         replacing_export(Path(folder), Scene.of(content), certain, overwrite=overwrite) as new,

@@ -97,8 +97,9 @@ def write_tiles(
     once all is written.
 
     Tiles are `.glb` files with KHR_gaussian_splatting, compressed as SPZ. The
-    importance of instances is left out. The world's origin is at that of the tiles, the
-    Earth's centre; viewers can put it elsewhere.
+    importance of instances is left out, and so are, with a warning, opacity and tint.
+    The world's origin is at that of the tiles, the Earth's centre; viewers can put it
+    elsewhere.
 
     Args:
         subject: A scene or a bundle, or its file.
@@ -124,6 +125,7 @@ def write_tiles(
         check_outside(Path(folder), [subject])
     content = opened(subject)
     scene = Scene.of(content)
+    scene = _common.exported(scene, "3D Tiles")
     root = np.eye(4)
     root[:3, :3] = _common.rotation_to(up or up_of(content)[0], "z")
     check("scene", len(scene), "instances to export, got none")

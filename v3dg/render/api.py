@@ -156,12 +156,9 @@ def first_camera(
     """
     width = whole(width, "width", "a positive whole number", 1)
     height = whole(height, "height", "a positive whole number", 1)
-    path = Path()
-    if isinstance(subject, str | os.PathLike):
-        path = Path(subject)
     content: Subject = opened(subject)
     if up is None:
-        up = up_of(content, path=path)[0]
+        up = up_of(content)[0]
     if isinstance(up, str):
         one_of(up, "up", AXES)
         up = direction_of(up)
@@ -178,7 +175,7 @@ def _with_first_camera(subject: Subject | File) -> tuple[Subject, Camera]:
     content, cameras = open_with_cameras(path)
     if cameras:
         return content, next(iter(cameras.values()))
-    return content, first_camera(content, up=up_of(content, path=path)[0])
+    return content, first_camera(content, up=up_of(content)[0])
 
 
 def _still_frame(

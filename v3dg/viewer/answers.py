@@ -87,6 +87,8 @@ class Scene(msgspec.Struct, tag="scene"):
         homes: First views, from narrow windows to wide ones.
         instances: Number of instances.
         has_files: Whether all its bundles are in files, so that the scene can be saved.
+        writes_files: Whether the server writes new assets, beside the file that is
+            shown; otherwise the browser saves them.
         level_colors: Colour of each level.
         ramp: Colours from the smallest value to the largest.
         most_counted: Number of gaussians in a pixel that gets the last colour of the
@@ -104,6 +106,7 @@ class Scene(msgspec.Struct, tag="scene"):
     homes: list[Home]
     instances: int
     has_files: bool
+    writes_files: bool
     level_colors: list[Color]
     ramp: list[Color]
     most_counted: int

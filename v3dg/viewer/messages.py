@@ -12,6 +12,7 @@ import msgspec
 
 from v3dg.cameras import Axis
 from v3dg.viewer.answers import Limits
+from v3dg.viewer.edits import check_new_name
 from v3dg.viewer.frame import Settings, Shows
 from v3dg.viewer.pacing import Request, scaled
 from v3dg.viewer.path import CameraPath
@@ -157,6 +158,25 @@ class Save(msgspec.Struct, tag="save", forbid_unknown_fields=True):
         return CameraPath([(seconds, stop.view()) for seconds, stop in self.path])
 
 
+class Crop(msgspec.Struct, tag="crop", forbid_unknown_fields=True):
+    """Asks for a new asset, of the gaussians of a bundle whose centres lie in a box, or
+    of all others.
+
+    Attributes:
+        instance: One that shows the bundle.
+        box: Lower and upper corner, in the bundle's own coordinates.
+        name: Name of the file, whose end is the format.
+    """
+
+    instance: Annotated[int, msgspec.Meta(ge=0)]
+    box: tuple[_Vector, _Vector]
+    keep: Literal["inside", "outside"]
+    name: _Name
+
+    def __post_init__(self) -> None:
+        check_new_name(self.name)
+
+
 class Stop(msgspec.Struct, tag="stop", forbid_unknown_fields=True):
     """Ends the work that `Save` started."""
 
@@ -172,7 +192,7 @@ class Open(msgspec.Struct, tag="open", forbid_unknown_fields=True):
     size: Annotated[int, msgspec.Meta(ge=1, le=1 << 38)]
 
 
-Message = Look | Pick | Move | Save | Stop | Open
+Message = Look | Pick | Move | Save | Crop | Stop | Open
 read_message = msgspec.json.Decoder(Message).decode
 
 

@@ -77,6 +77,8 @@ class Site:
         tolerance, budget, background: Initial settings of a tab.
         up: (3,) direction in the world that is up.
         asks_up: Whether ``up`` is only assumed, so that the page asks the user.
+        edits_folder: Folder that pages may write new assets to, never over a file that
+            exists; if None, or if other machines can connect, browsers save them.
 
     Attributes:
         port, url, is_secret: See `Gate`.
@@ -101,9 +103,9 @@ class Site:
         background: Sequence[float] = (0.0, 0.0, 0.0),
         up: VectorLike = (0.0, 0.0, 1.0),
         asks_up: bool = False,
+        edits_folder: Path | None = None,
     ) -> None:
-        for module in ("msgspec", "websockets.asyncio.server"):
-            _extras.load(module)
+        _load_extras()
         from v3dg.viewer.gate import Gate
         from v3dg.viewer.tab import Tab
 
@@ -127,7 +129,14 @@ class Site:
         self.port = self._gate.port
         self.url = self._gate.url
         self.is_secret = self._gate.is_secret
+        self._edits_folder = self._allowed_folder(edits_folder)
         self._start()
+
+    def _allowed_folder(self, folder: Path | None) -> Path | None:
+        """The folder that pages may write to; None if other machines can connect."""
+        if folder is None or self.is_secret:
+            return None
+        return Path(folder).absolute()
 
     def _start(self) -> None:
         """Start the server's thread, and wait until it accepts connections."""
@@ -198,7 +207,9 @@ class Site:
                 if open_tab.scene_view is scene_view:
                     open_tab.ask_again()
 
-        tab = self._make_tab(self._scene_view, self._name, send, moved, self._greeting.up)
+        tab = self._make_tab(
+            self._scene_view, self._name, send, moved, self._greeting.up, self._edits_folder
+        )
         self._tabs.add(tab)
         try:
             await connection.send(encode(self._greeting))
@@ -259,6 +270,11 @@ def _checked_color(values: Sequence[float]) -> tuple[float, float, float]:
     fits = all(0 <= part <= 1 for part in (red, green, blue))
     check("background", fits, f"three numbers from 0 to 1, got {(red, green, blue)}")
     return red, green, blue
+
+
+def _load_extras() -> None:
+    for module in ("msgspec", "websockets.asyncio.server"):
+        _extras.load(module)
 
 
 def _greeting(

@@ -24,12 +24,14 @@ from v3dg._urls import beside
 from v3dg.bundle import Bundle
 from v3dg.camera_file import write_cameras
 from v3dg.cameras import Camera, VectorLike
+from v3dg.editing import crop_box
 from v3dg.gaussians import Gaussians
-from v3dg.io import read_asset, subject_name
+from v3dg.io import read_asset, subject_name, write_asset
 from v3dg.pictures import to_8bit
 from v3dg.scene.file import write_scene
 from v3dg.video import write_video
 from v3dg.viewer import answers, messages
+from v3dg.viewer.edits import write_new_asset
 from v3dg.viewer.exports import Exporter, bundle_names
 from v3dg.viewer.frame import MOST_COUNTED, Frame, Pixels, SceneView
 from v3dg.viewer.pacing import RenderLoop
@@ -60,6 +62,8 @@ class Tab:
         send: Sends text or binary data to the page; waits until they are sent, except
             in the server's thread.
         moved: Called with a scene view after one of its instances was moved.
+        edits_folder: Folder that new assets are written to; None has the browser save
+            them, which it also does for a file that was dropped.
     """
 
     def __init__(
@@ -69,12 +73,14 @@ class Tab:
         send: _Send,
         moved: Callable[[SceneView], None],
         up: VectorLike = (0.0, 0.0, 1.0),
+        edits_folder: Path | None = None,
     ) -> None:
         self.scene_view = scene_view
         self._up = up
         self._name = name
         self._send = send
         self._moved = moved
+        self._edits_folder = edits_folder
         self._exporter = Exporter(self._tell, lambda error: self.scene_view.explain(error))
         self._loop = RenderLoop(scene_view, self._show, self._fail)
         self._look: messages.Look | None = None
@@ -116,6 +122,8 @@ class Tab:
                 self._move(message)
             case messages.Save():
                 self._exporter.begin(functools.partial(self._save, message))
+            case messages.Crop():
+                self._exporter.begin(lambda _: self._crop(message))
             case messages.Stop():
                 self._exporter.stop()
             case messages.Open():
@@ -133,6 +141,7 @@ class Tab:
             near=scene_view.near,
             homes=self._homes(),
             instances=len(scene_view.scene),
+            writes_files=self._edits_folder is not None,
             has_files=self._folder is None and all(bundle.path for bundle in bundles),
             level_colors=_colors(_core.level_colors(scene_view.num_levels)),
             ramp=_colors(_core.ramp(np.linspace(0, 1, 7))),
@@ -235,9 +244,7 @@ class Tab:
 
     def _describe_instance(self, number: int) -> answers.Picked:
         scene = self.scene_view.scene
-        if number >= len(scene):
-            raise ValueError(f"instance: expected 0 to {len(scene) - 1}, got {number}")
-        bundle = scene.bundles[scene.instance_bundle[number]]
+        bundle = scene.bundles[scene.instance_bundle[self._checked_instance(number)]]
         boxes = bundle.clusters.box[: bundle.level_range(0).stop]
         w, x, y, z = scene.quaternions[number].tolist()
         pose = answers.Pose(
@@ -316,6 +323,29 @@ class Tab:
             f"{self._name}.json", lambda file: write_scene(file, scene, names, cameras)
         )
 
+    def _crop(self, message: messages.Crop) -> None:
+        """Save a part of level 0 of a bundle as a new asset."""
+        scene = self.scene_view.scene
+        bundle = scene.bundles[scene.instance_bundle[self._checked_instance(message.instance)]]
+        whole = bundle.level_gaussians(0)
+        part = crop_box(whole, *message.box, keep=message.keep)
+        name = message.name
+        counts = f"{len(part):,} of {len(whole):,} gaussians"
+        if not len(part):
+            raise ValueError(f"box: nothing is left of {len(whole):,} gaussians; change the box")
+        if self._edits_folder is None:
+            self._exporter.save(name, lambda file: write_asset(file, part))
+            self._tell(answers.Notice(f"{name} has {counts}."))
+            return
+        write_new_asset(self._edits_folder, name, part)
+        self._tell(answers.Notice(f"{name} was written beside what is shown: {counts}."))
+
+    def _checked_instance(self, number: int) -> int:
+        count = len(self.scene_view.scene)
+        if number >= count:
+            raise ValueError(f"instance: expected 0 to {count - 1}, got {number}")
+        return number
+
     def _begin_file(self, message: messages.Open) -> None:
         """Create the file for the binary data that follows, in a folder that is removed
         with the tab."""
@@ -350,6 +380,7 @@ class Tab:
         old_loop = self._loop
         self.scene_view = scene_view
         self._name = subject_name(path)
+        self._edits_folder = None
         self._loop = RenderLoop(scene_view, self._show, self._fail)
         old_loop.close(0.0)
         self._tell(self.describe_scene())

@@ -13,6 +13,23 @@ export type Shows =
   | "count"
   | "difference";
 
+/**
+ * Asks for a new asset, of the gaussians of a bundle whose centres lie in a box, or
+ * of all others.
+ *
+ * Attributes:
+ *     instance: One that shows the bundle.
+ *     box: Lower and upper corner, in the bundle's own coordinates.
+ *     name: Name of the file, whose end is the format.
+ */
+export interface Crop {
+  type: "crop";
+  instance: number;
+  box: [[number, number, number], [number, number, number]];
+  keep: "inside" | "outside";
+  name: string;
+}
+
 /** The work that the page requested has ended. */
 export interface Done {
   type: "done";
@@ -251,6 +268,8 @@ export interface Save {
  *     homes: First views, from narrow windows to wide ones.
  *     instances: Number of instances.
  *     has_files: Whether all its bundles are in files, so that the scene can be saved.
+ *     writes_files: Whether the server writes new assets, beside the file that is
+ *         shown; otherwise the browser saves them.
  *     level_colors: Colour of each level.
  *     ramp: Colours from the smallest value to the largest.
  *     most_counted: Number of gaussians in a pixel that gets the last colour of the
@@ -269,6 +288,7 @@ export interface Scene {
   homes: Home[];
   instances: number;
   has_files: boolean;
+  writes_files: boolean;
   level_colors: [number, number, number][];
   ramp: [number, number, number][];
   most_counted: number;
@@ -329,7 +349,7 @@ export interface View {
 }
 
 /** What the page says. */
-export type FromPage = Look | Pick | Move | Save | Stop | Open;
+export type FromPage = Look | Pick | Move | Save | Crop | Stop | Open;
 
 /** What the viewer says. */
 export type FromViewer =
