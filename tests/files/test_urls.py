@@ -193,7 +193,7 @@ def test_a_server_that_does_not_answer_ends_the_wait(there, many, monkeypatch):
 
     monkeypatch.setattr(type(there), "cat_file", slow)
     start = time.monotonic()
-    with pytest.raises(TimeoutError, match="pages are missing and none came in"):
+    with pytest.raises(TimeoutError, match="pages are missing and none arrived"):
         renderer.settle(NEAR, timeout=0.2, **FINE)
     assert renderer.render(NEAR, **FINE).stats.missing > 0  # which waits for nothing
     assert time.monotonic() - start < 30
