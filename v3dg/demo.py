@@ -38,6 +38,13 @@ _AZIMUTH = 0.80  # radians; the sun is then behind the camera
 _SKY = (0.6, 0.73, 0.85)
 
 
+def _output(path: str | os.PathLike[str]) -> Path:
+    """Return the path of a picture, whose folder is made."""
+    output = check_picture_path(path)
+    _files.make_folder(output)
+    return output
+
+
 def run_demo(
     output: str | os.PathLike[str] = "v3dg_demo.png",
     *,
@@ -69,7 +76,7 @@ def run_demo(
         ValueError: The picture cannot be written to ``output``, or an argument is out
             of range.
     """
-    path = check_picture_path(output)
+    path = _output(output)
     files = _Files.new(keep)
     chosen_device = _device.resolve(device)
     start = time.perf_counter()

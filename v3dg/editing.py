@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from v3dg._numbers import check, check_type, one_of, positive, real, whole
+from v3dg._numbers import check, check_type, one_of, positive, real, value_text, whole
 from v3dg.cleaning import examine, outliers
 from v3dg.gaussians import Array, Gaussians
 
@@ -41,9 +41,8 @@ def crop_box(
     """
     lowest = _corner(low, "low")
     highest = _corner(high, "high")
-    check(
-        "high", (lowest <= highest).all(), f"no coordinate below low, got {highest} below {lowest}"
-    )
+    is_box = (lowest <= highest).all()
+    check("low, high", is_box, f"no coordinate of high below low, got {lowest} and {highest}")
     means = _check_gaussians(gaussians).numpy().means
     with np.errstate(invalid="ignore"):
         is_inside = ((means >= lowest) & (means <= highest)).all(axis=1)
@@ -162,10 +161,10 @@ def _corner(values: Array | npt.ArrayLike, name: str) -> npt.NDArray[np.float64]
         host = host.numpy(force=True)
     try:
         corner = np.array(host, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         corner = np.full(0, np.nan)
     is_point = corner.shape == (3,) and not np.isnan(corner).any()
-    check(name, is_point, f"three numbers, got {values!r}")
+    check(name, is_point, f"three numbers, got {value_text(values)}")
     return corner
 
 

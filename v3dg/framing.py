@@ -2,14 +2,14 @@
 
 A grid of voxels around most of the gaussians says how much of every direction is
 blocked from each place (ambient occlusion). A subject surrounds its viewer if much of
-its middle is
-free, closed on nearly all sides, and holds something beside its outer walls: a room
-    does,
-while a solid object has no such place, and a hollow one has nothing in it.
+its middle is free, closed on nearly all sides, and holds something beside its outer
+walls: a room does, while a solid object has no such place, and a hollow one has nothing
+in it.
 """
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -31,6 +31,8 @@ from outside."""
 # Enough gaussians to find where a subject is and what surrounds it, and quick to read.
 _MOST_GAUSSIANS = 60_000
 _MOST_INSTANCES = 15_000
+# Views around an object; a turntable is so far away that each of them shows it all.
+_DISTANCE_VIEWS = 36
 # Share of the picture that stays free at each of its sides.
 _MARGIN = 0.04
 # Tangents of half the field of view across the shorter side, and at most across the
@@ -144,14 +146,11 @@ class Framing:
         elevation: float = DEFAULT_ELEVATION,
     ) -> list[Camera]:
         """Return cameras that go once around an object at one distance, from which each
-        sees all of it, or turn once inside a room; a single one is that of `camera`."""
-        azimuths = [2 * math.pi * number / count for number in range(count)]
-        cameras = [
-            self.camera(up, width, height, elevation=elevation, azimuth=azimuth)
-            for azimuth in azimuths
-        ]
-        if self.is_inside or count < 2:
-            return cameras
+        sees all of it, or turn once inside a room. The distance does not depend on
+        their number, so view 0 is the same for all numbers."""
+        if self.is_inside:
+            return self._cameras_at(_azimuths(count), up, width, height, elevation)
+        cameras = self._cameras_at(_azimuths(_DISTANCE_VIEWS), up, width, height, elevation)
         axis = _unit(up)
         right_tangent, down_tangent = _tangents(
             width, height, _OUTSIDE_TANGENT, widest=_OUTSIDE_MOST
@@ -172,6 +171,15 @@ class Framing:
                 width=width,
                 height=height,
             )
+            for azimuth in _azimuths(count)
+        ]
+
+    def _cameras_at(
+        self, azimuths: Sequence[float], up: VectorLike, width: int, height: int, elevation: float
+    ) -> list[Camera]:
+        """Return the first view from each of the azimuths."""
+        return [
+            self.camera(up, width, height, elevation=elevation, azimuth=azimuth)
             for azimuth in azimuths
         ]
 
@@ -198,6 +206,11 @@ class Framing:
             width=size[0],
             height=size[1],
         )
+
+
+def _azimuths(count: int) -> list[float]:
+    """Return angles all around, in radians, from 0 on."""
+    return [2 * math.pi * number / count for number in range(count)]
 
 
 def frame_subject(subject: Subject) -> Framing:

@@ -80,17 +80,14 @@ def contact_sheet(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
 
 
 def check_picture_path(path: str | os.PathLike[str]) -> Path:
-    """Check, before long work, that a picture can be written to a path, and create its
-    folder.
+    """Check, before long work, that the name of a picture has a known suffix.
 
     Raises:
         ValueError: The suffix is not one of ``SUFFIXES``.
-        OSError: Its folder cannot be created.
     """
     path = Path(path)
     is_known = path.suffix.lower() in SUFFIXES
     check(path, is_known, f"a file name ending in {', '.join(SUFFIXES)}; choose one of them")
-    _files.make_folder(path)
     return path
 
 

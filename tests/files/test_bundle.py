@@ -873,7 +873,7 @@ def test_random_pages_are_finite_gaussians_or_refused(tmp_path_factory, data):
         tensors["pages.hash"][page] = np.frombuffer(digest, np.uint8)
     path.write_bytes(join_file(header, tensors))
     opened = Bundle.open(path)
-    message = r"small\.v3dg: page \d+ \(.*\): cluster \d+ of the page: expected ranges of finite"
+    message = r"small\.v3dg: page \d+ \(.*\): cluster \d+ of the page: expected finite ranges"
     for page in range(opened.num_pages):
         gaussians = None
         with contextlib.suppress(ValueError):

@@ -206,5 +206,7 @@ def test_frame_refuses_what_is_on_the_other_device():
     with pytest.raises(ValueError, match="scene: expected a scene on the frame's device"):
         frame.draw(
             residency.scene(scene, Device(1)).core,
-            _core.FrameRequest(CAMERA.core, rule, shade_of([0, 0, 0], None, False, True)),
+            _core.FrameRequest(
+                CAMERA.core, rule, shade_of([0, 0, 0], None, is_asset=False, depth=True)
+            ),
         )

@@ -207,12 +207,16 @@ def _camera_name(text: str, names: Sequence[str]) -> str:
 
 
 def _around(subject: Subject, options: ViewOptions, views: int) -> dict[str, Camera]:
-    """First views of a subject, from around an object or inside a room."""
+    """First views of a subject, from around an object or inside a room. A single one
+    that no --views asks for is framed closer than a turntable."""
     elevation = DEFAULT_ELEVATION
     if options.elevation is not None:
         elevation = math.radians(options.elevation)
     up = direction_of(options.up or up_of(subject)[0])
-    cameras = frame_subject(subject).turntable(up, views, *options.size, elevation=elevation)
+    framing = frame_subject(subject)
+    if options.views is None and views == 1:
+        return {"0": framing.camera(up, *options.size, elevation=elevation)}
+    cameras = framing.turntable(up, views, *options.size, elevation=elevation)
     digits = len(str(views - 1))
     return {f"{i:0{digits}}": camera for i, camera in enumerate(cameras)}
 

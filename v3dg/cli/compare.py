@@ -10,7 +10,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 import tyro
 
-from v3dg import _device, pictures
+from v3dg import _device, _files, pictures
 from v3dg._json import JsonObject
 from v3dg._judges import Judges, mean_of
 from v3dg._numbers import check
@@ -88,6 +88,7 @@ def run(options: Compare) -> None:
     subjects = (options.reference, options.test)
     _common.check_output(options.output, *subjects)
     output = pictures.check_picture_path(options.output)
+    _files.make_folder(output)
     are_pictures = [beside(path).suffix.lower() in pictures.SUFFIXES for path in subjects]
     is_pair = any(are_pictures) == all(are_pictures)
     _common.check_usage("PATH", is_pair, "two pictures, or two subjects to draw, got one of each")

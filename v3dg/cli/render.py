@@ -161,6 +161,7 @@ def _checked_output(options: Render, background: Color | None) -> Path:
         output = check_picture_path(output)
         is_png = output.suffix.lower() == ".png"
         check_usage("--background", background or is_png, f"a .png for none, got {output}")
+        _files.make_folder(output)
     return output
 
 

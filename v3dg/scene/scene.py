@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v3dg import _device
-from v3dg._numbers import Floats, check, check_type, one_of
+from v3dg._numbers import Floats, check, check_type, one_of, positive, vector
 from v3dg.bundle import Bundle
 from v3dg.cameras import AXES, Axis, Camera
 from v3dg.gaussians import Array, Gaussians
@@ -186,6 +186,12 @@ class Scene:
             ValueError: As in `add`.
         """
         check_type("scene", scene, Scene, "a Scene")
+        if position is not None:
+            position = vector(position, "position")
+        if quaternion is not None:
+            quaternion = vector(quaternion, "quaternion", (4,))
+        if scale is not None:
+            scale = positive(scale, "scale")
         parts: tuple[Array, Array, Array] = (position, quaternion, scale)
         if matrix is not None:
             parts = parts_of(matrix, *parts)

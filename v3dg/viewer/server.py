@@ -107,19 +107,18 @@ class Site:
     ) -> None:
         _load_extras()
         from v3dg.viewer.gate import Gate
-        from v3dg.viewer.tab import Tab
 
-        self._make_tab = Tab
         self._scene_view = scene_view
         self._name = name
         cameras = cameras or {}
         check_cameras(cameras)
-        shade = _checked_color(background)
         self._photographs = [dict(photographs or {}).get(camera) for camera in cameras]
+        shade = _checked_color(background)
+        settings = Settings(tolerance=tolerance, budget=budget, background=shade)
         self._greeting = _greeting(
             cameras,
             self._photographs,
-            settings=Settings(tolerance=tolerance, budget=budget, background=shade),
+            settings=settings,
             up=up,
             asks_up=asks_up,
         )
@@ -189,6 +188,8 @@ class Site:
 
     async def _talk(self, connection: ServerConnection) -> None:
         """Serve one tab while it is open."""
+        from v3dg.viewer.tab import Tab
+
         from v3dg.viewer.answers import encode
 
         def send(data: str | bytes) -> None:
@@ -207,9 +208,7 @@ class Site:
                 if open_tab.scene_view is scene_view:
                     open_tab.ask_again()
 
-        tab = self._make_tab(
-            self._scene_view, self._name, send, moved, self._greeting.up, self._edits_folder
-        )
+        tab = Tab(self._scene_view, self._name, send, moved, self._greeting.up, self._edits_folder)
         self._tabs.add(tab)
         try:
             await connection.send(encode(self._greeting))
