@@ -133,7 +133,8 @@ class Site:
         self._start()
 
     def _allowed_folder(self, folder: Path | None) -> Path | None:
-        """The folder that pages may write to; None if other machines can connect."""
+        """Return the folder that pages may write to; None if other machines can
+        connect."""
         if folder is None or self.is_secret:
             return None
         return Path(folder).absolute()
