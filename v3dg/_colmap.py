@@ -35,7 +35,7 @@ class _Model(NamedTuple):
     Attributes:
         num_focal: Focal lengths, which are the first parameters; the centre follows.
         num_distortion: Parameters of the lens after these.
-        projection: What it is where these parameters are 0.
+        projection: Name of the projection if the distortion is 0.
     """
 
     name: str
@@ -69,7 +69,7 @@ _NUM_WIDTH_HEIGHT = 2  # the parameters of EQUIRECTANGULAR
 
 @dataclass(frozen=True)
 class Lens:
-    """What COLMAP calls a camera: an image's size and lens.
+    """An image's size and lens, which COLMAP calls a camera.
 
     Attributes:
         distortion: Parameters of the lens beside focal lengths and centre.
@@ -176,7 +176,7 @@ def _take(path: Path, file: IO[bytes], size: int) -> bytes:
 
 
 def _count(path: Path, file: IO[bytes], least_bytes: int) -> int:
-    """A number of entries that the file has room for."""
+    """Read a number of entries; ValueError if the file has too few bytes for them."""
     (count,) = _COUNT.unpack(_take(path, file, _COUNT.size))
     num_bytes = os.fstat(file.fileno()).st_size
     check(path, count <= num_bytes // least_bytes, f"{count} entries, got {num_bytes} bytes")
@@ -207,7 +207,8 @@ def _binary_images(path: Path, file: IO[bytes]) -> Iterator[_ImageEntry]:
 
 
 def _binary_name(path: Path, file: IO[bytes]) -> str:
-    """A name that ends with a zero; the file is then behind that."""
+    """Read a name up to its final zero byte; the file's position is then after that
+    byte."""
     start = file.tell()
     for num_bytes in (_USUAL_NAME_BYTES, _MAX_NAME_BYTES):
         file.seek(start)
@@ -221,7 +222,7 @@ def _binary_name(path: Path, file: IO[bytes]) -> str:
 
 
 def _text(content: bytes) -> str:
-    """A name in UTF-8; bytes of another encoding are shown by their numbers."""
+    """Decode a name in UTF-8; bytes of another encoding become escapes."""
     return content.decode("utf-8", errors="backslashreplace")
 
 
@@ -230,7 +231,7 @@ def _bad_line(path: Path, number: int, expected: str, line: bytes) -> NoReturn:
 
 
 def _numbered_lines(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
-    """The lines of a text with their numbers, without a byte order mark."""
+    """Yield the lines of a text with their numbers, without a byte order mark."""
     for number, line in enumerate(file, start=1):
         if number == 1:
             line = line.removeprefix(codecs.BOM_UTF8)

@@ -119,7 +119,7 @@ class _Place(NamedTuple):
 
 
 def _place_of(path: Path) -> _Place:
-    """Where the cameras of a file, a folder or a run of nerfstudio are."""
+    """Return where the cameras of a file, a folder or a run of nerfstudio are."""
     folder = path
     if path.name == _RUN:
         folder = path.parent
@@ -137,8 +137,8 @@ def _place_of(path: Path) -> _Place:
 
 
 def _named(pairs: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
-    """Cameras by their names; by their numbers if a name is empty or repeats, so that
-    none replaces another."""
+    """Return cameras by name, or by number if a name is empty or repeats, so that none
+    replaces another."""
     names = []
     cameras = []
     for name, camera in pairs:
@@ -150,7 +150,7 @@ def _named(pairs: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
 
 
 def _file_in(folder: Path) -> Path:
-    """The file of cameras in a folder: of a model of COLMAP, or one of JSON."""
+    """Return the camera file in a folder: one of a COLMAP model, or a JSON file."""
     places = [folder / part for part in ("", "sparse/0", "sparse", "0")]
     files = [place / name for place in places for name in IMAGE_FILES]
     files += [folder / name for name in (*_FRAMES, "cameras.json", "camera_path.json")]
@@ -164,7 +164,8 @@ def _file_in(folder: Path) -> Path:
 
 
 def _frames_at_top(document: Node) -> dict[str, Node]:
-    """The fields of a file with frames; ValueError says what other files are."""
+    """Return the fields of a file with frames; the ValueError for another file says
+    what it is."""
     if document.has("keyframes") or document.has("camera_path"):
         advice = "save the path in nerfstudio's viewer, which then writes them, too"
         raise document.problem(f"expected frames in camera_path, got none; {advice}")
@@ -175,8 +176,8 @@ def _frames_at_top(document: Node) -> dict[str, Node]:
 
 
 def _read_3dgs(node: Node) -> tuple[str, Camera]:
-    """A camera of the `cameras.json` that the code of the 3DGS paper writes: rotation
-    and position of camera to world, with x right, y down, z forward."""
+    """Return a camera of the `cameras.json` that the code of the 3DGS paper writes. Its
+    rotation and position take camera to world; x is right, y down, z forward."""
     if node.has("transform"):
         raise node.problem(
             "expected position, rotation, fx and fy, got a pose alone, as ns-export cameras "
@@ -198,9 +199,9 @@ def _read_3dgs(node: Node) -> tuple[str, Camera]:
 
 
 def _read_path(document: Node, size: tuple[int, int] | None) -> Iterator[tuple[str, Camera]]:
-    """The frames of a path of nerfstudio's viewer, by their number or `file_path`:
-    camera to world with x right, y up, z backward, and the vertical field of view in
-    degrees of square pixels."""
+    """Yield the frames of a camera path of nerfstudio's viewer, named by `file_path` or
+    else by their number. Matrices take camera to world, with x right, y up, z backward;
+    `fov` is the vertical field of view in degrees, and pixels are square."""
     for key in ("camera_type", "camera_model"):
         if document.has(key) and document.field(key).text() != "perspective":
             raise document.field(key).error('"perspective"')
@@ -224,7 +225,8 @@ def _read_path(document: Node, size: tuple[int, int] | None) -> Iterator[tuple[s
 
 
 def _flat_or_rows(node: Node) -> Floats:
-    """A (4, 4) matrix of 16 numbers, row by row, or of rows."""
+    """Return a (4, 4) matrix that is given as 16 numbers, row by row, or as four
+    rows."""
     if isinstance(node.value, list) and len(node.value) == 16:
         matrix = np.array(node.vector(16)).reshape(4, 4)
         matrix[3] = (0, 0, 0, 1)
@@ -240,7 +242,8 @@ def _read_frame(
     size: tuple[int, int] | None,
     distortion: str,
 ) -> Camera:
-    """The camera of a frame; fields that it lacks are those at the top of the file."""
+    """Return the camera of a frame; fields that the frame lacks are read from the top
+    of the file."""
     fields = {**top, **frame}
     _check_is_pinhole(fields, distortion)
     focal = top
@@ -260,7 +263,7 @@ def _read_frame(
 
 
 def _data_of(run: Path) -> Path:
-    """The `transforms.json` of the data that a nerfstudio run was trained on."""
+    """Return the `transforms.json` of the data that a nerfstudio run was trained on."""
     # YAML with Python objects, of which only a path is read.
     text = (run / _RUN).read_text(encoding="utf-8", errors="replace")
     files = []
@@ -282,7 +285,7 @@ def _data_of(run: Path) -> Path:
 
 
 def _trained(file: Path) -> tuple[Floats, float]:
-    """The transform from the frame of a run's training to that of its data, as
+    """Return the transform from the frame of a run's training to that of its data, as
     `_applied` returns it."""
     top = read_json(file).some_fields(("transform", "scale"))
     matrix = _rows(top["transform"])
@@ -352,8 +355,8 @@ def _check_is_pinhole(fields: Mapping[str, Node], distortion: str) -> None:
 
 
 def _rows(node: Node) -> Floats:
-    """A matrix of 3 or 4 rows as (4, 4); a fourth row is ignored, as by other
-    readers."""
+    """Return a matrix that is given as 3 or 4 rows as (4, 4); a fourth row is ignored,
+    as other readers do."""
     num_rows = 4
     if isinstance(node.value, list) and len(node.value) == 3:
         num_rows = 3
@@ -363,8 +366,8 @@ def _rows(node: Node) -> Floats:
 
 
 def _applied(top: Mapping[str, Node]) -> tuple[Floats, float]:
-    """The (4, 4) rotation and translation, then the scale, that were applied to the
-    file's positions."""
+    """Return the (4, 4) rotation and translation, then the scale, that were applied to
+    the file's positions."""
     transform: Floats = np.eye(4)
     if "applied_transform" in top:
         transform = _rows(top["applied_transform"])

@@ -75,7 +75,8 @@ class Findings:
 
 
 def summary(num_dropped: int, num_gaussians: int, counts: Mapping[str, int]) -> str:
-    """One line that says how many of an asset cannot be drawn and why."""
+    """Return one line that says how many gaussians of an asset cannot be drawn, and
+    why."""
     return f"{num_dropped:,} of {num_gaussians:,} gaussians cannot be drawn: {describe(counts)}"
 
 
@@ -99,9 +100,9 @@ def examine(asset: Gaussians) -> Findings:
 def outliers(
     means: npt.NDArray[np.float32], reference: npt.NDArray[np.float32] | None = None
 ) -> npt.NDArray[np.bool_]:
-    """(N,) whether each of the finite positions (N, 3) lies far from all others: at
-    more than 20 times the median distance from the median of ``reference``, of all of
-    them if None."""
+    """Return (N,) whether each finite position (N, 3) is an outlier: its distance from
+    the median of ``reference`` is more than 20 times the median distance. If
+    ``reference`` is None, it is the positions themselves."""
     if reference is None:
         reference = means
     if len(means) == 0 or len(reference) == 0:
@@ -114,8 +115,8 @@ def outliers(
 
 
 def ball_of_most(points: npt.NDArray[np.floating]) -> tuple[npt.NDArray[np.floating], float]:
-    """Centre (3,) and radius, above 0, of a ball around nearly all of N > 0 points (N,
-    3).
+    """Return the centre (3,) and the radius, above 0, of a ball around nearly all of N
+    > 0 points (N, 3).
 
     It is the part to look at: trained assets have a few gaussians far away from all
     others.

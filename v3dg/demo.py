@@ -117,7 +117,7 @@ def _columns(
 def _rows(
     views: Sequence[tuple[float, float]], panels: Sequence[tuple["_Panel", "_Panel"]]
 ) -> list[list[tuple[str, Picture]]]:
-    """The rows of the result: the full asset above, the selected cut below."""
+    """Return the rows of the result: the full asset above, the selected cut below."""
     rows: list[list[tuple[str, Picture]]] = [[], []]
     for (distance, _), pair in zip(views, panels, strict=True):
         for row, kind, panel in zip(rows, ("full", "bundle"), pair, strict=True):
@@ -139,8 +139,8 @@ class _Files(NamedTuple):
 
     @classmethod
     def new(cls, keep: str | os.PathLike[str] | None) -> "_Files | None":
-        """The files in a folder, which is created, and none of which may exist; None
-        without a folder."""
+        """Create a folder and return the paths of the files in it, none of which may
+        exist yet; None without a folder."""
         if keep is None:
             return None
         folder = Path(keep)

@@ -79,7 +79,7 @@ class _Sample(NamedTuple):
 
 @dataclass(frozen=True)
 class Framing:
-    """Where a subject is, and from where it is first looked at.
+    """The place and extent of a subject, which determine its first views.
 
     Attributes:
         center: (3,) centre of the box around nearly all gaussians, world units.
@@ -194,7 +194,7 @@ class Framing:
     def _inside(
         self, places: "_Places", axis: Floats, size: tuple[int, int], azimuth: float
     ) -> Camera:
-        """The camera inside a room, at the place from which most is seen."""
+        """Return the camera at the place in a room from which most is visible."""
         eye, best_azimuth = places.best(axis)
         forward = -_outwards(axis, -_INSIDE_PITCH, best_azimuth + azimuth)
         right_tangent, _ = _tangents(*size, _INSIDE_TANGENT, widest=_INSIDE_MOST)
@@ -253,7 +253,7 @@ def _empty_sample() -> _Sample:
 
 
 def _coarse_level(bundle: Bundle) -> Gaussians:
-    """The finest level that is quick to read and not damaged, else the coarsest one.
+    """Return the finest undamaged level that is quick to read, else the coarsest level.
 
     Drawing reports damaged pages; a first view can do without them.
     """
@@ -270,7 +270,7 @@ def _coarse_level(bundle: Bundle) -> Gaussians:
 
 
 def _sample_of(asset: Gaussians, most_rows: int) -> _Sample:
-    """At most so many gaussians of an asset, evenly from its order."""
+    """Return at most `most_rows` gaussians of an asset, evenly spaced in its order."""
     count = min(most_rows, len(asset))
     rows = asset.numpy().subset(np.linspace(0, len(asset) - 1, count).astype(np.int64))
     scales = np.asarray(rows.scales, np.float64)
@@ -292,7 +292,7 @@ def _sample_of(asset: Gaussians, most_rows: int) -> _Sample:
 
 
 def _placed(local: _Sample, scene: Scene, instances: npt.NDArray[np.int64]) -> _Sample:
-    """The gaussians of a bundle at the poses of its instances."""
+    """Return the gaussians of a bundle at the poses of its instances."""
     linear = scene.rotations[instances] * scene.scales[instances, None, None]
     turned = [
         np.einsum("iab,kb->ika", linear, values).reshape(-1, 3)
@@ -304,8 +304,8 @@ def _placed(local: _Sample, scene: Scene, instances: npt.NDArray[np.int64]) -> _
 
 
 def _box(means: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Lowest and highest corner of a box around all gaussians but those far from
-    others.
+    """Return the lowest and the highest corner of a box around all gaussians that are
+    not far from the others.
 
     From the middle 96 % along each axis the box grows in steps while there are
     gaussians in the next step, so that a thin tip belongs to it and a distant sky does
@@ -323,7 +323,7 @@ def _box(means: Floats, weights: Floats) -> tuple[Floats, Floats]:
 
 
 def _steps_with_gaussians(distances: Floats, weights: Floats) -> int:
-    """The number of steps beyond a border in each of which there are gaussians."""
+    """Return the number of consecutive steps beyond a border that have gaussians."""
     is_beyond = (distances > 0) & (distances <= _MOST_STEPS)
     numbers = np.ceil(distances[is_beyond]).astype(np.int64) - 1
     amounts = np.bincount(numbers, weights[is_beyond], _MOST_STEPS)
@@ -334,7 +334,7 @@ def _steps_with_gaussians(distances: Floats, weights: Floats) -> int:
 
 
 def _outline(sample: _Sample, low: Floats, high: Floats) -> Floats:
-    """(P, 3) points of the gaussians in a box, at two standard deviations."""
+    """Return (P, 3) points of the gaussians in a box, at two standard deviations."""
     is_inside = ((sample.means >= low) & (sample.means <= high)).all(axis=1)
     means = sample.means[is_inside]
     first = sample.first_axes[is_inside]
@@ -355,7 +355,7 @@ def _unit(vector: VectorLike) -> Floats:
 
 
 def _outwards(up: Floats, elevation: float, azimuth: float) -> Floats:
-    """(3,) unit vector from a subject to its camera.
+    """Return the (3,) unit vector from a subject to its camera.
 
     At azimuth 0 the camera is where viewers take the front of an asset to be: at +z
         where
@@ -372,7 +372,7 @@ def _outwards(up: Floats, elevation: float, azimuth: float) -> Floats:
 
 
 def _tangents(width: int, height: int, shorter: float, *, widest: float) -> tuple[float, float]:
-    """Tangents of half the fields of view across width and height."""
+    """Return the tangents of half the fields of view across width and height."""
     ratio = max(width, height) / min(width, height)
     longer = min(shorter * ratio, widest)
     if width >= height:
@@ -383,8 +383,8 @@ def _tangents(width: int, height: int, shorter: float, *, widest: float) -> tupl
 def _eye_that_sees(
     points: Floats, forward: Floats, up: Floats, right_tangent: float, down_tangent: float
 ) -> Floats:
-    """(3,) the nearest eye that has all points in its frustum, and as much free space
-    on the left as on the right, or above as below."""
+    """Return (3,) the nearest eye whose frustum contains all points, with equal free
+    space to the left and the right, or above and below."""
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
     down = np.cross(forward, right)
@@ -420,7 +420,7 @@ class _Grid(NamedTuple):
         return self.density > 0.5
 
     def center(self, voxels: npt.NDArray[np.intp]) -> Floats:
-        """(N, 3) centres of voxels (N, 3)."""
+        """Return the centres (N, 3) of voxels (N, 3)."""
         return np.asarray(self.origin + self.side * (voxels + 0.5))
 
 
@@ -435,8 +435,8 @@ class _Places:
     size: float
 
     def best(self, up: Floats) -> tuple[Floats, float]:
-        """The place, and the azimuth, from which most is seen and nothing is close
-        by."""
+        """Return the place, and the azimuth, from which most is visible and nothing is
+        close."""
         heights = self.places @ up
         low, high = np.quantile(self.means @ up, (0.02, 0.98))
         is_at_eye_height = np.abs((heights - low) / max(high - low, 1e-12) - 0.55) < 0.15
@@ -452,7 +452,7 @@ class _Places:
         return best[1], best[2]
 
     def _scores(self, place: Floats, up: Floats) -> Floats:
-        """What is seen from a place in each of the azimuths of its view."""
+        """Return how much is visible from a place at each of its azimuths."""
         front = -_outwards(up, 0.0, 0.0)
         aside = np.cross(up, front)
         offsets = self.means - place
@@ -472,8 +472,8 @@ _AZIMUTHS = 36
 
 
 def _places(sample: _Sample) -> _Places | None:
-    """The places inside of a subject that surrounds its viewer; None for another
-    one."""
+    """Return the places inside a subject that surrounds its viewer; None for any other
+    subject."""
     grid = _grid(sample)
     if grid is None:
         return None
@@ -500,8 +500,8 @@ def _places(sample: _Sample) -> _Places | None:
 
 
 def _grid(sample: _Sample) -> _Grid | None:
-    """The voxels around most of a sample; None for too few gaussians to enclose a
-    place."""
+    """Return the voxels around most of a sample; None if there are too few gaussians to
+    enclose a place."""
     means = sample.means
     if len(means) < 200:
         return None
@@ -528,7 +528,7 @@ def _grid(sample: _Sample) -> _Grid | None:
 
 
 def _distances(is_solid: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
-    """(26, V, V, V) distances to the next solid voxel in each direction."""
+    """Return the distances (26, V, V, V) to the next solid voxel in each direction."""
     distances = np.full((len(_DIRECTIONS), *is_solid.shape), np.inf, np.float32)
     for number, direction in enumerate(_DIRECTIONS):
         source = tuple(_shifted(step) for step in direction)
@@ -549,7 +549,8 @@ def _shifted(step: int) -> slice:
 
 
 def _grown(mask: npt.NDArray[np.bool_], count: int) -> npt.NDArray[np.bool_]:
-    """A mask grown by so many voxels, and by those outside of the grid."""
+    """Return a mask that is grown by `count` voxels; all voxels outside of the grid
+    belong to it."""
     grown = np.pad(mask, count, constant_values=True)
     for _ in range(count):
         wider = grown.copy()

@@ -94,8 +94,9 @@ WRITE_SUFFIXES = tuple(_WRITERS)
 
 
 def subject_name(path: AnyPath) -> str:
-    """The name of the subject in a file or at a URL: the file's without its suffix, or
-    the folder's for a file that is always called alike, such as `lod-meta.json`."""
+    """Return the name of the subject in a file or at a URL: the file's name without its
+    suffix, or the folder's name if all files of that kind have the same name, such as
+    `lod-meta.json`."""
     file = beside(path)
     if file.name.lower() in ("lod-meta.json", "meta.json"):
         folder = folder_of(path)
@@ -150,7 +151,7 @@ def read_asset(path: AnyPath) -> Gaussians:
 
 
 def loaded(asset: Gaussians | AnyPath) -> Gaussians:
-    """An asset, which is read if it is given by its file."""
+    """Return an asset, after reading it if a file is given."""
     if isinstance(asset, str | os.PathLike):
         return read_asset(asset)
     return asset
@@ -204,8 +205,8 @@ def _open_fetched(at_url: FileAtUrl, reader: Callable[[AnyPath], AssetFile]) -> 
 
 
 def run_files(folder: pathlib.Path) -> list[pathlib.Path]:
-    """The last checkpoint of a run of gsplat, nerfstudio or the code of the 3DGS paper;
-    its files are one asset."""
+    """Return the last checkpoint of a run of gsplat, nerfstudio or the code of the 3DGS
+    paper; its files are one asset."""
     steps: dict[int, list[pathlib.Path]] = {}
     for pattern in _RUNS:
         for file in sorted(folder.glob(pattern)):
@@ -220,7 +221,8 @@ def run_files(folder: pathlib.Path) -> list[pathlib.Path]:
 
 
 def asset_bytes(path: AnyPath) -> int:
-    """Size on disk of a readable asset, including the existing files that it names."""
+    """Return the size on disk of a readable asset, including the existing files that it
+    names."""
     names = _by_name(path, _FILES)
     at_url = in_parts(path)
     if isinstance(at_url, FileAtUrl):
@@ -294,8 +296,8 @@ def write_asset(
 
 
 def turned_up(path: AnyPath) -> Axis | None:
-    """The axis that is up in a file that `write_asset` writes, by its name; None for
-    formats without axes."""
+    """Return the axis that is up in a file that `write_asset` writes, by its name; None
+    for formats without axes."""
     name = beside(path).name.lower()
     for ending, axis in _UP.items():
         if name.endswith(ending):
@@ -304,8 +306,8 @@ def turned_up(path: AnyPath) -> Axis | None:
 
 
 def losses_of(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) -> Losses | None:
-    """What a file does not hold of the gaussians that `write_asset` wrote to it, which
-    is read back; None for formats of float32 numbers, which lose nothing.
+    """Read back the file that `write_asset` wrote, and return what it lacks of the
+    gaussians; None for formats of float32 numbers, which lose nothing.
 
     Args:
         up: As it was given to `write_asset`.

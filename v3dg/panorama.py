@@ -82,7 +82,8 @@ def draw_panorama(
 
 
 def _side(longitude: float, latitude: float) -> Floats:
-    """(3, 3) right, down and forward of a side, in the frame of the panorama."""
+    """Return (3, 3) the right, down and forward axes of a side, in the frame of the
+    panorama."""
     sine = math.sin(longitude)
     cosine = math.cos(longitude)
     right = np.array([cosine, 0.0, -sine])
@@ -93,14 +94,14 @@ def _side(longitude: float, latitude: float) -> Floats:
 
 
 def _level_frame(camera: Camera, up: Floats) -> Floats:
-    """(3, 3) rotation from the world to the panorama's frame, whose -y is up and whose
-    z is where the camera looks, as seen from above."""
+    """Return the (3, 3) rotation from the world to the panorama's frame: -y is up, and
+    z is the camera's direction, made horizontal."""
     check("up", up.any(), "a direction, got (0, 0, 0)")
     axis = up / np.abs(up).max()  # squares neither overflow nor underflow
     axis /= np.linalg.norm(axis)
     forward = camera.viewmat[2, :3] - axis * (camera.viewmat[2, :3] @ axis)
     length = np.linalg.norm(forward)
-    check("up, camera", length > 1e-6, "directions that are not along each other, got such ones")
+    check("up, camera", length > 1e-6, "directions that are not parallel, got parallel ones")
     forward = forward / length
     return np.stack([np.cross(forward, axis), -axis, forward])
 
@@ -135,7 +136,8 @@ def _add(
 
 
 def _interpolated(pixels: Floats, column: Floats, row: Floats) -> Floats:
-    """(N, C) bilinear interpolation of a picture (H, W, C) at places in px."""
+    """Return (N, C) the bilinear interpolation of a picture (H, W, C) at places in
+    px."""
     last = pixels.shape[0] - 2
     left = np.clip(np.floor(column), 0, last).astype(np.int64)
     top = np.clip(np.floor(row), 0, last).astype(np.int64)

@@ -177,7 +177,7 @@ def write_picture(
 
 
 def _straight(premultiplied: NDArray[np.generic], alpha: Array) -> NDArray[np.generic]:
-    """(H, W, 4) straight colours and alpha."""
+    """Return (H, W, 4) straight colours and alpha."""
     if hasattr(alpha, "detach"):
         alpha = alpha.detach().cpu().numpy()
     coverage = np.asarray(alpha)

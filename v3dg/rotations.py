@@ -40,26 +40,26 @@ class Similarity(NamedTuple):
 
 
 def turn_upright(up: Axis) -> Floats:
-    """(4,) w x y z that turns what is up in an asset to -y; ValueError for another
-    name."""
+    """Return the quaternion (4,) w x y z that turns the axis that is up in an asset to
+    -y; ValueError for another name."""
     one_of(up, "up", tuple(_TO_UPRIGHT))
     return np.array(_TO_UPRIGHT[up])
 
 
 def turn_between(up: Axis, target: Axis) -> Floats:
-    """(4,) w x y z that turns one axis to another; between y or z and their opposites
-    x stays."""
+    """Return the quaternion (4,) w x y z that turns one axis to another; between y or z
+    and their opposites, x stays."""
     return product(turn_upright(target) * [1, -1, -1, -1], turn_upright(up))
 
 
 def product(first: Floats, second: Floats) -> Floats:
-    """Quaternions (..., 4) w x y z of the second rotation followed by the first."""
+    """Return quaternions (..., 4) w x y z that rotate by `second`, then by `first`."""
     return np.asarray((first[..., None, :] @ product_matrix(second))[..., 0, :])
 
 
 def product_matrix(quaternions: Floats) -> Floats:
-    """Matrices (..., 4, 4) by which row vectors (4,) of other quaternions are
-    multiplied on the right, as by these quaternions."""
+    """Return the matrices M (..., 4, 4) of quaternions q for which p @ M, with row
+    vectors p (4,) of quaternions, is the quaternion product p q."""
     w, x, y, z = np.moveaxis(quaternions, -1, 0)
     rows = [[w, x, y, z], [-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]]
     return np.ascontiguousarray(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
@@ -154,7 +154,7 @@ def normalised(quaternions: NDArray[np.floating]) -> Floats:
 
 
 def rotation_from_quaternion(quaternions: Floats) -> Floats:
-    """Rotation matrices (I, 3, 3) of unit quaternions (I, 4) w x y z."""
+    """Return rotation matrices (I, 3, 3) of unit quaternions (I, 4) w x y z."""
     w, x, y, z = np.moveaxis(quaternions, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -186,7 +186,8 @@ class Selection:
         return np.asarray((clusters.level == 0) & (clusters.filter_px2 == 0) & fades)
 
     def _first(self) -> npt.NDArray[np.int64]:
-        """(S + 1,) first gaussian of each selected cluster, and their total number."""
+        """Return (S + 1,) the first gaussian of each selected cluster, then their total
+        number."""
         return np.concatenate(
             [[0], np.cumsum(self.per_pair(lambda clusters: np.diff(clusters.offset)))]
         )

@@ -90,8 +90,8 @@ def turned_upright(gaussians: Gaussians, up: Axis) -> Gaussians:
 
 
 def _middles(subject: Bundle | Gaussians) -> Floats:
-    """(N, 3) centres of gaussians of level 0, or of the clusters of a bundle, for which
-    no page is read."""
+    """Return the centres (N, 3) of gaussians of level 0, or of the clusters of a
+    bundle, of which no page is read."""
     if isinstance(subject, Gaussians):
         return np.asarray(subject.means[:: max(len(subject) // 100_000, 1)], np.float64)
     if not subject.num_levels:
@@ -100,8 +100,8 @@ def _middles(subject: Bundle | Gaussians) -> Floats:
 
 
 def _flat_axis(points: Floats) -> Axis | None:
-    """The axis along the normal of the plane that the points lie in, ignoring outliers;
-    None without one."""
+    """Return the axis along the normal of the plane that the points lie in, ignoring
+    outliers; None if they lie in no plane."""
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 16:
         return None

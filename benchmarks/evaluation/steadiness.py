@@ -1,5 +1,5 @@
-"""How steady pictures of a moving camera are: paths, and the changes between frames
-that should not occur.
+"""Measures how steady the pictures of a moving camera are: paths, and the changes
+between frames that should not occur.
 
 The error of a frame minus the error of the frame before is what an eye sees besides the
 motion: flicker, and levels that are replaced at once. An average over the whole picture

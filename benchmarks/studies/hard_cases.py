@@ -52,8 +52,9 @@ def histogram(errors: np.ndarray) -> dict[str, Any]:
 
 
 def gradient_histogram(case: cases.HardCase, device: str) -> dict[str, Any]:
-    """Return errors of the drawn gaussians' gradients by relative changes, in units of
-    each input's root mean square."""
+    """Return a histogram of the errors of the drawn gaussians' gradients. Gradients are
+    by relative changes of the inputs, and errors are in units of the root mean square
+    gradient of each input."""
     import torch
 
     single = cases.gradients(case, cases.draw_core, torch.float32, device)

@@ -48,7 +48,7 @@ class Config:
 
 
 def published_levels(folder: Path) -> Iterator[tuple[int, v3dg.Gaussians]]:
-    """The levels of a bundle of the published code, with their numbers."""
+    """Yield the levels of a bundle of the published code, with their numbers."""
     clusters = np.load(folder / "clusters.npz")
     gaussians = np.load(folder / "gaussians.npz")
     start = clusters["start_indices"].ravel()
@@ -71,7 +71,8 @@ def published_levels(folder: Path) -> Iterator[tuple[int, v3dg.Gaussians]]:
 
 
 def everywhere(config: Config, level: v3dg.Gaussians) -> RenderedImage:
-    """The camera's picture of the layout where all instances show the gaussians."""
+    """Return the camera's picture of the layout if every instance shows these
+    gaussians."""
     bundle = v3dg.build_bundle(level, config=BuildConfig.leaves_only(), progress=False)
     names = {config.asset.name: bundle}
     scene, cameras = v3dg.read_scene(config.layout, bundles=names)

@@ -33,10 +33,10 @@ class Errors(NamedTuple):
     """The largest errors of a figure.
 
     Attributes:
-        position: Of a coordinate, relative to the height of the figure.
-        shape: Of a covariance, relative to the largest variance of its gaussian.
-        color: Of a colour of degree 0, where 1 is from black to white.
-        harmonics: Of a coefficient of higher degrees.
+        position: Error of a coordinate, relative to the height of the figure.
+        shape: Error of a covariance, relative to the largest variance of its gaussian.
+        color: Error of a colour of degree 0, where 1 is from black to white.
+        harmonics: Error of a coefficient of higher degrees.
     """
 
     position: float
@@ -46,7 +46,8 @@ class Errors(NamedTuple):
 
 
 def make_figure() -> Gaussians:
-    """A post with a foot, a long arm to the right and a short one forward; -y is up."""
+    """Make a post with a foot, a long arm to the right and a short one forward; -y is
+    up."""
     rng = np.random.default_rng(0)
     along = np.linspace(0, 1, _COUNT // 4)
     none = np.zeros_like(along)
@@ -86,7 +87,7 @@ def write(path: Path, figure: Gaussians) -> None:
 
 
 def _splat(figure: Gaussians) -> bytes:
-    """The records of a `.splat`, which has no harmonics."""
+    """Return the records of a `.splat`, which has no harmonics."""
     color = figure.sh[:, 0] * _core.sh_base0 + 0.5
     rgba = np.concatenate([color, figure.opacities[:, None]], axis=1)
     columns = [
@@ -99,7 +100,7 @@ def _splat(figure: Gaussians) -> bytes:
 
 
 def place_of(folder: Path, ending: str) -> Path:
-    """A path for a file of a format in a folder of its own."""
+    """Return a path for a file of a format in a folder of its own."""
     own = folder / ending.strip(".").replace(".", "_")
     own.mkdir(exist_ok=True)
     if ending.startswith("."):
@@ -108,7 +109,7 @@ def place_of(folder: Path, ending: str) -> Path:
 
 
 def errors_of(found: Gaussians, figure: Gaussians) -> Errors:
-    """The largest errors, between gaussians that are nearest to each other."""
+    """Return the largest errors, between gaussians that are nearest to each other."""
     distances = np.square(figure.means[:, None].astype(np.float64) - found.means).sum(axis=2)
     nearest = distances.argmin(axis=1)
     same = found.subset(nearest)
@@ -126,7 +127,8 @@ def errors_of(found: Gaussians, figure: Gaussians) -> Errors:
 
 
 def _covariances(gaussians: Gaussians) -> npt.NDArray[np.float64]:
-    """(N, 3, 3) the shapes of gaussians, whatever their own axes are called."""
+    """Return the covariances (N, 3, 3) of gaussians, which do not depend on the order
+    and the signs of a gaussian's axes."""
     half = rotation_from_quaternion(normalised(gaussians.quats)) * gaussians.scales[:, None]
     return np.asarray(half @ half.transpose(0, 2, 1))
 
@@ -164,7 +166,8 @@ def main() -> None:
 
 
 def _text(errors: Errors) -> str:
-    """Errors with one digit; those of float32's own rounding are none."""
+    """Return errors as text with one digit each; errors below 1e-6, the rounding of
+    float32, become 0."""
     return ", ".join(map(_digit, errors))
 
 

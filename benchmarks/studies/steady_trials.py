@@ -214,7 +214,7 @@ class Arrives:
 
 
 class ArrivesInPool(Arrives):
-    """The same with a renderer's pool, which reads pages while true pictures are
+    """As Arrives, with a renderer's pool, which reads pages while true pictures are
     drawn."""
 
     def __init__(self, scene: Scene, tolerance: float, fade: float) -> None:

@@ -37,7 +37,7 @@ from v3dg.pictures import to_8bit
 
 Row = dict[str, Any]
 
-# Of the pictures' tangent, relative to that of the scene's own cameras.
+# The range of the tangent of the field of view, relative to the scene's own cameras.
 _NARROWEST, _WIDEST = 0.9, 1.25
 _PITCH = 0.4  # radians, at most
 _EXAMPLE = Path(__file__).parents[2] / "examples" / "drop_unseen.py"
@@ -66,7 +66,7 @@ class Config:
     parts: tuple[float, ...] = (1.0, 0.9, 0.8, 0.7, 0.6)
     """Fractions of the visible gaussians to keep."""
     refit: tuple[float, ...] = ()
-    """Those of the fractions that are also refitted."""
+    """The fractions of `parts` that are also refitted."""
     tolerances: tuple[float, ...] = ()
     """Tolerances at which the rest is also drawn with levels."""
     steps: int = 4000

@@ -58,7 +58,7 @@ struct BoundGivenCut {
     }
 };
 
-// What a picture shows instead of the gaussians' own colours, and the cut that it
+// The content of a picture other than the gaussians' own colours, and the cut that it
 // shows.
 struct BoundLook {
     FrameLook look = FrameLook::appearance;
@@ -202,7 +202,7 @@ class BoundSceneFrame {
         if (!bound.is_complete()) completed = bound.completed(device_, *state);
         const FrameRequest& request = completed ? *completed : bound.plain;
         if (has_pool && request.cut)
-            throw py::value_error("cut: expected none for a pool, which selects its own, got one");
+            throw py::value_error("cut: a pool selects its own cut; leave out the given one");
         if (backend_of(device_).traits.draws_only_plainly && !request.is_plain())
             throw py::value_error(
                 "shows, colors, chooser, aside: these work only on the CPU; leave them out on a "

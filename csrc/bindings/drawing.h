@@ -15,8 +15,8 @@ namespace v3dg {
 
 // Gives one thread exclusive use of a frame while it exists. Python's lock does not
 // suffice, because torch releases it while it allocates memory. For the same reason the
-// constructor releases Python's lock while it waits for another thread. For backends
-// whose frames share buffers.
+// constructor releases Python's lock while it waits for another thread. Used by
+// backends whose frames share buffers.
 class V3DG_SCOPED_CAPABILITY Turn {
   public:
     explicit Turn(Mutex& mutex) V3DG_ACQUIRE(mutex) : mutex_(mutex) { wait_for(mutex); }

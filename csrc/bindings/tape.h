@@ -9,7 +9,7 @@
 
 namespace v3dg {
 
-// Which gradients by the gaussians' centres on the image are requested.
+// The requested gradients by the gaussians' centres on the image.
 struct Centers {
     bool sum, size;
 };

@@ -229,8 +229,8 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
     }
     fit.d_pixels()[lane] = make_float4(d[0], d[1], d[2], 0);
 
-    // The same records are blended again with the same results, now that the sum over
-    // all of them is known.
+    // Blends the same records again, with the same results, now that the sum over all
+    // of them is known.
     const auto slot_of = [&](uint32_t j) {
         const uint32_t slot =
             fit.slot_first(region)[j] + __popcll(fit.mask(region)[j] & ((CellMask(1) << cell) - 1));

@@ -250,7 +250,7 @@ int attribute(cudaDeviceAttr name) {
 template <class Shape, int kBlocks>
 bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stream,
          int blocks = kBlocks) {
-    // Of this kernel and of the driver, per block.
+    // The shared memory that this kernel and the driver reserve per block, bytes.
     const size_t reserved = sizeof(FitShared) + 1024;
     const size_t limit =
         (std::min<size_t>(

@@ -129,9 +129,9 @@ V3DG_HD inline uint64_t held_out_view(const FitConfig& config, int i) {
     return config.num_views > 0 ? static_cast<uint64_t>(config.num_views + i) : ~uint64_t(0) - i;
 }
 
-// A group is compared with pictures of its fixed views, or of the views of all steps,
-// and then with pictures of the views held out. These functions return the number of
-// pictures, and the view of one.
+// A group is compared with the pictures of its fixed views, or else of the views of all
+// steps; then with the pictures of the views held out. The functions below return the
+// number of fitted pictures, the number of all pictures, and the view of one picture.
 V3DG_HD inline uint64_t num_fitted_pictures(const FitConfig& config) {
     return config.num_views > 0 ? static_cast<uint64_t>(config.num_views)
                                 : static_cast<uint64_t>(config.steps) * config.views_per_step;

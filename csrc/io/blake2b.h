@@ -22,7 +22,7 @@ using PageHash = std::array<uint8_t, kPageHashBytes>;
 // of similar length are fastest.
 void blake2b(Span<const Span<const uint8_t>> messages, PageHash* digests);
 
-// The same hash of one message that is added in parts.
+// Computes the same hash for one message that is added in parts.
 class Blake2b {
   public:
     Blake2b();

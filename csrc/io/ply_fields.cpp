@@ -94,7 +94,8 @@ std::vector<std::string> slot_names(const Fields& fields, size_t num_stored, Ply
     return names;
 }
 
-// What a file without these properties is, and what to do with it.
+// Returns advice for a file that lacks required properties: what it is, and what to do
+// with it.
 std::string advice(const Fields& fields, size_t num_missing) {
     if (fields.has("f_anchor_feat_0"))
         return "; this file has the anchors of Scaffold-GS, of which a network makes gaussians: "

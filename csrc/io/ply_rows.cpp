@@ -137,8 +137,7 @@ class ByteReader {
             buffer_begin_ = begin;
             buffer_size_ = file_.read_at(begin, buffer_.data(), buffer_.size());
             if (buffer_size_ < size)
-                throw PlyError(
-                    "expected the file not to change while it is read, got a shorter one");
+                throw PlyError("the file became shorter while it was read; read it again");
         }
         return buffer_.data() + (begin - buffer_begin_);
     }
@@ -197,8 +196,7 @@ PlyPlace read_fixed_rows(const PlyFile& ply, PlyPlace begin, const PlyGaussians<
             const size_t count = std::min(block_rows, num_rows - first);
             const size_t size = count * row_bytes;
             if (ply.file.read_at(begin.offset + first * row_bytes, rows, size) != size)
-                throw PlyError(
-                    "expected the file not to change while it is read, got a shorter one");
+                throw PlyError("the file became shorter while it was read; read it again");
             decoder.decode(rows, count, first);
         });
     }

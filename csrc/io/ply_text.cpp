@@ -48,8 +48,7 @@ class LineReader {
             cut_lines(max_lines, at_end);
             if (!lines_.empty() || at_end) break;
             if (begin_ == 0 && end_ == buffer_.size() && end_ < kPlyChunkBytes)
-                throw PlyError(
-                    "expected the file not to change while it is read, got a longer one");
+                throw PlyError("the file became longer while it was read; read it again");
             if (begin_ == 0 && end_ == buffer_.size())
                 throw PlyError("expected lines of at most " + std::to_string(kPlyChunkBytes) +
                                " bytes, got a longer one");

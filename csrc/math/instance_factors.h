@@ -1,6 +1,7 @@
 #pragma once
 
-// What an instance multiplies the opacities and the colours of its gaussians by.
+// The factors by which an instance multiplies the opacities and colours of its
+// gaussians.
 
 #include "math/gaussian.h"
 

@@ -74,8 +74,8 @@ struct BlendShared {
     uint16_t sorted[kPiece];       // indices into `key`
     uint32_t blocks[kBlendBatch];  // live blocks that each record of the batch may reach
     // The records of the batch that may reach a warp's sub-tile, as addresses in shared
-    // memory. They fill the array from its end backwards; the first element is only
-    // read ahead.
+    // memory. They fill the array from its end backwards; the first element stays
+    // unused, and is only loaded ahead of time.
     uint16_t list[kBlendWarps][kBlendBatch + 1];
     TilePixels pixels;
     uint32_t alive_blocks;  // bits as in blocks_of(TileEntry)

@@ -1,6 +1,6 @@
 #pragma once
 
-// Which pages of a pool have begun to fade in, and when.
+// Tracks which pages of a pool have begun to fade in, and when.
 
 #include <cstdint>
 #include <vector>

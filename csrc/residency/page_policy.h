@@ -47,8 +47,9 @@ struct SlotPlan {
 
     size_t num_rows() const { return first_slot_row + num_slots * slot_rows; }
     size_t num_clusters() const { return first_slot_cluster + num_slots * slot_clusters; }
-    // Returns how many cluster entries belong to a page of so many clusters that begins
-    // at entry `cluster`: those of a whole slot, or those of a coarsest page.
+    // Returns the number of cluster entries of a page of `num_clusters` clusters that
+    // begins at entry `cluster`: all entries of its slot, or, for a coarsest page, one
+    // per cluster.
     size_t num_clusters_at(size_t cluster, size_t num_clusters) const {
         return cluster < first_slot_cluster ? num_clusters : slot_clusters;
     }

@@ -79,8 +79,9 @@ PagePool::State::State(const std::vector<PagedBundle>& bundles, const PoolLimits
     const size_t num_blocks = shared.blocks.num_blocks();
     most_bytes = root_bytes + shared.blocks.num_bytes();
     most_changes = 2 * num_blocks + bundles.size();
-    // A page has two clusters, unless groups are larger, and each cluster may request
-    // another page.
+    // The limit on the requests of one frame; those beyond it are left out. Usually a
+    // page has two clusters, each of which may request another page, so eight requests
+    // per slot leave room for larger groups.
     most_needs = std::min(policy.num_pages(), 8 * policy.num_slots() + 1024);
     decider.reserve(num_blocks, most_changes);
     shared.read.reserve(num_blocks);

@@ -1,6 +1,7 @@
 #pragma once
 
-// Which pages of a bundle are resident, where they lie, and which pages a cut needs.
+// The page table of a bundle: it says which pages are resident, where they lie, and
+// which pages a cut needs.
 
 #include <cstdint>
 

@@ -1,7 +1,7 @@
 #pragma once
 
-// Which pages a cut needs, and how urgently, if only some pages of a bundle are
-// resident.
+// Finds the pages that a cut needs, and their urgency, if only some pages of a bundle
+// are resident.
 
 #include <cfloat>
 #include <cmath>

@@ -92,7 +92,7 @@ __global__ void keep_kernel(const int64_t* in_offset, const int64_t* out_offset,
             const double other = score_of_row[k];
             num_before += octant_of_row[k] < octant;
             num_here += is_here;
-            // Of equal scores the one with the lower index comes first.
+            // Among equal scores, the one with the lower index comes first.
             rank += is_here && (other > score || (other == score && k < i));
         }
         is_kept[i] = rank < octant_share(num_before, num_here, last - first, wanted);

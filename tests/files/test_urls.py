@@ -379,7 +379,7 @@ def test_commands_take_urls_and_write_into_the_working_folder(
         ),
         ("nowhere://in/a.ply", "Protocol not known: nowhere"),
         ("memory://in/scene.json", "expected a scene that is here, got a URL"),
-        ("memory://in/lod-meta.json", "got one of a file that names others"),
+        ("memory://in/lod-meta.json", "got the URL of a file that names other files"),
         ("memory://in/a.txt", "memory://in/a.txt: expected a file ending in"),
     ],
 )

@@ -67,7 +67,7 @@ def test_prims_stand_where_their_transforms_put_them(tmp_path):
     np.testing.assert_allclose(found.sh, wanted.sh, atol=1e-5)
     scale.Set(Gf.Vec3f(2, 2, 1))
     stage.GetRootLayer().Save()
-    with pytest.raises(ValueError, match="a transform of /gaussians that is no rotation"):
+    with pytest.raises(ValueError, match="a transform of /gaussians that is more than a rotation"):
         v3dg.read_asset(tmp_path / "a.usda")
 
 

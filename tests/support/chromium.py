@@ -1,4 +1,4 @@
-"""How tests start Chromium, for pages that draw with WebGL."""
+"""Starts Chromium in tests, for pages that draw with WebGL."""
 
 import shutil
 

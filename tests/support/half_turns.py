@@ -14,7 +14,7 @@ _TURNS = {
 
 
 def half_turn(gaussians, axis):
-    """The gaussians after half a turn about an axis of the world."""
+    """Return the gaussians after half a turn about an axis of the world."""
     quaternion, signs = _TURNS[axis]
     moved = gaussians.transform(quaternion)
     return Gaussians(

@@ -460,7 +460,7 @@ def test_what_a_pool_cannot_do_is_refused(asset, device):
     with pytest.raises(ValueError, match=r"memory: expected None for an asset, .*; leave it out"):
         Renderer(asset.gaussians, device=device, memory="1MB")
     cut = v3dg.select(asset, CAMERA, device=device)
-    with pytest.raises(ValueError, match="cut: expected none for a pool"):
+    with pytest.raises(ValueError, match="cut: a renderer with a pool selects its own cut"):
         render(asset, CAMERA, cut=cut, device=device, memory="1MB")
     renderer = Renderer(asset, device=device)
     renderer.settle(CAMERA)  # all is there

@@ -160,7 +160,9 @@ def test_what_needs_all_is_drawn_of_all(path, device, free):
     free(max(size_of(path, device).values()))
     other = Bundle.open(path)
     cut = v3dg.select(other, CAMERA, device=device)
-    with pytest.raises(ValueError, match=r"cut: expected none for a pool, .*; give memory=None"):
+    with pytest.raises(
+        ValueError, match=r"cut: a renderer with a pool selects its own cut; .*memory=None"
+    ):
         render(other, CAMERA, device=device, cut=cut)
     assert render(other, CAMERA, device=device, cut=cut, memory=None).stats.memory is None
 

@@ -235,7 +235,7 @@ def test_up_keeps_what_is_right_and_applies_before_the_pose():
     before = scene.rotations
     scene.move(quaternions=quarter, up="z")
     np.testing.assert_allclose(scene.rotations, before, atol=1e-12)
-    with pytest.raises(ValueError, match="up: expected quaternions or a matrix with it"):
+    with pytest.raises(ValueError, match="up: expected quaternions or a matrix beside up"):
         scene.move(positions=[(0, 0, 0)], up="z")
 
 
@@ -305,7 +305,9 @@ def test_rounded_matrices_are_similarities():
     pose = similarity_of(noisy)
     np.testing.assert_allclose(rotation_from_quaternion(pose.quaternions)[0], rotation, atol=1e-4)
     np.testing.assert_allclose(pose.scales, 3, rtol=1e-4)
-    with pytest.raises(ValueError, match="matrix: expected no positions, quaternions or scales"):
+    with pytest.raises(
+        ValueError, match="matrix: it already places the instances; leave out positions"
+    ):
         Scene().add(BUNDLE, (0, 0, 0), matrix=noisy)
 
 

@@ -241,13 +241,13 @@ class Bundle:
         return f"<p>{html.escape(repr(self))}<table>{cells}</table>"
 
     def level_range(self, level: int) -> range:
-        """Ids of the clusters of one level."""
+        """Return the ids of the clusters of one level."""
         check_index("level", level, self.num_levels)
         first, last = np.searchsorted(self.clusters.level, [level, level + 1])
         return range(int(first), int(last))
 
     def page_range(self, page: int) -> range:
-        """Ids of the clusters of one page."""
+        """Return the ids of the clusters of one page."""
         check_index("page", page, self.num_pages)
         first = self._layout.first_cluster
         return range(int(first[page]), int(first[page + 1]))

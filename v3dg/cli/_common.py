@@ -46,8 +46,8 @@ def failure_text(error: BaseException) -> str:
 
 
 def printable(line: str) -> str:
-    """A line with its control characters escaped, because file names and texts of files
-    may contain any."""
+    """Return a line with its control characters escaped, because file names and texts
+    of files may contain any."""
     return "".join(map(_printable_letter, line))
 
 
@@ -99,7 +99,8 @@ class OnPool(OnDevice):
     into the free memory, and otherwise uses half of the free memory."""
 
     def pool(self) -> str | None:
-        """The memory of the pool as `Renderer` takes it: None draws without a pool."""
+        """Return the memory of the pool as an argument of `Renderer`; None draws
+        without a pool."""
         if self.memory == "all":
             return None
         return self.memory
@@ -128,7 +129,7 @@ def check_range(name: str, value: float, minimum: float, maximum: float) -> None
 
 
 def color_of(value: Color | str) -> Color | None:
-    """The colour of --background; None for none.
+    """Return the colour of --background; None if the value is `none`.
 
     Raises:
         UsageError: It is no colour.
@@ -205,8 +206,8 @@ def level_size(bundle: Bundle, level: int) -> int:
 
 
 def finite(number: float) -> float | None:
-    """A number for JSON, which has no infinity: None for the infinite tolerance of a
-    small budget."""
+    """Return a number for JSON, which has no infinity; None stands for the infinite
+    tolerance of a small budget."""
     if math.isfinite(number):
         return number
     return None
@@ -229,7 +230,7 @@ class Column:
     form: str
 
     def cell(self, row: Mapping[str, object]) -> str:
-        """The cell of a row; `-` if the row lacks a value."""
+        """Return the cell of a row; `-` if the row lacks a value."""
         try:
             return printable(self.form.format_map(row))
         except (KeyError, TypeError):  # the value is missing, or is None, which takes no format
@@ -237,8 +238,8 @@ class Column:
 
 
 def table_lines(columns: Sequence[Column], rows: Iterable[Mapping[str, object]]) -> list[str]:
-    """Lines of a table, whose first column is aligned to the left, the others to the
-    right."""
+    """Return the lines of a table; its first column is aligned to the left, the others
+    to the right."""
     table = [[column.head for column in columns]]
     for row in rows:
         table.append([column.cell(row) for column in columns])

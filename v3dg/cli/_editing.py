@@ -30,7 +30,7 @@ class EditOptions:
 
     add: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, option("FILE@X,Y,Z")] = ()
     """Add another asset or bundle, placed at X,Y,Z in the frame of the first; a fourth
-    number is its scale, three more turn it by degrees about x, then y, then z. Can be
+    number scales it, and three more turn it, in degrees about x, then y, then z. Can be
     repeated."""
     drop_outliers: Flag = False
     """Drop gaussians further than 20 median distances from all others, as `v3dg info`
@@ -46,7 +46,7 @@ class EditOptions:
     """Cut the spherical harmonics down to this degree."""
 
     def option_names(self) -> list[str]:
-        """The names of the options on the command line."""
+        """Return the names of the options on the command line."""
         options = {
             "--add": self.add,
             "--drop-outliers": self.drop_outliers,
@@ -88,7 +88,8 @@ class Editor:
         self._degree_after = 0
 
     def joined(self, gaussians: Gaussians) -> Gaussians:
-        """The gaussians with those of the added files, each without its outliers."""
+        """Return the gaussians and those of the added files, all without the outliers
+        of their files."""
         parts = [self._without_outliers(gaussians)]
         for text in self._options.add:
             addition = _Addition.parse(text)
@@ -96,7 +97,7 @@ class Editor:
         return editing.join(parts)
 
     def trimmed(self, gaussians: Gaussians) -> Gaussians:
-        """The gaussians that the crops and limits leave, with SH of the chosen
+        """Return the gaussians that the crops and limits leave, with SH of the chosen
         degree."""
         options = self._options
         remaining = gaussians
@@ -125,13 +126,13 @@ class Editor:
         return remaining
 
     def result(self) -> dict[str, object]:
-        """The counts, for a command's result as JSON; empty without options."""
+        """Return the counts, for a command's result as JSON; empty without options."""
         if not self._options.option_names():
             return {}
         return {"added": len(self._options.add), "left_out": dict(self._left_out)}
 
     def lines(self) -> list[str]:
-        """Lines that say what was added, left out and cut."""
+        """Return lines that say what was added, left out and cut."""
         lines = []
         if self._options.add:
             lines.append(f"{1 + len(self._options.add)} files joined")
@@ -178,7 +179,8 @@ class _Addition:
 
     @staticmethod
     def parse(text: str) -> "_Addition":
-        """The value of --add; a file whose own name ends like a placement has none."""
+        """Parse a value of --add. If a file has the whole value as its name, it has no
+        placement."""
         name, separator, numbers_text = text.rpartition("@")
         if not separator or os.path.exists(text) or "/" in numbers_text:
             return _Addition(Path(text), (0.0, 0.0, 0.0), 1.0, (0.0, 0.0, 0.0))
@@ -196,7 +198,7 @@ class _Addition:
         return _Addition(Path(name), (numbers[0], numbers[1], numbers[2]), scale, angles)
 
     def read(self) -> Gaussians:
-        """The asset in the file, or level 0 of the bundle."""
+        """Return the asset in the file, or level 0 of the bundle."""
         subject = open_subject(self.path)
         if isinstance(subject, Bundle):
             return subject.level_gaussians(0)
@@ -252,7 +254,8 @@ def _is_ordered(low: float, high: float) -> bool:
 def _numbers(
     name: str, numbers_text: str, expected: str, text: str, counts: Iterable[int]
 ) -> tuple[float, ...]:
-    """Numbers separated by commas, none of them NaN, in one of these counts."""
+    """Return numbers that are separated by commas; refuse NaN, and any number of them
+    that is not in `counts`."""
     try:
         numbers = tuple(map(float, numbers_text.split(",")))
     except ValueError:

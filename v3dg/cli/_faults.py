@@ -70,8 +70,8 @@ def checked(options: FaultOptions, gaussians: Gaussians, subject: Path, output: 
 
 
 def _holds(output: Path, gaussians: Gaussians) -> bool:
-    """Whether a file of this name can hold the wrong values of gaussians: a `.ply`
-    holds all that have a log or a logit."""
+    """Return whether a file of this name can hold the gaussians' wrong values: a `.ply`
+    stores logs and logits, so it holds values that have them."""
     name = output.name.lower()
     if not name.endswith(".ply") or name.endswith(".compressed.ply"):
         return False

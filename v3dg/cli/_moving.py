@@ -28,7 +28,7 @@ class MoveOptions:
     """Move by this much, after --scale and --rotate."""
 
     def option_names(self) -> list[str]:
-        """The names of the options on the command line."""
+        """Return the names of the options on the command line."""
         values = {
             "--scale": self.scale,
             "--rotate": self.rotate,
@@ -48,7 +48,8 @@ class MoveOptions:
             check_usage("--translate", is_finite, f"finite numbers, got {self.translate}")
 
     def moved(self, gaussians: Gaussians) -> Gaussians:
-        """The gaussians after all of it; the same ones without options."""
+        """Return the gaussians after scaling, rotation and translation; without
+        options, return the same object."""
         if not self.option_names():
             return gaussians
         quaternion = np.array([1.0, 0.0, 0.0, 0.0])
@@ -65,7 +66,7 @@ Moves: TypeAlias = Annotated[MoveOptions, tyro.conf.OmitArgPrefixes]
 
 
 def _quaternion(text: str) -> Floats:
-    """(4,) w x y z of a value of --rotate."""
+    """Return the quaternion (4,) w x y z of a value of --rotate."""
     kind, _, numbers_text = text.partition(":")
     try:
         numbers = [float(number) for number in numbers_text.split(",")]

@@ -47,8 +47,8 @@ class CameraFile:
     """Whether lens distortion in that file is an error, or left out of the pictures."""
 
     def read(self, size: tuple[int, int] = (800, 800)) -> dict[str, Camera]:
-        """The cameras of --cameras, with this size if their file has none; empty
-        without the option."""
+        """Return the cameras of --cameras, with this size if their file has none;
+        return none without the option."""
         if self.cameras is None:
             return {}
         cameras = read_cameras(self.cameras, size=size, distortion=self.distortion)
@@ -70,7 +70,7 @@ class ViewOptions(CameraFile):
     link: Annotated[str | None, tyro.conf.arg(name="at", metavar="LINK", help_behavior_hint="")] = (
         None
     )
-    """Look from the place of a link of `v3dg view`, the address of its page in
+    """Look from the camera of a link: an address of the page of `v3dg view`, in
     quotes."""
     camera: Annotated[str | None, option("NAME")] = None
     """Draw only this camera of a file with cameras, given by its name or its number in
@@ -120,11 +120,12 @@ class ViewOptions(CameraFile):
             check_usage(name, value is None or is_used, expected)
 
     def turntable(self) -> dict[str, object]:
-        """Options of the views around a subject, by name; None: not given."""
+        """Return the options of views around a subject by name; None stands for an
+        option that was not given."""
         return {"--views": self.views, "--elevation": self.elevation, "--up": self.up}
 
     def needs_up(self, own_cameras: Mapping[str, Camera] | None) -> bool:
-        """Whether the axis that is up has to be known."""
+        """Return whether the axis that is up has to be known."""
         has_cameras = self.link is not None or self.cameras is not None or bool(own_cameras)
         return self.eye is not None or not has_cameras
 
@@ -141,8 +142,8 @@ def choose_cameras(
     own_cameras: dict[str, Camera] | None,
     views: int = 1,
 ) -> dict[str, Camera]:
-    """The camera of --eye or --at, else those of --cameras, else the subject's own,
-    else first views of it, by default `views`."""
+    """Return the camera of --eye or --at, else those of --cameras, else the subject's
+    own, else first views of the subject (`views` of them by default)."""
     if options.link is not None:
         cameras = {"link": _linked(options.link, options.size)}
     elif options.eye is not None:
@@ -165,7 +166,7 @@ def choose_cameras(
 
 
 def _linked(link: str, size: tuple[int, int]) -> Camera:
-    """The camera of a link of the viewer's page."""
+    """Return the camera of a link of the viewer's page."""
     from v3dg.viewer.link import read_link
 
     place = read_link(link)
@@ -195,7 +196,7 @@ def _placed(options: ViewOptions, subject: Subject) -> Camera:
 
 
 def _camera_name(text: str, names: Sequence[str]) -> str:
-    """The name of the camera that --camera selects by name or number."""
+    """Return the name of the camera that --camera selects by name or number."""
     if text in names:
         return text
     if text.isdecimal() and int(text) < len(names):
@@ -207,8 +208,10 @@ def _camera_name(text: str, names: Sequence[str]) -> str:
 
 
 def _around(subject: Subject, options: ViewOptions, views: int) -> dict[str, Camera]:
-    """First views of a subject, from around an object or inside a room. A single one
-    that no --views asks for is framed closer than a turntable."""
+    """Return first views of a subject, from around an object or inside a room.
+
+    A single one that no --views asks for is closer than views of a turntable.
+    """
     elevation = DEFAULT_ELEVATION
     if options.elevation is not None:
         elevation = math.radians(options.elevation)
@@ -224,8 +227,8 @@ def _around(subject: Subject, options: ViewOptions, views: int) -> dict[str, Cam
 def choose_up(
     requested: Axis | None, subject: Subject, cameras: Mapping[str, Camera] | None, path: Path
 ) -> tuple[Axis, list[str]]:
-    """The axis that is up: that of --up, or else as `up_of` finds it, with a line that
-    says so.
+    """Return the axis that is up, from --up or else from `up_of`, and lines that say
+    why.
 
     If the axis is unknown, a user at a terminal is asked.
     """
@@ -239,15 +242,16 @@ def choose_up(
 
 
 def lines_of_up(path: Path, axis: Axis, reason: str) -> list[str]:
-    """The line that says which axis is up and why; none without a reason, which is for
-    --up."""
+    """Return a line that says which axis is up and why; no line without a reason, as
+    for --up."""
     if not reason:
         return []
     return [f"{beside(path).name}: {axis} is up, {reason}; change it with --up"]
 
 
 def is_at_terminal() -> bool:
-    """Whether a user can answer questions; a job in the background would be stopped."""
+    """Return whether a user can answer questions. A job in the background cannot ask:
+    reading would stop it."""
     is_open = sys.stdin and sys.stdin.isatty() and sys.stderr.isatty()
     return bool(is_open and os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp())
 
@@ -265,8 +269,8 @@ def ask_up(path: Path, axis: Axis) -> Axis:
 
 
 def picture_paths(output: Path, cameras: Collection[str]) -> list[Path]:
-    """The paths of the pictures of cameras; if there are several, each path has the
-    name of its camera.
+    """Return the paths of the pictures of cameras; if there are several, each path
+    contains the name of its camera.
 
     If two paths would be the same, all have the number of their camera in the file
     instead, from 0.
@@ -280,7 +284,7 @@ def picture_paths(output: Path, cameras: Collection[str]) -> list[Path]:
 
 
 def _file_stem(name: str) -> str:
-    """The name of a camera as a part of a file's name, without the suffix of its
+    """Return the name of a camera as a part of a file's name, without the suffix of its
     photograph."""
     photograph = Path(name)
     if photograph.suffix.lower() in SUFFIXES and photograph.stem:

@@ -30,8 +30,8 @@ from v3dg.upright import ASSUMED, up_of
 
 _PATIENCE_S = 20  # time for a scheduler to answer
 _MOST_REASON = 200  # characters of an error of dask's
-# The axis that is up is guessed from so many samples of an asset, of so many gaussians
-# each.
+# The number and the size, in gaussians, of the samples from which the axis that is up
+# is guessed.
 _NUM_SAMPLES = 64
 _SAMPLE_SIZE = 256
 _SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
@@ -96,8 +96,8 @@ def run(options: Build) -> None:
 
 
 def _asked_up(path: Path) -> Axis | None:
-    """The axis that is up, which a user at a terminal is asked if neither the format
-    nor the gaussians determine it."""
+    """Return the axis that is up; ask a user at a terminal if neither the format nor
+    the gaussians determine it."""
     if not is_at_terminal():
         return None
     _common.require_file(path, *SUFFIXES)
@@ -240,8 +240,8 @@ def _print_many(options: Build, results: list[JsonObject], seconds: float) -> No
 
 
 def _assets_of(paths: Sequence[Path]) -> dict[Path, list[Path]]:
-    """The files of each asset, by the path that names it: a file, or the folder of a
-    trainer's run."""
+    """Return the files of each asset by the path that names it, which is a file or the
+    folder of a trainer's run."""
     assets: dict[Path, list[Path]] = {}
     for path in paths:
         if not path.is_dir():
@@ -260,7 +260,7 @@ def _assets_of(paths: Sequence[Path]) -> dict[Path, list[Path]]:
 
 
 def _output_of(asset: Path, folder: Path | None) -> Path:
-    """The path of the bundle that is named after an asset."""
+    """Return the path of the bundle that is named after an asset."""
     if asset.is_dir():
         place = asset.resolve()
         stem = place.name
@@ -271,7 +271,7 @@ def _output_of(asset: Path, folder: Path | None) -> Path:
 
 
 def _outputs(assets: Sequence[Path], folder: Path | None) -> dict[Path, Path]:
-    """The path of the bundle of each asset."""
+    """Return the path of the bundle of each asset."""
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     asset_from_output: dict[Path, Path] = {}
@@ -394,7 +394,7 @@ def _resume_advised(output: Path) -> Iterator[None]:
 
 
 def _resume_advice(output: Path) -> str:
-    """The end of the message of an unfinished build, which says from which file it can
+    """Return the end of the message about an unfinished build: from which file it can
     continue."""
     levels = levels_path(output)
     if levels.exists():

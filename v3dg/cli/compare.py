@@ -215,7 +215,8 @@ def _errors(pair: _Pair) -> dict[str, float | None]:
 
 
 def _difference(row: JsonObject) -> float:
-    """The order of views: FLIP, or the negative PSNR if FLIP is missing."""
+    """Return the key by which views are sorted: FLIP, or the negative PSNR if FLIP is
+    missing."""
     if row["flip"] is not None:
         return float(row["flip"])
     if row["psnr"] is not None:

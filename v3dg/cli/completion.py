@@ -13,7 +13,7 @@ import tyro
 from v3dg.cli._common import Common
 
 _Shell: TypeAlias = Literal["bash", "zsh", "fish"]
-# What a command completes, as tyro's scripts have it: nested dicts and lists.
+# The completions of a command in the form of tyro's scripts: nested dicts and lists.
 _Spec: TypeAlias = dict[str, object]
 
 # Replacements in tyro's scripts that complete file names if neither a command nor an
@@ -52,8 +52,8 @@ def run(options: Completion) -> None:
 
 
 def _plain(script: str, shell: _Shell) -> str:
-    """A script that completes names alone: without the help of each, and without None
-    as a value of options that may be left out."""
+    """Return a script that completes names without their help texts, and without None
+    as a value of optional options."""
     match = _SPEC.search(script)
     if match is None:
         raise RuntimeError("completion: tyro wrote another script; install an earlier tyro")

@@ -164,7 +164,7 @@ def _lines_of_file(name: str, subject: Subject) -> list[str]:
 
 
 def _lines_of_up(name: str, output: Path, up: Axis, reason: str) -> list[str]:
-    """Lines that say what is up, and what was turned for the output."""
+    """Return lines that say what is up, and what was turned for the output."""
     up_in_file = turned_up(output)
     if up_in_file is not None:
         text = f"{name}: {up} is up, {reason}; {output.name} is turned so that {up_in_file} is"
@@ -197,7 +197,8 @@ def _check_output(options: Convert) -> None:
 
 
 def _part_options(options: Convert) -> list[str]:
-    """The names of the options on the command line that ask for a level or a cut."""
+    """Return the names of the options on the command line that ask for a level or a
+    cut."""
     values = {
         "--level": options.level,
         "--tolerance": options.tolerance,
@@ -230,7 +231,7 @@ def _part(
     own_cameras: dict[str, Camera] | None,
     part_options: list[str],
 ) -> _Part:
-    """The asset, a level of the bundle, or a cut."""
+    """Return the asset, a level of the bundle, or a cut."""
     if isinstance(subject, Gaussians):
         expected = "a bundle or a scene; build one first"
         _common.check_usage(", ".join(part_options), not part_options, expected)

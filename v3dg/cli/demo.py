@@ -87,7 +87,7 @@ def run(options: Demo) -> None:
 
 
 def _advice(files: Sequence[str]) -> list[str]:
-    """The lines that say what to do with files that were kept."""
+    """Return the lines that say what to do with files that were kept."""
     if not files:
         return []
     asset, bundle, scene = map(shlex.quote, files)

@@ -133,7 +133,7 @@ def _lines(folder: Path, written: _Written, seconds: float) -> list[str]:
 
 
 def _advice(folder: Path, written: _Written) -> list[str]:
-    """The lines that say how to open an export in a browser."""
+    """Return the lines that say how to open an export in a browser."""
     quoted = shlex.quote(str(folder))
     lines = []
     if written.needs:

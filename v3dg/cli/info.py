@@ -59,8 +59,8 @@ def run(options: Info) -> None:
 
 
 def _first_view(subject: Subject) -> tuple[JsonObject | None, str]:
-    """The camera that first shows a subject, in `v3dg render` and the viewer, too; None
-    if the pages that it needs are damaged."""
+    """Return the camera that first shows a subject, also in `v3dg render` and the
+    viewer; None if pages that it needs are damaged."""
     try:
         framing = frame_subject(subject)
     except (OSError, ValueError) as error:
@@ -113,7 +113,7 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
 
 
 def _extent_lines(result: JsonObject) -> list[str]:
-    """Lines about the positions of the gaussians that can be drawn."""
+    """Return lines about the positions of the gaussians that can be drawn."""
     lines = []
     if result["drawable"]:
         lines.append("means from {} to {}".format(*map(_point, result["box"])))
@@ -129,7 +129,7 @@ def _extent_lines(result: JsonObject) -> list[str]:
 
 
 def _spread_lines(spread: Mapping[str, Sequence[float]]) -> list[str]:
-    """A line about the percentiles of each value."""
+    """Return a line about the percentiles of each value."""
     lines = []
     for name, (p5, p50, p95) in spread.items():
         text = name.replace("_", " ")
@@ -243,8 +243,8 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
 
 
 def _settings(config: JsonObject, prefix: str = "") -> Iterator[tuple[str, Json]]:
-    """Names and values of a bundle's config; names of nested settings, but for the
-    build's, have a prefix."""
+    """Yield names and values of a bundle's config; the names of nested settings, except
+    for those of the build, have a prefix."""
     for name, value in config.items():
         if isinstance(value, dict):
             nested_prefix = f"{name} "

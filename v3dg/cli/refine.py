@@ -91,7 +91,8 @@ def run(options: Refine) -> None:
 
 
 def _compared(bundle: Bundle, refined: Bundle, options: Refine) -> Iterator[JsonObject]:
-    """How near pictures of the asset are before and after, from large to small ones."""
+    """Yield the mean PSNR of pictures before and after refining, for each picture width
+    from large to small."""
     cameras = list(options.read().values())[:_MOST_CAMERAS]
     up = direction_of(up_of(bundle)[0])
     framing = frame_subject(bundle)
@@ -113,7 +114,7 @@ def _compared(bundle: Bundle, refined: Bundle, options: Refine) -> Iterator[Json
 
 
 def _resized(camera: Camera, width: int) -> Camera:
-    """A camera whose picture is so wide, with the same field of view."""
+    """Return a camera with the same field of view and a picture of this width."""
     height = max(round(camera.height * width / camera.width), 1)
     scale = np.array([[width / camera.width], [height / camera.height], [1.0]])
     return replace(camera, K=camera.K * scale, width=width, height=height)
@@ -124,7 +125,7 @@ def _psnr(mean_square: float) -> float:
 
 
 def _warning(rows: list[JsonObject]) -> list[str]:
-    """A line that says in which sizes the result is worse."""
+    """Return a line that says in which sizes the result is worse."""
     worse = [str(row["width"]) for row in rows if row["after"] < row["before"] - _NOTICED_DB]
     if not worse:
         return []

@@ -41,7 +41,7 @@ from v3dg.video import write_video
 @dataclass
 class Render(Cut, OnPool):
     """Draw a scene, a bundle or an asset: from its own cameras, from those of a camera
-    file, from a place, or all of it as a first look."""
+    file, from a given position, or else from first views that show all of it."""
 
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg) or an asset (.ply, .spz, ...)."""
@@ -142,8 +142,8 @@ def _print(options: Render, pictures: list[JsonObject], notes: list[str], output
 
 
 def _checked_output(options: Render, background: Color | None) -> Path:
-    """The file to write, which can be written; refuses options that do not go with
-    it, before anything is read."""
+    """Return the file to write, which can be written. Options that do not go with it
+    are refused before anything is read."""
     output = options.output or Path(f"{subject_name(options.subject)}.png")
     check_output(output, options.subject)
     check_usage("--fps", 1 <= options.fps <= 1000, f"1 to 1000, got {options.fps}")
@@ -219,7 +219,8 @@ def _drawn(
 
 
 def _costs(faces: list[RenderedImage]) -> JsonObject:
-    """The costs of a picture: of one of six faces, their sums."""
+    """Return the costs of a picture; for a panorama, they are sums over its six
+    faces."""
     stats = [face.stats for face in faces]
     costs: JsonObject = stats[0]._asdict()
     for name in ("gaussians_selected", "gaussians_in_frustum", "select_ms", "draw_ms"):

@@ -134,8 +134,8 @@ def _folder_of(subject: Path) -> Path | None:
 
 
 def _tolerance_of(options: View) -> float:
-    """The tolerance to begin with; UsageError or ValueError for one that is not
-    finite, or a wrong budget."""
+    """Return the tolerance to begin with; UsageError or ValueError if it is not finite,
+    or the budget is wrong."""
     from v3dg.select import DEFAULT_TOLERANCE, rule_of
 
     tolerance = options.tolerance
@@ -160,8 +160,8 @@ def _announce(options: View, site: "Site", notes: list[str]) -> None:
 
 
 def _has_browser() -> bool:
-    """Whether to open a browser: not over ssh, on the wrong machine, nor a text browser
-    without a display."""
+    """Return whether to open a browser: not over ssh, where it would open on the other
+    machine, and no text browser without a display."""
     if "SSH_CONNECTION" in os.environ:
         return False
     has_display = any(os.environ.get(name) for name in ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY"))
@@ -169,8 +169,8 @@ def _has_browser() -> bool:
 
 
 def _photographs(cameras: Path | None, names: Iterable[str]) -> dict[str, Path]:
-    """The photographs of cameras by name, beside the file of the cameras or in a folder
-    `images` near it."""
+    """Return the photographs of cameras by name, beside the file of the cameras or in a
+    folder `images` near it."""
     if cameras is None:
         return {}
     folder = cameras

@@ -36,13 +36,13 @@ _WORLDS = {"y": _axes.GLTF, "z": _axes.Z_UP}
 
 
 def rotation_to(up: Axis, frame: Literal["y", "z"]) -> Floats:
-    """(3, 3) rotation that turns what is up to an axis."""
+    """Return the (3, 3) rotation that turns the axis that is up to another axis."""
     return _axes.turn(_axes.axes_of_up(up), _WORLDS[frame])
 
 
 def exported(scene: Scene, format_name: str) -> Scene:
-    """The instances of a scene that are drawn, for a format that holds neither opacity
-    nor tint; warns if any is left out."""
+    """Return the instances of a scene that are drawn, for a format without opacity and
+    tint; warn if any has one."""
     if scene.factors is None:
         return scene
     visible = copy.copy(scene)
@@ -60,15 +60,15 @@ def exported(scene: Scene, format_name: str) -> Scene:
 
 
 def names_of(scene: Scene, reserved: Collection[str] = ()) -> list[str]:
-    """The name of a folder for each bundle, made from that of its file; no reserved
+    """Return a folder name for each bundle, made from the name of its file; no reserved
     name is used."""
     stems = [beside(bundle.path or "bundle").stem[:80] for bundle in scene.bundles]
     return distinct([_OTHER_LETTERS.sub("_", stem) for stem in stems], reserved)
 
 
 def distinct(names: Iterable[str], reserved: Collection[str] = ()) -> list[str]:
-    """The names with a number added to each that is reserved or repeats an earlier one,
-    whatever its case."""
+    """Return the names, with a number added to each that is reserved or repeats an
+    earlier one in upper or lower case."""
     results: list[str] = []
     used = {name.casefold() for name in reserved}
     for number, name in enumerate(names):
@@ -82,14 +82,15 @@ def distinct(names: Iterable[str], reserved: Collection[str] = ()) -> list[str]:
 
 
 def rows_by(numbers: NDArray[np.int32] | NDArray[np.int64], count: int) -> list[NDArray[np.intp]]:
-    """The rows that have each of the numbers 0 to `count` - 1, in ascending order."""
+    """Return for each number from 0 to `count` - 1 the rows that have it, in ascending
+    order."""
     order = np.argsort(numbers, kind="stable")
     return np.split(order, np.searchsorted(numbers[order], np.arange(count + 1)))[1:-1]
 
 
 def detail_of(bundle: Bundle) -> dict[str, float]:
-    """The distances of levels: level 1 is enough from `reach` times the focal length in
-    px over √tolerance.
+    """Return from which distances levels are fine enough: for level 1 it is `reach`
+    times the focal length in px, divided by √tolerance.
 
     Each further level is enough from `ratio` times the distance of the one before it.
     """
@@ -112,7 +113,7 @@ def write_document(path: Path, document: Mapping[str, object]) -> None:
 
 
 def write_page(folder: Path, name: str) -> None:
-    """The page of an export, which the package has by that name."""
+    """Write the page of an export, a copy of the package's file of that name."""
     (folder / "index.html").write_bytes(files("v3dg.export").joinpath(name).read_bytes())
 
 

@@ -38,7 +38,7 @@ class LevelFilter(NamedTuple):
 
 
 def num_halvings(num_gaussians: int) -> int:
-    """The number of halvings down to one gaussian."""
+    """Return the number of halvings down to one gaussian."""
     return max(0, num_gaussians - 1).bit_length()
 
 
@@ -68,7 +68,7 @@ def halved_levels(chunks: Sequence[Gaussians], drawn: LevelFilter) -> list[list[
 def _halved(
     chunks: Sequence[Gaussians], num_levels: int, drawn: LevelFilter, first_chunk: int
 ) -> list[list[Gaussians]]:
-    """`num_levels` levels above those of some chunks."""
+    """Return `num_levels` further levels above those of some chunks."""
     if num_levels == 0:
         return []
     finest = Gaussians.concatenate(chunks)
@@ -126,5 +126,5 @@ def _fit(
 
 
 def _ranges(offset: Offsets) -> Offsets:
-    """(N, 2) first element and end of each of N parts."""
+    """Return (N, 2) the first element and the end of each of N parts."""
     return np.stack([offset[:-1], offset[1:]], axis=1)

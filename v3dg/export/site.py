@@ -137,8 +137,8 @@ class _Axes(NamedTuple):
 
 
 def _axes(up: Axis, *, is_scene: bool) -> _Axes:
-    """A bundle alone is turned to what viewers take to be up; a scene's stay as its
-    instances have them."""
+    """Return the axes of the files: a single bundle is turned so that the axis that
+    viewers expect is up; bundles of a scene stay as its instances place them."""
     if is_scene:
         return _Axes(asset="-y", files=up, cameras=up)
     return _Axes(asset=up, files="-y", cameras=up)
@@ -160,7 +160,7 @@ def _write_bundles(
 def _document(
     scene: Scene, bundles: list[dict[str, object]], axes: _Axes, cameras: Mapping[str, Camera]
 ) -> dict[str, object]:
-    """The document that the page reads first."""
+    """Return the document that the page reads first."""
     return {
         "version": 1,
         "tolerance": DEFAULT_TOLERANCE,
@@ -176,7 +176,8 @@ def _document(
 
 
 def _start_views(scene: Scene, up: Axis) -> list[dict[str, object]]:
-    """What the page first shows without cameras, in windows from narrow to wide."""
+    """Return the first views of a page without cameras, for windows from narrow to
+    wide."""
     framing = frame_subject(scene)
     views = []
     for aspect in _START_ASPECTS:
@@ -196,15 +197,15 @@ def _bundle(name: str, plan: Plan, levels: Export) -> dict[str, object]:
 
 
 def _reach_of_half(bundle: Bundle) -> float:
-    """As `detail_of` has it, for the level that a chunk of all gaussians is halved
-    to."""
+    """Return the `reach` of `detail_of` for the level to which a chunk of all gaussians
+    is halved."""
     corners = bundle.clusters.box[np.diff(bundle.clusters.offset) > 0].reshape(-1, 3)
     radius = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0))) / 2
     return radius * math.sqrt(math.pi * 2 / (bundle.num_gaussians + 1))
 
 
 def _instances(scene: Scene) -> dict[str, list[int] | list[float]]:
-    """Columns, in a few digits more than float32 has."""
+    """Return the columns of the instances, with a few more digits than float32 has."""
     columns: dict[str, list[int] | list[float]] = {"bundle": scene.instance_bundle.tolist()}
     for name in ("positions", "quaternions", "scales", "importance"):
         values = getattr(scene, name).ravel().tolist()

@@ -44,7 +44,7 @@ from v3dg.upright import up_of
 INDEX = "lod-meta.json"
 SETTINGS = "settings.json"
 DEFAULT_CHUNK = 16384
-# A folder is filled chunk by chunk until it holds so many gaussians: about a megabyte
+# A folder is filled chunk by chunk until it holds this many gaussians: about a megabyte
 # to load at once.
 _FOLDER_GAUSSIANS = 1 << 17
 _FOV_DEGREES = 50.0  # vertical, of the camera that a viewer starts with
@@ -226,8 +226,8 @@ def _write_sog(folder: Path, gaussians: Gaussians) -> None:
 
 
 def _viewer_settings(gaussians: Gaussians) -> dict[str, object]:
-    """The settings of SuperSplat's viewer: a camera that shows most of the asset, and
-    no effects."""
+    """Return the settings of SuperSplat's viewer: a camera that shows most of the
+    asset, and no effects."""
     # Viewers have y up and turn an asset, whose y is taken to be down, by half a turn
     # about z.
     centre, radius = ball_of_most(gaussians.means.astype(np.float64) * (-1.0, -1.0, 1.0))
@@ -330,19 +330,19 @@ class Plan:
         return np.take_along_axis(self._bundle_sizes, self._source, axis=0)
 
     def levels(self) -> Iterator[Iterable[Gaussians]]:
-        """Gaussians of all levels, each chunk by chunk."""
+        """Yield the gaussians of all levels, each chunk by chunk."""
         for level in range(self.top + 1):
             yield self._parts(level)
         yield from self._halved_levels()
 
     def _parts(self, level: int) -> Iterator[Gaussians]:
-        """Gaussians of a level up to `top`, chunk by chunk."""
+        """Yield the gaussians of a level up to `top`, chunk by chunk."""
         for number, source in enumerate(self._source[level].tolist()):
             clusters = self._clusters_of_level(source)[number]
             yield Gaussians.concatenate([self.bundle.cluster_gaussians(int(c)) for c in clusters])
 
     def _halved_levels(self) -> Iterator[list[Gaussians]]:
-        """The levels above `top`; chunks without any gaussians have none there
+        """Yield the levels above `top`; a chunk without gaussians has none there
         either."""
         chunks = list(self._parts(self.top))
         used = [number for number, chunk in enumerate(chunks) if len(chunk)]
@@ -359,19 +359,19 @@ class Plan:
             yield parts
 
     def _clusters_of_level(self, level: int) -> list[NDArray[np.int64]]:
-        """Ids of the clusters of a level of the bundle, by chunk."""
+        """Return the ids of the clusters of a level of the bundle, by chunk."""
         if level not in self._clusters:
             self._clusters[level] = self.by_chunk(np.array(self.bundle.level_range(level)))
         return self._clusters[level]
 
     def by_chunk(self, clusters: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-        """Ids of clusters, by the chunk that they are in."""
+        """Return the ids of clusters, by the chunk that they are in."""
         chunks = _common.rows_by(self.chunk_of_cluster[clusters], self.num_chunks)
         return [clusters[rows] for rows in chunks]
 
     def tree(self, leaves: list[_Leaf], turn: Floats) -> _TreeNode:
-        """The spatial index: the groups above the chunks, with bounds, in boxes that
-        stay along the axes."""
+        """Return the spatial index: the groups above the chunks, with their bounds as
+        axis-aligned boxes."""
         parent = self.bundle.groups.parent
         nodes = self._leaf_nodes(leaves, turn)
         node_of_group = {
@@ -389,8 +389,8 @@ class Plan:
         return node_of_group[-1]
 
     def _leaf_nodes(self, leaves: list[_Leaf], turn: Floats) -> dict[int, _TreeNode]:
-        """The leaves with their bounds, by the numbers of those chunks that have
-        gaussians."""
+        """Return the leaves with their bounds, by the number of their chunk, for chunks
+        that have gaussians."""
         clusters = self.bundle.clusters
         used = np.flatnonzero((self.chunk_of_cluster >= 0) & (np.diff(clusters.offset) > 0))
         corners = clusters.box.astype(np.float64) @ rotation_from_quaternion(turn).T
@@ -404,7 +404,7 @@ class Plan:
 
 
 def _joined(nodes: list[_TreeNode]) -> _TreeNode:
-    """One node, or a node that bounds several."""
+    """Return the only node, or a node that bounds several."""
     if len(nodes) == 1:
         return nodes[0]
     corners: list[list[float]] = []
@@ -414,5 +414,5 @@ def _joined(nodes: list[_TreeNode]) -> _TreeNode:
 
 
 def _bound(points: ArrayLike) -> _Bound:
-    """The lowest and the highest of the coordinates of points."""
+    """Return the lowest and the highest coordinates of points."""
     return {"min": np.min(points, axis=0).tolist(), "max": np.max(points, axis=0).tolist()}

@@ -158,7 +158,7 @@ def _write_bundles(scene: Scene, names: list[str], folder: Path, progress: Progr
 
 
 def _instances(scene: Scene, names: list[str], trees: list[_Tile]) -> list[_Tile]:
-    """A tile for each instance, whose content is the tileset of its bundle."""
+    """Return a tile for each instance; its content is the tileset of the bundle."""
     return [
         {
             "transform": transform.T.ravel().tolist(),
@@ -192,8 +192,8 @@ class _Writer:
         self.tops = np.flatnonzero(groups.parent < 0).tolist() or [-1]
 
     def tile_of(self, group: int) -> _Tile:
-        """The tile of a group with all tiles below it; of -1, that of a bundle without
-        groups."""
+        """Return the tile of a group with all tiles below it; for -1, the tile of a
+        bundle without groups."""
         if group < 0:
             return self._tile("asset", np.arange(len(self._bundle.clusters)), 0.0, [])
         level = self._bundle.groups.level[group]
@@ -225,7 +225,8 @@ class _Writer:
 
 
 def _parent(tiles: list[_Tile]) -> _Tile:
-    """One tile, or a tile without content that is always refined to all of several."""
+    """Return the only tile, or a tile without content that is always refined to several
+    tiles."""
     if len(tiles) == 1 and "transform" not in tiles[0]:
         return tiles[0]
     volume = _box([_bounds(tile) for tile in tiles])
@@ -235,7 +236,8 @@ def _parent(tiles: list[_Tile]) -> _Tile:
 
 
 def _box(bounds: list[Floats]) -> _Volume:
-    """A bounding volume around boxes, each of a lower and an upper corner (2, 3)."""
+    """Return a bounding volume around boxes, each given by its lower and upper corner
+    (2, 3)."""
     low = np.min([corners[0] for corners in bounds], axis=0)
     high = np.max([corners[1] for corners in bounds], axis=0)
     half = np.maximum((high - low) / 2, np.finfo(np.float32).tiny)
@@ -257,7 +259,7 @@ def _moved(volume: _Volume, matrix: Floats) -> Floats:
 
 
 def _transforms(scene: Scene) -> Floats:
-    """(I, 4, 4) matrices of the instances."""
+    """Return (I, 4, 4) matrices of the instances."""
     matrices = np.tile(np.eye(4), (len(scene), 1, 1))
     matrices[:, :3, :3] = scene.rotations * scene.scales[:, None, None]
     matrices[:, :3, 3] = scene.positions
@@ -265,8 +267,9 @@ def _transforms(scene: Scene) -> Floats:
 
 
 def _ball_of_leaves(scene: Scene, root: Floats) -> list[float]:
-    """Centre and radius of a ball around the finest level of all instances, which the
-    page shows first: coarse gaussians, and with them the tiles, reach far beyond it."""
+    """Return the centre and the radius of a ball around the finest level of all
+    instances. The page shows it first, because coarse gaussians, and with them the
+    tiles, reach far beyond it."""
     boxes: list[Floats] = []
     for bundle in scene.bundles:
         leaves = bundle.clusters.box[np.array(bundle.level_range(0))].astype(np.float64)
@@ -286,7 +289,8 @@ def _write_tileset(
         "asset": {"version": "1.1", "generator": f"v3dg {__version__}"},
         "extensionsUsed": [_CONTENT],
         "extensionsRequired": [_CONTENT],
-        # Also those of tiles in other tilesets: CesiumJS reads the first tileset.
+        # This includes the extensions of other tilesets: CesiumJS reads the first one
+        # only.
         "extensions": {_CONTENT: extensions},
         "geometricError": root["geometricError"],
         "root": {"refine": "REPLACE", **root},

@@ -19,11 +19,11 @@ MEMORY = "RDF"
 """The axes of gaussians in memory, with which -y is up."""
 MEMORY_UP: Axis = "-y"
 OPENGL = "RUB"
-"""Those of `.spz`, and of OpenUSD with y up."""
+"""The axes of `.spz`, and of OpenUSD with y up."""
 GLTF = "LUF"
-"""Those of glTF 2.0, whose assets face forward (section 3.4)."""
+"""The axes of glTF 2.0, whose assets face forward (section 3.4)."""
 Z_UP = "RFU"
-"""Those of OpenUSD with z up, and of 3D Tiles."""
+"""The axes of OpenUSD with z up, and of 3D Tiles."""
 
 # The axes of gaussians of which an axis is up: those that differ least from the axes in
 # memory.
@@ -47,8 +47,9 @@ _DIRECTIONS: dict[str, tuple[float, float, float]] = {
 # it is odd in.
 _ODD = ("", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 
-# A ground: so much of the points, so thin for its width, so wide for all of the points;
-# and so many of the points at most below it, and at least above it.
+# Limits of a ground: the least share of the points in it; the largest thickness and the
+# least width, relative to the extent of the points; the largest share of the points
+# below it, and the least share above it.
 _GROUND_SHARE = 0.3
 _GROUND_THICKNESS = 0.03
 _GROUND_WIDTH = 0.7
@@ -58,7 +59,8 @@ _LEAST_POINTS = 256
 
 
 def axes_of_up(up: Axis) -> str:
-    """The axes of gaussians of which an axis is up; ValueError for another name."""
+    """Return the axes of gaussians for which this axis is up; ValueError for another
+    name."""
     one_of(up, "up", tuple(_AXES_FROM_UP))
     return _AXES_FROM_UP[up]
 
@@ -74,16 +76,16 @@ def up_of_axes(axes: str) -> Axis:
 
 
 def turn(source: str, target: str) -> Floats:
-    """The (3, 3) matrix that takes vectors from axes to others: a rotation, or one and
-    a mirroring."""
+    """Return the (3, 3) matrix that takes vectors from one set of axes to another: a
+    rotation, or a rotation with a reflection."""
     rows = np.array([_DIRECTIONS[letter] for letter in target])
     columns = np.array([_DIRECTIONS[letter] for letter in source]).T
     return np.asarray(rows @ columns) + 0.0
 
 
 def turned(gaussians: Gaussians, source: str, target: str) -> Gaussians:
-    """Gaussians on the host, from axes to others; they share memory where nothing
-    changes."""
+    """Return gaussians on the host, taken from one set of axes to another; arrays that
+    do not change are shared."""
     matrix = turn(source, target)
     if np.array_equal(np.abs(matrix), np.eye(3)):
         return _mirrored(gaussians, np.diag(matrix))
@@ -95,7 +97,7 @@ def turned(gaussians: Gaussians, source: str, target: str) -> Gaussians:
 
 
 def _mirrored(gaussians: Gaussians, signs: Floats) -> Gaussians:
-    """Gaussians of which coordinates change their sign, exactly.
+    """Return gaussians with the signs of some coordinates changed, exactly.
 
     A reflection M takes the rotation R of a gaussian to M R, which stands for the same
     gaussian as the rotation M R M, whose quaternion differs in signs alone.
@@ -118,7 +120,7 @@ def _mirrored(gaussians: Gaussians, signs: Floats) -> Gaussians:
 
 
 def up_of_ground(points: NDArray[np.floating]) -> Axis | None:
-    """The axis y, -y or z that is up above a ground, which (N, 3) points show; None if
+    """Return which of y, -y and z is up, if the points (N, 3) show a ground; None if
     they do not.
 
     A ground is thin and wide, has many of the points, many of the others above it, and
@@ -138,8 +140,8 @@ def up_of_ground(points: NDArray[np.floating]) -> Axis | None:
 
 
 def _side_above(points: Floats, axis: int) -> int:
-    """1 or -1 if a ground across an axis has the points on that side of it; 0 without
-    one."""
+    """Return 1 or -1, the side of a ground across an axis on which the points lie; 0
+    without a ground."""
     order = np.argsort(points[:, axis])
     heights = points[order, axis]
     size = int(_GROUND_SHARE * len(heights))
@@ -163,6 +165,6 @@ def _side_above(points: Floats, axis: int) -> int:
 
 
 def _extents(points: Floats) -> Floats:
-    """The extent of nearly all points in each coordinate."""
+    """Return the extent of nearly all points in each coordinate."""
     low, high = np.percentile(points, (5, 95), axis=0)
     return np.asarray(high - low)

@@ -1,4 +1,4 @@
-"""What a file declares about its gaussians beside their numbers."""
+"""The declarations of a file about its gaussians, beside their numbers."""
 
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
@@ -9,7 +9,7 @@ from v3dg.gaussians import Gaussians
 
 @dataclass(frozen=True)
 class Declared:
-    """What a file, or its format, declares about its gaussians.
+    """The declarations of a file, or of its format, about its gaussians.
 
     Attributes:
         up: The axis that is up among the gaussians as they are read; None if neither
@@ -41,5 +41,5 @@ def declare(gaussians: Gaussians, declared: Declared) -> Gaussians:
 
 
 def declared_of(gaussians: Gaussians) -> Declared:
-    """What the file of gaussians that `read_asset` returned declares."""
+    """Return what a file declares about the gaussians that `read_asset` returned."""
     return _OF_GAUSSIANS.get(gaussians, NOTHING)

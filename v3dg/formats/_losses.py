@@ -1,5 +1,5 @@
-"""What a packed file does not hold of the gaussians that were written to it: values
-that were cut to the range of its format, and how far others were rounded."""
+"""Measures what gaussians lose in a packed file: the values that are cut to the range
+of its format, and the rounding errors of the others."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from v3dg.gaussians import Gaussians
 
 @dataclass(frozen=True)
 class Losses:
-    """What a packed file does not hold.
+    """The losses of gaussians in a packed file.
 
     Attributes:
         cut: Number of values that were cut to the range of the format, by kind:
@@ -50,7 +50,7 @@ class Losses:
         return [*lines, f"largest errors of rounding: {errors}"]
 
     def result(self) -> JsonObject:
-        """The same for a command's result as JSON."""
+        """Return the losses for a command's result as JSON."""
         errors = {
             "positions": self.position_error,
             "colors": self.color_error,

@@ -39,7 +39,7 @@ from v3dg.rotations import normalised
 _FIELDS = ("means", "scales", "quats", "opacities", "sh0", "shN")
 _NERFSTUDIO = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
 _NERFSTUDIO_PREFIXES = ("_model.gauss_params.", "_model.")  # the second before version 1.1
-# Where the tensors are in the tuple of the papers' code, in the order of _FIELDS.
+# The indices of the tensors in the tuple of the papers' code, in the order of _FIELDS.
 _CAPTURED = (1, 4, 5, 6, 2, 3)
 _MIN_CAPTURE = 12  # values of that tuple; variants add some
 # Members of a checkpoint that say nothing about its gaussians.
@@ -116,12 +116,12 @@ class _Tensor(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """Where the gaussians of a checkpoint are, and how they are stored.
+    """The places and the encoding of the gaussians in a checkpoint.
 
     Attributes:
         fields: The tensors by the names that gsplat has for them. Without `shN`, `sh0`
             has logits of colours without view dependence.
-        notes: What else the checkpoint has.
+        notes: Sentences about the other content of the checkpoint.
     """
 
     fields: dict[str, _Tensor]
@@ -140,7 +140,7 @@ class _Layout(NamedTuple):
 
 
 class _Settings(NamedTuple):
-    """What the settings of a run say about its gaussians."""
+    """The settings of a run that concern its gaussians."""
 
     antialiased: bool | None = None
     is_flat: bool = False
@@ -212,7 +212,8 @@ def _sigmoid(logits: Floats) -> Floats:
 
 
 def _layout_of(path: AnyPath, archive: Archive) -> tuple[_Layout, str]:
-    """Where the gaussians are, and the folder of the zip that holds their numbers."""
+    """Return where the gaussians are, and the folder of the zip that holds their
+    numbers."""
     root = next((name[:-8] for name in archive.names if name.endswith("data.pkl")), "")
     pickle = archive.read(f"{root}data.pkl")
     check(
@@ -230,7 +231,7 @@ def _layout_of(path: AnyPath, archive: Archive) -> tuple[_Layout, str]:
 
 
 def _size(path: AnyPath, layout: _Layout, claims: Claims) -> tuple[int, int]:
-    """Number of gaussians, and of coefficients a channel past the first."""
+    """Return the number of gaussians, and of higher SH coefficients per channel."""
     count = layout.fields["means"].shape[0]
     claims.add(path, count)
     if layout.has_logits:
@@ -242,8 +243,8 @@ def _size(path: AnyPath, layout: _Layout, claims: Claims) -> tuple[int, int]:
 
 
 def _settings_of(path: AnyPath) -> _Settings:
-    """What the settings beside a checkpoint, or above its folder, say; nothing where
-    there are none."""
+    """Return the settings from a file beside a checkpoint or in the folder above; empty
+    ones if there is no such file."""
     folder = Path(path).absolute().parent
     files = [place / name for place in (folder, folder.parent) for name in _SETTINGS]
     file = next((file for file in files if file.is_file()), None)
@@ -287,7 +288,8 @@ def _doubles(values: _Numbers) -> Floats:
 
 
 def _layout(path: AnyPath, content: _Value) -> _Layout:
-    """Where the gaussians are in what was pickled; ValueError if one is missing."""
+    """Return where the gaussians are in the pickled object; ValueError if a part is
+    missing."""
     members: dict[str, _Value] = {}
     if isinstance(content, dict):
         members = content
@@ -340,13 +342,13 @@ def _nerfstudio_layout(path: AnyPath, pipeline: dict[str, _Value]) -> _Layout:
     notes = _left_out(unread)
     tensors = _tensors(path, values)
     if math.prod(tensors["shN"].shape) == 0 and tensors["means"].shape[0] > 0:
-        # Of SH degree 0, splatfacto stores logits of colours.
+        # For SH degree 0, splatfacto stores logits of colours.
         del tensors["shN"]
     return _Layout(tensors, notes)
 
 
 def _left_out(members: Iterable[str]) -> tuple[str, ...]:
-    """A sentence for each member of a checkpoint that is known to change something, and
+    """Return a sentence for each unread member that is known to change the picture, and
     one for all others."""
     names = list(members)
     notes = [_NOT_GAUSSIANS[name] for name in names if name in _NOT_GAUSSIANS]
@@ -369,7 +371,8 @@ def _tensors(path: AnyPath, values: Mapping[str, _Value]) -> dict[str, _Tensor]:
 
 
 def _array(path: AnyPath, name: str, tensor: _Tensor, archive: Archive, root: str) -> _Numbers:
-    """The numbers of a tensor; ValueError unless each of them is stored in the file."""
+    """Return the numbers of a tensor; ValueError unless the file stores each of
+    them."""
     steps = zip(tensor.shape, tensor.strides, strict=True)
     last = tensor.offset + sum((size - 1) * step for size, step in steps)
     count = math.prod(tensor.shape)
@@ -400,8 +403,8 @@ class _Unpickler:
         self._memo: dict[int, _Value] = {}
 
     def run(self, pickle: bytes) -> _Value:
-        """The object that a pickle holds; ValueError for an operation or a name that is
-        not allowed."""
+        """Return the object that a pickle holds; ValueError for an operation or a name
+        that is not allowed."""
         for opcode, argument, _ in pickletools.genops(pickle):
             if opcode.name == "STOP":
                 break
@@ -470,7 +473,7 @@ class _Unpickler:
 
 
 def _allowed_name(argument: str) -> _Named:
-    """The name of a class or function, "module name"; ValueError unless its module is
+    """Return the "module name" of a class or function; ValueError unless its module is
     allowed."""
     module, _, name = argument.partition(" ")
     short = f"{module[:60]}.{name[:60]}"
@@ -480,7 +483,7 @@ def _allowed_name(argument: str) -> _Named:
 
 
 def _called(name: str, arguments: tuple[_Value, ...]) -> _Value:
-    """The result of a call, without calling anything."""
+    """Return what stands for the result of a call; nothing is called."""
     if name.startswith("collections."):
         return {}
     if name == "torch._utils._rebuild_parameter":

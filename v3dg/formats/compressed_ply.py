@@ -92,7 +92,7 @@ def open_file(path: AnyPath) -> AssetFile:
 
 
 def _notes(elements: Mapping[str, _Element]) -> tuple[str, ...]:
-    """What is in the file and is not read, one sentence each."""
+    """Return a sentence for each part of the file that is not read."""
     used = {
         "chunk": [name for kind in _RANGES for name in _range_names(kind)],
         "vertex": list(_PACKED),
@@ -114,8 +114,8 @@ def _decoded(
     ranges: dict[str, tuple[Floats, Floats]],
     sh_bytes: NDArray[np.uint8],
 ) -> tuple[Floats, ...]:
-    """Means, quats, scales, opacities and sh of rows of `vertex` and `sh`, which are in
-    these chunks."""
+    """Return means, quats, scales, opacities and sh of rows of `vertex` and `sh`;
+    `chunks` has the chunk of each row."""
 
     def interpolated(kind: str, fractions: Floats) -> Floats:
         low, high = ranges[kind]
@@ -220,7 +220,8 @@ def _range_names(kind: str) -> list[str]:
 
 
 def _range_kinds(path: AnyPath, chunk: _Element) -> list[str]:
-    """The kinds of ranges that chunks have; older files have none of colours."""
+    """Return the kinds of ranges that chunks have; in older files, colours have
+    none."""
     kinds = [kind for kind in _RANGES if kind != "color" or chunk.kinds.keys() & _range_names(kind)]
     for kind in kinds:
         _require(path, "chunk", chunk, _range_names(kind), "float")
@@ -228,8 +229,8 @@ def _range_kinds(path: AnyPath, chunk: _Element) -> list[str]:
 
 
 def _ranges(chunk: NDArray[np.void], kinds: Sequence[str]) -> dict[str, tuple[Floats, Floats]]:
-    """Lowest and highest value of each chunk, (C, 3) each; without ranges of colour, it
-    is 0 to 1."""
+    """Return the lowest and the highest values of each chunk, (C, 3) each, by kind;
+    colours without ranges have 0 and 1."""
     shape = (len(chunk), 3)
     ranges: dict[str, tuple[Floats, Floats]] = {"color": (np.zeros(shape), np.ones(shape))}
     for kind in kinds:
@@ -265,7 +266,8 @@ def _require(path: AnyPath, label: str, element: _Element, names: Sequence[str],
 
 
 def _elements(file: File) -> dict[str, _Element]:
-    """The elements of the header, in file order, with the place of their rows."""
+    """Return the elements of the header in file order, with the offsets of their
+    rows."""
     path = file.path
     encoding, offset, header = _core.ply_header(path)
     is_little = encoding == "binary_little_endian"

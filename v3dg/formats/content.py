@@ -1,4 +1,4 @@
-"""What a file is, by its first bytes, whatever its name says."""
+"""Recognises the kind of a file by its first bytes, whatever its name says."""
 
 import contextlib
 import zipfile
@@ -13,7 +13,7 @@ _START_BYTES = ksplat.HEADER_BYTES
 _UNPACKED_BYTES = 64  # of a gzip, to tell what is in it
 _MAX_ZIP_NAMES = 4096  # looked at
 
-# What begins with these bytes: the suffix of its reader.
+# The suffix of the reader for files that begin with these bytes.
 _BY_START = {
     b"ply\n": ".ply",
     b"ply\r": ".ply",
@@ -22,8 +22,8 @@ _BY_START = {
     b"#usda ": ".usda",
     b"PXR-USDC": ".usdc",
 }
-# What no reader reads, with letters in lower case. All are long enough to begin no
-# `.splat`, which may begin with any number.
+# Beginnings of files that no reader reads, in lower case, and what these files are. A
+# `.splat` may begin with any number, but these are too long to begin one by chance.
 _NOT_READ = {
     b"version https://git-lfs": "a pointer of Git LFS in place of the file; run git lfs pull",
     b"<!doctype html": "a web page; download the file itself",
@@ -39,11 +39,11 @@ _NOT_READ = {
 
 
 class Content(NamedTuple):
-    """What a file is.
+    """The kind of a file.
 
     Attributes:
-        suffix: That of the reader for it; empty if there is none.
-        text: What it is and what to do, for a message.
+        suffix: Suffix of the reader for the file; empty if there is none.
+        text: Part of a message: what the file is, and what to do with it.
     """
 
     suffix: str
@@ -51,7 +51,8 @@ class Content(NamedTuple):
 
 
 def content_of(path: AnyPath) -> Content | None:
-    """What a file is; None if its first bytes do not tell, or cannot be read.
+    """Return the kind of a file's content; None if its first bytes do not show it, or
+    cannot be read.
 
     A few kilobytes are read, and of a zip its list of names.
     """

@@ -29,8 +29,8 @@ _USED_HEADER_BYTES = 44  # the rest is zeros
 _MINOR = 1  # the newest version is 0.1
 _SECTION_BYTES = 1024
 _MAX_SECTIONS = 1 << 16
-# By compression: types of a mean's coordinates, of scales and quaternions, and of
-# higher SH.
+# The types of a mean's coordinates, of scales and quaternions, and of higher SH, by
+# compression.
 _TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 _SH_RANGE = (-1.5, 1.5)  # if the header has none
 _DEFAULT_STEPS = 32767  # per half side of a bucket
@@ -71,8 +71,9 @@ def open_file(path: AnyPath) -> AssetFile:
 
 
 def is_start_of_one(start: bytes) -> bool:
-    """Whether the first bytes of a file, at least `HEADER_BYTES`, are a header of this
-    format. It has no magic number: its numbers are plausible, and the rest is zeros."""
+    """Return whether the first bytes of a file, at least `HEADER_BYTES`, are a header
+    of this format. The format has no magic number, so the header must have plausible
+    numbers and zeros in the rest."""
     if len(start) < HEADER_BYTES or any(start[_USED_HEADER_BYTES:HEADER_BYTES]):
         return False
     major, minor, most_sections, num_sections, _, _, compression = struct.unpack_from(
@@ -84,7 +85,8 @@ def is_start_of_one(start: bytes) -> bool:
 
 
 def _declared(start: bytes) -> Declared:
-    """What the header declares: a newer version may mean something unknown."""
+    """Return a note if the header has a newer version, in which bytes may mean
+    something else."""
     minor = start[1]
     if minor <= _MINOR:
         return NOTHING
@@ -112,8 +114,8 @@ def read(path: AnyPath) -> Gaussians:
 
 
 def _headers(path: AnyPath, content: bytes) -> tuple[list[_Section], int, int]:
-    """The headers of all sections, the SH degree and the compression; ``content`` is
-    the start of a file."""
+    """Return the headers of all sections, the SH degree and the compression;
+    ``content`` is the start of a file."""
     num_bytes = len(content)
     check(path, num_bytes >= HEADER_BYTES, f"a header of {HEADER_BYTES} bytes, got {num_bytes}")
     major, minor, num_sections, count, compression = struct.unpack_from("<BB2xI8xIH", content)
@@ -135,8 +137,8 @@ def _headers(path: AnyPath, content: bytes) -> tuple[list[_Section], int, int]:
 def _section(
     path: AnyPath, content: bytes, start: int, number: int, section: _Section, compression: int
 ) -> tuple[NDArray[np.void], _Buckets | None, int]:
-    """The rows of a section, the buckets that their means are relative to, and the end
-    of the section."""
+    """Return the rows of a section, the buckets that their means are relative to, and
+    the end of the section."""
     mean_type, shape_type, sh_type = _TYPES[compression]
     count = section.num_gaussians
     max_count = section.max_gaussians
@@ -166,7 +168,7 @@ def _section(
 
 
 def _buckets(path: AnyPath, content: bytes, start: int, number: int, section: _Section) -> _Buckets:
-    """The buckets of a section that begins at ``start``."""
+    """Return the buckets of a section that begins at ``start``."""
     count = section.num_gaussians
     sizes = np.frombuffer(content, "<u4", section.num_partial_buckets, start)
     partial_sizes = sizes.astype(np.int64)
@@ -193,7 +195,7 @@ def _buckets(path: AnyPath, content: bytes, start: int, number: int, section: _S
 def _decoded(
     records: NDArray[np.void], buckets: _Buckets | None, degree: int, sh_range: tuple[float, float]
 ) -> Gaussians:
-    """The gaussians of a section, padded with zeros to the coefficients of
+    """Return the gaussians of a section; their coefficients are padded with zeros to
     ``degree``."""
 
     def decode(block: slice) -> tuple[Floats, ...]:

@@ -40,8 +40,8 @@ from v3dg.gaussians import Gaussians
 
 _Pixels: TypeAlias = NDArray[np.uint8]
 _MAX_GAUSSIANS = 1 << 28  # pixels of the largest WebP
-# A picture may have up to so many pixels: a multiple of what is needed, because writers
-# round up differently, and a constant.
+# A picture may have this many times the pixels that are needed, because writers round
+# up differently, plus a constant.
 _MAX_PIXELS_FACTOR = 4
 _FREE_PIXELS = 1 << 16
 _LEAST_PALETTE = 1024
@@ -87,8 +87,8 @@ def read(path: str | os.PathLike[str], claims: Claims | None = None) -> Gaussian
 
 
 def _folder_in(path: Path, archive: Archive) -> str:
-    """The folder of a zip that has its meta.json, with a slash at the end; "" for a zip
-    without folders."""
+    """Return the folder of a zip that contains its meta.json, with a slash at the end;
+    "" if it is at the top."""
     names = [name for name in archive.names if not name.startswith(_RESOURCE_FORKS)]
     is_streamed = any(name.rsplit("/", 1)[-1] == "lod-meta.json" for name in names)
     advice = "unpack it, and open its lod-meta.json"
@@ -104,7 +104,7 @@ def _folder_in(path: Path, archive: Archive) -> str:
 
 
 def files(path: Path) -> list[Path]:
-    """The `.sog` file itself, or a `meta.json` and its pictures."""
+    """Return the `.sog` file itself, or a `meta.json` and its pictures."""
     if path.suffix != ".json":
         return [path]
     names = _names(_meta(path, Claims().read(path)))
@@ -119,7 +119,7 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
     claims.add(path, count)  # after all files are open, because their sizes bound the claim
 
     def pixels(name: str) -> _Pixels:
-        """(N, 4) red, green, blue and alpha, a pixel for each gaussian."""
+        """Return (N, 4) red, green, blue and alpha: one pixel for each gaussian."""
         return _decoded(path, name, pictures[name], count).reshape(-1, 4)[:count]
 
     low, high = (np.array(meta["means"].field(name).vector(3)) for name in ("mins", "maxs"))
@@ -179,7 +179,7 @@ def _palette(
 
 
 def _labels(path: Path, pixels: _Pixels, palette: _Palette) -> _packing.Integers:
-    """(N,) the entry of the palette that each gaussian refers to."""
+    """Return (N,) the index of the palette entry of each gaussian."""
     labels: _packing.Integers = pixels[:, 0] | (pixels[:, 1].astype(np.uint16) << 8)
     largest = labels.max(initial=0)
     expected = f"labels below {palette.num_entries}"
@@ -219,7 +219,7 @@ def _declared(meta: dict[str, Node]) -> Declared:
 
 
 def _size(meta: dict[str, Node]) -> tuple[int, int]:
-    """Number of gaussians, and their SH degree."""
+    """Return the number of gaussians, and their SH degree."""
     count = integer_of(meta["count"], "a number of gaussians", 0, _MAX_GAUSSIANS)
     if "shN" not in meta:
         return count, 0
@@ -227,8 +227,8 @@ def _size(meta: dict[str, Node]) -> tuple[int, int]:
 
 
 def _names(meta: dict[str, Node]) -> dict[str, list[str]]:
-    """Names of the pictures of each part, beside meta.json; nothing outside of its
-    folder is read."""
+    """Return the names of the pictures of each part, which are beside meta.json; files
+    outside of its folder are not read."""
     names = {}
     for part, count in _PARTS.items():
         if part in meta:
@@ -259,8 +259,8 @@ def _codebook(part: Node) -> Floats:
 def _decoded(
     path: Path, name: str, content: bytes, num_pixels: int, row: int | None = None
 ) -> _Pixels:
-    """(H, W, 4) pixels of a picture, of at least ``num_pixels`` and not many more, in
-    rows of ``row``."""
+    """Return the pixels (H, W, 4) of a picture, which has at least ``num_pixels`` and
+    not many more, in rows of ``row``."""
     from PIL.WebPImagePlugin import WebPImageFile  # Image.open would also try other formats
 
     width, height = _size_of_webp(content)
@@ -282,8 +282,8 @@ def _decoded(
 
 
 def _size_of_webp(content: bytes) -> tuple[int, int]:
-    """Width and height from the first chunk, known before a decoder allocates; 0, 0 for
-    another file."""
+    """Return the width and the height from the first chunk, before a decoder allocates
+    memory for them; 0, 0 for another file."""
 
     def number(first: int, size: int) -> int:
         return int.from_bytes(content[first : first + size], "little")
@@ -318,8 +318,8 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
 
 
 def encode(gaussians: Gaussians, *, palette_size: int | None = None) -> dict[str, bytes]:
-    """The files of a SOG by name; ``gaussians`` have passed `check_writable`, and their
-    order stays.
+    """Return the files of a SOG by name; ``gaussians`` have passed `check_writable`,
+    and keep their order.
 
     Args:
         palette_size: Number of sets of higher SH, at most 65,536 of which are made;
@@ -372,8 +372,8 @@ def encode(gaussians: Gaussians, *, palette_size: int | None = None) -> dict[str
 def _encoded_means(
     means: NDArray[np.float32],
 ) -> tuple[NDArray[np.uint32], NDArray[np.float64], NDArray[np.float64]]:
-    """Positions as 16-bit steps (N, 3) between the lowest and the highest logs; these
-    bounds, (3,) each."""
+    """Return positions as 16-bit steps (N, 3) between the lowest and the highest logs,
+    and these two bounds, (3,) each."""
     doubles = means.astype(np.float64)
     logs = np.sign(doubles) * np.log1p(np.abs(doubles))
     low = np.zeros(3)
@@ -388,8 +388,8 @@ def _encoded_means(
 def _encoded_palette(
     gaussians: Gaussians, palette_size: int | None
 ) -> tuple[dict[str, object], bytes, _packing.Integers]:
-    """The part of meta.json for higher SH, the picture of its palette, and a label for
-    each gaussian."""
+    """Return the part of meta.json for higher SH, the picture of its palette, and a
+    label for each gaussian."""
     count = len(gaussians)
     num_coefficients = (gaussians.sh_degree + 1) ** 2 - 1
     vectors = np.ascontiguousarray(gaussians.sh[:, 1:]).reshape(count, 3 * num_coefficients)
@@ -414,12 +414,13 @@ def _table_of(values: Floats) -> Floats:
 
 
 def _nearest(table: Floats, values: Floats) -> NDArray[np.uint8]:
-    """Index of the entry of an ascending table that is nearest to each value."""
+    """Return the index of the entry of an ascending table that is nearest to each
+    value."""
     return np.searchsorted((table[1:] + table[:-1]) / 2, values).astype(np.uint8)
 
 
 def _webp(values: _packing.Integers, width: int, height: int) -> bytes:
-    """A picture whose first pixels have these values (N, C), padded with 255."""
+    """Return a picture whose first pixels have these values (N, C), padded with 255."""
     from PIL import Image
 
     pixels = np.full((height, width, 4), 255, np.uint8)

@@ -62,7 +62,8 @@ LIMITS = _packing.Limits(
     color=(-0.5 / _COLOR_SCALE, 0.5 / _COLOR_SCALE),
     harmonic=(-1.0, 127.5 / 128),
 )
-"""What the format can hold, with half a step more where that is rounded to it."""
+"""The ranges of values in the format. Where values half a step beyond are rounded into
+the range, they include that half step."""
 
 
 class _Header(NamedTuple):
@@ -111,7 +112,7 @@ def open_file(path: AnyPath) -> AssetFile:
 
 
 def decode(path: AnyPath, content: bytes, claims: Claims) -> Gaussians:
-    """The gaussians of a `.spz` file's content, which are not turned."""
+    """Return the gaussians of the content of a `.spz` file, in the axes of the file."""
     return _decode(_expanded(path, content, claims))
 
 
@@ -191,8 +192,8 @@ def encode(host: Gaussians, version: int = 3, *, axes: str = "") -> Iterator[byt
 def _zstd_parts(
     header: bytes, extensions: bytes, count: int, sections: list[Callable[[slice], bytes]]
 ) -> Iterator[bytes]:
-    """The header, with number of streams and offset of their table; the extensions; the
-    table of sizes; the streams."""
+    """Yield the header, which has the number of streams and the offset of their table;
+    then the extensions, the table of sizes, and the streams."""
     import zstandard
 
     raw = [b"".join(map(section, _packing.blocks(count))) for section in sections]
@@ -209,7 +210,7 @@ def _bytes(values: Floats) -> bytes:
 
 
 def _rotation_bytes(quats: Floats) -> bytes:
-    """x y z of the quaternion whose w is not negative."""
+    """Return x y z, as bytes, of the quaternions whose w is not negative."""
     unit = normalised(quats)
     return _bytes((unit[:, 1:] * np.where(unit[:, :1] < 0, -1.0, 1.0) + 1.0) * 127.5)
 
@@ -224,7 +225,7 @@ def _rotation_words(quats: Floats) -> bytes:
 
 
 def _means(content: _Content, rows: slice) -> Floats:
-    """(N, 3) positions as they are stored."""
+    """Return (N, 3) positions as they are stored."""
     positions = np.frombuffer(content.sections[0], "u1")
     if content.header.version == 1:
         return positions.view("<f2").reshape(-1, 3)[rows].astype(np.float64)
@@ -234,8 +235,8 @@ def _means(content: _Content, rows: slice) -> Floats:
 
 
 def _axes_of(path: AnyPath, content: _Content) -> tuple[str, str]:
-    """The axes that gaussians are stored with, and why they are taken for that, as a
-    phrase."""
+    """Return the axes of the stored gaussians, and a phrase that says how they are
+    known."""
     for kind, payload in _records(content.extensions):
         if kind == _AXES_EXTENSION:
             number = int.from_bytes(payload, "little")
@@ -295,7 +296,8 @@ def _decode(content: _Content) -> Gaussians:
 
 
 def _quats(rotations: NDArray[np.uint8]) -> Floats:
-    """Quaternions w x y z from words (version 3 and later), or from x y z as bytes."""
+    """Return quaternions w x y z from words (version 3 and later), or from x y z as
+    bytes."""
     if rotations.shape[1] == 3:
         xyz = rotations / 127.5 - 1.0
         return normalised(_packing.quats_from_three(xyz, np.zeros(len(xyz), np.intp)))

@@ -65,7 +65,7 @@ def open_file(path: str | os.PathLike[str]) -> AssetFile:
 
 
 def _declared(index: _Index, parts: list[Declared]) -> Declared:
-    """What the index declares, and what all of its parts do."""
+    """Return what the index declares together with all of its parts."""
     notes = list(dict.fromkeys(note for part in parts for note in part.notes))
     if index.unread:
         notes.append(f"Fields of lod-meta.json were left out: {listed(index.unread)}.")
@@ -100,7 +100,8 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def files(path: Path) -> list[Path]:
-    """The index and the files of all levels and of the environment that exist."""
+    """Return the index and the files of all levels and of the environment that
+    exist."""
     index = _index(path, Claims())
     names = dict.fromkeys([*index.names, index.environment])
     parts = [path.parent / name for name in names if name is not None]
@@ -108,7 +109,7 @@ def files(path: Path) -> list[Path]:
 
 
 def _used(path: Path, index: _Index) -> dict[PurePosixPath, list[range]]:
-    """The rows to read of each file, in their order."""
+    """Return the rows to read of each file, in the order of the files."""
     finest = _finest(index.tree, index.names)
     has_any = finest or index.environment is not None
     check(path, has_any, "gaussians in the tree, got none")
@@ -131,8 +132,8 @@ def _index(path: Path, claims: Claims) -> _Index:
 
 
 def _inside(node: Node) -> PurePosixPath:
-    """The path of a file in the folder of the index or below it; ValueError for any
-    other."""
+    """Return the path of a file in the folder of the index or below it; ValueError for
+    a path that leads out of it."""
     path = PurePosixPath(node.text())
     if path.is_absolute() or ".." in path.parts or "\\" in node.text():
         raise node.error("a path below that of lod-meta.json")

@@ -61,7 +61,7 @@ _MOST_DEGREE = 100
 
 
 class _Kernel(Enum):
-    """What a prim's particles are, as far as gaussians can be made of them."""
+    """The shapes of particles that can be read as gaussians."""
 
     ELLIPSOID = "ParticleFieldKernelGaussianEllipsoidAPI"
     SURFLET = "ParticleFieldKernelGaussianSurfletAPI"  # flat in its z
@@ -77,7 +77,7 @@ class _Column(NamedTuple):
 
 @cache
 def pxr() -> ModuleType:
-    """The package `pxr`; ImportError says how to get it."""
+    """Return the package `pxr`; ImportError says how to get it."""
     for part in (
         "Usd",
         "UsdGeom",
@@ -119,13 +119,14 @@ def read(path: AnyPath) -> tuple[Gaussians, Declared]:
         joined = Gaussians.concatenate([_padded(part, degree) for part in parts])
         letter = str(usd.UsdGeom.GetStageUpAxis(root.GetStage()))
         if letter not in _AXES:
-            raise ValueError(f"the up axis {letter[:20]!a}; Y or Z is one")
+            raise ValueError(f"the up axis {letter[:20]!a}; only Y and Z can be read")
         gaussians = _axes.turned(joined, _AXES[letter], _axes.MEMORY)
         return gaussians, _declared(usd, root.GetStage(), letter, notes)
 
 
 def _declared(usd: ModuleType, stage: Usd.Stage, letter: str, notes: list[str]) -> Declared:
-    """What a stage of which this axis is up declares, and the notes about its prims."""
+    """Return what a stage declares, with the notes about its prims; `letter` is its
+    axis that is up."""
     unit = usd.UsdGeom.GetStageMetersPerUnit(stage)
     distinct = list(dict.fromkeys(notes))
     if usd.UsdGeom.StageHasAuthoredMetersPerUnit(stage) and unit != 1:
@@ -137,7 +138,7 @@ def _declared(usd: ModuleType, stage: Usd.Stage, letter: str, notes: list[str]) 
 
 
 def _padded(gaussians: Gaussians, degree: int) -> Gaussians:
-    """The same gaussians with zeros for the coefficients up to a degree."""
+    """Return the same gaussians with zeros for the coefficients up to a degree."""
     missing = (degree + 1) ** 2 - gaussians.sh.shape[1]
     if missing == 0:
         return gaussians
@@ -146,7 +147,7 @@ def _padded(gaussians: Gaussians, degree: int) -> Gaussians:
 
 
 def has_instances(path: AnyPath) -> bool:
-    """Whether instances make a USD file a scene."""
+    """Return whether instances make a USD file a scene."""
     with _opened(path, "OpenUSD with gaussians") as (usd, root):
         kind = usd.UsdGeom.PointInstancer
         return any(prim.IsInstanceProxy() or prim.IsA(kind) for prim in _prims(usd, root))
@@ -185,8 +186,8 @@ def read_world(path: AnyPath) -> tuple[list[Gaussians], list[int], list[_Pose], 
 
 @contextlib.contextmanager
 def _opened(path: AnyPath, expected: str) -> Iterator[tuple[ModuleType, Usd.Prim]]:
-    """The package `pxr`, and the root of the prims of a file; ValueError unless some
-    are gaussians."""
+    """Yield the package `pxr`, and the root of the prims of a file; ValueError if no
+    prim has gaussians."""
     check(
         path, Path(path).suffix.lower() in SUFFIXES, f"a file name ending in {', '.join(SUFFIXES)}"
     )
@@ -218,8 +219,8 @@ def _check_package(path: AnyPath) -> None:
 
 
 def _prims(usd: ModuleType, root: Usd.Prim) -> Iterator[Usd.Prim]:
-    """Prims of gaussians and instancers at and below a root that are to be drawn,
-    without those of coarser levels."""
+    """Yield the prims of gaussians, and the instancers, that are to be drawn at and
+    below a root; coarser levels are left out."""
     walk = iter(usd.Usd.PrimRange(root, usd.Usd.TraverseInstanceProxies()))
     for prim in walk:
         is_instancer = prim.IsA(usd.UsdGeom.PointInstancer)
@@ -231,14 +232,14 @@ def _prims(usd: ModuleType, root: Usd.Prim) -> Iterator[Usd.Prim]:
 
 
 def _is_coarse(usd: ModuleType, prim: Usd.Prim) -> bool:
-    """Whether a prim is a level of detail other than the first."""
+    """Return whether a prim is a level of detail other than the first."""
     parent = prim.GetParent()
     return bool(parent and parent.HasAPI(usd.UsdLod.RootAPI) and prim != parent.GetChildren()[0])
 
 
 def _is_hidden(usd: ModuleType, prim: Usd.Prim) -> bool:
-    """Whether a prim and all below it are not drawn: it is made invisible, or stands in
-    for others, or helps to edit."""
+    """Return whether a prim and all below it are not drawn, because it is invisible, a
+    stand-in for others, or an aid for editing."""
     imageable = usd.UsdGeom.Imageable(prim)
     if not imageable:
         return False
@@ -249,7 +250,7 @@ def _is_hidden(usd: ModuleType, prim: Usd.Prim) -> bool:
 
 
 def _kernel(usd: ModuleType, prim: Usd.Prim) -> _Kernel | None:
-    """The shape of a prim's particles; None if they are no gaussians."""
+    """Return the shape of a prim's particles; None if they are not gaussians."""
     if prim.IsA(usd.UsdVol.ParticleField):
         for kernel in _Kernel:
             if prim.HasAPI(getattr(usd.UsdVol, kernel.value)):
@@ -258,7 +259,7 @@ def _kernel(usd: ModuleType, prim: Usd.Prim) -> _Kernel | None:
 
 
 def _left_out(usd: ModuleType, root: Usd.Prim) -> list[str]:
-    """What is on a stage and is not read, one sentence each."""
+    """Return a sentence for each part of the stage that is not read."""
     hidden: list[str] = []
     particles: list[str] = []
     unread: list[str] = []
@@ -287,8 +288,8 @@ def _left_out(usd: ModuleType, root: Usd.Prim) -> list[str]:
 
 
 def _placed(usd: ModuleType, root: Usd.Prim) -> Iterator[tuple[Usd.Prim, Floats]]:
-    """Prims of gaussians, each with the (4, 4) matrix from it, or from an instance of
-    it, to the root."""
+    """Yield each prim of gaussians with the (4, 4) matrix from the prim, or from an
+    instance of it, to the root."""
     root_from_world = np.linalg.inv(_to_world(usd, root))
     time = usd.Usd.TimeCode.EarliestTime()
     for prim in _prims(usd, root):
@@ -316,17 +317,20 @@ def _to_world(usd: ModuleType, prim: Usd.Prim) -> Floats:
 
 
 def _similarity(prim: Usd.Prim, matrix: Floats) -> _Pose:
-    """Quaternion, translation and scale of a (4, 4) matrix that places a prim."""
+    """Return the quaternion, the translation and the scale of a (4, 4) matrix that
+    places a prim."""
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not (scale > 0 and is_rotation(matrix[:3, :3] / scale)):
         raise ValueError(
-            f"a transform of {prim.GetPath()} that is no rotation, translation and one scale"
+            f"a transform of {prim.GetPath()} that is more than a rotation, a translation and "
+            "one scale"
         )
     return quaternion_from_rotation(matrix[:3, :3] / scale), matrix[:3, 3], scale
 
 
 def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]]:
-    """The gaussians of a prim, and what of it was read otherwise than it is written."""
+    """Return the gaussians of a prim, and notes on values that were read otherwise than
+    they are written."""
     means = _column(usd, prim, "positions", None).values
     if means is None:
         means = np.zeros((0, 3), np.float32)
@@ -368,7 +372,7 @@ def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]
 
 
 def _degree(usd: ModuleType, prim: Usd.Prim) -> int:
-    """The SH degree of a prim, which is 3 by default."""
+    """Return the SH degree of a prim, which is 3 by default."""
     degree = _value(usd, prim, f"{_SH}Degree")
     if degree is None:  # the prim has no coefficients either
         return 0
@@ -378,8 +382,8 @@ def _degree(usd: ModuleType, prim: Usd.Prim) -> int:
 
 
 def _column(usd: ModuleType, prim: Usd.Prim, name: str, count: int | None) -> _Column:
-    """The first `count` values of an attribute, in single precision or, if there are
-    none of those, in half; the schema ignores one with fewer values."""
+    """Return the first `count` values of an attribute in single precision, or else in
+    half precision; the schema ignores an attribute with fewer values."""
     stored = _value(usd, prim, name)
     if stored is None:
         stored = _value(usd, prim, f"{name}h")
@@ -395,7 +399,7 @@ def _column(usd: ModuleType, prim: Usd.Prim, name: str, count: int | None) -> _C
 
 
 def _value(usd: ModuleType, prim: Usd.Prim, name: str) -> object:
-    """The first value of an attribute; None if the prim has none, or no such
+    """Return the first value of an attribute; None if the prim has none, or no such
     attribute."""
     attribute = prim.GetAttribute(name)
     if not attribute:
@@ -404,7 +408,7 @@ def _value(usd: ModuleType, prim: Usd.Prim, name: str) -> object:
 
 
 def _notes_of(usd: ModuleType, prim: Usd.Prim) -> list[str]:
-    """What else a prim says about its gaussians, one sentence each."""
+    """Return a sentence for everything else that a prim says about its gaussians."""
     notes = []
     authored = prim.GetAuthoredAttributes()
     is_moving = usd.UsdGeom.Xformable(prim).TransformMightBeTimeVarying() or any(
@@ -436,7 +440,7 @@ def write(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) ->
 
 
 def new_stage(up: Literal["Y", "Z"]) -> Usd.Stage:
-    """An empty stage in metres; Y is USD's default for the axis that is up."""
+    """Return an empty stage in metres; Y is USD's default for the axis that is up."""
     usd = pxr()
     stage = usd.Usd.Stage.CreateInMemory()
     usd.UsdGeom.SetStageUpAxis(stage, up)

@@ -227,7 +227,7 @@ class BuildConfig:
 
     @staticmethod
     def leaves_only() -> "BuildConfig":
-        """Settings that make level 0 the only level."""
+        """Return settings that make level 0 the only level."""
         return BuildConfig(min_clusters=1 << 31)
 
     @staticmethod

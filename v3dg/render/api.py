@@ -168,7 +168,8 @@ def first_camera(
 
 
 def _with_first_camera(subject: Subject | File) -> tuple[Subject, Camera]:
-    """A subject, and the camera that it is seen from if none is asked for."""
+    """Return a subject and the camera that it is drawn with by default: the first one
+    of its file, else a first view of it."""
     if not isinstance(subject, str | os.PathLike):
         return subject, first_camera(subject)
     path = Path(subject)

@@ -188,5 +188,7 @@ def _finish(picture: Picture) -> None:
 
 
 def _refuse_given_cut(request: FrameRequest) -> None:
-    is_selected = request.selection is None
-    check("cut", is_selected, "none for a pool, which selects its own, got one; give memory=None")
+    if request.selection is not None:
+        raise ValueError(
+            "cut: a renderer with a pool selects its own cut; leave it out, or give memory=None"
+        )

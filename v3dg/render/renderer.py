@@ -150,10 +150,10 @@ class Renderer:
         """Wait until everything that a view needs is resident, so that its picture
         misses no page.
 
-        The picture is then the same, bit for bit, as if all were resident; if there is
-        not enough room, as at the tolerance that it reports. This holds for the next
-        picture, which is waited for on a CUDA device, too. Returns at once if
-        everything is resident. Threads that share a renderer may evict each other's
+        The next picture is then the same, bit for bit, as if everything were resident.
+        If there is not enough room, it is the picture at the tolerance that it reports.
+        On a CUDA device, drawing it waits, too. Returns at once if everything is
+        resident. Threads that share a renderer may evict each other's
         pages between the two calls; `v3dg.render` settles and draws in one step.
 
         Args:

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from v3dg.false_color import ColorBy
     from v3dg.select import Selection
 
-# For pictures with levels, whose own error is far larger; docs/cuda.md states what it
-# saves.
+# The default for pictures with levels, whose own error is far larger; docs/cuda.md
+# states how much time it saves.
 DEFAULT_MIN_TRANSMITTANCE = 1e-3
 BLACK = (0.0, 0.0, 0.0)
 _PLAIN_TYPES = frozenset({float, int, type(None)})

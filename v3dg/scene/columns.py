@@ -60,7 +60,7 @@ def columns_of(
     opacity: npt.ArrayLike,
     tint: npt.ArrayLike,
 ) -> Columns:
-    """The columns of as many instances as there are positions."""
+    """Return the columns of as many instances as there are positions."""
     points = _points_of(positions)
     count = len(points)
     return Columns(
@@ -74,7 +74,7 @@ def columns_of(
 
 
 def composed(outer: Columns, inner: Columns) -> Columns:
-    """The columns of instances that one pose places as a whole."""
+    """Return the columns of instances that one pose places as a whole."""
     size = outer.scales[0]
     rotation = rotation_from_quaternion(outer.quaternions[0])
     with np.errstate(over="ignore", under="ignore"):  # columns_of() refuses the results
@@ -89,7 +89,8 @@ def composed(outer: Columns, inner: Columns) -> Columns:
 
 
 def _points_of(positions: Array | npt.ArrayLike | None) -> Array:
-    """(I, 3) positions, of which one may be given as (3,); the origin for None."""
+    """Return (I, 3) positions; a single one may be given as (3,), and None stands for
+    the origin."""
     points: Array = positions
     if positions is None:
         points = (0.0, 0.0, 0.0)
@@ -103,15 +104,18 @@ def _points_of(positions: Array | npt.ArrayLike | None) -> Array:
 
 
 def parts_of(matrix: Array | npt.ArrayLike, *parts: Array | npt.ArrayLike | None) -> Similarity:
-    """The parts of matrices; ValueError if there are other parts with them."""
-    is_alone = all(part is None for part in parts)
-    check("matrix", is_alone, "no positions, quaternions or scales with it, got some")
+    """Return the position, the quaternion and the scale of matrices; ValueError if
+    other parts are given, too."""
+    if any(part is not None for part in parts):
+        raise ValueError(
+            "matrix: it already places the instances; leave out positions, quaternions and scales"
+        )
     return similarity_of(matrix)
 
 
 def turned(quaternions: Array, bundles: Sequence[Bundle], up: Axis) -> Array:
-    """Rotations (I, 4), of one bundle or of I, after a turn of what is up in the
-    bundles to an axis."""
+    """Return the rotations (I, 4) of instances after the axis that is up in their
+    bundles was turned to another axis; `bundles` has one bundle, or I."""
     one_of(up, "up", AXES)
     turns = {bundle: turn_between(up_of_bundle(bundle), up) for bundle in set(bundles)}
     matrices = product_matrix(np.array([turns[bundle] for bundle in bundles]).reshape(-1, 4))
@@ -119,8 +123,8 @@ def turned(quaternions: Array, bundles: Sequence[Bundle], up: Axis) -> Array:
 
 
 def up_of_bundle(bundle: Bundle) -> Axis:
-    """The axis that is up in a bundle: as its file says, else -y, as in trained
-    assets."""
+    """Return the axis that is up in a bundle according to its file, else -y, as in
+    trained assets."""
     recorded = bundle.config.get("up")
     if recorded in AXES:
         return cast(Axis, recorded)
@@ -128,8 +132,8 @@ def up_of_bundle(bundle: Bundle) -> Axis:
 
 
 def column(values: Array | None, name: str, count: int) -> Array:
-    """A contiguous (count, ...) copy of a column, or of its default for None; one row
-    stands for all, except of positions."""
+    """Return a contiguous copy (count, ...) of a column, or of its default for None. A
+    single row stands for all, except of positions."""
     source: Array = values
     if values is None:
         source = _DEFAULTS.get(name)
@@ -166,8 +170,8 @@ def column(values: Array | None, name: str, count: int) -> Array:
 
 
 def on_device_of(array: Array, values: Array) -> Array:
-    """The values as a tensor on the device of ``array``; unchanged if that is a NumPy
-    array."""
+    """Return the values as a tensor on the device of ``array``; unchanged if that is a
+    NumPy array."""
     if isinstance(array, np.ndarray):
         return values
     import torch
@@ -178,8 +182,8 @@ def on_device_of(array: Array, values: Array) -> Array:
 
 
 def _on_one_device(first: Array, second: Array) -> tuple[Array, Array]:
-    """Both arrays on the device of either that is a tensor; on the host if neither
-    is."""
+    """Return both arrays on the device of the one that is a tensor; on the host if
+    neither is."""
     target = first
     if isinstance(first, np.ndarray):
         target = second
@@ -187,13 +191,13 @@ def _on_one_device(first: Array, second: Array) -> tuple[Array, Array]:
 
 
 def joined(first: Array, second: Array) -> Array:
-    """The concatenation, on the device of either."""
+    """Return the concatenation of two arrays, on the device of either."""
     first, second = _on_one_device(first, second)
     return _device.library_of(first).concatenate([first, second])
 
 
 def replaced(values: Array, rows: npt.NDArray[np.int64], row_values: Array) -> Array:
-    """A copy with other values in some rows."""
+    """Return a copy of an array with other values in some rows."""
     values, row_values = _on_one_device(values, row_values)
     if isinstance(values, np.ndarray):
         values = values.copy()

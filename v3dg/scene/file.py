@@ -50,8 +50,8 @@ class _Instance(NamedTuple):
 
 
 def is_scene(path: Path) -> bool:
-    """Whether a file has the name of a scene: JSON, but not the `meta.json` of an asset
-    in SOG."""
+    """Return whether a file has the name of a scene: JSON, but not the `meta.json` of
+    an asset in SOG."""
     name = beside(path).name
     return name.endswith(".json") and not name.endswith(SUFFIXES)
 
@@ -87,7 +87,8 @@ class _Files:
         self._chain: list[str] = []
 
     def read(self, path: Path, opened: dict[str, Bundle]) -> tuple[Scene, dict[str, Camera]]:
-        """A scene and its cameras, of whose bundles some are already open."""
+        """Return a scene and its cameras; bundles that are already open are used
+        again."""
         root = read_json(path)
         self._chain.append(os.path.realpath(path))
         if root.has("layouts"):
@@ -100,7 +101,7 @@ class _Files:
         return result
 
     def nested(self, node: Node, folder: Path) -> Scene:
-        """The scene in a file that another one names."""
+        """Return the scene in a file that another one names."""
         path = folder / node.text()
         real_path = os.path.realpath(path)
         if real_path in self._chain:
@@ -121,7 +122,7 @@ class _Files:
     def open_bundles(
         self, nodes: Mapping[str, Node], folder: Path, opened: dict[str, Bundle]
     ) -> dict[str, Bundle]:
-        """Bundles by their names, also those that an earlier file has opened."""
+        """Return bundles by name, including those that an earlier file has opened."""
         real_paths = {
             node.text(): os.path.realpath(folder / node.text()) for node in nodes.values()
         }
@@ -192,8 +193,8 @@ def _camera_as_json(name: str, camera: Camera) -> dict[str, object]:
 
 
 def _paths_of_bundles(scene: Scene, folder: str) -> list[str]:
-    """The files that the bundles were opened from, relative to a folder; ValueError for
-    those without one."""
+    """Return the files that the bundles were opened from, relative to a folder;
+    ValueError for a bundle without a file."""
     paths = []
     for number, bundle in enumerate(scene.bundles):
         if not bundle.path or is_url(bundle.path):
@@ -204,7 +205,7 @@ def _paths_of_bundles(scene: Scene, folder: str) -> list[str]:
 
 
 def _instances_as_json(scene: Scene, names: list[str]) -> list[dict[str, object]]:
-    """The instances of a scene, whose bundles have these names."""
+    """Return the instances of a scene as JSON; `names` are those of its bundles."""
     bundles = scene.instance_bundle.tolist()
     positions = scene.positions.tolist()
     quaternions = scene.quaternions.tolist()
@@ -273,7 +274,8 @@ _POSE = ("position", "quaternion", "scale")
 
 
 def _instance_of(node: Node, subjects: _Subjects, scene: Scene) -> _Instance:
-    """An instance of a scene file, whose scene takes the axis that is up from it."""
+    """Return an instance of a scene file; if it names an axis that is up, its scene
+    takes that axis."""
     optional = ("bundle", "scene", *_POSE, "matrix", "up", "importance", "opacity", "tint")
     fields = node.fields((), optional)
     if ("bundle" in fields) == ("scene" in fields):
@@ -415,7 +417,7 @@ def _importance(node: Node) -> float:
 
 
 def _scene_of(instances: list[_Instance]) -> Scene:
-    """A scene of the instances, whose ids are their numbers in the file."""
+    """Return a scene of the instances, whose ids are their numbers in the file."""
     scene = Scene()
     _add_all(scene, instances)
     return scene
@@ -502,8 +504,8 @@ def _read_flat_layout(
 
 
 def _read_blender_cameras(nodes: Iterable[Node], keys: tuple[str, ...]) -> dict[str, Camera]:
-    """Cameras in Blender's convention by name; if names repeat, each is prefixed with
-    its number."""
+    """Return cameras in Blender's convention by name; if names repeat, each is prefixed
+    with its number."""
     names = []
     cameras = []
     for node in nodes:

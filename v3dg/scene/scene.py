@@ -281,7 +281,7 @@ class Scene:
         if matrix is not None:
             positions, quaternions, scales = parts_of(matrix, positions, quaternions, scales)
         if up is not None:
-            check("up", quaternions is not None, "quaternions or a matrix with it, got neither")
+            check("up", quaternions is not None, "quaternions or a matrix beside up, got neither")
         parts = {"positions": positions, "quaternions": quaternions, "scales": scales}
         with _lock:
             rows = self._ids(ids)
@@ -428,7 +428,7 @@ class Scene:
         return state.positions, state.quaternions, state.scales
 
     def _ids(self, ids: Array | None) -> npt.NDArray[np.int64]:
-        """Checked ids of instances; those of all instances for None."""
+        """Return checked ids of instances; for None, those of all instances."""
         count = len(self)
         if ids is None:
             return np.arange(count)
@@ -454,8 +454,8 @@ class Scene:
 
 
 def turn_of(subject: Scene | Bundle, up: Axis) -> Floats:
-    """(4,) w x y z that turns what is up in a scene or a bundle to an axis; ValueError
-    if there is no such axis."""
+    """Return the quaternion (4,) w x y z that turns the axis that is up in a scene or a
+    bundle to another one; ValueError if there is no such axis."""
     one_of(up, "up", AXES)
     if isinstance(subject, Bundle):
         return turn_between(up_of_bundle(subject), up)
@@ -467,7 +467,8 @@ Subject: TypeAlias = Scene | Bundle | Gaussians
 
 
 def _bundles_of(bundle: Bundle | str | os.PathLike[str] | Sequence[Bundle]) -> list[Bundle]:
-    """The bundles of a list or a tuple, or a single one, which may be a file."""
+    """Return the bundles of a list or a tuple, or a single bundle; each may be given by
+    its file."""
     if isinstance(bundle, str | os.PathLike):
         return [Bundle.open(bundle)]
     bundles: list[Bundle] = []

@@ -68,7 +68,7 @@ class Hello(msgspec.Struct, tag="hello"):
 
 
 class Home(msgspec.Struct):
-    """What a tab first shows, in a window of a certain aspect.
+    """The first view of a tab in a window of a certain aspect.
 
     Attributes:
         focus: The point that orbits go around.

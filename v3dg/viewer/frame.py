@@ -211,11 +211,12 @@ class SceneView:
 
     @functools.cached_property
     def framing(self) -> Framing:
-        """Where the scene is, and from where it is first looked at."""
+        """The framing of the scene, which determines its first views."""
         return frame_subject(self.scene)
 
     def first_view(self, up: VectorLike, aspect: float) -> tuple[View, Floats]:
-        """The view that a tab begins with, and the (3,) point that orbits go around."""
+        """Return the view that a tab begins with, and the (3,) point that orbits go
+        around."""
         height = _FIRST_PIXELS
         camera = self.framing.camera(up, max(round(aspect * height), 1), height)
         return replace(View.of_camera(camera), aspect=aspect), self.framing.focus(camera)
@@ -484,7 +485,7 @@ def _paint(drawn: _Drawn, settings: Settings) -> _Painting:
 
 
 def _on_background(color: _Float32, alpha: _Float32, settings: Settings) -> _Float32:
-    """(H, W, 3) premultiplied colours over the background."""
+    """Return (H, W, 3) premultiplied colours over the background."""
     colors = np.asarray(_device.to_host(color))
     if not any(settings.background):
         return colors

@@ -14,7 +14,7 @@ _DEFAULT_FOV = 45.0
 
 @dataclass(frozen=True)
 class LinkedPlace:
-    """Where the camera of a link is.
+    """The camera of a link.
 
     Attributes:
         view: The camera; its aspect is 1, because a link has none.
@@ -53,7 +53,7 @@ def read_link(link: str) -> LinkedPlace:
 
 
 def _numbers(values: dict[str, str], name: str, count: int) -> list[float]:
-    """The numbers of a value, separated by commas."""
+    """Return the numbers of a value, separated by commas."""
     text = values.get(name)
     expected = "an address that the viewer's page has in its address bar, with"
     check("link", text is not None, f"{expected} at= and turn= behind #, got none of {name}=")

@@ -35,7 +35,7 @@ _STEPS_AN_OCTAVE = 4
 
 
 class Draft(NamedTuple):
-    """How to draw while the camera moves.
+    """The quality of pictures while the camera moves.
 
     Attributes:
         size: Width and height, px.

@@ -132,7 +132,8 @@ class Site:
         self._start()
 
     def _allowed_folder(self, folder: Path | None) -> Path | None:
-        """The folder that pages may write to; None if other machines can connect."""
+        """Return the folder that pages may write to; None if other machines can
+        connect."""
         if folder is None or self.is_secret:
             return None
         return Path(folder).absolute()
@@ -188,9 +189,8 @@ class Site:
 
     async def _talk(self, connection: ServerConnection) -> None:
         """Serve one tab while it is open."""
-        from v3dg.viewer.tab import Tab
-
         from v3dg.viewer.answers import encode
+        from v3dg.viewer.tab import Tab
 
         def send(data: str | bytes) -> None:
             coroutine = connection.send(data)

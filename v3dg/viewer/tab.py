@@ -152,7 +152,7 @@ class Tab:
         )
 
     def _homes(self) -> list[answers.Home]:
-        """First views for windows from narrow to wide."""
+        """Return the first views for windows from narrow to wide."""
         homes = []
         for aspect in _HOME_ASPECTS:
             view, focus = self.scene_view.first_view(self._up, aspect)

@@ -88,27 +88,27 @@ class Measure:
         "merged",
         "peers",
     )
-    """What is measured; "all" is every gaussian at one sample a pixel."""
+    """Methods to measure; "all" draws every gaussian with one sample per pixel."""
     known: tuple[Path, ...] = ()
     """Recorded results, from which rows are taken that are not measured here."""
     percents: tuple[float, ...] = PERCENTS
-    """Counts, in percent of the asset's."""
+    """Counts of gaussians, in percent of the asset's count."""
     factors: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-    """Sizes, in those at which a level is at home."""
+    """Picture sizes, relative to the native size of each level."""
     widest: int = 512
     """px of a side of the pictures that are compared."""
     views: int = 4
     device: Literal["auto", "cpu", "cuda"] = "auto"
     build: v3dg.BuildConfig = field(default_factory=v3dg.BuildConfig)
-    """How ours are built; merging alone is the same without a step."""
+    """Settings of our levels; "merged" has the same settings, without fitting steps."""
     refine: int = 0
-    """Steps of "refined": ours, refined; without any it is left out."""
+    """Refinement steps of the method "refined"; with 0 steps it is left out."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What is drawn: gaussians completely, or a cut of a bundle; and its weight in the
-    error of its method."""
+    """The subject of a picture: all gaussians, or a cut of a bundle; and the weight of
+    the picture in the error of its method."""
 
     method: str
     subject: v3dg.Gaussians | v3dg.Bundle

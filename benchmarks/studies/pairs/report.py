@@ -33,10 +33,11 @@ _ABOUT = """# Levels at equal counts and several sizes
 
 Written by `python -m benchmarks.studies.pairs report` from recorded JSON, never by hand.
 
-A level is at home at 2 px² a gaussian: of the footprint of the object's ball, or of a scene's picture, for
-as large a share of them as is in it of the asset. (Groups of a bundle are fitted at 2 px² of their own
-balls, which overlap and lie behind each other: they are at home at a quarter to half the size that is called
-1 here.) Each level is drawn at several times that size, along a side, by the same renderer, and compared
+The native size of a level is 2 px² per gaussian. For an object, the area is the footprint of its ball. For a
+scene, it is the whole picture, and as large a share of the level's gaussians counts as of the asset's
+gaussians is in the picture. (Groups of a bundle are fitted at 2 px² per gaussian of their own balls, which
+overlap and hide each other, so their native size is a quarter to half of the size that is called 1 here.)
+Each level is drawn at several times that size, along a side, by the same renderer, and compared
 with every gaussian at 4 x 4 samples a pixel: FLIP (67 pixels per degree), PSNR and SSIM, means of {views}
 views, windows of at most {widest} px. *Ours* is the finest cut with at most as many gaussians as the other
 level has (of a scene, as many as it has in each picture), interpolated between two cuts where groups are too
@@ -259,7 +260,8 @@ def plot(rows: Sequence[Row], path: Path) -> None:
 
 
 def _draw(panel: Any, rows: Sequence[Row], key: str) -> None:
-    """Plot the points of each method, at one size, at the counts of others' levels."""
+    """Plot one curve per method from rows of one picture size, at the counts of
+    gaussians at which another tool has a level."""
     counts = {
         row["level"]: row["gaussians"] for row in rows if row["method"] not in (*_OURS, "all")
     }

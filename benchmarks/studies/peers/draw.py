@@ -118,7 +118,8 @@ def differentiate(draw: Callable[[Raw, Camera, float], Any]) -> Step:
 
 
 def v3dg_renderer(min_transmittance: float | None) -> Prepare:
-    """With None, scenes and bundles stop as by default, and assets as in gsplat."""
+    """Return the renderer of v3dg. If `min_transmittance` is None, pixels of scenes and
+    bundles stop at the default transmittance, and those of assets as in gsplat."""
 
     def prepare(subject: Subject, filter_px2: float) -> Callable[[Camera], Draw]:
         whole, device = subject.whole(filter_px2), subject.gaussians.means.device.type

@@ -380,7 +380,7 @@ def _seats(
 
 
 def _leaf_colours(shape: _Kind, twigs: NDArray[np.int64], rng: np.random.Generator) -> Array:
-    """A colour for each leaf; leaves of one twig are alike."""
+    """Return a colour for each leaf; leaves of one twig are alike."""
     k = len(twigs)
     of_twig = rng.random(int(twigs.max(initial=0)) + 1)[twigs]
     x = np.clip(0.5 * of_twig + 0.5 * rng.random(k) + 0.10 * rng.standard_normal(k), 0, 1)
