@@ -239,12 +239,13 @@ class BoundSceneFrame {
 // Draws the gaussians of one asset, which have no levels.
 class BoundAssetFrame {
   public:
-    explicit BoundAssetFrame(const py::object& model_object) {
+    BoundAssetFrame(const py::object& model_object, float filter_px2, bool antialiased) {
         const auto& model = held<BoundModel>(model_object, "model");
         if (model.has_codes())
             throw py::value_error("model: expected one of rows, got one of codes");
         const Work work(model.device());
-        frame_ = work.backend().make_asset_frame(model.handle(), work);
+        const Appearance<float> appearance{filter_px2, antialiased, false};
+        frame_ = work.backend().make_asset_frame(model.handle(), appearance, work);
     }
 
     std::unique_ptr<BoundDrawing> draw(const BoundCamera& camera, const Shade& shade,
@@ -336,7 +337,8 @@ void bind_frame(py::module_& m) {
              "there.");
     py::class_<BoundAssetFrame>(m, "AssetFrame",
                                 "Draws gaussians without levels on the device that they are on.")
-        .def(py::init<py::object>(), "model"_a)
+        .def(py::init<py::object, float, bool>(), "model"_a, py::kw_only(), "filter_px2"_a = 0.0f,
+             "antialiased"_a = false)
         .def("draw", &BoundAssetFrame::draw, "camera"_a, "shade"_a, "stop"_a = nullptr);
 }
 

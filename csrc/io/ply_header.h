@@ -47,7 +47,8 @@ struct PlyElement {
 struct PlyHeader {
     PlyEncoding encoding = PlyEncoding::ascii;
     std::vector<PlyElement> elements;
-    size_t size = 0;  // bytes, including the end of the line end_header
+    std::vector<std::string> comments;  // without the word, and without space around them
+    size_t size = 0;                    // bytes, including the end of the line end_header
 };
 
 // Throws std::system_error, or PlyError if the path is not a regular file.
