@@ -52,13 +52,19 @@ def rotation_from_quaternion(quaternions: Floats) -> Floats:
 
 def quaternion_from_rotation(rotation: Floats) -> tuple[float, float, float, float]:
     """Unit quaternion w x y z with w >= 0 of a (3, 3) rotation."""
+    w, x, y, z = quaternions_from_rotations(np.asarray(rotation, np.float64)[None])[0].tolist()
+    return w, x, y, z
+
+
+def quaternions_from_rotations(rotations: Floats) -> Floats:
+    """Unit quaternions (I, 4) w x y z with w >= 0 of rotations (I, 3, 3)."""
     # The eigenvector of Bar-Itzhack's symmetric matrix: no case distinctions, stable
     # for any angle.
-    r = np.asarray(rotation, np.float64)
-    symmetric = np.full((4, 4), np.trace(r))
-    symmetric[1:, 0] = [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]
-    symmetric[1:, 1:] = r + r.T - np.trace(r) * np.eye(3)
-    w, x, y, z = np.linalg.eigh(symmetric, UPLO="L")[1][:, -1].tolist()
-    if w < 0:
-        return -w, -x, -y, -z
-    return w, x, y, z
+    trace = np.trace(rotations, axis1=1, axis2=2)
+    symmetric = np.broadcast_to(trace[:, None, None], (len(rotations), 4, 4)).copy()
+    skew = rotations - rotations.transpose(0, 2, 1)
+    symmetric[:, 1:, 0] = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
+    trace_matrix = trace[:, None, None] * np.eye(3)
+    symmetric[:, 1:, 1:] = rotations + rotations.transpose(0, 2, 1) - trace_matrix
+    wxyz = np.linalg.eigh(symmetric, UPLO="L")[1][..., -1]
+    return np.where(wxyz[:, :1] < 0, -wxyz, wxyz)
