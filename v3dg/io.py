@@ -23,7 +23,7 @@ _READERS: dict[str, Callable[[AnyPath], AssetFile]] = {
     ".splat": splat.open_file,
     ".ksplat": ksplat.open_file,
     ".spz": spz.open_file,
-    ".glb": gltf.open_file,
+    **dict.fromkeys((".glb", ".gltf"), gltf.open_file),
     ".hier": hier.open_file,
     **dict.fromkeys(usd.SUFFIXES, usd.open_file),
     ".sog": sog.open_file,
@@ -43,6 +43,7 @@ _WRITERS: dict[str, Callable[[AnyPath, Gaussians], None]] = {
 _FILES: dict[str, Callable[[pathlib.Path], list[pathlib.Path]]] = {
     "lod-meta.json": streamed_sog.files,
     "meta.json": sog.files,
+    ".gltf": gltf.files,
     "": lambda path: [path],
 }
 
@@ -72,8 +73,9 @@ def read_asset(path: AnyPath) -> Gaussians:
       those of length zero, which stay as they are. Values that are not finite are
       passed on. Little more memory is needed than for the result. A compressed `.ply`,
       of PlayCanvas and SuperSplat, is recognised by its content.
-    - `.glb`, glTF with KHR_gaussian_splatting, also compressed as `.spz`; the leaves of
-      `.hier`, of H3DG.
+    - `.glb` and `.gltf`, glTF with KHR_gaussian_splatting, also compressed as `.spz`:
+      the gaussians of the scene, where its nodes place them; the leaves of `.hier`, of
+      H3DG.
     - `.usd`, `.usda` and `.usdc`, OpenUSD, with the extra `usd`, whose library bounds
       what is read.
     - `.splat`, of antimatter15; `.ksplat`, of mkkellogg; `.spz`, of Niantic, version 1
@@ -81,6 +83,9 @@ def read_asset(path: AnyPath) -> Gaussians:
       zip; the finest level of streamed SOG, by its `lod-meta.json`.
     - `.pt` and `.ckpt`, checkpoints of gsplat's trainer and of nerfstudio's splatfacto,
       from which nothing but tensors is taken.
+
+    Whether the gaussians were trained with antialiasing is read from the files that can
+    say it, see `Gaussians.antialiased`.
 
     With the extra `fsspec`, the file may be at a URL, which is fetched once per
     process, unless it refers to other files.
@@ -95,7 +100,8 @@ def read_asset(path: AnyPath) -> Gaussians:
             IsADirectoryError, ...).
     """
     file = open_asset(path)
-    return file.read(0, file.num_gaussians)
+    gaussians = file.read(0, file.num_gaussians)
+    return gaussians.trained(antialiased=file.declared.antialiased)
 
 
 def loaded(asset: Gaussians | AnyPath) -> Gaussians:
@@ -166,6 +172,7 @@ def write_asset(
     path: AnyPath,
     gaussians: Gaussians | AnyPath,
     *,
+    antialiased: bool | None = None,
     encoding: PlyEncoding = "binary_little_endian",
     version: Literal[2, 3, 4] | None = None,
 ) -> None:
@@ -189,6 +196,9 @@ def write_asset(
 
     Args:
         gaussians: The asset, or its file.
+        antialiased: Whether the gaussians were trained with antialiasing, which the
+            file then declares (docs/formats.md); None for what the gaussians say, see
+            `Gaussians.trained`.
         encoding: Encoding of a `.ply`; other formats have only one.
         version: Version of a `.spz`; 3 if None. Version 2 is for viewers from before
             2025, 4 for those since 2026.
@@ -201,6 +211,8 @@ def write_asset(
     """
     gaussians = loaded(gaussians)
     check_type("gaussians", gaussians, Gaussians, "Gaussians")
+    if antialiased is not None:
+        gaussians = gaussians.trained(antialiased=antialiased)
     write = _by_name(path, _WRITERS)
     if version is not None:
         check(

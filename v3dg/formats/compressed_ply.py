@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core, _files
-from v3dg.formats import _packing
+from v3dg.formats import _packing, _ply_comments
 from v3dg.formats._packing import SH_C0, SQRT2, Floats, assemble
 from v3dg.formats._reading import AnyPath, AssetFile, File, check
 from v3dg.gaussians import Gaussians
@@ -84,7 +84,8 @@ def open_file(path: AnyPath) -> AssetFile:
 
         return assemble(last - first, degree, decode)
 
-    return AssetFile(path, count, degree, read_rows)
+    declared = _ply_comments.declared_by(_core.ply_comments(path))
+    return AssetFile(path, count, degree, read_rows, declared=declared)
 
 
 def _decoded(
@@ -137,7 +138,8 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
         extent = np.where(high > low, high.astype(np.float64) - low, 1.0)[chunks]
         fractions[kind] = np.clip((array - low[chunks]) / extent, 0.0, 1.0)
     with _files.replacing(path) as temporary, open(temporary, "wb") as file:
-        file.write(_header(count, num_chunks, num_rest))
+        comments = _ply_comments.comments_for(host.antialiased)
+        file.write(_header(count, num_chunks, num_rest, comments))
         file.write(np.concatenate(ranges, axis=1).astype("<f4").tobytes())
         for block in _packing.blocks(count):
             rows = order[block]
@@ -157,11 +159,12 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
                 )
 
 
-def _header(count: int, num_chunks: int, num_rest: int) -> bytes:
+def _header(count: int, num_chunks: int, num_rest: int, comments: Sequence[str]) -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
         "comment made by v3dg",
+        *(f"comment {comment}" for comment in comments),
         f"element chunk {num_chunks}",
     ]
     lines += [f"property float {name}" for kind in _RANGES for name in _range_names(kind)]

@@ -4,7 +4,7 @@ import os
 from typing import Literal
 
 from v3dg import _core, _files
-from v3dg.formats import compressed_ply
+from v3dg.formats import _ply_comments, compressed_ply
 from v3dg.formats._reading import AnyPath, AssetFile
 from v3dg.gaussians import Gaussians
 
@@ -24,7 +24,8 @@ def open_file(path: AnyPath) -> AssetFile:
     def read(first: int, last: int) -> Gaussians:
         return Gaussians(*file.read(first, last))
 
-    return AssetFile(path, file.num_gaussians, file.sh_degree, read)
+    declared = _ply_comments.declared_by(_core.ply_comments(name))
+    return AssetFile(path, file.num_gaussians, file.sh_degree, read, declared=declared)
 
 
 def write(
@@ -34,4 +35,5 @@ def write(
     host = gaussians.numpy()
     arrays = (host.means, host.quats, host.scales, host.opacities, host.sh)
     with _files.replacing(path) as temporary:
-        _core.ply_write(temporary, *arrays, encoding=encoding)
+        comments = _ply_comments.comments_for(host.antialiased)
+        _core.ply_write(temporary, *arrays, encoding=encoding, comments=comments)

@@ -13,6 +13,7 @@ import math
 import os
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -20,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core, _files
-from v3dg._json import Node, parse_json
+from v3dg._json import Node, json_text, parse_json
 from v3dg._version import __version__
 from v3dg.formats import _packing
+from v3dg.formats._declared import Declared
 from v3dg.formats._packing import SQRT2, Floats, assemble, opacity_bytes
 from v3dg.formats._reading import (
     Archive,
@@ -45,6 +47,15 @@ _FREE_PIXELS = 1 << 16
 _PALETTE_COLUMNS = 64  # entries of the palette side by side in its picture
 _MAX_LOG = 88.0  # about the log of the largest float32
 
+# Models of splat-transform, and whether they are antialiased.
+_MODELS: dict[str, bool | None] = {"default": False, "antialiased": True, "2dgs": None}
+_KEYS = frozenset(
+    {
+        *("version", "count", "asset", "antialias", "model"),
+        *("means", "scales", "quats", "sh0", "shN"),
+    }
+)
+
 # Number of pictures of each part of meta.json.
 _PARTS = {"means": 2, "scales": 1, "quats": 1, "sh0": 1, "shN": 2}
 
@@ -57,8 +68,28 @@ def open_file(path: str | os.PathLike[str]) -> AssetFile:
             text = file.read()
         else:
             text = Archive(path, file).read("meta.json")
-    count, degree = _size(_meta(path, text))
-    return whole_file(path, count, degree, read, files(path))
+    meta = _meta(path, text)
+    count, degree = _size(meta)
+    opened = whole_file(path, count, degree, read, files(path))
+    return replace(opened, declared=_declared(meta))
+
+
+def _declared(meta: dict[str, Node]) -> Declared:
+    """What meta.json declares: `antialias`, of the specification, and `model`, of
+    splat-transform, which counts where there are both."""
+    antialiased = None
+    notes = [f"{json_text(name)} of meta.json is not read." for name in meta if name not in _KEYS]
+    if "antialias" in meta:
+        antialiased = meta["antialias"].value
+        if not isinstance(antialiased, bool):
+            raise meta["antialias"].error("true or false")
+    if "model" in meta:
+        model = meta["model"].text()
+        if model in _MODELS:
+            antialiased = _MODELS[model]
+        else:
+            notes.append(f"The model {json_text(model)} of meta.json is unknown, and is not used.")
+    return Declared(antialiased=antialiased, notes=tuple(notes))
 
 
 def read(path: str | os.PathLike[str], claims: Claims | None = None) -> Gaussians:
@@ -303,6 +334,10 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_table.tolist(), "files": ["sh0.webp"]},
     }
+    if gaussians.antialiased is not None:
+        meta["antialias"] = gaussians.antialiased
+    if gaussians.antialiased:
+        meta["model"] = "antialiased"
     if gaussians.sh_degree:
         part, centroids, labels = _encoded_palette(gaussians)
         meta["shN"] = part

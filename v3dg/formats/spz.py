@@ -12,6 +12,7 @@ import math
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from v3dg import _files
 from v3dg.formats import _packing
+from v3dg.formats._declared import Declared
 from v3dg.formats._packing import SQRT2, Floats, assemble
 from v3dg.formats._reading import (
     AnyPath,
@@ -36,18 +38,29 @@ _MAGIC = 0x5053474E  # NGSP
 _HEADER = struct.Struct("<IIIBBBB")
 _ZSTD_HEADER_BYTES = 32
 _STREAM_SIZES = struct.Struct("<QQ")
+MAX_START = 1 << 16
+"""Bytes that contain the header, also after the optional fields of a gzip header."""
 _MAX_TRAILER = 1 << 20  # bytes after the attributes, for extensions of vendors
-# Bytes that contain the header, also after the optional fields of a gzip header.
-_MAX_START = 1 << 16
 _COLOR_SCALE = 0.15
 _LARGEST_FIXED = (1 << 23) - 1
+# Bits of the flags.
+_ANTIALIASED = 1
+_HAS_EXTENSIONS = 2
 
 
-class _Header(NamedTuple):
+class Header(NamedTuple):
+    """What the first bytes of a file say."""
+
     version: int
     sh_degree: int
     fraction_bits: int  # fraction bits of the fixed-point positions
     num_gaussians: int
+    flags: int
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether the gaussians were trained with antialiasing."""
+        return bool(self.flags & _ANTIALIASED)
 
     @property
     def section_bytes(self) -> list[int]:
@@ -67,12 +80,27 @@ def open_file(path: AnyPath) -> AssetFile:
     """Open a `.spz` file; all of it is read with its first rows."""
     claims = Claims()
     with claims.open(path) as file:
-        header = file.read(_MAX_START)
+        header = header_of(path, file.read(MAX_START), claims)
+    opened = whole_file(path, header.num_gaussians, header.sh_degree, read)
+    declared = Declared(antialiased=header.antialiased, notes=flag_notes(header))
+    return replace(opened, declared=declared)
+
+
+def header_of(path: AnyPath, start: bytes | memoryview, claims: Claims) -> Header:
+    """The header in the first `MAX_START` bytes of a `.spz` file's content."""
+    header = bytes(start)
     if header[:2] == b"\x1f\x8b":
         with value_errors(path, "a gzip stream that is not damaged"):
             header = zlib.decompressobj(31).decompress(header, _HEADER.size)
-    checked = _checked_header(path, header, claims)
-    return whole_file(path, checked.num_gaussians, checked.sh_degree, read)
+    return _checked_header(path, header, claims)
+
+
+def flag_notes(header: Header) -> tuple[str, ...]:
+    """Sentences about flags that were not understood."""
+    unknown = header.flags & ~(_ANTIALIASED | _HAS_EXTENSIONS)
+    if not unknown:
+        return ()
+    return (f"Its flags {unknown:#04x} are unknown, and are not read.",)
 
 
 def read(path: AnyPath) -> Gaussians:
@@ -131,7 +159,10 @@ def encode(host: Gaussians, version: int = 3) -> Iterator[bytes]:
         lambda rows: rotations(host.quats[rows]),
         lambda rows: _bytes(host.sh[rows, 1:] * 128.0 + 128.0),
     ]
-    header = _HEADER.pack(_MAGIC, version, len(host), host.sh_degree, bits, 0, 0)
+    flags = 0
+    if host.antialiased:
+        flags |= _ANTIALIASED
+    header = _HEADER.pack(_MAGIC, version, len(host), host.sh_degree, bits, flags, 0)
     if version == 4:
         if not host.sh_degree:
             del sections[-1]
@@ -179,7 +210,7 @@ def _rotation_words(quats: Floats) -> bytes:
     return words.astype("<u4").tobytes()
 
 
-def _decode(header: _Header, sections: list[memoryview]) -> Gaussians:
+def _decode(header: Header, sections: list[memoryview]) -> Gaussians:
     count = header.num_gaussians
     positions = np.frombuffer(sections[0], "u1")
     opacities, colors, scales, rotations, higher_sh = (
@@ -221,20 +252,20 @@ def _quats(rotations: NDArray[np.uint8]) -> Floats:
     return np.roll(_packing.quats_from_three(three, words >> 30), 1, axis=1)
 
 
-def _checked_header(path: AnyPath, header: bytes, claims: Claims) -> _Header:
+def _checked_header(path: AnyPath, header: bytes, claims: Claims) -> Header:
     check(path, len(header) >= _HEADER.size, f"a header of {_HEADER.size} bytes, got {len(header)}")
-    magic, version, count, degree, fraction_bits, _, _ = _HEADER.unpack_from(header)
+    magic, version, count, degree, fraction_bits, flags, _ = _HEADER.unpack_from(header)
     check(path, magic == _MAGIC, f".spz, which begins with NGSP, got {header[:4].hex(' ')}")
     check(path, 1 <= version <= 4, f".spz of version 1 to 4, got {version}")
     check(path, degree <= 3, f"SH degree 0 to 3, got {degree}")
     check(path, fraction_bits <= 24, f"at most 24 fraction bits, got {fraction_bits}")
     claims.add(path, count)
-    return _Header(version, degree, fraction_bits, count)
+    return Header(version, degree, fraction_bits, count, flags)
 
 
 def _sections_of_gzip(
     path: AnyPath, content: bytes, claims: Claims
-) -> tuple[_Header, list[memoryview]]:
+) -> tuple[Header, list[memoryview]]:
     stream = zlib.decompressobj(31)
     with value_errors(path, "a gzip stream that is not damaged"):
         start = stream.decompress(content, _HEADER.size)
@@ -257,7 +288,7 @@ def _sections_of_gzip(
 
 def _sections_of_zstd(
     path: AnyPath, content: bytes, claims: Claims
-) -> tuple[_Header, list[memoryview]]:
+) -> tuple[Header, list[memoryview]]:
     import zstandard
 
     num_bytes = len(content)
