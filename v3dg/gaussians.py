@@ -21,6 +21,10 @@ Array: TypeAlias = (
     Any  # numpy.ndarray or torch.Tensor; a union would make every use of a field a type error
 )
 
+TRAINED_FILTER_PX2 = 0.3
+"""Variance of the filter that trainers draw with, px²: that of the code of 3DGS and of
+gsplat, with antialiasing and without."""
+
 _NUM_SH = {1: 0, 4: 1, 9: 2, 16: 3}  # coefficients a channel -> degree
 
 

@@ -27,7 +27,7 @@ def rasterize(
     camera: Camera,
     *,
     filter_px2: float = 0.0,
-    antialiased: bool = False,
+    antialiased: bool | None = None,
     background: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Image:
     """Draw gaussians with the meaning of 3D Gaussian Splatting, as gsplat 1.5 defines
@@ -49,7 +49,8 @@ def rasterize(
             assets that were trained with the original 3DGS code as they were trained.
         antialiased: Scale opacities by sqrt(det before / det after the filter)
             (Mip-Splatting, eq. 9), so that the filter spreads a gaussian without adding
-            to it.
+            to it; None if the gaussians are said to be trained so
+            (`Gaussians.antialiased`).
         background: Three numbers, or a tensor of them.
 
     Raises:
@@ -64,13 +65,15 @@ def rasterize(
     check_type("camera", camera, Camera, "a Camera")
     filter_px2 = real(filter_px2, "filter_px2", "a variance of at least 0 px²", 0)
     background_color = color(background, "background")
+    if antialiased is None:
+        antialiased = bool(getattr(gaussians, "antialiased", None))
     means = gaussians.means
     if isinstance(means, np.ndarray):
         drawn = _core.rasterize(
             gaussians.rows,
             camera.core,
             filter_px2=filter_px2,
-            antialiased=bool(antialiased),
+            antialiased=antialiased,
             background=background_color,
             with_depth=True,
             keep_tape=False,
@@ -81,7 +84,7 @@ def rasterize(
     check_device(means)
     arrays = [means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh]
     arrays.append(torch.as_tensor(background, dtype=means.dtype))
-    settings = DrawSettings(filter_px2=filter_px2, antialiased=bool(antialiased))
+    settings = DrawSettings(filter_px2=filter_px2, antialiased=antialiased)
     return Image(*draw_views([camera.core], settings, [[array] for array in arrays]))
 
 

@@ -315,10 +315,15 @@ class Bundle:
         return self.read_page(page).subset(slice(start, stop))
 
     def level_gaussians(self, level: int) -> Gaussians:
-        """Gaussians of one level; reads the pages of that level only."""
+        """Gaussians of one level; reads the pages of that level only. Those of level 0
+        are antialiased if the asset is."""
         clusters = self.level_range(level)
         first, last = np.searchsorted(self._layout.first_cluster, [clusters.start, clusters.stop])
-        return self._pages.read(int(first), int(last))
+        gaussians = self._pages.read(int(first), int(last))
+        table = self.clusters.antialiased[clusters.start : clusters.stop]
+        if level == 0 and len(table) and table.all():
+            return gaussians.trained(antialiased=True)
+        return gaussians
 
     def info(self) -> JsonObject:
         """Describe the bundle in JSON values, without reading gaussians; sizes are

@@ -22,7 +22,7 @@ from v3dg.cameras import Axis
 from v3dg.cleaning import AssetWarning, describe
 from v3dg.cli import _common
 from v3dg.cli._views import ask_up, is_at_terminal
-from v3dg.gaussians import Gaussians
+from v3dg.gaussians import Gaussians, common
 from v3dg.io import SUFFIXES, open_asset, run_files
 from v3dg.levels import BuildConfig, build_file, levels_path
 from v3dg.levels.scheduler import SchedulerError
@@ -58,6 +58,9 @@ class Build(_common.OnDevice):
     up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
     """The axis that is up in the asset, which the bundle records; if it is unknown, a
     user at a terminal is asked."""
+    antialiased: Annotated[Literal["yes", "no"] | None, _common.option("{yes,no}")] = None
+    """Whether the asset was trained with antialiasing; by default what its file says,
+    or else no."""
     seed: int = 0
     """Seed of random numbers; the same seed gives the same file, byte for byte, on the
     same kind of device, with any number of threads."""
@@ -301,7 +304,14 @@ def _build(
     status = "kept"
     if is_built:
         status = "built"
+    notes = []
+    if options.antialiased is not None:
+        declared = common([open_asset(path).declared.antialiased for path in paths])
+        contradiction = _config_of(options).contradiction(antialiased=declared)
+        if contradiction:
+            notes.append(f"{shown(paths[0])}: {contradiction}")
     return {
+        "notes": notes,
         "asset": asset,
         "output": str(output),
         "status": status,
@@ -318,11 +328,6 @@ def _build(
 def _build_file(
     options: Build, paths: Sequence[Path], output: Path, executor: Executor | None
 ) -> tuple[Bundle, bool]:
-    config = BuildConfig()
-    if options.config == "paper":
-        config = BuildConfig.paper()
-    if options.cluster_size is not None:
-        config = replace(config, cluster_size=options.cluster_size)
     unusable: Literal["drop", "refuse"] = "drop"
     if options.strict:
         unusable = "refuse"
@@ -331,7 +336,7 @@ def _build_file(
         return build_file(
             paths,
             output,
-            config=config,
+            config=_config_of(options),
             seed=options.seed,
             progress=not options.quiet,
             device=options.device,
@@ -342,6 +347,17 @@ def _build_file(
             codec=options.codec,
             up=options.up,
         )
+
+
+def _config_of(options: Build) -> BuildConfig:
+    config = BuildConfig()
+    if options.config == "paper":
+        config = BuildConfig.paper()
+    if options.cluster_size is not None:
+        config = replace(config, cluster_size=options.cluster_size)
+    if options.antialiased is not None:
+        config = replace(config, asset_antialiased=options.antialiased == "yes")
+    return config
 
 
 @contextmanager
@@ -380,4 +396,4 @@ def _lines(result: JsonObject) -> list[str]:
     ]
     if result["dropped"]:
         lines.append("left out: " + describe(result["dropped"]))
-    return lines
+    return [*lines, *result["notes"]]

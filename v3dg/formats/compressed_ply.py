@@ -138,8 +138,7 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
         extent = np.where(high > low, high.astype(np.float64) - low, 1.0)[chunks]
         fractions[kind] = np.clip((array - low[chunks]) / extent, 0.0, 1.0)
     with _files.replacing(path) as temporary, open(temporary, "wb") as file:
-        comments = _ply_comments.comments_for(host.antialiased)
-        file.write(_header(count, num_chunks, num_rest, comments))
+        file.write(_header(host, num_chunks))
         file.write(np.concatenate(ranges, axis=1).astype("<f4").tobytes())
         for block in _packing.blocks(count):
             rows = order[block]
@@ -159,7 +158,10 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
                 )
 
 
-def _header(count: int, num_chunks: int, num_rest: int, comments: Sequence[str]) -> bytes:
+def _header(host: Gaussians, num_chunks: int) -> bytes:
+    count = len(host)
+    num_rest = 3 * (host.sh.shape[1] - 1)
+    comments = _ply_comments.comments_for(host.antialiased)
     lines = [
         "ply",
         "format binary_little_endian 1.0",

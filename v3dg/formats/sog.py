@@ -323,7 +323,6 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
     }
     meta: dict[str, object] = {
         "version": 2,
-        "asset": {"generator": f"v3dg {__version__}"},
         "count": count,
         "means": {
             "mins": low.tolist(),
@@ -333,17 +332,24 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
         "scales": {"codebook": scale_table.tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_table.tolist(), "files": ["sh0.webp"]},
+        **_declarations(gaussians),
     }
-    if gaussians.antialiased is not None:
-        meta["antialias"] = gaussians.antialiased
-    if gaussians.antialiased:
-        meta["model"] = "antialiased"
     if gaussians.sh_degree:
         part, centroids, labels = _encoded_palette(gaussians)
         meta["shN"] = part
         contents["shN_centroids.webp"] = centroids
         contents["shN_labels.webp"] = picture(labels & 255, labels >> 8, np.zeros(count, np.uint8))
     return {"meta.json": json.dumps(meta, separators=(",", ":")).encode(), **contents}
+
+
+def _declarations(gaussians: Gaussians) -> dict[str, object]:
+    """What meta.json says of gaussians beside their numbers."""
+    declarations: dict[str, object] = {"asset": {"generator": f"v3dg {__version__}"}}
+    if gaussians.antialiased is not None:
+        declarations["antialias"] = gaussians.antialiased
+    if gaussians.antialiased:
+        declarations["model"] = "antialiased"
+    return declarations
 
 
 def _encoded_means(

@@ -156,14 +156,15 @@ class _FileBuild:
     def run(self, source: AbstractContextManager[Leaves], *, resume: bool) -> tuple[Bundle, bool]:
         """Keep or build the bundle; returns it, and whether it was built."""
         with source as leaves:
-            if resume and self._is_finished(leaves):
+            config = leaves.settings(self.config)
+            if resume and self._is_finished(leaves, config):
                 with suppress(RuntimeError):  # another build has begun to write there
                     discard_levels(self.levels_path)
                 return Bundle.open(self.bundle_path), False
             bundle = build_into(
                 self.levels_path,
                 leaves,
-                self.config,
+                config,
                 self.seed,
                 self.devices,
                 self.progress,
@@ -175,13 +176,13 @@ class _FileBuild:
             )
             return bundle, True
 
-    def _is_finished(self, leaves: Leaves) -> bool:
+    def _is_finished(self, leaves: Leaves, config: BuildConfig) -> bool:
         """Whether the bundle exists, was made of these leaves with these settings, and
         was not converted to another codec since."""
-        config = made_with(leaves, self.config, self.seed, self.codec, self.up)
+        expected = made_with(leaves, config, self.seed, self.codec, self.up)
         try:
             bundle = Bundle.open(self.bundle_path)
-            return bundle.config == config and bundle.codec == self.codec
+            return bundle.config == expected and bundle.codec == self.codec
         except (ValueError, OSError):  # missing, damaged, or of another version: build it
             return False
 

@@ -5,7 +5,7 @@ import threading
 import warnings
 from abc import ABC, abstractmethod
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Literal, get_args
 
 import numpy as np
@@ -34,6 +34,15 @@ class Leaves(ABC):
     dropped: dict[str, int]
     digest: str
     resident_bytes: int  # memory of the host that they need as long as they are read
+    antialiased: bool | None = field(default=None, kw_only=True)  # as the asset says
+
+    def settings(self, config: BuildConfig) -> BuildConfig:
+        """The settings with which they are built; an AssetWarning says where these
+        contradict the asset."""
+        contradiction = config.contradiction(antialiased=self.antialiased)
+        if contradiction:
+            warnings.warn(f"asset: {contradiction}", cleaning.AssetWarning, stacklevel=3)
+        return config.of_asset(antialiased=self.antialiased)
 
     @abstractmethod
     def read(self, first: int, last: int) -> Gaussians:
@@ -65,6 +74,7 @@ class MemoryLeaves(Leaves):
             dropped=tally.counts,
             digest=digest_of(host),
             resident_bytes=len(asset) * (gaussian_bytes(asset.sh_degree) + 4),
+            antialiased=asset.antialiased,
         )
         self._asset = _device.place(asset, _device.of(asset.means))  # without gradients
         self._config = config

@@ -26,7 +26,7 @@ from v3dg._progress import Bar, Progress
 from v3dg._urls import shown
 from v3dg.bundle.codec import Codec
 from v3dg.formats._reading import AssetFile
-from v3dg.gaussians import Gaussians, gaussian_bytes, put
+from v3dg.gaussians import Gaussians, common, gaussian_bytes, put
 from v3dg.io import open_asset
 from v3dg.levels import external_split
 from v3dg.levels.config import BuildConfig
@@ -101,9 +101,8 @@ def leaves_on_disk(
     needed, and removed at the end.
     """
     files = map(open_asset, paths)  # lazily, so that few files are open at once
-    tiles = [
-        _Tile(file.path, file.num_gaussians, file.sh_degree, file.whole_bytes) for file in files
-    ]
+    tiles = list(map(_Tile.of, files))
+    antialiased = common([tile.antialiased for tile in tiles])
     count = sum(tile.num_gaussians for tile in tiles)
     check("asset", count < MOST_GAUSSIANS, f"fewer than 2^32 gaussians, got {count:,}")
     degree = max(tile.sh_degree for tile in tiles)
@@ -122,12 +121,13 @@ def leaves_on_disk(
             for _ in _blocks(tiles, buffer, bar):
                 pass
             bar.close()
-            leaves = MemoryLeaves(buffer, config, unusable, device)
+            leaves: Leaves = MemoryLeaves(buffer, config, unusable, device)
             del buffer
-            yield leaves
         else:
             _check_disk(folder, scratch_bytes(count, degree))
-            yield _sort_on_disk(tiles, folder, sizes, config, unusable, bar)
+            leaves = _sort_on_disk(tiles, folder, sizes, config, unusable, bar)
+        leaves.antialiased = antialiased
+        yield leaves
 
 
 def _check_disk(folder: Path, num_bytes: int) -> None:
@@ -147,6 +147,17 @@ class _Tile(NamedTuple):
     num_gaussians: int
     sh_degree: int
     whole_bytes: int
+    antialiased: bool | None
+
+    @staticmethod
+    def of(file: AssetFile) -> "_Tile":
+        return _Tile(
+            file.path,
+            file.num_gaussians,
+            file.sh_degree,
+            file.whole_bytes,
+            file.declared.antialiased,
+        )
 
     def open(self) -> AssetFile:
         file = open_asset(self.path)

@@ -70,7 +70,8 @@ def render(
     Clusters whose gaussians each stand for at most `tolerance` px² are drawn in place
     of finer ones; level 0 with the asset's own filter, coarser levels with the filter
     they were made for (V3DG, section 3.4; our metric is in docs/levels.md). An asset is
-    drawn whole, without a filter.
+    drawn whole: without a filter, or as it was trained if that was with antialiasing
+    (`Gaussians.antialiased`), with 0.3 px² and opacities compensated for it.
 
     Args:
         subject: What to draw, in world space; or the file of it, which is then opened
