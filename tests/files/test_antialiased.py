@@ -1,0 +1,251 @@
+"""Whether an asset was trained with antialiasing: read, kept, drawn and built with."""
+
+import copy
+import json
+import pickle
+import warnings
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import v3dg
+from command_line import run
+from random_bundle import random_gaussians
+from test_ply import Element, ply_bytes, random_columns
+from v3dg import BuildConfig, Gaussians, build_bundle
+from v3dg.cleaning import AssetWarning
+from v3dg.formats import sog
+from v3dg.gaussians import TRAINED_FILTER_PX2
+from v3dg.io import open_asset
+from v3dg.levels import build_file
+
+ASSET = random_gaussians(np.random.default_rng(0), 300, 1)
+FAST = BuildConfig(cluster_size=32, steps=0, smooth="no")
+NAMES = ["a.ply", "a.compressed.ply", "a.sog", "a.glb", "a.spz"]
+
+
+def declared(path):
+    return open_asset(path).declared.antialiased
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("antialiased", [True, False])
+def test_files_keep_it(tmp_path, name, antialiased):
+    path = tmp_path / name
+    v3dg.write_asset(path, ASSET.trained(antialiased=antialiased))
+    assert declared(path) is antialiased
+    found = v3dg.read_asset(path)
+    assert found.antialiased is antialiased
+    v3dg.write_asset(tmp_path / "again.spz", found)
+    assert declared(tmp_path / "again.spz") is antialiased
+    v3dg.write_asset(path, found, antialiased=not antialiased)
+    assert declared(path) is not antialiased
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_files_say_nothing_where_nothing_is_known(tmp_path, name):
+    """A `.spz` has a bit for it, which says no."""
+    v3dg.write_asset(tmp_path / name, ASSET)
+    assert declared(tmp_path / name) is (False if name == "a.spz" else None)
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_every_version_of_spz_keeps_it(tmp_path, version):
+    path = tmp_path / "a.spz"
+    v3dg.write_asset(path, ASSET, antialiased=True, version=version)
+    assert declared(path) is True
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_every_encoding_of_ply_keeps_it(tmp_path, encoding):
+    path = tmp_path / "a.ply"
+    v3dg.write_asset(path, ASSET, antialiased=True, encoding=encoding)
+    assert b"\ncomment SplatRenderMode: mip\n" in path.read_bytes()[:200]
+    assert v3dg.read_asset(path).antialiased is True
+
+
+COMMENTS = {
+    "Brush": (["Exported from Brush", "SH degree: 0", "SplatRenderMode: mip"], True),
+    "Brush, default": (["SplatRenderMode: default"], False),
+    "2DGS": (["SplatRenderMode: 2dgs"], None),
+    "Postshot": (["postshot.anti_aliasing=1"], True),
+    "Postshot, off": (["postshot.anti_aliasing=0"], False),
+    "after Postshot": (["antialiased 1"], True),
+    "any case and space": (["  SPLATRENDERMODE:  MIP  "], True),
+    "the last counts": (["antialiased 1", "SplatRenderMode: default"], False),
+    "other words": (["antialiased 2", "not antialiased 1", "mip", "SplatRenderMode"], None),
+    "none": ([], None),
+}
+
+
+@pytest.mark.parametrize("case", COMMENTS)
+@pytest.mark.parametrize("place", ["before", "after"])
+def test_comments_of_trainers_are_understood(tmp_path, case, place):
+    """Wherever they are in the header."""
+    comments, wanted = COMMENTS[case]
+    content = ply_bytes([Element("vertex", random_columns(2, 0))], "ascii")
+    lines = "".join(f"comment {comment}\n" for comment in comments).encode()
+    line = b"element vertex 2\n"
+    new = lines + line if place == "before" else line + lines
+    (tmp_path / "a.ply").write_bytes(content.replace(line, new))
+    assert declared(tmp_path / "a.ply") is wanted
+    assert open_asset(tmp_path / "a.ply").declared.notes == ()
+
+
+def test_a_mode_that_is_not_known_is_told(tmp_path):
+    v3dg.write_asset(tmp_path / "a.ply", ASSET, antialiased=True)
+    content = (tmp_path / "a.ply").read_bytes().replace(b"Mode: mip", b"Mode: x\xffy")
+    (tmp_path / "a.ply").write_bytes(content)
+    found = open_asset(tmp_path / "a.ply").declared
+    assert found.antialiased is None
+    assert found.notes == ("Its SplatRenderMode x?y is unknown, and is not used.",)
+
+
+def with_meta(path, **fields):
+    """A `.sog` with these fields in its meta.json."""
+    contents = sog.encode(ASSET)
+    meta = json.loads(contents["meta.json"])
+    contents["meta.json"] = json.dumps({**meta, **fields}).encode()
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in contents.items():
+            archive.writestr(name, content)
+    return path
+
+
+SOG = {
+    "the specification": ({"antialias": True}, True, ()),
+    "splat-transform": ({"model": "antialiased"}, True, ()),
+    "splat-transform, 2DGS": ({"model": "2dgs"}, None, ()),
+    "both": ({"antialias": False, "model": "antialiased"}, True, ()),
+    "another model": (
+        {"antialias": True, "model": "x"},
+        True,
+        ('The model "x" of meta.json is unknown, and is not used.',),
+    ),
+    "other fields": ({"author": 3}, None, ('"author" of meta.json is not read.',)),
+}
+
+
+@pytest.mark.parametrize("case", SOG)
+def test_fields_of_sog_are_understood(tmp_path, case):
+    fields, antialiased, notes = SOG[case]
+    found = open_asset(with_meta(tmp_path / "a.sog", **fields)).declared
+    assert (found.antialiased, found.notes) == (antialiased, notes)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"antialias": 1}, "antialias: expected true or false, got 1"),
+        ({"model": 3}, "model: expected a string, got 3"),
+    ],
+)
+def test_fields_of_another_kind_are_refused(tmp_path, fields, message):
+    with pytest.raises(ValueError, match=message):
+        v3dg.read_asset(with_meta(tmp_path / "a.sog", **fields))
+
+
+def test_flags_of_spz_that_are_not_known_are_told(tmp_path):
+    v3dg.write_asset(tmp_path / "a.spz", ASSET, version=4)
+    content = bytearray((tmp_path / "a.spz").read_bytes())
+    content[14] |= 0x41
+    (tmp_path / "a.spz").write_bytes(content)
+    found = open_asset(tmp_path / "a.spz").declared
+    assert found.antialiased is True
+    assert "Its flags 0x40 are unknown, and are not read." in found.notes
+
+
+def test_what_is_made_of_gaussians_keeps_it():
+    asset = ASSET.trained(antialiased=True)
+    made = [
+        asset.subset(slice(3)),
+        asset.subset([1, 2]),
+        asset.transform((0, 1, 0, 0)),
+        asset.torch(),
+        asset.torch().transform(scale=2),
+        asset.torch().numpy(),
+        Gaussians.concatenate([asset, asset]),
+        pickle.loads(pickle.dumps(asset)),
+        copy.copy(asset),
+    ]
+    assert [gaussians.antialiased for gaussians in made] == [True] * len(made)
+    assert Gaussians.concatenate([asset, ASSET]).antialiased is None
+    assert ASSET.antialiased is None
+    assert asset.means is ASSET.means
+    assert list(vars(asset)) == ["means", "quats", "scales", "opacities", "sh"]
+    with pytest.raises(TypeError, match="antialiased: expected a bool or None, got str"):
+        ASSET.trained(antialiased="yes")
+
+
+CAMERA = v3dg.Camera.look_at((0, -20, 0), (0, 0, 0), width=48, height=48, fov_x=0.3)
+
+
+def test_an_asset_is_drawn_as_it_was_trained(tmp_path):
+    """From afar, where a filter without compensation would make it thicker, and no
+    filter makes it flicker."""
+    asset = ASSET.trained(antialiased=True)
+    v3dg.write_asset(tmp_path / "a.ply", asset)
+    asset = v3dg.read_asset(tmp_path / "a.ply")
+    as_trained = v3dg.rasterize(asset, CAMERA, filter_px2=TRAINED_FILTER_PX2, antialiased=True)
+    plain = v3dg.rasterize(ASSET, CAMERA)
+    assert np.abs(as_trained.color - plain.color).max() > 0.05
+    for subject in (asset, tmp_path / "a.ply"):
+        picture = v3dg.render(subject, CAMERA, device="cpu")
+        np.testing.assert_allclose(picture.color, as_trained.color, atol=1e-6)
+    np.testing.assert_array_equal(v3dg.render(ASSET, CAMERA, device="cpu").color, plain.color)
+    drawn = v3dg.rasterize(tmp_path / "a.ply", CAMERA, filter_px2=TRAINED_FILTER_PX2)
+    np.testing.assert_array_equal(drawn.color, as_trained.color)
+    explicit = v3dg.rasterize(asset, CAMERA, filter_px2=TRAINED_FILTER_PX2, antialiased=False)
+    assert np.abs(explicit.color - as_trained.color).max() > 0.05
+
+
+def look_of(bundle):
+    """Filter and compensation of the clusters of level 0."""
+    level = bundle.clusters.level == 0
+    filters = set(bundle.clusters.filter_px2[level].tolist())
+    return filters, set(bundle.clusters.antialiased[level].tolist())
+
+
+@pytest.mark.parametrize("antialiased", [True, False, None])
+def test_a_bundle_has_it_from_the_asset(tmp_path, antialiased):
+    asset = ASSET.trained(antialiased=antialiased)
+    bundle = build_bundle(asset, config=FAST, progress=False, device="cpu")
+    wanted = ({np.float32(TRAINED_FILTER_PX2).item()}, {1}) if antialiased else ({0.0}, {0})
+    assert look_of(bundle) == wanted
+    assert bundle.config["build"]["asset_antialiased"] is bool(antialiased)
+    assert bundle.level_gaussians(0).antialiased is (True if antialiased else None)
+    v3dg.write_asset(tmp_path / "a.spz", asset)
+    built, _ = build_file(
+        tmp_path / "a.spz", tmp_path / "a.v3dg", config=FAST, progress=False, device="cpu"
+    )
+    assert look_of(built) == wanted
+
+
+@pytest.mark.parametrize("antialiased", [True, False])
+def test_settings_win_over_the_asset_and_the_contradiction_is_told(antialiased):
+    asset = ASSET.trained(antialiased=not antialiased)
+    config = replace(FAST, asset_antialiased=antialiased, asset_filter_px2=0.1)
+    with pytest.warns(AssetWarning, match="It says that it was trained with"):
+        bundle = build_bundle(asset, config=config, progress=False, device="cpu")
+    assert look_of(bundle) == ({np.float32(0.1).item()}, {int(antialiased)})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        build_bundle(ASSET, config=config, progress=False, device="cpu")
+
+
+def test_files_of_one_asset_that_differ_are_not_antialiased(tmp_path):
+    v3dg.write_asset(tmp_path / "a.ply", ASSET, antialiased=True)
+    v3dg.write_asset(tmp_path / "b.ply", ASSET, antialiased=False)
+    paths = [tmp_path / "a.ply", tmp_path / "b.ply"]
+    bundle, _ = build_file(paths, tmp_path / "a.v3dg", config=FAST, progress=False, device="cpu")
+    assert look_of(bundle) == ({0.0}, {0})
+
+
+def test_commands_keep_it(tmp_path):
+    v3dg.write_asset(tmp_path / "a.spz", ASSET, antialiased=True)
+    run("convert", tmp_path / "a.spz", tmp_path / "b.ply")
+    assert declared(tmp_path / "b.ply") is True
+    run("convert", tmp_path / "b.ply", tmp_path / "c.sog")
+    assert declared(tmp_path / "c.sog") is True
