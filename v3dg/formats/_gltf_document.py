@@ -5,6 +5,7 @@ Source: glTF 2.0, sections 3.2 (URIs), 3.6.1 (buffers and views) and 4 (GLB).
 
 import base64
 import contextlib
+import os
 import re
 import struct
 from pathlib import Path
@@ -20,6 +21,7 @@ BINARY_CHUNK = 0x004E4942  # "BIN\0"
 # Parsed JSON takes many times the memory of its text, but for long strings.
 _MOST_JSON = 1 << 20  # bytes, without data: URIs
 _DATA_URI = re.compile(rb'"data:[^"\\]*"')
+_MOST_NAME = 255  # bytes of a file name
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 # Extensions of buffer views whose bytes are packed.
 _PACKED_VIEWS = ("EXT_meshopt_compression", "KHR_meshopt_compression")
@@ -34,7 +36,8 @@ class Document:
         self.claims = Claims()
         self._binary: memoryview | None = None
         self._buffers: dict[int, memoryview] = {}
-        self._files: dict[Path, memoryview] = {}  # a file may be named by many buffers
+        # By device and inode: a file may be named by many buffers, and in many ways.
+        self._files: dict[tuple[int, int], memoryview] = {}
         content = self.claims.read(path)
         if path.suffix.lower() == ".gltf" and content[:4] != b"glTF":
             text = content
@@ -133,10 +136,10 @@ class Document:
         return list(dict.fromkeys(files))
 
     def claim_buffers(self) -> None:
-        """Let the sizes of the files of buffers count; one that is missing may not be
-        needed."""
+        """Let the sizes of the files of buffers count; one that cannot be read may not
+        be needed."""
         for path in self.buffer_files():
-            with contextlib.suppress(FileNotFoundError), self.claims.open(path):
+            with contextlib.suppress(OSError, ValueError), self.claims.open(path):
                 pass
 
     def _buffer(self, view: Node) -> memoryview:
@@ -173,9 +176,15 @@ class Document:
             except ValueError:
                 raise uri.error("data in base64 that is whole") from None
         path = self._path_of(uri)
-        if path not in self._files:
-            self._files[path] = memoryview(self.claims.read(path))
-        return self._files[path]
+        try:
+            status = os.stat(path)
+        except (FileNotFoundError, NotADirectoryError):
+            problem = uri.problem(f"expected the file {path.name} beside the document, got none")
+            raise FileNotFoundError(str(problem)) from None
+        key = (status.st_dev, status.st_ino)
+        if key not in self._files:
+            self._files[key] = memoryview(self.claims.read(path))
+        return self._files[key]
 
     def _path_of(self, uri: Node) -> Path:
         """The file that a relative URI names; nothing outside of the document's folder
@@ -187,7 +196,8 @@ class Document:
         name = unquote(text)
         parts = name.split("/")
         is_below = not {"", ".."} & set(parts) and "\\" not in name
-        if not is_below or not is_one_line(name):
+        is_short = all(len(os.fsencode(part)) <= _MOST_NAME for part in parts)
+        if not is_below or not is_one_line(name) or not is_short:
             raise uri.error(expected)
         return self.path.parent / name
 
