@@ -16,10 +16,9 @@ import pytest
 
 import v3dg
 from fuzz.attacks.good_files import good_files, streamed
-from gltf_files import NAME, GltfFile
+from gltf_files import file_of_every_part
 from random_bundle import random_gaussians
 from v3dg._json import is_one_line
-from v3dg.formats import spz
 
 LONG = "a number of 5,000 digits"  # which stands for one
 ODD = [[], [26], [[]], [None], {}, {"a": 1}, None, True, False, "", "a", "0", "\x1b[31m", LONG]
@@ -104,31 +103,8 @@ def glb_kind(folder, compressed):
 
 
 def gltf_kind(folder):
-    """A document with every kind of part that is looked at."""
+    file = file_of_every_part()
     path = folder / "a.gltf"
-    asset = random_gaussians(np.random.default_rng(0), 5, 1)
-    file = GltfFile()
-    attributes = file.attributes(asset)
-    part = {
-        "count": 1,
-        "indices": {"bufferView": file.view(b"\x02"), "componentType": 5121},
-        "values": {"bufferView": file.view(bytes(12))},
-    }
-    attributes["POSITION"] = file.bare_accessor(asset.means, sparse=part)
-    plain = file.primitive(attributes, colorSpace="lin_rec709_display", extras={})
-    plain["indices"] = file.accessor(np.arange(4), 5123)
-    packed = file.primitive({}, extensions={f"{NAME}_compression_spz_2": {}})
-    stream = file.view(b"".join(spz.encode(asset, 2)))
-    packed["extensions"][NAME]["extensions"][f"{NAME}_compression_spz_2"]["bufferView"] = stream
-    packed["attributes"]["POSITION"] = file.bare_accessor(asset.means)
-    matrix = [2, 0, 0, 0, 0, 3, 0, 0, 0, 0, 4, 0, 1, 1, 1, 1]
-    file.nodes(
-        {"children": [1, 2], "rotation": [0, 0, 0, 1], "scale": [2, 2, 2]},
-        {"mesh": file.mesh(plain), "translation": [1, 2, 3]},
-        {"mesh": file.mesh(packed), "matrix": matrix},
-    )
-    file.document["bufferViews"][0]["byteStride"] = 12
-    file.document["extensionsRequired"] = [NAME]
     (folder / "a.bin").write_bytes(file.blob)
     file.write(path, "a.bin")
     return Kind(json.loads(path.read_text()), path.write_text, read_both, path)

@@ -6,6 +6,9 @@ import struct
 
 import numpy as np
 
+from random_bundle import random_gaussians
+from v3dg.formats import spz
+
 NAME = "KHR_gaussian_splatting"
 FLOAT = 5126
 DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", FLOAT: "<f4"}
@@ -88,6 +91,34 @@ class GltfFile:
         else:
             path.write_bytes(glb_bytes(self.document, bytes(self.blob)))
         return path
+
+
+def file_of_every_part():
+    """A file with every kind of part that a reader looks at: ten gaussians in two
+    meshes."""
+    asset = random_gaussians(np.random.default_rng(0), 5, 1)
+    file = GltfFile()
+    attributes = file.attributes(asset)
+    part = {
+        "count": 1,
+        "indices": {"bufferView": file.view(b"\x02"), "componentType": 5121},
+        "values": {"bufferView": file.view(bytes(12))},
+    }
+    attributes["POSITION"] = file.bare_accessor(asset.means, sparse=part)
+    plain = file.primitive(attributes, colorSpace="lin_rec709_display", extras={})
+    plain["indices"] = file.accessor(np.arange(5), 5123)
+    stream = {"bufferView": file.view(b"".join(spz.encode(asset, 2)))}
+    packed = file.primitive({}, extensions={f"{NAME}_compression_spz_2": stream})
+    packed["attributes"]["POSITION"] = file.bare_accessor(asset.means)
+    matrix = [2, 0, 0, 0, 0, 3, 0, 0, 0, 0, 4, 0, 1, 1, 1, 1]
+    file.nodes(
+        {"children": [1, 2], "rotation": [0, 0, 0, 1], "scale": [2, 2, 2]},
+        {"mesh": file.mesh(plain), "translation": [1, 2, 3]},
+        {"mesh": file.mesh(packed), "matrix": matrix},
+    )
+    file.document["bufferViews"][0]["byteStride"] = 12
+    file.document["extensionsRequired"] = [NAME]
+    return file
 
 
 def glb_bytes(document, blob=b""):
