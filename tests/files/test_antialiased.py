@@ -30,6 +30,15 @@ def declared(path):
     return open_asset(path).declared.antialiased
 
 
+@pytest.mark.parametrize("antialiased", [True, False, None])
+def test_usd_keeps_it(tmp_path, antialiased):
+    pytest.importorskip("pxr")
+    path = tmp_path / "a.usda"
+    v3dg.write_asset(path, ASSET.trained(antialiased=antialiased))
+    assert declared(path) is antialiased
+    assert v3dg.read_asset(path).antialiased is antialiased
+
+
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("antialiased", [True, False])
 def test_files_keep_it(tmp_path, name, antialiased):

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from v3dg import _extras, _files
 from v3dg._numbers import check
 from v3dg.cameras import Axis, Floats, is_rotation
+from v3dg.formats._declared import Declared
 from v3dg.formats._packing import check_writable
 from v3dg.formats._reading import AnyPath, AssetFile, value_errors
 from v3dg.gaussians import Gaussians
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".usd", ".usda", ".usdc")
 _Pose: TypeAlias = tuple[tuple[float, float, float, float], Floats, float]
+_ANTIALIASED = "antialiased"  # in the custom data of a prim: the schema has no place for it
 _SH = "radiance:sphericalHarmonics"
 _HALVES = (
     "positions",
@@ -66,7 +68,8 @@ def open_file(path: AnyPath) -> AssetFile:
     def read_rows(first: int, last: int) -> Gaussians:
         return gaussians.subset(slice(first, last))
 
-    return AssetFile(path, len(gaussians), gaussians.sh_degree, read_rows)
+    declared = Declared(antialiased=gaussians.antialiased)
+    return AssetFile(path, len(gaussians), gaussians.sh_degree, read_rows, declared=declared)
 
 
 def read(path: AnyPath) -> Gaussians:
@@ -199,13 +202,17 @@ def _gaussians_of(prim: Usd.Prim) -> Gaussians:
 
     means = column("positions")
     degree = prim.GetAttribute(f"{_SH}Degree").Get()
-    return Gaussians(
+    gaussians = Gaussians(
         means=means,
         quats=normalised(np.roll(column("orientations"), 1, axis=1)).astype(np.float32),
         scales=column("scales"),
         opacities=column("opacities"),
         sh=column(f"{_SH}Coefficients").reshape(len(means), (degree + 1) ** 2, 3),
     )
+    antialiased = prim.GetCustomDataByKey(_ANTIALIASED)
+    if isinstance(antialiased, bool):
+        return gaussians.trained(antialiased=antialiased)
+    return gaussians
 
 
 def write(path: AnyPath, gaussians: Gaussians) -> None:
@@ -258,4 +265,6 @@ def define(stage: Usd.Stage, path: str, host: Gaussians) -> Usd.Prim:
     }
     for name, value in values.items():
         prim.GetAttribute(name).Set(value)
+    if host.antialiased is not None:
+        prim.SetCustomDataByKey(_ANTIALIASED, host.antialiased)
     return prim
