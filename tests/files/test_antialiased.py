@@ -144,6 +144,21 @@ def test_fields_of_sog_are_understood(tmp_path, case):
     assert (found.antialiased, found.notes) == (antialiased, notes)
 
 
+@pytest.mark.parametrize("others", [True, False])
+def test_folders_of_streamed_sog_must_agree(tmp_path, others):
+    lods = []
+    for number, antialiased in enumerate((True, others)):
+        (tmp_path / str(number)).mkdir()
+        for name, content in sog.encode(ASSET.trained(antialiased=antialiased)).items():
+            (tmp_path / str(number) / name).write_bytes(content)
+        lods.append({"lods": {"0": {"file": number, "offset": 0, "count": len(ASSET)}}})
+    path = tmp_path / "lod-meta.json"
+    names = ["0/meta.json", "1/meta.json"]
+    path.write_text(json.dumps({"filenames": names, "tree": {"children": lods}}))
+    assert declared(path) is (True if others else None)
+    assert v3dg.read_asset(path).antialiased is declared(path)
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [

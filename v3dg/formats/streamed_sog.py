@@ -7,14 +7,16 @@ what is in its bounds.
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from v3dg._json import Node, parse_json
 from v3dg.formats import sog
+from v3dg.formats._declared import Declared
 from v3dg.formats._reading import AssetFile, Claims, check, integer_of, value_errors, whole_file
-from v3dg.gaussians import Gaussians
+from v3dg.gaussians import Gaussians, common
 
 _LEVEL = re.compile(r"[0-9]{1,9}")
 
@@ -28,7 +30,11 @@ def open_file(path: str | os.PathLike[str]) -> AssetFile:
     if environment is not None:
         parts.append(sog.open_file(path.parent / environment))
         count += parts[-1].num_gaussians
-    return whole_file(path, count, parts[0].sh_degree, read, files(path))
+    opened = whole_file(path, count, parts[0].sh_degree, read, files(path))
+    declared = [part.declared for part in parts]
+    antialiased = common([part.antialiased for part in declared])
+    notes = dict.fromkeys(note for part in declared for note in part.notes)
+    return replace(opened, declared=Declared(antialiased=antialiased, notes=tuple(notes)))
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
