@@ -129,6 +129,11 @@ def _open_fetched(at_url: FileAtUrl, reader: Callable[[AnyPath], AssetFile]) -> 
     """An asset at a URL, whose local copy exists as long as this object; errors name
     the URL."""
     with reading(at_url) as local:
+        if reader is gltf.open_file:
+            # Nothing that a document at a URL names is read, here or there.
+            is_alone = len(gltf.files(pathlib.Path(local))) == 1
+            expected = "the URL of an asset in one file, got one that names others"
+            check(shown(at_url), is_alone, f"{expected}; fetch the folder")
         file = reader(local)
         whole = None
         if at_url.needs_name:

@@ -39,7 +39,9 @@ class Document:
         # By device and inode: a file may be named by many buffers, and in many ways.
         self._files: dict[tuple[int, int], memoryview] = {}
         content = self.claims.read(path)
-        if path.suffix.lower() == ".gltf" and content[:4] != b"glTF":
+        is_binary = content[:4] == b"glTF" or path.suffix.lower() != ".gltf"
+        # A copy of what was at a URL has no suffix.
+        if not is_binary or content[:1] == b"{":
             text = content
             expected = "a .gltf file, glTF 2.0 as JSON in UTF-8"
         else:
