@@ -107,6 +107,10 @@ class PlyFile:
     def num_gaussians(self) -> int: ...
     @property
     def sh_degree(self) -> int: ...
+    @property
+    def used(self) -> list[str]:
+        """Names of the properties that are read."""
+
     def read(self, first: int, last: int) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
 
 def ply_header(

@@ -19,7 +19,6 @@ EXTRAS = {
     "flip_evaluator": Extra("flip-evaluator>=1.6", "errors by FLIP"),
     "av": Extra("av>=12", "videos"),
     "pxr": Extra("usd-core>=26.11", "OpenUSD"),
-    "pycolmap": Extra("pycolmap>=4.0", "cameras of COLMAP"),
     "fsspec": Extra("fsspec[http]>=2024.2", "files at URLs"),
     "distributed": Extra("distributed>=2024.1", "builds on many machines"),
 }

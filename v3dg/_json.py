@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
 import os
@@ -21,13 +22,21 @@ a file is checked by `Node`."""
 JsonObject: TypeAlias = dict[str, Json]
 
 _LARGEST_SIDE = 1 << 20  # px of a picture
+_BYTE_ORDER_MARK = "\ufeff"
+_UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 def parse_json(text: str | bytes) -> Json:
-    """Parse strict JSON: no NaN, no key twice, no unbounded nesting; ValueError
-    otherwise."""
+    """Parse strict JSON, also after a byte order mark: no NaN, no key twice, no
+    unbounded nesting; ValueError otherwise."""
+    if isinstance(text, bytes):
+        text = text.decode("utf-8")
     try:
-        return json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
+        return json.loads(
+            text.removeprefix(_BYTE_ORDER_MARK),
+            object_pairs_hook=_unique_keys,
+            parse_constant=_refuse_constant,
+        )
     except RecursionError:
         raise ValueError("nested too deep") from None
 
@@ -73,7 +82,9 @@ def read_json(path: str | os.PathLike[str]) -> Node:
     with _files.naming_errors(path), open(_files.open_regular(path), "rb") as file:
         content = file.read()
     try:
-        return Node(parse_json(content.decode("utf-8")), path.name, "")
+        if content.startswith(_UTF16_MARKS):
+            raise ValueError("it is in UTF-16; save it as UTF-8")
+        return Node(parse_json(content), path.name, "")
     except ValueError as error:
         raise ValueError(
             f"{path.name}: expected JSON, got a file that does not parse: {error}"

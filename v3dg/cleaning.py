@@ -37,7 +37,8 @@ _WRONG = (1 << KINDS.index("transparent")) - 1  # the bits of all kinds before i
 
 
 class AssetWarning(UserWarning):
-    """Gaussians of an asset have wrong values and were left out."""
+    """Gaussians of an asset have wrong values and were left out; or something in its
+    file was not understood, or read otherwise than it is written."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +50,18 @@ class Findings:
         drawable: (N,) bool, on the host.
         counts: Number of gaussians of each kind that cannot be drawn; kinds without any
             are left out, and a gaussian can be of several kinds.
-        num_wrong: Gaussians with wrong values; the others that cannot be drawn are
+        wrong: (N,) bool, those with wrong values; the others that cannot be drawn are
             valid, but transparent.
     """
 
     drawable: npt.NDArray[np.bool_]
     counts: dict[str, int]
-    num_wrong: int
+    wrong: npt.NDArray[np.bool_]
+
+    @property
+    def num_wrong(self) -> int:
+        """Gaussians with wrong values."""
+        return int(self.wrong.sum())
 
     @property
     def num_dropped(self) -> int:
@@ -87,9 +93,7 @@ def examine(asset: Gaussians) -> Findings:
         count = int((nonzero >> bit & 1).sum())
         if count:
             counts[kind] = count
-    return Findings(
-        drawable=faults == 0, counts=counts, num_wrong=int((nonzero & _WRONG != 0).sum())
-    )
+    return Findings(drawable=faults == 0, counts=counts, wrong=(faults & _WRONG) != 0)
 
 
 def outliers(means: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:

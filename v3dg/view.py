@@ -63,14 +63,13 @@ def view(
     from v3dg.viewer.frame import SceneView
     from v3dg.viewer.server import Site
 
-    path = Path()
     if isinstance(subject, str | os.PathLike):
         path = Path(subject)
         subject, cameras = open_with_cameras(path)
         options.setdefault("name", beside(path).stem)
         options.setdefault("cameras", cameras)
     if up is None:
-        up, reason = up_of(subject, options.get("cameras"), path)
+        up, reason = up_of(subject, options.get("cameras"))
         options.setdefault("asks_up", reason == ASSUMED)
     if isinstance(up, str):
         one_of(up, "up", AXES)

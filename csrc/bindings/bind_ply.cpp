@@ -55,7 +55,16 @@ class BoundPlyFile {
         : path_(path), ply_(with_path(path_, open_ply)), next_(ply_.begin()) {}
 
     size_t num_gaussians() const { return ply_.num_gaussians(); }
-    int sh_degree() const { return static_cast<int>(std::lround(std::sqrt(ply_.num_sh))) - 1; }
+    int sh_degree() const {
+        return static_cast<int>(std::lround(std::sqrt(ply_.layout.num_sh))) - 1;
+    }
+    py::list used() const {
+        py::list names;
+        for (const PlyField& field : ply_.layout.fields)
+            if (field.property != PlyField::kNone)
+                names.append(printable(ply_.vertex.properties[field.property].name));
+        return names;
+    }
 
     py::tuple read(int64_t first, int64_t last) {
         if (first < 0 || last < first || static_cast<size_t>(last) > ply_.num_gaussians())
@@ -63,7 +72,7 @@ class BoundPlyFile {
                 "rows: expected 0 <= first <= last <= " + std::to_string(ply_.num_gaussians()) +
                 ", got " + std::to_string(first) + " to " + std::to_string(last));
         const auto n = static_cast<py::ssize_t>(last - first),
-                   k = static_cast<py::ssize_t>(ply_.num_sh);
+                   k = static_cast<py::ssize_t>(ply_.layout.num_sh);
         const NewArray<float> means({}, {n, 3}), quats({}, {n, 4}), scales({}, {n, 3}),
             opacities({}, {n}), sh({}, {n, k, 3});
         const PlyGaussians<float> out = {means.span, quats.span, scales.span, opacities.span,
@@ -84,8 +93,8 @@ class BoundPlyFile {
 };
 
 constexpr const char* kEncodings[] = {"ascii", "binary_little_endian", "binary_big_endian"};
-constexpr const char* kTypes[] = {"char", "uchar", "short", "ushort",
-                                  "int",  "uint",  "float", "double"};
+constexpr const char* kTypes[] = {"char",  "uchar",  "short", "ushort", "int",   "uint",
+                                  "float", "double", "half",  "int64",  "uint64"};
 
 py::tuple ply_header(const py::object& path) {
     const PlyHeader header = with_path(
@@ -147,6 +156,8 @@ void bind_ply(py::module_& m) {
         .def(py::init<const py::object&>(), "path"_a)
         .def_property_readonly("num_gaussians", &BoundPlyFile::num_gaussians)
         .def_property_readonly("sh_degree", &BoundPlyFile::sh_degree)
+        .def_property_readonly("used", &BoundPlyFile::used,
+                               "Names of the properties that are read.")
         .def("read", &BoundPlyFile::read, "first"_a, "last"_a);
     m.def("ply_header", &ply_header, "path"_a,
           "Encoding, bytes of the header, and elements: name, count, and properties' names and "

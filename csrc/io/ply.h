@@ -3,6 +3,7 @@
 // A file holds, for each gaussian, x y z, f_dc_0..2, f_rest_* (all red coefficients, then green,
 // then blue), opacity (logit), scale_0..2 (log) and rot_0..3 (w x y z). Memory holds values:
 // standard deviations and opacities in [0, 1], computed in double precision and rounded once.
+// What other trainers write differently is in PlyLayout.
 //
 // Source: Kerbl et al., 3D Gaussian Splatting, SIGGRAPH 2023, and the files of its code.
 #pragma once
@@ -32,6 +33,28 @@ struct PlyPlace {
     size_t row, offset;
 };
 
+// Where in a row a number is.
+struct PlyField {
+    static constexpr size_t kNone = ~size_t(0);  // the property of what no row has
+
+    size_t property;  // among the properties of the vertex element
+    size_t offset;    // bytes from the start of the row, without lists
+    PlyType type;
+};
+
+// How the properties of a vertex make a gaussian: the slots that they fill, and what is otherwise
+// than in the files of the 3DGS code. A row without scale_2 is a flat gaussian, as 2DGS has them;
+// red, green and blue stand for f_dc where a trainer writes base colours; filter_3D is the standard
+// deviation of the filter by which Mip-Splatting widens a gaussian.
+struct PlyLayout {
+    size_t num_sh = 1;  // K; coefficients of higher degrees in the file are not read
+    bool is_flat = false;
+    bool has_base_colors = false;
+    bool has_filter = false;
+    double color_scale[3] = {1, 1, 1};  // from a stored base colour to one of 0 to 1
+    std::vector<PlyField> fields;       // of each PlySlot
+};
+
 // An opened file whose header, and its claims against the file's size, have been checked.
 struct PlyFile {
     PosixFile file;
@@ -39,7 +62,7 @@ struct PlyFile {
     PlyEncoding encoding;
     PlyElement vertex;
     size_t vertex_offset;  // where the first gaussian's bytes begin
-    size_t num_sh;         // K
+    PlyLayout layout;
 
     size_t num_gaussians() const { return vertex.count; }
     PlyPlace begin() const { return {0, vertex_offset}; }

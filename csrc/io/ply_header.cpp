@@ -42,7 +42,8 @@ PlyType parse_type(const std::string& name) {
         {"ushort", PlyType::uint16},   {"uint16", PlyType::uint16},   {"int", PlyType::int32},
         {"int32", PlyType::int32},     {"uint", PlyType::uint32},     {"uint32", PlyType::uint32},
         {"float", PlyType::float32},   {"float32", PlyType::float32}, {"double", PlyType::float64},
-        {"float64", PlyType::float64},
+        {"float64", PlyType::float64}, {"half", PlyType::float16},    {"float16", PlyType::float16},
+        {"int64", PlyType::int64},     {"uint64", PlyType::uint64},
     };
     for (const auto& [text, type] : kTypes)
         if (name == text) return type;
@@ -86,7 +87,7 @@ PlyProperty parse_property(const std::vector<std::string>& words) {
     property.name = words.back();
     if (property.is_list) {
         property.count_type = parse_type(words[2]);
-        if (property.count_type == PlyType::float32 || property.count_type == PlyType::float64)
+        if (property.count_type >= PlyType::float32)
             throw PlyError("expected an integer type for the length of a list, got " +
                            quoted(words[2]));
     }

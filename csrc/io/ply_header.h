@@ -20,10 +20,23 @@ struct PlyError : std::runtime_error {
 
 enum class PlyEncoding { ascii, binary_little_endian, binary_big_endian };
 
-enum class PlyType { int8, uint8, int16, uint16, int32, uint32, float32, float64 };
+// The types of the format, integers first, then those that some writers use besides.
+enum class PlyType {
+    int8,
+    uint8,
+    int16,
+    uint16,
+    int32,
+    uint32,
+    float32,
+    float64,
+    float16,
+    int64,
+    uint64
+};
 
 inline size_t size_of(PlyType type) {
-    constexpr size_t kSizes[] = {1, 1, 2, 2, 4, 4, 4, 8};
+    constexpr size_t kSizes[] = {1, 1, 2, 2, 4, 4, 4, 8, 2, 8, 8};
     return kSizes[static_cast<size_t>(type)];
 }
 

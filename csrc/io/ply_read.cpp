@@ -52,15 +52,14 @@ PlyFile open_ply(const char* path) {
                    .encoding = header.encoding,
                    .vertex = {},
                    .vertex_offset = header.size,
-                   .num_sh = 1};
+                   .layout = {}};
     const auto is_vertex = [](const PlyElement& element) { return element.name == "vertex"; };
     const auto num_found = std::count_if(header.elements.begin(), header.elements.end(), is_vertex);
     if (num_found != 1)
         throw PlyError("expected one element 'vertex', got " + std::to_string(num_found));
     const auto vertex = std::find_if(header.elements.begin(), header.elements.end(), is_vertex);
     ply.vertex = *vertex;
-    ply.num_sh = num_sh_of(ply.vertex);
-    fields_of(ply.vertex, ply.num_sh);  // throws if a property is missing
+    ply.layout = layout_of(ply.vertex);
     for (auto element = header.elements.begin(); element != vertex; ++element)
         ply.vertex_offset = skip_element(ply, *element, ply.vertex_offset);
     check_size(ply, ply.vertex, ply.vertex_offset);

@@ -4,8 +4,10 @@
 #include "io/ply_rows.h"
 
 #include <algorithm>
+#include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <limits>
 #include <memory>
 #include <string>
 #include <vector>
@@ -32,6 +34,17 @@ T load_as(const char* bytes, bool is_swapped) {
     return value;
 }
 
+// The number that IEEE 754's 16 bits stand for.
+double from_half(uint16_t bits) {
+    const int exponent = bits >> 10 & 31;
+    const int fraction = bits & 1023;
+    const double sign = bits >> 15 ? -1 : 1;
+    if (exponent == 31 && fraction != 0) return std::numeric_limits<double>::quiet_NaN();
+    if (exponent == 31) return sign * std::numeric_limits<double>::infinity();
+    if (exponent == 0) return sign * std::ldexp(fraction, -24);
+    return sign * std::ldexp(1024 + fraction, exponent - 25);
+}
+
 double load_scalar(const char* bytes, PlyType type, bool is_swapped) {
     switch (type) {
         case PlyType::int8: return load_as<int8_t>(bytes, is_swapped);
@@ -42,6 +55,9 @@ double load_scalar(const char* bytes, PlyType type, bool is_swapped) {
         case PlyType::uint32: return load_as<uint32_t>(bytes, is_swapped);
         case PlyType::float32: return load_as<float>(bytes, is_swapped);
         case PlyType::float64: return load_as<double>(bytes, is_swapped);
+        case PlyType::float16: return from_half(load_as<uint16_t>(bytes, is_swapped));
+        case PlyType::int64: return static_cast<double>(load_as<int64_t>(bytes, is_swapped));
+        case PlyType::uint64: return static_cast<double>(load_as<uint64_t>(bytes, is_swapped));
     }
     return 0;
 }
@@ -57,22 +73,18 @@ bool is_swapped(PlyEncoding encoding) {
 class RowDecoder {
   public:
     RowDecoder(const PlyFile& ply, const PlyGaussians<float>& out)
-        : fields_(fields_of(ply.vertex, ply.num_sh)),
-          num_sh_(ply.num_sh),
-          is_swapped_(is_swapped(ply.encoding)),
-          out_(out) {
+        : layout_(ply.layout), is_swapped_(is_swapped(ply.encoding)), out_(out) {
         for (const PlyProperty& property : ply.vertex.properties)
             if (!property.is_list) row_bytes_ += size_of(property.type);
+        const auto is_float = [](const PlyField& field) { return field.type == PlyType::float32; };
         is_native_float_ =
-            !is_swapped_ && std::all_of(fields_.begin(), fields_.end(), [](const PlyField& field) {
-                return field.type == PlyType::float32;
-            });
+            !is_swapped_ && std::all_of(layout_.fields.begin(), layout_.fields.end(), is_float);
     }
     size_t row_bytes() const { return row_bytes_; }
 
     // Converts `count` rows into gaussians `first` and on.
     void decode(const char* rows, size_t count, size_t first) const {
-        const PlyField* fields = fields_.data();
+        const PlyField* fields = layout_.fields.data();
         for (size_t r = 0; r < count; ++r) {
             const char* row = rows + r * row_bytes_;
             if (is_native_float_) {
@@ -81,19 +93,18 @@ class RowDecoder {
                     std::memcpy(&value, row + fields[slot].offset, sizeof(value));
                     return value;
                 };
-                store_gaussian(load, first + r, num_sh_, out_);
+                store_gaussian(load, first + r, layout_, out_);
             } else {
                 const auto load = [this, row, fields](size_t slot) {
                     return load_scalar(row + fields[slot].offset, fields[slot].type, is_swapped_);
                 };
-                store_gaussian(load, first + r, num_sh_, out_);
+                store_gaussian(load, first + r, layout_, out_);
             }
         }
     }
 
   private:
-    std::vector<PlyField> fields_;
-    size_t num_sh_;
+    const PlyLayout& layout_;
     bool is_swapped_;
     bool is_native_float_;
     size_t row_bytes_ = 0;

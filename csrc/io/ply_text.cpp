@@ -163,7 +163,7 @@ void parse_row(Line line, uint64_t row, const PlyElement& vertex, double* value_
 
 PlyPlace read_text(const PlyFile& ply, PlyPlace begin, const PlyGaussians<float>& out) {
     constexpr size_t kLinesPerTask = 256;
-    const std::vector<PlyField> fields = fields_of(ply.vertex, ply.num_sh);
+    const std::vector<PlyField>& fields = ply.layout.fields;
     const size_t num_properties = ply.vertex.properties.size();
     const size_t num_rows = out.opacities.size;
     std::vector<double> values(most_threads() * num_properties);
@@ -178,7 +178,7 @@ PlyPlace read_text(const PlyFile& ply, PlyPlace begin, const PlyGaussians<float>
                 double* row = values.data() + omp_get_thread_num() * num_properties;
                 parse_row(lines[r], begin.row + first + r, ply.vertex, row);
                 store_gaussian([&](size_t slot) { return row[fields[slot].property]; }, first + r,
-                               ply.num_sh, out);
+                               ply.layout, out);
             });
         }
         error.rethrow();

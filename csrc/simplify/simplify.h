@@ -14,8 +14,9 @@ namespace v3dg {
 // is at most as many as come in. Decisions are made in the order of the rows, ties by index, and do
 // not depend on threads; both halves give the same bits.
 namespace cpu {
-// Finds the gaussians with the largest opacity * (s1 s2 s3)^(2/3), the same share of each of eight
-// cells of a median split (V3DG, section 3.2). kept: [out_offset[S]], the rows in ascending order.
+// Finds the gaussians with the largest opacity * (s1 s2 s3)^(2/3), the same share of each of the
+// eight octants around the medians of a segment (V3DG, section 3.2). kept: [out_offset[S]], the
+// rows in ascending order.
 void prune(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
            Span<const int64_t> out_offset, Span<int64_t> kept);
 

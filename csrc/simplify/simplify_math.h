@@ -23,19 +23,28 @@ V3DG_HD inline double prune_score(const float scale[3], float opacity) {
     return o * o * o * (volume * volume);
 }
 
-// Pruning splits the gaussians at medians into these cells and keeps the same share of each cell.
-constexpr int kPruneHalvings = 3, kPruneCells = 1 << kPruneHalvings;
+// Pruning keeps the same share of each octant of a group, so that no side of it is left empty. The
+// octants meet at the median of each axis, as in the published code of V3DG: halving the longest
+// axis again and again makes other cells for long groups, and levels that are visibly worse.
+constexpr int kOctants = 8;
 
-// Computes how many of a cell's gaussians are kept when `wanted` of first .. last are. The shares
-// are rounded so that they add up.
-struct CellShares {
-    int64_t first, last, wanted;
-    V3DG_HD int64_t of(int64_t cell_first, int64_t cell_last) const {
-        if (cell_first == cell_last) return 0;
-        const int64_t count = last - first;
-        return (cell_last - first) * wanted / count - (cell_first - first) * wanted / count;
-    }
-};
+// Returns the octant of a position around the medians of its group. A coordinate at the median lies
+// in the upper half.
+V3DG_HD inline int octant_of(const float mean[3], const float median[3]) {
+    return 4 * (mean[0] >= median[0]) + 2 * (mean[1] >= median[1]) + (mean[2] >= median[2]);
+}
+
+// Returns the place, in ascending order, of the median among `count` coordinates: of two in the
+// middle, the lower one.
+V3DG_HD inline int64_t median_rank(int64_t count) { return (count - 1) / 2; }
+
+// Returns how many gaussians of an octant are kept when a group of `count` keeps `wanted`. The
+// octants before this one hold `num_before` gaussians, this one `num_here`. The shares are rounded
+// so that they add up to `wanted`.
+V3DG_HD inline int64_t octant_share(int64_t num_before, int64_t num_here, int64_t count,
+                                    int64_t wanted) {
+    return (num_before + num_here) * wanted / count - num_before * wanted / count;
+}
 
 // Returns the surface area of an ellipsoid over 4 pi, within 1.2 %. It is the mean of the
 // ellipsoid's shadow, sqrt(b2c2 x2 + a2c2 y2 + a2b2 z2), over directions along axes, between two

@@ -35,6 +35,7 @@ import sys, warnings
 from pathlib import Path
 warnings.simplefilter("error")
 import v3dg
+warnings.simplefilter("ignore", v3dg.cleaning.AssetWarning)
 for warm_up in sys.argv[2:]:  # what is imported late
     v3dg.read_asset(warm_up)
 def kib(name):

@@ -21,7 +21,7 @@ MAY_INCLUDE = {
     "base": set(),
     "math": {"base"},
     "camera": {"base", "math"},
-    "io": {"base"},
+    "io": {"base", "math"},
     "frame": {"base", "math", "camera"},
     "cluster": {"base", "math"},
     "simplify": {"base", "math", "cluster"},

@@ -148,7 +148,7 @@ CONTENTS = {
     "text": lambda good: "Käse und Brot\n".encode() * 100,
     "latin-1": lambda good: "Käse und Brot\n".encode("latin-1") * 100,
     "utf-16": lambda good: "Käse und Brot\n".encode("utf-16") * 100,
-    "good after a byte order mark": lambda good: b"\xef\xbb\xbf" + good,
+    "good after two byte order marks": lambda good: 2 * b"\xef\xbb\xbf" + good,
     "good after a zero": lambda good: b"\0" + good,
     "good after a space": lambda good: b" \xa0" + good,
     "good but packed": gzip.compress,
@@ -166,6 +166,17 @@ CONTENTS = {
     "deep objects": lambda good: b'{"a":' * 100_000 + b"1" + b"}" * 100_000,
     "a long number": lambda good: b"1" * 100_000,
 }
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_only_text_may_have_a_byte_order_mark(tmp_path, reader):
+    """Programs of Windows write one before JSON."""
+    name, content, read = READERS[reader]
+    (tmp_path / name).write_bytes(b"\xef\xbb\xbf" + content(tmp_path))
+    if name.endswith(".json"):
+        read(tmp_path / name)
+    else:
+        assert_refused(read, tmp_path / name)
 
 
 @pytest.mark.parametrize("reader", READERS)

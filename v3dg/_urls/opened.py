@@ -32,7 +32,7 @@ _SPARE_BYTES = 256 << 20
 # open anyway.
 _MOST_OPENED = 256
 # The USD library depends on the end of a name.
-_NEEDS_NAME = (".usd", ".usda", ".usdc")
+_NEEDS_NAME = (".usd", ".usda", ".usdc", ".usdz")
 
 _opened: dict[str, "FileAtUrl"] = {}
 

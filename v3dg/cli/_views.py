@@ -122,7 +122,7 @@ def choose_cameras(
     default of `views`."""
     cameras = options.read(options.size) or own_cameras
     if cameras is None and not isinstance(subject, Scene):
-        cameras = _around(subject, options, options.views or views, path)
+        cameras = _around(subject, options, options.views or views)
     if not cameras:
         refuse(shown(path), "cameras, got a file without any; give some with --cameras")
     if options.camera is not None:
@@ -145,9 +145,7 @@ def _camera_name(text: str, names: Sequence[str]) -> str:
     raise ValueError(f"--camera: expected one of {choices}, or 0 to {len(names) - 1}, got {text}")
 
 
-def _around(
-    subject: Bundle | Gaussians, options: ViewOptions, views: int, path: Path
-) -> dict[str, Camera]:
+def _around(subject: Bundle | Gaussians, options: ViewOptions, views: int) -> dict[str, Camera]:
     """Cameras around the ball of most gaussians, at a distance that shows nearly all of
     it."""
     means = _means_to_frame(subject)
@@ -165,7 +163,7 @@ def _around(
         distance,
         views,
         math.radians(elevation),
-        up=direction_of(options.up or up_of(subject, path=path)[0]),
+        up=direction_of(options.up or up_of(subject)[0]),
         width=options.size[0],
         height=options.size[1],
         near=min(0.01, 0.01 * distance),
@@ -195,7 +193,7 @@ def choose_up(
     """
     if requested:
         return requested, []
-    axis, reason = up_of(subject, cameras, path)
+    axis, reason = up_of(subject, cameras)
     if reason == ASSUMED and is_at_terminal():
         axis = ask_up(path, axis)
         reason = "as you answered"

@@ -22,7 +22,7 @@ from v3dg.cameras import Axis
 from v3dg.cleaning import AssetWarning, describe
 from v3dg.cli import _common
 from v3dg.cli._views import ask_up, is_at_terminal
-from v3dg.gaussians import Gaussians, common
+from v3dg.gaussians import Gaussians
 from v3dg.io import SUFFIXES, open_asset, run_files
 from v3dg.levels import BuildConfig, build_file, levels_path
 from v3dg.levels.scheduler import SchedulerError
@@ -108,7 +108,7 @@ def _asked_up(path: Path) -> Axis | None:
     stride = max(asset.num_gaussians // _NUM_SAMPLES, _SAMPLE_SIZE)
     for start in range(0, asset.num_gaussians, stride):
         samples.append(asset.read(start, min(start + _SAMPLE_SIZE, asset.num_gaussians)))
-    axis, reason = up_of(Gaussians.concatenate(samples), path=path)
+    axis, reason = up_of(Gaussians.concatenate(samples), declared=asset.declared)
     if reason == ASSUMED:
         return ask_up(path, axis)
     return None
@@ -298,20 +298,16 @@ def _build(
     start = time.perf_counter()
     with _resume_advised(output):
         bundle, is_built = _build_file(options, paths, output, executor)
+    notes = _notes(options, paths)
+    for note in notes:
+        _common.tell(note)
     asset: str | list[str] = [shown(path) for path in paths]
     if len(paths) == 1:
         asset = shown(paths[0])
     status = "kept"
     if is_built:
         status = "built"
-    notes = []
-    if options.antialiased is not None:
-        declared = common([open_asset(path).declared.antialiased for path in paths])
-        contradiction = _config_of(options).contradiction(antialiased=declared)
-        if contradiction:
-            notes.append(f"{shown(paths[0])}: {contradiction}")
     return {
-        "notes": notes,
         "asset": asset,
         "output": str(output),
         "status": status,
@@ -322,7 +318,25 @@ def _build(
         "levels": bundle.num_levels,
         "bytes": output.stat().st_size,
         "seconds": time.perf_counter() - start,
+        "notes": notes,
     }
+
+
+def _notes(options: Build, paths: Sequence[Path]) -> list[str]:
+    """Lines about what the files of an asset declare."""
+    config = _config_of(options)
+    lines = []
+    for path in paths:
+        declared = open_asset(path).declared
+        if declared.up is not None:
+            lines.append(f"{shown(path)}: {declared.up} is up, {declared.up_reason}")
+        contradiction = config.contradiction(antialiased=declared.antialiased)
+        if contradiction:
+            lines.append(f"{shown(path)}: {contradiction}")
+        elif declared.antialiased:
+            lines.append(f"{shown(path)}: trained with antialiasing")
+        lines += [f"{shown(path)}: {note}" for note in declared.notes]
+    return lines
 
 
 def _build_file(
@@ -396,4 +410,4 @@ def _lines(result: JsonObject) -> list[str]:
     ]
     if result["dropped"]:
         lines.append("left out: " + describe(result["dropped"]))
-    return [*lines, *result["notes"]]
+    return lines

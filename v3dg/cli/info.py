@@ -16,11 +16,13 @@ from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cleaning import OUTLIER_DISTANCE, describe, examine, outliers
 from v3dg.cli import _common
+from v3dg.formats._declared import declared_of
 from v3dg.gaussians import Array, Gaussians
 from v3dg.io import asset_bytes
 from v3dg.levels import BuildConfig
 from v3dg.opening import open_with_cameras
 from v3dg.scene import Scene
+from v3dg.upright import up_of
 
 # JSON values, and lines of text.
 _Description: TypeAlias = tuple[JsonObject, list[str]]
@@ -46,11 +48,15 @@ def run(options: Info) -> None:
     else:
         description = _asset_info(options.file, subject)
     result, lines = description
+    up, reason = up_of(subject, cameras)
+    result = {**result, "up": up, "up_reason": reason}
+    lines.insert(1, f"{up} is up, {reason}")
     _common.print_result(result, lines, as_json=options.json)
 
 
 def _asset_info(path: Path, asset: Gaussians) -> _Description:
     num_bytes = asset_bytes(path)
+    declared = declared_of(asset)
     findings = examine(asset)
     drawable = asset.subset(findings.drawable)
     far = outliers(drawable.means)
@@ -72,12 +78,17 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
         "bytes": num_bytes,
         **boxes,
         "percentiles_5_50_95": spread,
+        "antialiased": declared.antialiased,
+        "notes": list(declared.notes),
     }
     lines = [f"{shown(path)}: asset, {_common.bytes_text(num_bytes)}"]
     lines += [f"{len(asset):,} gaussians, SH degree {asset.sh_degree}"]
     if findings.counts:
         lines.append(f"{findings.num_dropped:,} cannot be drawn: {describe(findings.counts)}")
-    return result, [*lines, *_extent_lines(result), *_spread_lines(spread)]
+    lines += [*_extent_lines(result), *_spread_lines(spread)]
+    if declared.antialiased:
+        lines.append("trained with antialiasing")
+    return result, lines
 
 
 def _extent_lines(result: JsonObject) -> list[str]:

@@ -76,7 +76,7 @@ def run(options: View) -> None:
     up = options.up
     reason = ""
     if up is None:
-        up, reason = up_of(subject, cameras, options.subject)
+        up, reason = up_of(subject, cameras)
     scene_view = SceneView(subject, device=options.device, memory=options.pool())
     # Imported early because it takes long; the site reports errors.
     with contextlib.suppress(ImportError):

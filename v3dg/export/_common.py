@@ -12,44 +12,28 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg._numbers import one_of
 from v3dg._urls import beside
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Floats
-from v3dg.rotations import rotation_from_quaternion
+from v3dg.formats import _axes
+from v3dg.rotations import quaternion_from_rotation
 from v3dg.scene import Scene
 
 _OTHER_LETTERS = re.compile("[^A-Za-z0-9]")  # than names of folders have
 
-# Quaternions w x y z that turn an axis to -y, which is up where y is down, as viewers
-# take it.
-_HALF = math.sqrt(0.5)
-_TO_UPRIGHT: dict[Axis, tuple[float, float, float, float]] = {
-    "x": (_HALF, 0.0, 0.0, -_HALF),
-    "y": (0.0, 1.0, 0.0, 0.0),
-    "z": (_HALF, _HALF, 0.0, 0.0),
-    "-x": (_HALF, 0.0, 0.0, _HALF),
-    "-y": (1.0, 0.0, 0.0, 0.0),
-    "-z": (_HALF, -_HALF, 0.0, 0.0),
-}
-# Rotations from that frame to one with y up, as in WebGL, and to one with z up, as on a
-# globe.
-_FROM_UPRIGHT = {
-    "y": np.diag([-1.0, -1.0, 1.0]),
-    "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
-}
+# The axes of a world of which this axis is up: y as in WebGL, z as on a globe.
+_WORLDS = {"y": _axes.GLTF, "z": _axes.Z_UP}
 
 
 def turn_upright(up: Axis) -> Floats:
-    """(4,) w x y z that turns what is up in an asset to -y; ValueError for another
-    name."""
-    one_of(up, "up", tuple(_TO_UPRIGHT))
-    return np.array(_TO_UPRIGHT[up])
+    """(4,) w x y z that turns what is up in an asset to -y, which viewers take for up;
+    ValueError for another name."""
+    return np.array(quaternion_from_rotation(_axes.turn(_axes.axes_of_up(up), _axes.MEMORY)))
 
 
 def rotation_to(up: Axis, frame: Literal["y", "z"]) -> Floats:
     """(3, 3) rotation that turns what is up to an axis."""
-    return np.asarray(_FROM_UPRIGHT[frame] @ rotation_from_quaternion(turn_upright(up))) + 0.0
+    return _axes.turn(_axes.axes_of_up(up), _WORLDS[frame])
 
 
 def names_of(scene: Scene, reserved: Collection[str] = ()) -> list[str]:

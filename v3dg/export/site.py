@@ -144,7 +144,7 @@ def _write_bundles(
     """Write the levels of each bundle to the folder of its name, which is made unless
     it is `.`."""
     levels: list[Export] = []
-    with Bar(sum(plan.bundle.num_gaussians for plan in plans), "export", progress) as bar:
+    with Bar(sum(plan.num_gaussians for plan in plans), "export", progress) as bar:
         for name, plan in zip(names, plans, strict=True):
             (folder / name).mkdir(exist_ok=True)
             levels.append(write_levels(plan, folder / name, turn, bar.update))
@@ -172,7 +172,18 @@ def _bundle(name: str, plan: Plan, levels: Export) -> dict[str, object]:
     url = INDEX
     if name != ".":
         url = f"{name}/{INDEX}"
-    return {"url": url, "counts": levels.counts, **_common.detail_of(plan.bundle)}
+    detail = _common.detail_of(plan.bundle)
+    if plan.bundle.num_levels == 1:
+        detail["reach"] = _reach_of_half(plan.bundle)
+    return {"url": url, "counts": levels.counts, **detail}
+
+
+def _reach_of_half(bundle: Bundle) -> float:
+    """As `detail_of` has it, for the level that a chunk of all gaussians is halved
+    to."""
+    corners = bundle.clusters.box[np.diff(bundle.clusters.offset) > 0].reshape(-1, 3)
+    radius = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0))) / 2
+    return radius * math.sqrt(math.pi * 2 / (bundle.num_gaussians + 1))
 
 
 def _instances(scene: Scene) -> dict[str, list[int] | list[float]]:

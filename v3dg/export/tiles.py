@@ -9,7 +9,7 @@ px, the usual limit, is v3dg's tolerance of 3 px².
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypedDict
@@ -133,7 +133,8 @@ def write_tiles(
     with replacing_export(Path(folder), scene, (TILESET, "index.html"), overwrite=overwrite) as new:
         trees = _write_bundles(scene, names, new.path, progress)
         world = _parent(_instances(scene, names, trees))
-        _write_tileset(new.path / TILESET, {"transform": root.T.ravel().tolist(), **world})
+        world["transform"] = root.T.ravel().tolist()
+        _write_tileset(new.path / TILESET, world, {"ball": _ball_of_leaves(scene, root)})
         _common.write_page(new.path, "tiles.html")
         num_bytes = _common.bytes_below(new.path)
         num_tiles = len(list(new.path.rglob("*.glb")))
@@ -241,8 +242,13 @@ def _box(bounds: list[Floats]) -> _Volume:
 
 def _bounds(tile: _Tile) -> Floats:
     """Lower and upper corner of a tile's box, after its transform."""
-    box = np.array(tile["boundingVolume"]["box"])
     matrix = np.reshape(tile.get("transform", np.eye(4).ravel()), (4, 4)).T
+    return _moved(tile["boundingVolume"], matrix)
+
+
+def _moved(volume: _Volume, matrix: Floats) -> Floats:
+    """Lower and upper corner of a volume after a transform."""
+    box = np.array(volume["box"])
     centre = matrix[:3, :3] @ box[:3] + matrix[:3, 3]
     half = np.abs(matrix[:3, :3] @ box[3:].reshape(3, 3).T).sum(axis=1)
     return np.array([centre - half, centre + half])
@@ -256,9 +262,25 @@ def _transforms(scene: Scene) -> Floats:
     return matrices
 
 
-def _write_tileset(path: Path, root: _Tile) -> None:
+def _ball_of_leaves(scene: Scene, root: Floats) -> list[float]:
+    """Centre and radius of a ball around the finest level of all instances, which the
+    page shows first: coarse gaussians, and with them the tiles, reach far beyond it."""
+    boxes: list[Floats] = []
+    for bundle in scene.bundles:
+        leaves = bundle.clusters.box[np.array(bundle.level_range(0))].astype(np.float64)
+        boxes.append(np.array([leaves[:, 0].min(axis=0), leaves[:, 1].max(axis=0)]))
+    bounds: list[Floats] = []
+    for bundle, transform in zip(scene.instance_bundle.tolist(), _transforms(scene), strict=True):
+        bounds.append(_moved(_box([boxes[bundle]]), root @ transform))
+    low, high = _moved(_box(bounds), np.eye(4))
+    return [*((low + high) / 2).tolist(), float(np.linalg.norm(high - low)) / 2]
+
+
+def _write_tileset(
+    path: Path, root: _Tile, extras: Mapping[str, list[float]] | None = None
+) -> None:
     extensions = {"extensionsUsed": _EXTENSIONS, "extensionsRequired": _EXTENSIONS}
-    document = {
+    document: dict[str, object] = {
         "asset": {"version": "1.1", "generator": f"v3dg {__version__}"},
         "extensionsUsed": [_CONTENT],
         "extensionsRequired": [_CONTENT],
@@ -267,4 +289,6 @@ def _write_tileset(path: Path, root: _Tile) -> None:
         "geometricError": root["geometricError"],
         "root": {"refine": "REPLACE", **root},
     }
+    if extras is not None:
+        document["extras"] = extras
     _common.write_document(path, document)

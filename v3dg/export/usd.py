@@ -42,7 +42,7 @@ def write_usd(
 
     Args:
         subject: A scene or a bundle, or its file.
-        path: File to write, .usd, .usda or .usdc.
+        path: File to write, .usd, .usda, .usdc or .usdz.
         up: The axis that is up in the world, which is turned to z; None uses the one of
             `v3dg.upright.up_of`.
 

@@ -1,8 +1,10 @@
 """What a file declares about its gaussians beside their numbers."""
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 from v3dg.cameras import Axis
+from v3dg.gaussians import Gaussians
 
 
 @dataclass(frozen=True)
@@ -27,3 +29,17 @@ class Declared:
 
 NOTHING = Declared()
 """The declarations of a file that declares nothing."""
+
+_OF_GAUSSIANS: WeakKeyDictionary[Gaussians, Declared] = WeakKeyDictionary()
+
+
+def declare(gaussians: Gaussians, declared: Declared) -> Gaussians:
+    """Remember what the file of these gaussians declares; gaussians that are made from
+    them declare nothing."""
+    _OF_GAUSSIANS[gaussians] = declared
+    return gaussians
+
+
+def declared_of(gaussians: Gaussians) -> Declared:
+    """What the file of gaussians that `read_asset` returned declares."""
+    return _OF_GAUSSIANS.get(gaussians, NOTHING)

@@ -217,6 +217,6 @@ def offset_of(node: Node, limit: int) -> int:
 
 def name_text(name: str) -> str:
     """A name from a document as part of a message."""
-    if is_one_line(name) and len(name) <= 60:
+    if name and is_one_line(name) and len(name) <= 60:
         return name
     return json_text(name)

@@ -19,7 +19,7 @@ from v3dg.formats import spz
 from v3dg.formats._gltf_accessors import column, count_of, has_data, indices
 from v3dg.formats._gltf_document import Document, name_text
 from v3dg.formats._packing import SH_C0, assemble
-from v3dg.formats._reading import check
+from v3dg.formats._reading import check, integer_of
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import normalised
 
@@ -266,11 +266,13 @@ class Primitive:
             )
         mode = _TRIANGLES
         if self._node.has("mode"):
-            mode = self._node.field("mode").value
+            mode = integer_of(self._node.field("mode"), "0 to 6", 0, 6)
         if mode != _POINTS:
-            notes.append(f"A primitive has the mode {mode!r}, and is read as points.")
+            notes.append(f"A primitive has the mode {mode}, and is read as points.")
         if self._packed is None:
             notes += self._attribute_notes()
+        else:
+            notes += spz.flag_notes(self._packed.header)
         if self._node.has("targets"):
             notes.append("Morph targets are not read.")
         return notes

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -26,6 +27,22 @@ DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
 _BLOCK = 1 << 16
 _MIN_LOG_SCALE = -20.0  # 2e-9: stands for scales of 0, whose log no quantised format can hold
 _LEAST_VISIBLE_OPACITY = np.float32(_core.min_alpha)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a quantised format can hold; values beyond are cut.
+
+    Attributes:
+        log_scale: Lowest and highest log of a scale.
+        color: Lowest and highest coefficient of degree 0.
+        harmonic: Lowest and highest coefficient of higher degrees.
+    """
+
+    log_scale: tuple[float, float] = (_MIN_LOG_SCALE, math.inf)
+    color: tuple[float, float] = (-math.inf, math.inf)
+    harmonic: tuple[float, float] = (-math.inf, math.inf)
+
 
 # The components of a quaternion that are stored, in ascending order, by the one that is
 # omitted.

@@ -21,6 +21,7 @@ from v3dg.formats._declared import NOTHING, Declared
 from v3dg.gaussians import Gaussians, gaussian_bytes
 
 _FREE_GAUSSIANS = 1 << 18  # 15 to 62 MB: a file of any size may claim this many
+_MAX_NAMES = 8  # in a message
 _FREE_BYTES = 1 << 20  # a member of a zip may have this size, whatever the size of the zip
 
 
@@ -49,6 +50,15 @@ class AssetFile:
     declared: Declared = NOTHING
 
 
+def listed(names: Iterable[str]) -> str:
+    """Names for a message: the first ones, each short, and how many more there are."""
+    all_names = list(names)
+    text = ", ".join(f"{name[:40]!a}" for name in all_names[:_MAX_NAMES])
+    if len(all_names) > _MAX_NAMES:
+        text += f" and {len(all_names) - _MAX_NAMES} more"
+    return text
+
+
 def bytes_of(files: Iterable[AnyPath]) -> int:
     """Size on disk of the files that exist, together."""
     return sum(os.stat(file).st_size for file in set(files) if os.path.exists(file))
@@ -60,6 +70,7 @@ def whole_file(
     sh_degree: int,
     read: Callable[[AnyPath], Gaussians],
     files: Iterable[AnyPath] = (),
+    declared: Declared = NOTHING,
 ) -> AssetFile:
     """A file, and others that it names, that can only be read whole: on the first read,
     and then cached."""
@@ -72,6 +83,7 @@ def whole_file(
         sh_degree=sh_degree,
         read=lambda first, last: read_once().subset(slice(first, last)),
         whole_bytes=memory,
+        declared=declared,
     )
 
 

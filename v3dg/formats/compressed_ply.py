@@ -8,8 +8,8 @@ colour and opacity (8 bits each), and element `sh` a byte a coefficient, channel
 channel, for -4 to 4. See docs/formats.md.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -18,10 +18,13 @@ from numpy.typing import NDArray
 from v3dg import _core, _files
 from v3dg.formats import _packing, _ply_comments
 from v3dg.formats._packing import SH_C0, SQRT2, Floats, assemble
-from v3dg.formats._reading import AnyPath, AssetFile, File, check
+from v3dg.formats._reading import AnyPath, AssetFile, File, check, listed
 from v3dg.gaussians import Gaussians
 
 _CHUNK = 256
+_MAX_LOG_SCALE = 20.0
+LIMITS = _packing.Limits(log_scale=(-20.0, _MAX_LOG_SCALE), harmonic=(-4.0, 4.0))
+"""What the format can hold."""
 _PLY_TYPES = {"float": "<f4", "uint": "<u4", "uchar": "u1"}
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _RANGES = {"": "xyz", "scale_": "xyz", "color": "rgb"}
@@ -85,7 +88,25 @@ def open_file(path: AnyPath) -> AssetFile:
         return assemble(last - first, degree, decode)
 
     declared = _ply_comments.declared_by(_core.ply_comments(path))
+    declared = replace(declared, notes=(*declared.notes, *_notes(elements)))
     return AssetFile(path, count, degree, read_rows, declared=declared)
+
+
+def _notes(elements: Mapping[str, _Element]) -> tuple[str, ...]:
+    """What is in the file and is not read, one sentence each."""
+    used = {
+        "chunk": [name for kind in _RANGES for name in _range_names(kind)],
+        "vertex": list(_PACKED),
+    }
+    notes = []
+    for element, read_names in used.items():
+        names = [name for name in elements[element].kinds if name not in read_names]
+        if names:
+            notes.append(f"Properties of {element} were left out: {listed(names)}.")
+    unread = [name for name in elements if name not in (*used, "sh")]
+    if unread:
+        notes.append(f"Elements beside chunk, vertex and sh were left out: {listed(unread)}.")
+    return tuple(notes)
 
 
 def _decoded(
@@ -123,7 +144,7 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
     num_chunks = -(-count // _CHUNK)
     values = {
         "": host.means[order].astype(np.float64),
-        "scale_": np.minimum(_packing.log_scales(host.scales[order]), 20.0),
+        "scale_": np.minimum(_packing.log_scales(host.scales[order]), _MAX_LOG_SCALE),
         "color": host.sh[order, 0].astype(np.float64) * SH_C0 + 0.5,
     }
     starts = np.arange(num_chunks) * _CHUNK

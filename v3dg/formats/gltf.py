@@ -2,12 +2,11 @@
 in `.spz`.
 
 The writer writes one primitive. The reader reads all gaussians of a scene, each where
-its node places it. Coordinates are passed on as they are stored; glTF's have y up.
+its node places it. Both turn gaussians: the axes of glTF are left, up, forward.
 """
 
 import json
 import struct
-from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -16,7 +15,8 @@ from numpy.typing import NDArray
 
 from v3dg import _files
 from v3dg._version import __version__
-from v3dg.formats import spz
+from v3dg.cameras import Axis
+from v3dg.formats import _axes, spz
 from v3dg.formats._declared import Declared
 from v3dg.formats._gltf_accessors import BYTE, FLOAT, TYPES
 from v3dg.formats._gltf_document import BINARY_CHUNK, JSON_CHUNK, MAGIC, Document
@@ -36,14 +36,13 @@ def open_file(path: AnyPath) -> AssetFile:
     """Open a `.glb` or `.gltf` file; all of it is read with its first rows."""
     document = Document(Path(path))
     scene = Scene(document)
-    opened = whole_file(path, scene.count, scene.degree, read, document.buffer_files())
-    declared = Declared(antialiased=scene.antialiased, notes=tuple(scene.notes))
-    return replace(opened, declared=declared)
+    declared = Declared(_axes.MEMORY_UP, "as in glTF", scene.antialiased, tuple(scene.notes))
+    return whole_file(path, scene.count, scene.degree, read, document.buffer_files(), declared)
 
 
 def read(path: AnyPath) -> Gaussians:
     """Read the gaussians of a `.glb` or `.gltf` file."""
-    return Scene(Document(Path(path))).read()
+    return _axes.turned(Scene(Document(Path(path))).read(), _axes.GLTF, _axes.MEMORY)
 
 
 def files(path: Path) -> list[Path]:
@@ -51,15 +50,17 @@ def files(path: Path) -> list[Path]:
     return [path, *Document(path).buffer_files()]
 
 
-def write(path: AnyPath, gaussians: Gaussians) -> None:
-    """Write a `.glb` file with float attributes; the order stays."""
-    content = encode(check_writable(gaussians))
+def write(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) -> None:
+    """Write a `.glb` file with float attributes, of gaussians of which `up` is up; the
+    order stays."""
+    content = encode(_axes.turned(check_writable(gaussians), _axes.axes_of_up(up), _axes.GLTF))
     with _files.replacing(path) as temporary:
         Path(temporary).write_bytes(content)
 
 
 def encode(host: Gaussians, *, compressed: bool = False) -> bytes:
-    """A `.glb` file of NumPy gaussians, whose values the format can hold."""
+    """A `.glb` file of NumPy gaussians with the axes of the file, whose values the
+    format can hold."""
     columns = _columns(host, compressed=compressed)
     if compressed:
         parts = [b"".join(spz.encode(host))]

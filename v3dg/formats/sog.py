@@ -13,7 +13,6 @@ import math
 import os
 import zipfile
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -33,6 +32,7 @@ from v3dg.formats._reading import (
     check,
     integer_of,
     least_bytes,
+    listed,
     value_errors,
     whole_file,
 )
@@ -49,15 +49,11 @@ _MAX_LOG = 88.0  # about the log of the largest float32
 
 # Models of splat-transform, and whether they are antialiased.
 _MODELS: dict[str, bool | None] = {"default": False, "antialiased": True, "2dgs": None}
-_KEYS = frozenset(
-    {
-        *("version", "count", "asset", "antialias", "model"),
-        *("means", "scales", "quats", "sh0", "shN"),
-    }
-)
+_RESOURCE_FORKS = "__MACOSX/"  # the folder of what the Finder adds to a zip
 
 # Number of pictures of each part of meta.json.
 _PARTS = {"means": 2, "scales": 1, "quats": 1, "sh0": 1, "shN": 2}
+_FIELDS = ("version", "count", "asset", "model", "antialias", *_PARTS)
 
 
 def open_file(path: str | os.PathLike[str]) -> AssetFile:
@@ -67,29 +63,11 @@ def open_file(path: str | os.PathLike[str]) -> AssetFile:
         if path.suffix == ".json":
             text = file.read()
         else:
-            text = Archive(path, file).read("meta.json")
+            archive = Archive(path, file)
+            text = archive.read(f"{_folder_in(path, archive)}meta.json")
     meta = _meta(path, text)
     count, degree = _size(meta)
-    opened = whole_file(path, count, degree, read, files(path))
-    return replace(opened, declared=_declared(meta))
-
-
-def _declared(meta: dict[str, Node]) -> Declared:
-    """What meta.json declares: `antialias`, of the specification, and `model`, of
-    splat-transform, which counts where there are both."""
-    antialiased = None
-    notes = [f"{json_text(name)} of meta.json is not read." for name in meta if name not in _KEYS]
-    if "antialias" in meta:
-        antialiased = meta["antialias"].value
-        if not isinstance(antialiased, bool):
-            raise meta["antialias"].error("true or false")
-    if "model" in meta:
-        model = meta["model"].text()
-        if model in _MODELS:
-            antialiased = _MODELS[model]
-        else:
-            notes.append(f"The model {json_text(model)} of meta.json is unknown, and is not used.")
-    return Declared(antialiased=antialiased, notes=tuple(notes))
+    return whole_file(path, count, degree, read, files(path), _declared(meta))
 
 
 def read(path: str | os.PathLike[str], claims: Claims | None = None) -> Gaussians:
@@ -102,7 +80,26 @@ def read(path: str | os.PathLike[str], claims: Claims | None = None) -> Gaussian
         )
     with claims.open(path) as file:
         archive = Archive(path, file)
-        return _read(path, archive.read("meta.json"), archive.read, claims)
+        folder = _folder_in(path, archive)
+        text = archive.read(f"{folder}meta.json")
+        return _read(path, text, lambda name: archive.read(folder + name), claims)
+
+
+def _folder_in(path: Path, archive: Archive) -> str:
+    """The folder of a zip that has its meta.json, with a slash at the end; "" for a zip
+    without folders."""
+    names = [name for name in archive.names if not name.startswith(_RESOURCE_FORKS)]
+    is_streamed = any(name.rsplit("/", 1)[-1] == "lod-meta.json" for name in names)
+    advice = "unpack it, and open its lod-meta.json"
+    check(path, not is_streamed, f"one SOG in the zip, got a streamed SOG; {advice}")
+    if "meta.json" in names:
+        return ""
+    folders = [name.removesuffix("meta.json") for name in names if name.endswith("/meta.json")]
+    names_of_folders = listed(folders)
+    check(
+        path, len(folders) <= 1, f"one SOG in the zip, got several: {names_of_folders}; unpack it"
+    )
+    return "".join(folders)
 
 
 def files(path: Path) -> list[Path]:
@@ -191,13 +188,36 @@ def _labels(path: Path, pixels: _Pixels, palette: _Palette) -> _packing.Integers
 
 def _meta(path: Path, text: bytes) -> dict[str, Node]:
     with value_errors(path, "JSON in meta.json"):
-        document = parse_json(text.decode("utf-8"))
+        document = parse_json(text)
     meta = Node(document, os.fspath(path), "")
     advice = "convert it with splat-transform first"
     check(path, "version" in meta.some_fields(()), f"SOG version 2, got an older file; {advice}")
     if meta.value["version"] != 2:
         raise meta.field("version").error("SOG version 2")
     return meta.some_fields(("count", "means", "scales", "quats", "sh0"))
+
+
+def _declared(meta: dict[str, Node]) -> Declared:
+    """What meta.json declares beside the pictures: `antialias`, of the specification,
+    and `model`, of splat-transform, which counts where there are both."""
+    notes = []
+    antialiased: bool | None = None
+    if "antialias" in meta:
+        antialiased = meta["antialias"].value
+        if not isinstance(antialiased, bool):
+            raise meta["antialias"].error("true or false")
+    if "model" in meta:
+        model = meta["model"].text()
+        if model in _MODELS:
+            antialiased = _MODELS[model]
+        else:
+            notes.append(f"The model {json_text(model)} is not known and was left out.")
+        if model == "2dgs":
+            notes.append("The gaussians are those of 2DGS; they were read as flat ellipsoids.")
+    unread = [name for name in meta if name not in _FIELDS]
+    if unread:
+        notes.append(f"Fields of meta.json were left out: {listed(unread)}.")
+    return Declared(antialiased=antialiased, notes=tuple(notes))
 
 
 def _size(meta: dict[str, Node]) -> tuple[int, int]:

@@ -4,22 +4,25 @@ positions.
 Versions 1 to 3 are one gzip stream: a header of 16 bytes, then positions, opacities,
 colours, scales, rotations and higher SH, each for all gaussians. Version 4 is a header
 of 32 bytes, a table of sizes and a zstd stream an attribute. Version 1 has positions in
-half precision, 1 and 2 quaternions without w. Coordinates are passed on as they are
-stored. See docs/formats.md.
+half precision, 1 and 2 quaternions without w. Axes are right, up, back, unless the
+extension SPZ_ADOBE_coordinate_system records others. Some programs store those of
+`.ply` without a record: a ground, where there is one, shows which they are. See
+docs/formats.md.
 """
 
 import math
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _files
-from v3dg.formats import _packing
+from v3dg.cameras import Axis
+from v3dg.formats import _axes, _packing
 from v3dg.formats._declared import Declared
 from v3dg.formats._packing import SQRT2, Floats, assemble
 from v3dg.formats._reading import (
@@ -46,6 +49,24 @@ _LARGEST_FIXED = (1 << 23) - 1
 # Bits of the flags.
 _ANTIALIASED = 1
 _HAS_EXTENSIONS = 2
+_MOST_POINTS = 100_000  # that a ground is sought among
+_EXTENSION = struct.Struct("<II")  # a type and the bytes that follow
+_AXES_EXTENSION = 0xADBE0003  # SPZ_ADOBE_coordinate_system
+# The axes by their number in that extension, of version 4 of the library.
+_AXES = (
+    *("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
+    *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
+)
+# Programs that turn nothing store gaussians that have these axes, by what is up.
+_STORED_AXES: dict[Axis, str] = {"y": _axes.OPENGL, "-y": _axes.MEMORY, "z": _axes.Z_UP}
+
+
+LIMITS = _packing.Limits(
+    log_scale=(-10.0, -10.0 + 255 / 16),
+    color=(-0.5 / _COLOR_SCALE, 0.5 / _COLOR_SCALE),
+    harmonic=(-1.0, 127.5 / 128),
+)
+"""What the format can hold, with half a step more where that is rounded to it."""
 
 
 class Header(NamedTuple):
@@ -76,14 +97,28 @@ class Header(NamedTuple):
         return [self.num_gaussians * width for width in widths]
 
 
+@dataclass(frozen=True, eq=False)
+class _Content:
+    """What a file holds, expanded."""
+
+    header: Header
+    sections: list[memoryview]
+    extensions: bytes  # records of a type, a length and a payload
+
+
 def open_file(path: AnyPath) -> AssetFile:
-    """Open a `.spz` file; all of it is read with its first rows."""
+    """Open a `.spz` file of version 1 to 4, which is expanded; all of its gaussians are
+    decoded with the first."""
     claims = Claims()
-    with claims.open(path) as file:
-        header = header_of(path, file.read(MAX_START), claims)
-    opened = whole_file(path, header.num_gaussians, header.sh_degree, read)
-    declared = Declared(antialiased=header.antialiased, notes=flag_notes(header))
-    return replace(opened, declared=declared)
+    content = _expanded(path, claims.read(path), claims)
+    axes, reason = _axes_of(path, content)
+
+    def read(_: AnyPath) -> Gaussians:
+        return _axes.turned(_decode(content), axes, _axes.MEMORY)
+
+    header = content.header
+    declared = Declared(_axes.MEMORY_UP, reason, header.antialiased, _notes(content))
+    return whole_file(path, header.num_gaussians, header.sh_degree, read, declared=declared)
 
 
 def header_of(path: AnyPath, start: bytes | memoryview, claims: Claims) -> Header:
@@ -95,54 +130,40 @@ def header_of(path: AnyPath, start: bytes | memoryview, claims: Claims) -> Heade
     return _checked_header(path, header, claims)
 
 
-def flag_notes(header: Header) -> tuple[str, ...]:
-    """Sentences about flags that were not understood."""
-    unknown = header.flags & ~(_ANTIALIASED | _HAS_EXTENSIONS)
-    if not unknown:
-        return ()
-    return (f"Its flags {unknown:#04x} are unknown, and are not read.",)
-
-
-def read(path: AnyPath) -> Gaussians:
-    """Read a `.spz` file of version 1 to 4."""
-    claims = Claims()
-    return decode(path, claims.read(path), claims)
-
-
 def decode(path: AnyPath, content: bytes, claims: Claims) -> Gaussians:
-    """The gaussians of a `.spz` file's content."""
+    """The gaussians of a `.spz` file's content, which are not turned."""
+    return _decode(_expanded(path, content, claims))
+
+
+def _expanded(path: AnyPath, content: bytes, claims: Claims) -> _Content:
     if content[:2] == b"\x1f\x8b":
-        return _decode(*_sections_of_gzip(path, content, claims))
+        return _sections_of_gzip(path, content, claims)
     is_zstd = content[:4] == _MAGIC.to_bytes(4, "little")
     check(
         path, is_zstd, f"a .spz file, which begins with 1f 8b or NGSP, got {content[:4].hex(' ')}"
     )
-    return _decode(*_sections_of_zstd(path, content, claims))
+    return _sections_of_zstd(path, content, claims)
 
 
-def write(path: AnyPath, gaussians: Gaussians, version: int = 3) -> None:
-    """Write a `.spz` file of version 2, 3 or 4; the order stays."""
+def write(
+    path: AnyPath, gaussians: Gaussians, version: int = 3, *, up: Axis = _axes.MEMORY_UP
+) -> None:
+    """Write a `.spz` file of version 2, 3 or 4, of gaussians of which `up` is up; the
+    order stays."""
     check("version", version in (2, 3, 4), f"2, 3 or 4 for .spz, got {version}")
-    host = _packing.check_writable(gaussians)
+    host = _axes.turned(_packing.check_writable(gaussians), _axes.axes_of_up(up), _axes.OPENGL)
     with _files.replacing(path) as temporary, open(temporary, "wb") as file:
-        for part in encode(host, version):
+        for part in encode(host, version, axes=_axes.OPENGL):
             file.write(part)
         # Readers refuse files that are too small for what they claim, and ignore zeros
         # at the end.
         file.write(bytes(max(0, least_bytes(len(host)) - file.tell())))
 
 
-def encode(host: Gaussians, version: int = 3) -> Iterator[bytes]:
-    """Parts of a `.spz` file; ``host`` has passed `check_writable`."""
-    reach = float(np.abs(host.means).max(initial=0.0))
-    integer_bits = 0
-    if reach > 0:
-        integer_bits = math.ceil(math.log2(reach))
-    # Fraction bits: 12, as in Niantic's writer, or more if a step were above 2^-17 of
-    # the largest coordinate.
-    bits = max(0, min(max(12, 17 - integer_bits), 22 - integer_bits, 24))
-    fits = reach * 2**bits <= _LARGEST_FIXED
-    check("means", fits, f"coordinates within ±{_LARGEST_FIXED} for .spz, got {reach:g}")
+def encode(host: Gaussians, version: int = 3, *, axes: str = "") -> Iterator[bytes]:
+    """Parts of a `.spz` file, which records its axes if they are given; ``host`` has
+    passed `check_writable`."""
+    bits = _fraction_bits(host.means)
 
     def fixed(rows: slice) -> bytes:
         numbers = np.rint(host.means[rows].astype(np.float64) * 2**bits).astype("<i4")
@@ -160,32 +181,51 @@ def encode(host: Gaussians, version: int = 3) -> Iterator[bytes]:
         lambda rows: _bytes(host.sh[rows, 1:] * 128.0 + 128.0),
     ]
     flags = 0
+    extensions = b""
     if host.antialiased:
         flags |= _ANTIALIASED
+    if axes:
+        flags |= _HAS_EXTENSIONS
+        extensions = _EXTENSION.pack(_AXES_EXTENSION, 4) + struct.pack("<I", _AXES.index(axes))
     header = _HEADER.pack(_MAGIC, version, len(host), host.sh_degree, bits, flags, 0)
     if version == 4:
         if not host.sh_degree:
             del sections[-1]
-        yield from _zstd_parts(header, len(host), sections)
+        yield from _zstd_parts(header, extensions, len(host), sections)
         return
     compressor = zlib.compressobj(6, zlib.DEFLATED, 31)
     yield compressor.compress(header)
     for section in sections:
         for rows in _packing.blocks(len(host)):
             yield compressor.compress(section(rows))
+    yield compressor.compress(extensions)
     yield compressor.flush()
 
 
+def _fraction_bits(means: NDArray[np.float32]) -> int:
+    """12, as in Niantic's writer, or more if a step were above 2^-17 of the largest
+    coordinate."""
+    reach = float(np.abs(means).max(initial=0.0))
+    integer_bits = 0
+    if reach > 0:
+        integer_bits = math.ceil(math.log2(reach))
+    bits = max(0, min(max(12, 17 - integer_bits), 22 - integer_bits, 24))
+    fits = reach * 2**bits <= _LARGEST_FIXED
+    check("means", fits, f"coordinates within ±{_LARGEST_FIXED} for .spz, got {reach:g}")
+    return bits
+
+
 def _zstd_parts(
-    header: bytes, count: int, sections: list[Callable[[slice], bytes]]
+    header: bytes, extensions: bytes, count: int, sections: list[Callable[[slice], bytes]]
 ) -> Iterator[bytes]:
-    """The header, with number of streams and offset of their table; the table of sizes;
-    the streams."""
+    """The header, with number of streams and offset of their table; the extensions; the
+    table of sizes; the streams."""
     import zstandard
 
     raw = [b"".join(map(section, _packing.blocks(count))) for section in sections]
     packed = [zstandard.ZstdCompressor(level=12).compress(stream) for stream in raw]
-    yield header[:15] + struct.pack("<BI12x", len(raw), _ZSTD_HEADER_BYTES)
+    yield header[:15] + struct.pack("<BI12x", len(raw), _ZSTD_HEADER_BYTES + len(extensions))
+    yield extensions
     for compressed, stream in zip(packed, raw, strict=True):
         yield _STREAM_SIZES.pack(len(compressed), len(stream))
     yield from packed
@@ -210,20 +250,69 @@ def _rotation_words(quats: Floats) -> bytes:
     return words.astype("<u4").tobytes()
 
 
-def _decode(header: Header, sections: list[memoryview]) -> Gaussians:
+def _means(content: _Content, rows: slice) -> Floats:
+    """(N, 3) positions as they are stored."""
+    positions = np.frombuffer(content.sections[0], "u1")
+    if content.header.version == 1:
+        return positions.view("<f2").reshape(-1, 3)[rows].astype(np.float64)
+    three = positions.reshape(-1, 3, 3)[rows].astype(np.int32)
+    fixed = three[:, :, 0] | (three[:, :, 1] << 8) | (three[:, :, 2] << 16)
+    return ((fixed ^ 0x800000) - 0x800000) / float(1 << content.header.fraction_bits)
+
+
+def _axes_of(path: AnyPath, content: _Content) -> tuple[str, str]:
+    """The axes that gaussians are stored with, and why they are taken for that, as a
+    phrase."""
+    for kind, payload in _records(content.extensions):
+        if kind == _AXES_EXTENSION:
+            number = int.from_bytes(payload, "little")
+            is_known = len(payload) == 4 and number < len(_AXES)
+            expected = f"axes 0 to {len(_AXES) - 1} in their record, got {payload[:8].hex(' ')}"
+            check(path, is_known, expected)
+            if _AXES[number]:
+                return _AXES[number], f"as its record of axes says ({_AXES[number]})"
+    stride = max(1, content.header.num_gaussians // _MOST_POINTS)
+    up = _axes.up_of_ground(_means(content, slice(None, None, stride)))
+    if up is None:
+        return _axes.OPENGL, "as in .spz, which has y up"
+    return _STORED_AXES[up], f"guessed from its ground, with which {up} is up in the file"
+
+
+def _records(extensions: bytes) -> Iterator[tuple[int, bytes]]:
+    """Type and payload of each extension."""
+    first = 0
+    while first + _EXTENSION.size <= len(extensions):
+        kind, num_bytes = _EXTENSION.unpack_from(extensions, first)
+        first += _EXTENSION.size
+        yield kind, extensions[first : first + num_bytes]
+        first += num_bytes
+
+
+def _notes(content: _Content) -> tuple[str, ...]:
+    """Sentences about what is in the file and was not read."""
+    extensions = tuple(
+        f"Its extension {kind:#010x}, of {len(payload)} bytes, is not read."
+        for kind, payload in _records(content.extensions)
+        if kind != _AXES_EXTENSION
+    )
+    return (*flag_notes(content.header), *extensions)
+
+
+def flag_notes(header: Header) -> tuple[str, ...]:
+    """Sentences about flags that were not understood."""
+    unknown = header.flags & ~(_ANTIALIASED | _HAS_EXTENSIONS)
+    if not unknown:
+        return ()
+    return (f"Its flags {unknown:#04x} are unknown, and are not read.",)
+
+
+def _decode(content: _Content) -> Gaussians:
+    header = content.header
     count = header.num_gaussians
-    positions = np.frombuffer(sections[0], "u1")
     opacities, colors, scales, rotations, higher_sh = (
         np.frombuffer(section, "u1").reshape(count, len(section) // max(1, count))
-        for section in sections[1:]
+        for section in content.sections[1:]
     )
-
-    def means(block: slice) -> Floats:
-        if header.version == 1:
-            return positions.view("<f2").reshape(-1, 3)[block].astype(np.float64)
-        three = positions.reshape(-1, 3, 3)[block].astype(np.int32)
-        fixed = three[:, :, 0] | (three[:, :, 1] << 8) | (three[:, :, 2] << 16)
-        return ((fixed ^ 0x800000) - 0x800000) / float(1 << header.fraction_bits)
 
     def decode(block: slice) -> tuple[Floats, ...]:
         color = (colors[block] / 255.0 - 0.5) / _COLOR_SCALE
@@ -231,7 +320,7 @@ def _decode(header: Header, sections: list[memoryview]) -> Gaussians:
         sh = np.concatenate([color[:, None], higher.reshape(len(color), -1, 3)], axis=1)
         log_scales = scales[block] / 16.0 - 10.0
         return (
-            means(block),
+            _means(content, block),
             _quats(rotations[block]),
             np.exp(log_scales),
             opacities[block, 0] / 255.0,
@@ -263,9 +352,7 @@ def _checked_header(path: AnyPath, header: bytes, claims: Claims) -> Header:
     return Header(version, degree, fraction_bits, count, flags)
 
 
-def _sections_of_gzip(
-    path: AnyPath, content: bytes, claims: Claims
-) -> tuple[Header, list[memoryview]]:
+def _sections_of_gzip(path: AnyPath, content: bytes, claims: Claims) -> _Content:
     stream = zlib.decompressobj(31)
     with value_errors(path, "a gzip stream that is not damaged"):
         start = stream.decompress(content, _HEADER.size)
@@ -283,12 +370,13 @@ def _sections_of_gzip(
     check(path, is_whole, f"a gzip stream that ends after {total} bytes of gaussians, got another")
     ends = np.cumsum(sizes).tolist()
     sections = [memoryview(body)[end - size : end] for size, end in zip(sizes, ends, strict=True)]
-    return header, sections
+    extensions = b""
+    if header.flags & _HAS_EXTENSIONS:
+        extensions = body[total:]
+    return _Content(header, sections, extensions)
 
 
-def _sections_of_zstd(
-    path: AnyPath, content: bytes, claims: Claims
-) -> tuple[Header, list[memoryview]]:
+def _sections_of_zstd(path: AnyPath, content: bytes, claims: Claims) -> _Content:
     import zstandard
 
     num_bytes = len(content)
@@ -325,4 +413,7 @@ def _sections_of_zstd(
         first += packed
     if not header.sh_degree:
         sections.append(memoryview(b""))
-    return header, sections
+    extensions = b""
+    if header.flags & _HAS_EXTENSIONS:
+        extensions = content[_ZSTD_HEADER_BYTES:table]
+    return _Content(header, sections, extensions)

@@ -5,7 +5,7 @@ import threading
 import warnings
 from abc import ABC, abstractmethod
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Literal, get_args
 
 import numpy as np
@@ -17,6 +17,7 @@ from v3dg._json import JsonObject
 from v3dg._numbers import check, one_of, value_text, whole_number
 from v3dg.bundle.codec import Codec
 from v3dg.cameras import Axis
+from v3dg.formats._declared import declared_of
 from v3dg.gaussians import Gaussians, gaussian_bytes
 from v3dg.levels.config import BuildConfig
 from v3dg.levels.digest import digest_of
@@ -34,7 +35,8 @@ class Leaves(ABC):
     dropped: dict[str, int]
     digest: str
     resident_bytes: int  # memory of the host that they need as long as they are read
-    antialiased: bool | None = field(default=None, kw_only=True)  # as the asset says
+    up: Axis | None  # what is up, if the file of the asset declares it
+    antialiased: bool | None  # as in `Gaussians`
 
     def settings(self, config: BuildConfig) -> BuildConfig:
         """The settings with which they are built; an AssetWarning says where these
@@ -59,6 +61,7 @@ class MemoryLeaves(Leaves):
         config: BuildConfig,
         unusable: Unusable = "drop",
         device: Device = _device.CPU,
+        up: Axis | None = None,
     ) -> None:
         is_single = str(asset.means.dtype).endswith("32")
         check("asset", is_single, "float32 arrays, got float64; convert them first")
@@ -74,6 +77,7 @@ class MemoryLeaves(Leaves):
             dropped=tally.counts,
             digest=digest_of(host),
             resident_bytes=len(asset) * (gaussian_bytes(asset.sh_degree) + 4),
+            up=up or declared_of(asset).up,
             antialiased=asset.antialiased,
         )
         self._asset = _device.place(asset, _device.of(asset.means))  # without gradients
@@ -111,6 +115,7 @@ def made_with(
     }
     if codec != Codec.name:
         result["codec"] = codec
+    up = up or leaves.up
     if up is not None:
         result["up"] = up
     return result

@@ -25,6 +25,7 @@ from v3dg._numbers import check
 from v3dg._progress import Bar, Progress
 from v3dg._urls import shown
 from v3dg.bundle.codec import Codec
+from v3dg.cameras import Axis
 from v3dg.formats._reading import AssetFile
 from v3dg.gaussians import Gaussians, common, gaussian_bytes, put
 from v3dg.io import open_asset
@@ -102,7 +103,6 @@ def leaves_on_disk(
     """
     files = map(open_asset, paths)  # lazily, so that few files are open at once
     tiles = list(map(_Tile.of, files))
-    antialiased = common([tile.antialiased for tile in tiles])
     count = sum(tile.num_gaussians for tile in tiles)
     check("asset", count < MOST_GAUSSIANS, f"fewer than 2^32 gaussians, got {count:,}")
     degree = max(tile.sh_degree for tile in tiles)
@@ -117,16 +117,17 @@ def leaves_on_disk(
         progress = False
     with scratch, Bar(2 * count, "reading", progress) as bar:
         if fits:
-            buffer = Codec(degree).empty(count)
+            antialiased = _antialiased(tiles)
+            buffer = Codec(degree).empty(count).trained(antialiased=antialiased)
             for _ in _blocks(tiles, buffer, bar):
                 pass
             bar.close()
-            leaves: Leaves = MemoryLeaves(buffer, config, unusable, device)
+            leaves: Leaves = MemoryLeaves(buffer, config, unusable, device, tiles[0].up)
             del buffer
         else:
             _check_disk(folder, scratch_bytes(count, degree))
             leaves = _sort_on_disk(tiles, folder, sizes, config, unusable, bar)
-        leaves.antialiased = antialiased
+            bar.close()
         yield leaves
 
 
@@ -147,6 +148,7 @@ class _Tile(NamedTuple):
     num_gaussians: int
     sh_degree: int
     whole_bytes: int
+    up: Axis | None
     antialiased: bool | None
 
     @staticmethod
@@ -156,6 +158,7 @@ class _Tile(NamedTuple):
             file.num_gaussians,
             file.sh_degree,
             file.whole_bytes,
+            file.declared.up,
             file.declared.antialiased,
         )
 
@@ -164,6 +167,12 @@ class _Tile(NamedTuple):
         is_same = (file.num_gaussians, file.sh_degree) == (self.num_gaussians, self.sh_degree)
         check(shown(self.path), is_same, _CHANGED)
         return file
+
+
+def _antialiased(tiles: Sequence[_Tile]) -> bool | None:
+    """Whether the gaussians of all files were trained with antialiasing; None if that
+    is not known, or not the same for all."""
+    return common([tile.antialiased for tile in tiles])
 
 
 class _Sizes(NamedTuple):
@@ -271,15 +280,13 @@ def _sort_on_disk(
             bucket_depth = min(depth, _core.num_halvings(count, sizes.in_bucket))
             files = (point_file, spare_file)
             external_split.split(files, count, bucket_depth, sizes.in_node, order_file)
-        points.unlink()
-        spare.unlink()
+        _remove(points, spare)
         offset = halved(np.array([count]), bucket_depth)
         ends = _ends_in_buckets(order_file, offset, sizes.in_block, tally.num_gaussians)
         with RowFile(rows, gaussian_bytes(degree) // 4, np.float32, must_be_new=True) as row_file:
             second_digest = _write_rows(sizes.blocks(tiles, bar), order_file, ends, row_file)
     order.unlink()
     check(_name_of(tiles), second_digest == digest, _CHANGED)
-    bar.close()
     return DiskLeaves(
         num_gaussians=count,
         asset_gaussians=tally.num_gaussians,
@@ -287,10 +294,17 @@ def _sort_on_disk(
         dropped=tally.counts,
         digest=digest,
         resident_bytes=int(np.diff(offset).max()) * _bytes_in_bucket(degree),
+        up=tiles[0].up,
+        antialiased=_antialiased(tiles),
         path=rows.absolute(),
         bucket_offset=offset,
         bucket_depth=depth - bucket_depth,
     )
+
+
+def _remove(*paths: Path) -> None:
+    for path in paths:
+        path.unlink()
 
 
 def _new_words(path: Path, width: int) -> external_split.WordFile:
