@@ -18,9 +18,11 @@ from test_ply import Element, ply_bytes, random_columns
 from v3dg import BuildConfig, Gaussians, build_bundle
 from v3dg.cleaning import AssetWarning
 from v3dg.formats import sog
+from v3dg.formats._declared import Declared
 from v3dg.gaussians import TRAINED_FILTER_PX2
 from v3dg.io import open_asset
 from v3dg.levels import build_file
+from v3dg.levels.leaves_on_disk import leaves_on_disk
 
 ASSET = random_gaussians(np.random.default_rng(0), 300, 1)
 FAST = BuildConfig(cluster_size=32, steps=0, smooth="no")
@@ -271,6 +273,65 @@ def test_files_of_one_asset_that_differ_are_not_antialiased(tmp_path):
     paths = [tmp_path / "a.ply", tmp_path / "b.ply"]
     bundle, _ = build_file(paths, tmp_path / "a.v3dg", config=FAST, progress=False, device="cpu")
     assert look_of(bundle) == ({0.0}, {0})
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply"])
+def test_comments_declare_antialiasing_and_what_is_up_together(tmp_path, name):
+    path = tmp_path / name
+    v3dg.write_asset(path, ASSET, antialiased=True)
+    content = path.read_bytes()
+    lines = b"comment Vertical Axis: Z\ncomment SplatRenderMode: blur\nend_header\n"
+    path.write_bytes(content.replace(b"end_header\n", lines))
+    note = "Its SplatRenderMode blur is unknown, and is not used."
+    assert open_asset(path).declared == Declared("z", "as its header says", True, (note,))
+
+
+def test_files_that_have_axes_declare_all_together(tmp_path):
+    v3dg.write_asset(tmp_path / "a.spz", ASSET, antialiased=True)
+    reason = "as its record of axes says (RUB)"
+    assert open_asset(tmp_path / "a.spz").declared == Declared("-y", reason, True)
+    v3dg.write_asset(tmp_path / "a.glb", ASSET, antialiased=True)
+    assert open_asset(tmp_path / "a.glb").declared == Declared("-y", "as in glTF", True)
+
+
+def test_leaves_on_disk_keep_it(tmp_path):
+    """An asset that is sorted on disk has no gaussians in memory that could say it."""
+    v3dg.write_asset(tmp_path / "a.ply", ASSET, antialiased=True)
+    for most_in_memory in (len(ASSET), 10):
+        with leaves_on_disk(
+            [tmp_path / "a.ply"],
+            tmp_path / "scratch",
+            memory=1 << 30,
+            config=FAST,
+            most_in_memory=most_in_memory,
+        ) as leaves:
+            assert leaves.antialiased is True
+
+
+def test_commands_say_it_once(tmp_path):
+    v3dg.write_asset(tmp_path / "a.spz", ASSET, antialiased=True)
+    options = ("--quiet", "--cluster-size", 64)
+    done = [
+        run("info", tmp_path / "a.spz"),
+        run("convert", tmp_path / "a.spz", tmp_path / "b.ply"),
+        run("build", tmp_path / "a.spz", *options),
+        run("convert", tmp_path / "a.v3dg", tmp_path / "c.ply"),
+        run(
+            "build", tmp_path / "a.spz", "-o", tmp_path / "b.v3dg", "--antialiased", "no", *options
+        ),
+    ]
+    texts = [process.stdout + process.stderr for process in done]
+    assert [text.count("trained with antialiasing") for text in texts] == [1] * len(texts)
+    assert "but is built without" in texts[-1]
+
+
+def test_convert_says_once_what_is_not_read(tmp_path):
+    content = sog.encode(ASSET)
+    content["meta.json"] = json.dumps({**json.loads(content["meta.json"]), "fog": 1}).encode()
+    for name, part in content.items():
+        (tmp_path / name).write_bytes(part)
+    done = run("convert", tmp_path / "meta.json", tmp_path / "a.ply")
+    assert done.stderr.count("Fields of meta.json were left out: 'fog'.") == 1
 
 
 def test_commands_keep_it(tmp_path):

@@ -1,6 +1,7 @@
 """`v3dg convert`."""
 
 import time
+import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
@@ -13,6 +14,7 @@ from v3dg._numbers import check
 from v3dg._urls import shown
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Camera
+from v3dg.cleaning import AssetWarning
 from v3dg.cli import _common
 from v3dg.cli._faults import FaultOptions, Faults, checked
 from v3dg.cli._moving import MoveOptions, Moves
@@ -86,7 +88,9 @@ def run(options: Convert) -> None:
     expected = "no scene, camera, tolerance or budget with it; leave out one or the other"
     _common.check_usage("--level", options.level is None or not is_cut, expected)
     start = time.perf_counter()
-    subject, own_cameras = open_with_cameras(options.subject)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AssetWarning)  # the result says it
+        subject, own_cameras = open_with_cameras(options.subject)
     output = options.output
     notes: list[str] = []
     if _is_bundle(output):
