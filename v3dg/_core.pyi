@@ -97,6 +97,8 @@ class Rows:
 # Means, quats, scales, opacities and sh.
 Columns: TypeAlias = tuple[Array, Array, Array, Array, Array]
 
+def sh_bases(degree: int, directions: NDArray[np.float64]) -> NDArray[np.float64]: ...
+
 # ply
 class PlyFile:
     """A .ply file of gaussians, read in runs of rows."""
@@ -115,6 +117,7 @@ class PlyFile:
 def ply_header(
     path: str | PathLike[str],
 ) -> tuple[str, int, list[tuple[str, int, list[tuple[str, str]]]]]: ...
+def ply_comments(path: str | PathLike[str]) -> list[str]: ...
 def ply_write(
     path: str | PathLike[str],
     means: Float32,
@@ -123,6 +126,7 @@ def ply_write(
     opacities: Float32,
     sh: Float32,
     encoding: str,
+    comments: list[str] = [],
 ) -> None: ...
 
 # cluster
@@ -663,7 +667,9 @@ class SceneFrame:
 class AssetFrame:
     """Draws gaussians without levels on the device that they are on."""
 
-    def __init__(self, model: Model) -> None: ...
+    def __init__(
+        self, model: Model, *, filter_px2: float = 0.0, antialiased: bool = False
+    ) -> None: ...
     def draw(self, camera: Camera, shade: Shade, stop: Stop | None = None) -> Drawing: ...
 
 # fit_level

@@ -119,7 +119,9 @@ def place(gaussians: Gaussians, device: Device) -> Gaussians:
     without gradients."""
     if not device.is_cuda:
         return gaussians.numpy()
-    return Gaussians(*(array.detach() for array in vars(gaussians.torch(str(device))).values()))
+    tensors = vars(gaussians.torch(str(device))).values()
+    placed = Gaussians(*(tensor.detach() for tensor in tensors))
+    return placed.trained(antialiased=gaussians.antialiased)
 
 
 def place_rows(array: Array, rows: npt.NDArray[np.bool_], device: Device) -> Array:

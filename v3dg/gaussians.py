@@ -21,6 +21,10 @@ Array: TypeAlias = (
     Any  # numpy.ndarray or torch.Tensor; a union would make every use of a field a type error
 )
 
+TRAINED_FILTER_PX2 = 0.3
+"""Variance of the filter that trainers draw with, px²: the value of the code of 3DGS
+and of gsplat, with antialiasing and without."""
+
 _NUM_SH = {1: 0, 4: 1, 9: 2, 16: 3}  # coefficients per channel -> degree
 
 
@@ -38,8 +42,22 @@ def _kind(value: object) -> str:
     return type(value).__name__
 
 
+class _Trained:
+    """How gaussians were trained: in a slot, so that `vars` of gaussians has their
+    arrays and nothing else."""
+
+    __slots__ = ("_antialiased",)
+    _antialiased: bool | None
+
+    @property
+    def antialiased(self) -> bool | None:
+        """Whether opacities were trained to be compensated for the filter of the
+        rasterizer; None if that is not known. See `trained`."""
+        return self._antialiased
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Gaussians:
+class Gaussians(_Trained):
     """N 3D Gaussians: NumPy arrays or torch tensors, float32, C-contiguous, all of one
     kind on one device.
 
@@ -56,7 +74,8 @@ class Gaussians:
             colour is their value in the view direction plus ½.
 
     Kinds, shapes, dtypes and layout are checked here, values are not. Nothing is
-    copied.
+    copied. `antialiased` is None until `trained` sets it, as readers of files do; what
+    is made of gaussians by the methods below keeps it.
 
     Raises:
         TypeError: an argument is not an array, or NumPy and torch are mixed.
@@ -70,6 +89,7 @@ class Gaussians:
     sh: Array
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "_antialiased", None)
         for name, array in vars(self).items():
             _check_kind(name, array, self.means)
         shape = tuple(self.means.shape)
@@ -85,6 +105,9 @@ class Gaussians:
         shape = tuple(self.sh.shape)
         fits = any(shape == (num, count, 3) for count in _NUM_SH)
         check("sh", fits, f"shape ({num}, K, 3) with K 1, 4, 9 or 16, got {shape}")
+
+    def __reduce__(self) -> tuple[Callable[..., Gaussians], tuple[object, ...]]:
+        return _restored, (list(vars(self).values()), self.antialiased)
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -113,6 +136,24 @@ class Gaussians:
         if not self.means.is_cuda:
             return _core.Rows(*(tensor.numpy() for tensor in tensors))
         return _core.Rows(*map(_aligned, tensors))
+
+    def trained(self, *, antialiased: bool | None) -> Gaussians:
+        """The same gaussians, of which it is known whether they were trained with
+        antialiasing, or not known (None); the arrays are shared.
+
+        Trainers that antialias draw with a filter and multiply each opacity by
+        sqrt(det before / det after the filter) (Mip-Splatting, eq. 9). Files can say
+        that (docs/formats.md); `v3dg.render` draws such an asset in that way, and
+        `v3dg.write_asset` keeps it.
+
+        Raises:
+            TypeError: ``antialiased`` is neither None nor a bool.
+        """
+        if antialiased is not None:
+            check_type("antialiased", antialiased, bool, "a bool or None")
+        marked = Gaussians(*vars(self).values())
+        object.__setattr__(marked, "_antialiased", antialiased)
+        return marked
 
     def subset(self, index: slice | Sequence[int] | Array) -> Gaussians:
         """Return the gaussians selected by a slice, an array of M indices or a mask of
@@ -176,12 +217,13 @@ class Gaussians:
             *_core.transform(self.rows, rotation, translation, positive(scale, "scale"))
         )
         if _is_tensor(self.means):
-            return moved.torch()
-        return moved
+            moved = moved.torch()
+        return moved.trained(antialiased=self.antialiased)
 
     @staticmethod
     def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
-        """Join sets of gaussians of one SH degree and one kind, in order.
+        """Join sets of gaussians of one SH degree and one kind, in order; whether they
+        are antialiased is known if it is the same for all.
 
         Raises:
             ValueError: no parts, or parts of different degrees.
@@ -199,11 +241,13 @@ class Gaussians:
                 f"parts[{i}]", is_right, f"SH degree {expected} like parts[0], got {part.sh_degree}"
             )
         columns = zip(*(vars(part).values() for part in parts), strict=True)
+        join: Callable[..., Array] = np.concatenate
         if _is_tensor(parts[0].means):
             import torch
 
-            return Gaussians(*map(torch.cat, columns))
-        return Gaussians(*map(np.concatenate, columns))
+            join = torch.cat
+        antialiased = common([part.antialiased for part in parts])
+        return Gaussians(*map(join, columns)).trained(antialiased=antialiased)
 
     def numpy(self) -> Gaussians:
         """Return the same gaussians as NumPy arrays, without gradients; copied only
@@ -246,7 +290,20 @@ class Gaussians:
         return self._map(tensor)
 
     def _map(self, function: Callable[[Array], Array]) -> Gaussians:
-        return Gaussians(*map(function, vars(self).values()))
+        mapped = Gaussians(*map(function, vars(self).values()))
+        return mapped.trained(antialiased=self.antialiased)
+
+
+def _restored(arrays: Sequence[Array], antialiased: bool | None) -> Gaussians:  # noqa: FBT001
+    """Gaussians from what `Gaussians.__reduce__` has."""
+    return Gaussians(*arrays).trained(antialiased=antialiased)
+
+
+def common(values: Sequence[bool | None]) -> bool | None:
+    """The value of all of them; None if there are several or none."""
+    if len(set(values)) == 1:
+        return values[0]
+    return None
 
 
 def _aligned(tensor: Array) -> Array:

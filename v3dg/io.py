@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Literal, TypeVar, get_args
+from typing import Literal, TypeAlias, TypeVar, get_args
 
 from v3dg import _core
 from v3dg._numbers import check, check_type, one_of
@@ -37,14 +37,15 @@ from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
 
 Format = TypeVar("Format")
+_Reader: TypeAlias = Callable[[AnyPath], AssetFile]
 
 # Readers by the end of a file's name; the first that matches is used.
-_READERS: dict[str, Callable[[AnyPath], AssetFile]] = {
+_READERS: dict[str, _Reader] = {
     ".ply": ply.open_file,
     ".splat": splat.open_file,
     ".ksplat": ksplat.open_file,
     ".spz": spz.open_file,
-    ".glb": gltf.open_file,
+    **dict.fromkeys((".glb", ".gltf"), gltf.open_file),
     ".hier": hier.open_file,
     **dict.fromkeys(usd.SUFFIXES, usd.open_file),
     ".sog": sog.open_file,
@@ -67,6 +68,7 @@ _UP: dict[str, Axis] = dict.fromkeys((".spz", ".glb", *usd.SUFFIXES), "y")
 _FILES: dict[str, Callable[[pathlib.Path], list[pathlib.Path]]] = {
     "lod-meta.json": streamed_sog.files,
     "meta.json": sog.files,
+    ".gltf": gltf.files,
     "": lambda path: [path],
 }
 
@@ -116,8 +118,9 @@ def read_asset(path: AnyPath) -> Gaussians:
       those of length zero, which stay as they are. Values that are not finite are
       passed on. Little more memory is needed than for the result. A compressed `.ply`,
       of PlayCanvas and SuperSplat, is recognised by its content.
-    - `.glb`, glTF with KHR_gaussian_splatting, also compressed as `.spz`; the leaves of
-      `.hier`, of H3DG.
+    - `.glb` and `.gltf`, glTF with KHR_gaussian_splatting, also compressed as `.spz`:
+      the gaussians of the scene, where its nodes place them; the leaves of `.hier`, of
+      H3DG.
     - `.usd`, `.usda`, `.usdc` and `.usdz`, OpenUSD, with the extra `usd`, whose library
       bounds what is read.
     - `.splat`, of antimatter15; `.ksplat`, of mkkellogg; `.spz`, of Niantic, version 1
@@ -128,6 +131,9 @@ def read_asset(path: AnyPath) -> Gaussians:
       tensors is taken.
 
     A file whose bytes are those of another of these formats is read as such.
+
+    Whether the gaussians were trained with antialiasing is read from the files that can
+    say it, see `Gaussians.antialiased`.
 
     With the extra `fsspec`, the file may be at a URL, which is fetched once per
     process, unless it refers to other files.
@@ -145,9 +151,10 @@ def read_asset(path: AnyPath) -> Gaussians:
             IsADirectoryError, ...).
     """
     file = open_asset(path)
+    gaussians = file.read(0, file.num_gaussians)
     for note in file.declared.notes:
         warnings.warn(f"{shown(path)}: {note}", AssetWarning, stacklevel=2)
-    return declare(file.read(0, file.num_gaussians), file.declared)
+    return declare(gaussians.trained(antialiased=file.declared.antialiased), file.declared)
 
 
 def loaded(asset: Gaussians | AnyPath) -> Gaussians:
@@ -168,29 +175,41 @@ def open_asset(path: AnyPath) -> AssetFile:
     at_url = in_parts(path)
     if isinstance(at_url, FileAtUrl):
         return _open_fetched(at_url, reader)
-    return _open_by_content(at_url, reader)
+    reader, notes = _by_content(at_url, reader)
+    return _noted(reader(at_url), notes)
 
 
-def _open_by_content(path: AnyPath, reader: Callable[[AnyPath], AssetFile]) -> AssetFile:
-    """An asset whose bytes may be those of another format than its name says; a note
-    then says so. ValueError if they are those of a format that is not read."""
+def _by_content(path: AnyPath, reader: _Reader) -> tuple[_Reader, tuple[str, ...]]:
+    """The reader of a file whose bytes may be those of another format than its name
+    says, and a note that then says so. ValueError if they are those of a format that is
+    not read."""
     content = content_of(path)
     if content is None or _READERS.get(content.suffix) is reader:
-        return reader(path)
+        return reader, ()
     name = beside(path).name.lower()
     ending = next(ending for ending in _READERS if name.endswith(ending))
     is_readable = content.suffix not in ("", *usd.SUFFIXES)  # USD takes it from the name
     check(path, is_readable, f"a {ending}, got {content.text}")
-    file = _READERS[content.suffix](path)
     note = f"Its name ends in {ending}, but it is {content.text}, and was read as such."
-    return replace(file, declared=replace(file.declared, notes=(note, *file.declared.notes)))
+    return _READERS[content.suffix], (note,)
 
 
-def _open_fetched(at_url: FileAtUrl, reader: Callable[[AnyPath], AssetFile]) -> AssetFile:
+def _noted(file: AssetFile, notes: tuple[str, ...]) -> AssetFile:
+    """The file, with notes in front of its own."""
+    return replace(file, declared=replace(file.declared, notes=(*notes, *file.declared.notes)))
+
+
+def _open_fetched(at_url: FileAtUrl, reader: _Reader) -> AssetFile:
     """An asset at a URL, whose local copy exists as long as this object; errors name
     the URL."""
     with reading(at_url) as local:
-        file = _open_by_content(local, reader)
+        reader, notes = _by_content(local, reader)
+        if reader is gltf.open_file:
+            # Nothing that a document at a URL names is read, here or there.
+            is_alone = len(gltf.files(pathlib.Path(local))) == 1
+            expected = "the URL of an asset in one file, got one that names others"
+            check(shown(at_url), is_alone, f"{expected}; fetch the folder")
+        file = _noted(reader(local), notes)
         whole = None
         if at_url.needs_name:
             whole = file.read(0, file.num_gaussians)
@@ -235,6 +254,7 @@ def write_asset(
     gaussians: Gaussians | AnyPath,
     *,
     up: Axis = _axes.MEMORY_UP,
+    antialiased: bool | None = None,
     encoding: PlyEncoding = "binary_little_endian",
     version: Literal[2, 3, 4] | None = None,
 ) -> None:
@@ -263,6 +283,9 @@ def write_asset(
         gaussians: The asset, or its file.
         up: The axis that is up among the gaussians; -y as in most trained assets, and
             in all that `read_asset` has turned.
+        antialiased: Whether the gaussians were trained with antialiasing, which the
+            file then declares (docs/formats.md); None for what the gaussians say, see
+            `Gaussians.trained`.
         encoding: Encoding of a `.ply`; other formats have only one.
         version: Version of a `.spz`; 3 if None. Version 2 is for viewers from before
             2025, 4 for those since 2026.
@@ -275,6 +298,8 @@ def write_asset(
     """
     gaussians = loaded(gaussians)
     check_type("gaussians", gaussians, Gaussians, "Gaussians")
+    if antialiased is not None:
+        gaussians = gaussians.trained(antialiased=antialiased)
     write = _by_name(path, _WRITERS)
     if version is not None:
         check(

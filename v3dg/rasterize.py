@@ -28,7 +28,7 @@ def rasterize(
     camera: Camera,
     *,
     filter_px2: float = 0.0,
-    antialiased: bool = False,
+    antialiased: bool | None = None,
     background: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Image:
     """Draw gaussians with the semantics of 3D Gaussian Splatting, as gsplat 1.5 defines
@@ -51,7 +51,8 @@ def rasterize(
             value that the original 3DGS code trains with.
         antialiased: Multiply opacities by sqrt(det before / det after the filter)
             (Mip-Splatting, eq. 9), so that the filter widens a gaussian without
-            increasing its total opacity.
+            increasing its total opacity. None means what the gaussians say
+            (`Gaussians.antialiased`).
         background: Three numbers, or a tensor of them.
 
     Raises:
@@ -66,13 +67,15 @@ def rasterize(
     check_type("camera", camera, Camera, "a Camera")
     filter_px2 = real(filter_px2, "filter_px2", "a variance of at least 0 px²", 0)
     background_color = color(background, "background")
+    if antialiased is None:
+        antialiased = bool(getattr(gaussians, "antialiased", None))
     means = gaussians.means
     if isinstance(means, np.ndarray):
         drawn = _core.rasterize(
             gaussians.rows,
             camera.core,
             filter_px2=filter_px2,
-            antialiased=bool(antialiased),
+            antialiased=antialiased,
             background=background_color,
             with_depth=True,
             keep_tape=False,
@@ -83,7 +86,7 @@ def rasterize(
     check_device(means)
     arrays = [means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh]
     arrays.append(torch.as_tensor(background, dtype=means.dtype))
-    settings = DrawSettings(filter_px2=filter_px2, antialiased=bool(antialiased))
+    settings = DrawSettings(filter_px2=filter_px2, antialiased=antialiased)
     return Image(*draw_views([camera.core], settings, [[array] for array in arrays]))
 
 

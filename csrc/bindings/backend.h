@@ -51,6 +51,7 @@
 #include "cluster/box.h"
 #include "cluster/cluster.h"
 #include "draw/request.h"
+#include "frame/draw_list.h"
 #include "gather/gather.h"
 #include "levels/fit_level.h"
 #include "levels/refine_cuts.h"
@@ -296,7 +297,8 @@ class Backend {
                                                      const Work& work) const = 0;
     virtual std::unique_ptr<backend::Frame> make_frame(const Work& work) const = 0;
     virtual std::unique_ptr<backend::AssetFrame> make_asset_frame(
-        std::shared_ptr<const backend::Model> model, const Work& work) const = 0;
+        std::shared_ptr<const backend::Model> model, Appearance<float> appearance,
+        const Work& work) const = 0;
     virtual std::unique_ptr<backend::Target> make_target(const Rows& rows, float filter_px2,
                                                          bool antialiased) const = 0;
 

@@ -250,12 +250,13 @@ class BoundSceneFrame {
 // Draws the gaussians of one asset, which have no levels.
 class BoundAssetFrame {
   public:
-    explicit BoundAssetFrame(const py::object& model_object) {
+    BoundAssetFrame(const py::object& model_object, float filter_px2, bool antialiased) {
         const auto& model = held<BoundModel>(model_object, "model");
         if (model.has_codes())
             throw py::value_error("model: expected a model of rows, got a model of codes");
         const Work work(model.device());
-        frame_ = work.backend().make_asset_frame(model.handle(), work);
+        const Appearance<float> appearance{filter_px2, antialiased, false};
+        frame_ = work.backend().make_asset_frame(model.handle(), appearance, work);
     }
 
     std::unique_ptr<BoundDrawing> draw(const BoundCamera& camera, const Shade& shade,
@@ -346,7 +347,8 @@ void bind_frame(py::module_& m) {
              "Returns the bytes that it holds on a CUDA device by part, and the bytes of the "
              "memory pool that all frames there share.");
     py::class_<BoundAssetFrame>(m, "AssetFrame", "Draws gaussians without levels on their device.")
-        .def(py::init<py::object>(), "model"_a)
+        .def(py::init<py::object, float, bool>(), "model"_a, py::kw_only(), "filter_px2"_a = 0.0f,
+             "antialiased"_a = false)
         .def("draw", &BoundAssetFrame::draw, "camera"_a, "shade"_a, "stop"_a = nullptr);
 }
 

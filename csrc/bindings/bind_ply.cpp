@@ -112,6 +112,14 @@ py::tuple ply_header(const py::object& path) {
     return py::make_tuple(kEncodings[static_cast<size_t>(header.encoding)], header.size, elements);
 }
 
+py::list ply_comments(const py::object& path) {
+    const PlyHeader header = with_path(
+        Path(path), [](const char* name) { return read_ply_header(open_ply_file(name)); });
+    py::list comments;
+    for (const std::string& comment : header.comments) comments.append(printable(comment));
+    return comments;
+}
+
 PlyEncoding encoding_of(const std::string& name) {
     for (size_t i = 0; i < std::size(kEncodings); ++i)
         if (name == kEncodings[i]) return static_cast<PlyEncoding>(i);
@@ -121,7 +129,10 @@ PlyEncoding encoding_of(const std::string& name) {
 
 void ply_write(const py::object& path, const py::array& means, const py::array& quats,
                const py::array& scales, const py::array& opacities, const py::array& sh,
-               const std::string& encoding) {
+               const std::string& encoding, const std::vector<std::string>& comments) {
+    for (const std::string& comment : comments)
+        if (comment.find_first_of("\r\n") != std::string::npos)
+            throw py::value_error("comments: expected lines, got " + quoted(comment));
     const PlyEncoding chosen = encoding_of(encoding);
     const py::ssize_t n = means.ndim() > 0 ? means.shape(0) : 0;
     const py::ssize_t k = sh.ndim() > 1 ? sh.shape(1) : 0;
@@ -133,8 +144,9 @@ void ply_write(const py::object& path, const py::array& means, const py::array& 
                                           span_of<const float>(scales, "scales", {n, 3}),
                                           span_of<const float>(opacities, "opacities", {n}),
                                           span_of<const float>(sh, "sh", {n, k, 3})};
-    with_path(Path(path),
-              [&](const char* name) { write_ply(name, in, chosen, static_cast<size_t>(k)); });
+    with_path(Path(path), [&](const char* name) {
+        write_ply(name, in, chosen, static_cast<size_t>(k), comments);
+    });
 }
 
 }  // namespace
@@ -150,8 +162,9 @@ void bind_ply(py::module_& m) {
     m.def("ply_header", &ply_header, "path"_a,
           "Returns the encoding, the bytes of the header, and the elements: name, count, and names "
           "and types of properties.");
+    m.def("ply_comments", &ply_comments, "path"_a, "Returns the comments of the header, in order.");
     m.def("ply_write", ply_write, "path"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a,
-          "encoding"_a);
+          "encoding"_a, "comments"_a = std::vector<std::string>());
 }
 
 }  // namespace v3dg

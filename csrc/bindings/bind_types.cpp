@@ -5,6 +5,7 @@
 
 #include "bindings/backend.h"
 #include "bindings/operations.h"
+#include "math/sh.h"
 
 namespace v3dg {
 
@@ -191,7 +192,24 @@ Window window_of(const Camera& c) {
             static_cast<int>(c.y1)};
 }
 
+py::object sh_bases_of(int degree, const py::array& directions) {
+    if (degree < 0 || degree > kMaxShDegree)
+        throw py::value_error("degree: expected 0 to 3, got " + std::to_string(degree));
+    const Span<const double> in = span_of<const double>(directions, "directions", {-1, 3});
+    const auto count = static_cast<py::ssize_t>(in.size / 3);
+    const int num_bases = num_sh_bases(degree);
+    const NewArray<double> out({}, {count, num_bases});
+    for (size_t i = 0; i < in.size / 3; ++i) {
+        double basis[kMaxShBases];
+        sh_bases(degree, in[3 * i], in[3 * i + 1], in[3 * i + 2], basis);
+        std::copy(basis, basis + num_bases, &out.span[num_bases * i]);
+    }
+    return out.object;
+}
+
 void bind_types(py::module_& m) {
+    m.def("sh_bases", &sh_bases_of, "degree"_a, "directions"_a,
+          "The bases of spherical harmonics in unit directions: (D, (degree + 1)^2).");
     py::class_<BoundCamera>(
         m, "Camera", "A pinhole camera, or a window of its image; the input of every operation.")
         .def(py::init(&make_camera), py::kw_only(), "viewmat"_a, "K"_a, "width"_a, "height"_a,

@@ -263,8 +263,9 @@ class CudaBackend final : public Backend {
         return cuda::make_frame(work);
     }
     std::unique_ptr<backend::AssetFrame> make_asset_frame(
-        std::shared_ptr<const backend::Model> model, const Work& work) const override {
-        return cuda::make_asset_frame(std::move(model), work);
+        std::shared_ptr<const backend::Model> model, Appearance<float> appearance,
+        const Work& work) const override {
+        return cuda::make_asset_frame(std::move(model), appearance, work);
     }
     std::unique_ptr<backend::Target> make_target(const Rows& rows, float filter_px2,
                                                  bool antialiased) const override {

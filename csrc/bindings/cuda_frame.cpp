@@ -266,8 +266,9 @@ class BackendFrame final : public backend::Frame {
 
 class BackendAssetFrame final : public backend::AssetFrame {
   public:
-    BackendAssetFrame(std::shared_ptr<const backend::Model> model, Device device)
-        : device_(device), model_(std::move(model)) {}
+    BackendAssetFrame(std::shared_ptr<const backend::Model> model, Appearance<float> appearance,
+                      Device device)
+        : device_(device), model_(std::move(model)), appearance_(appearance) {}
 
     std::unique_ptr<BoundDrawing> draw(const Camera& camera, const Shade& shade,
                                        const std::atomic<bool>*) override {
@@ -277,9 +278,9 @@ class BackendAssetFrame final : public backend::AssetFrame {
         const EyeImages images = new_images(camera, shade, pictures);
         const PackedModel& packed = *static_cast<const BackendModel&>(*model_).on_device().packed;
         std::unique_ptr<Drawing> drawing =
-            frame_.draw(packed.rows(), view_of_world<float>(camera), 0.0f, false, images.image[0],
-                        stream_of(work), &packed.packed(), images.min_transmittance,
-                        place_of(pictures, device_));
+            frame_.draw(packed.rows(), view_of_world<float>(camera), appearance_.filter_px2,
+                        appearance_.antialiased, images.image[0], stream_of(work), &packed.packed(),
+                        images.min_transmittance, place_of(pictures, device_));
         return std::make_unique<EnqueuedDrawing>(std::move(pictures), device_, turns_,
                                                  std::move(drawing), SelectRule{}, nullptr);
     }
@@ -288,6 +289,7 @@ class BackendAssetFrame final : public backend::AssetFrame {
     const Device device_;
     const std::shared_ptr<Mutex> turns_ = std::make_shared<Mutex>();
     const std::shared_ptr<const backend::Model> model_;
+    const Appearance<float> appearance_;
     ModelFrame frame_;
 };
 
@@ -388,8 +390,9 @@ std::unique_ptr<backend::Frame> make_frame(const Work& work) {
 }
 
 std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const backend::Model> model,
+                                                      Appearance<float> appearance,
                                                       const Work& work) {
-    return std::make_unique<BackendAssetFrame>(std::move(model), work.device());
+    return std::make_unique<BackendAssetFrame>(std::move(model), appearance, work.device());
 }
 
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,

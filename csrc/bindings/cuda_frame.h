@@ -35,6 +35,7 @@ std::unique_ptr<backend::Scene> make_scene();
 std::unique_ptr<backend::Pool> make_pool(PagePool& pool, const py::list& tables, const Work& work);
 std::unique_ptr<backend::Frame> make_frame(const Work& work);
 std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const backend::Model> model,
+                                                      Appearance<float> appearance,
                                                       const Work& work);
 
 // As Backend::rasterize().

@@ -172,8 +172,9 @@ class HostBackend final : public Backend {
         return host::make_frame();
     }
     std::unique_ptr<backend::AssetFrame> make_asset_frame(
-        std::shared_ptr<const backend::Model> model, const Work&) const override {
-        return host::make_asset_frame(std::move(model));
+        std::shared_ptr<const backend::Model> model, Appearance<float> appearance,
+        const Work&) const override {
+        return host::make_asset_frame(std::move(model), appearance);
     }
     std::unique_ptr<backend::Target> make_target(const Rows& rows, float filter_px2,
                                                  bool antialiased) const override {

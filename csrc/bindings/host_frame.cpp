@@ -254,8 +254,8 @@ class HostFrame final : public backend::Frame {
 
 class HostAssetFrame final : public backend::AssetFrame {
   public:
-    explicit HostAssetFrame(std::shared_ptr<const backend::Model> model)
-        : model_(std::move(model)) {}
+    HostAssetFrame(std::shared_ptr<const backend::Model> model, Appearance<float> appearance)
+        : model_(std::move(model)), appearance_(appearance) {}
 
     std::unique_ptr<BoundDrawing> draw(const Camera& camera, const Shade& shade,
                                        const std::atomic<bool>* stop) override {
@@ -264,13 +264,15 @@ class HostAssetFrame final : public backend::AssetFrame {
         SceneFrameCounts counts;
         {
             const Unlocked unlocked;
-            counts = cpu::draw_model(*model.planes(), model.size(), camera, out.pictures[0], stop);
+            counts = cpu::draw_model(*model.planes(), model.size(), appearance_, camera,
+                                     out.pictures[0], stop);
         }
         return std::make_unique<BoundDrawing>(std::move(out.made), stats_of(counts));
     }
 
   private:
     const std::shared_ptr<const backend::Model> model_;
+    const Appearance<float> appearance_;
 };
 
 template <class T>
@@ -403,8 +405,9 @@ std::unique_ptr<backend::Pool> make_pool(PagePool& pool) {
 
 std::unique_ptr<backend::Frame> make_frame() { return std::make_unique<HostFrame>(); }
 
-std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const backend::Model> model) {
-    return std::make_unique<HostAssetFrame>(std::move(model));
+std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const backend::Model> model,
+                                                      Appearance<float> appearance) {
+    return std::make_unique<HostAssetFrame>(std::move(model), appearance);
 }
 
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,

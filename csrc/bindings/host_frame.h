@@ -44,7 +44,8 @@ class HostPalette final : public backend::Palette {
 
 std::unique_ptr<backend::Pool> make_pool(PagePool& pool);
 std::unique_ptr<backend::Frame> make_frame();
-std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const backend::Model> model);
+std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const backend::Model> model,
+                                                      Appearance<float> appearance);
 
 // As Backend::rasterize(), for float32 or float64.
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,

@@ -71,8 +71,9 @@ SceneFrameCounts draw_scene(const HostScene& scene, const FrameRequest& request,
                             const SelectRule& rule, Span<const Picture<float>> pictures,
                             const std::atomic<bool>* stop = nullptr);
 
-// Draws all gaussians of one model, in world coordinates, without a filter.
-SceneFrameCounts draw_model(const GaussianPlanes<float>& model, size_t count, const Camera& camera,
+// Draws all gaussians of one model, in world coordinates.
+SceneFrameCounts draw_model(const GaussianPlanes<float>& model, size_t count,
+                            const Appearance<float>& appearance, const Camera& camera,
                             const Picture<float>& picture, const std::atomic<bool>* stop = nullptr);
 
 // Finds the gaussian with the largest weight in the first pixel of the first eye's

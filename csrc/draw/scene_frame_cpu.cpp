@@ -262,12 +262,11 @@ SceneFrameCounts cpu::draw_scene(const HostScene& scene, const FrameRequest& req
 }
 
 SceneFrameCounts cpu::draw_model(const GaussianPlanes<float>& model, size_t count,
-                                 const Camera& camera, const Picture<float>& picture,
-                                 const std::atomic<bool>* stop) {
+                                 const Appearance<float>& appearance, const Camera& camera,
+                                 const Picture<float>& picture, const std::atomic<bool>* stop) {
     const double start = now();
-    SceneFrameCounts counts =
-        draw_all({{&model, 0, count, view_of_world<float>(camera), {0.0f, false, false}}}, camera,
-                 picture, stop);
+    SceneFrameCounts counts = draw_all(
+        {{&model, 0, count, view_of_world<float>(camera), appearance}}, camera, picture, stop);
     counts.gaussians = static_cast<int64_t>(count);
     counts.draw_seconds = now() - start;
     return counts;

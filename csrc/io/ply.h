@@ -86,9 +86,10 @@ PlyPlace read_ply(const PlyFile& ply, size_t first, PlyPlace known, const PlyGau
 
 // Creates `path`, which must not exist yet. Opacity 1 is written as logit 20, opacity 0
 // as logit -110, scale 0 as log -110: these are finite, and are read as exactly 1, 0
-// and 0. Throws std::system_error, or std::invalid_argument for a negative scale or an
-// opacity outside [0, 1]; the file is then incomplete.
+// and 0. Each comment is one line of the header. Throws std::system_error, or
+// std::invalid_argument for a negative scale or an opacity outside [0, 1]; the file is
+// then incomplete.
 void write_ply(const char* path, const PlyGaussians<const float>& gaussians, PlyEncoding encoding,
-               size_t num_sh);
+               size_t num_sh, const std::vector<std::string>& comments = {});
 
 }  // namespace v3dg

@@ -14,8 +14,9 @@ constexpr size_t kMaxHeaderBytes = size_t(1) << 20;  // real headers have a few 
 // Real files have one or two elements; each one is skipped in sequence.
 constexpr size_t kMaxElements = 64;
 
+constexpr const char* kSpace = " \t\r\v\f";
+
 std::vector<std::string> words_of(const std::string& line) {
-    const char* kSpace = " \t\r\v\f";
     std::vector<std::string> words;
     size_t first = line.find_first_not_of(kSpace);
     while (first != std::string::npos) {
@@ -24,6 +25,15 @@ std::vector<std::string> words_of(const std::string& line) {
         first = line.find_first_not_of(kSpace, last);
     }
     return words;
+}
+
+// What follows the first word of a line, without space around it.
+std::string rest_of(const std::string& line) {
+    const size_t word = line.find_first_not_of(kSpace);
+    const size_t space = line.find_first_of(kSpace, word);
+    const size_t first = line.find_first_not_of(kSpace, space);
+    if (space == std::string::npos || first == std::string::npos) return {};
+    return line.substr(first, line.find_last_not_of(kSpace) + 1 - first);
 }
 
 PlyType parse_type(const std::string& name) {
@@ -93,7 +103,11 @@ struct HeaderParser {
     // Returns whether this was the last line.
     bool take(const std::string& line) {
         const std::vector<std::string> words = words_of(line);
-        if (words.empty() || words[0] == "comment" || words[0] == "obj_info") return false;
+        if (words.empty()) return false;
+        if (words[0] == "comment" || words[0] == "obj_info") {
+            header.comments.push_back(rest_of(line));
+            return false;
+        }
         if (words[0] == "format") {
             if (has_format) throw PlyError("expected one line 'format', got a second");
             header.encoding = parse_format(words);

@@ -60,7 +60,8 @@ struct PlyElement {
 struct PlyHeader {
     PlyEncoding encoding = PlyEncoding::ascii;
     std::vector<PlyElement> elements;
-    size_t size = 0;  // bytes, including the line end_header
+    std::vector<std::string> comments;  // without the keyword, and without outer spaces
+    size_t size = 0;                    // bytes, including the line end_header
 };
 
 // Throws std::system_error, or PlyError if the path is not a regular file.

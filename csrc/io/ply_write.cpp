@@ -31,10 +31,12 @@ constexpr size_t kTextBlocks = 16;   // in memory at the same time
 constexpr float kLogOfZero = -110;
 constexpr float kLogitOfOne = 20;
 
-std::string header_text(size_t num_gaussians, size_t num_sh, PlyEncoding encoding) {
+std::string header_text(size_t num_gaussians, size_t num_sh, PlyEncoding encoding,
+                        const std::vector<std::string>& comments) {
     const char* kNames[] = {"ascii", "binary_little_endian", "binary_big_endian"};
-    std::string text = std::string("ply\nformat ") + kNames[static_cast<int>(encoding)] +
-                       " 1.0\nelement vertex " + std::to_string(num_gaussians) + "\n";
+    std::string text = std::string("ply\nformat ") + kNames[static_cast<int>(encoding)] + " 1.0\n";
+    for (const std::string& comment : comments) text += "comment " + comment + "\n";
+    text += "element vertex " + std::to_string(num_gaussians) + "\n";
     const auto add = [&](const std::string& name, size_t count) {
         for (size_t i = 0; i < count; ++i)
             text += "property float " + name + std::to_string(i) + "\n";
@@ -173,10 +175,10 @@ struct Writer {
 }  // namespace
 
 void write_ply(const char* path, const PlyGaussians<const float>& gaussians, PlyEncoding encoding,
-               size_t num_sh) {
+               size_t num_sh, const std::vector<std::string>& comments) {
     const size_t num_gaussians = gaussians.opacities.size;
     PosixFile file = PosixFile::create(path);
-    const std::string header = header_text(num_gaussians, num_sh, encoding);
+    const std::string header = header_text(num_gaussians, num_sh, encoding, comments);
     file.write_at(0, header.data(), header.size());
     const Writer writer = {.file = file,
                            .gaussians = gaussians,

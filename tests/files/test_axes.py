@@ -66,6 +66,13 @@ def test_all_axes_are_turned_to_and_mirrored(asset, axes):
     np.testing.assert_allclose(back.sh, asset.sh, atol=1e-5)
 
 
+@pytest.mark.parametrize("axes", ["RUB", "LDF", "RFU"])  # half a turn, mirrored, a quarter
+@pytest.mark.parametrize("antialiased", [True, False, None])
+def test_turns_keep_antialiasing(asset, axes, antialiased):
+    marked = asset.trained(antialiased=antialiased)
+    assert _axes.turned(marked, _axes.MEMORY, axes).antialiased is antialiased
+
+
 @pytest.mark.parametrize("axis", "xyz")
 def test_half_turns_are_exact_and_those_of_the_core(asset, axis):
     axes = {"x": "RUB", "y": "LDB", "z": "LUF"}[axis]

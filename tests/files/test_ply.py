@@ -605,6 +605,7 @@ def test_every_cut_of_a_file_is_refused(tmp_path, encoding):
             read_asset(path)
 
 
+@pytest.mark.filterwarnings("ignore::v3dg.cleaning.AssetWarning")
 @given(
     encoding=st.sampled_from(ENCODINGS),
     edits=st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 255)), min_size=1, max_size=4),

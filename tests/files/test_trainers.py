@@ -235,7 +235,6 @@ SOG_FIELDS = {
     "others": ({"antialias": True}, True, []),
     "2DGS": ({"model": "2dgs"}, None, ["The gaussians are those of 2DGS; they were read as f"]),
     "a later one": ({"model": "cubes"}, None, ['The model "cubes" is not known and was left out.']),
-    "an object": ({"model": {}}, None, ["The model {} is not known and was left out."]),
     "a camera": ({"camera": {"fov": 1}}, None, ["Fields of meta.json were left out: 'camera'."]),
 }
 

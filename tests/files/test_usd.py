@@ -302,8 +302,9 @@ def new_stage(path):
 
 
 def read_with_notes(path):
+    """Gaussians with the axes of their stage, and what else is declared."""
     file = open_asset(path)
-    return file.read(0, file.num_gaussians), list(file.declared.notes)
+    return half_turn(file.read(0, file.num_gaussians), "x"), list(file.declared.notes)
 
 
 POINTS = [Gf.Vec3f(1, 2, 3), Gf.Vec3f(4, 5, 6)]

@@ -315,10 +315,15 @@ class Bundle:
         return self.read_page(page).subset(slice(start, stop))
 
     def level_gaussians(self, level: int) -> Gaussians:
-        """Return the gaussians of one level; reads only the pages of that level."""
+        """Return the gaussians of one level; reads only the pages of that level. Those
+        of level 0 are antialiased if the asset is."""
         clusters = self.level_range(level)
         first, last = np.searchsorted(self._layout.first_cluster, [clusters.start, clusters.stop])
-        return self._pages.read(int(first), int(last))
+        gaussians = self._pages.read(int(first), int(last))
+        table = self.clusters.antialiased[clusters.start : clusters.stop]
+        if level == 0 and len(table) and table.all():
+            return gaussians.trained(antialiased=True)
+        return gaussians
 
     def info(self) -> JsonObject:
         """Return a description of the bundle as JSON values, without reading gaussians;

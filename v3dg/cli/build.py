@@ -58,6 +58,9 @@ class Build(_common.OnDevice):
     up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
     """The axis that is up in the asset, which the bundle records; if it is unknown, a
     user at a terminal is asked."""
+    antialiased: Annotated[Literal["yes", "no"] | None, _common.option("{yes,no}")] = None
+    """Whether the asset was trained with antialiasing; by default what its file says,
+    or else no."""
     seed: int = 0
     """Seed of random numbers; the same seed gives the same file, byte for byte, on the
     same kind of device, with any number of threads."""
@@ -311,7 +314,7 @@ def _build(
     start = time.perf_counter()
     with _resume_advised(output):
         bundle, is_built = _build_file(options, paths, output, executor)
-    notes = _notes(paths)
+    notes = _notes(options, paths)
     for note in notes:
         _common.tell(note)
     asset: str | list[str] = [shown(path) for path in paths]
@@ -335,14 +338,18 @@ def _build(
     }
 
 
-def _notes(paths: Sequence[Path]) -> list[str]:
+def _notes(options: Build, paths: Sequence[Path]) -> list[str]:
     """Lines about what the files of an asset declare."""
+    config = _config_of(options)
     lines = []
     for path in paths:
         declared = open_asset(path).declared
         if declared.up is not None:
             lines.append(f"{shown(path)}: {declared.up} is up, {declared.up_reason}")
-        if declared.antialiased:
+        contradiction = config.contradiction(antialiased=declared.antialiased)
+        if contradiction:
+            lines.append(f"{shown(path)}: {contradiction}")
+        elif declared.antialiased:
             lines.append(f"{shown(path)}: trained with antialiasing")
         lines += [f"{shown(path)}: {note}" for note in declared.notes]
     return lines
@@ -351,11 +358,6 @@ def _notes(paths: Sequence[Path]) -> list[str]:
 def _build_file(
     options: Build, paths: Sequence[Path], output: Path, executor: Executor | None
 ) -> tuple[Bundle, bool]:
-    config = BuildConfig()
-    if options.config == "paper":
-        config = BuildConfig.paper()
-    if options.cluster_size is not None:
-        config = replace(config, cluster_size=options.cluster_size)
     unusable: Literal["drop", "refuse"] = "drop"
     if options.strict:
         unusable = "refuse"
@@ -364,7 +366,7 @@ def _build_file(
         return build_file(
             paths,
             output,
-            config=config,
+            config=_config_of(options),
             seed=options.seed,
             progress=not options.quiet,
             device=options.device,
@@ -375,6 +377,17 @@ def _build_file(
             codec=options.codec,
             up=options.up,
         )
+
+
+def _config_of(options: Build) -> BuildConfig:
+    config = BuildConfig()
+    if options.config == "paper":
+        config = BuildConfig.paper()
+    if options.cluster_size is not None:
+        config = replace(config, cluster_size=options.cluster_size)
+    if options.antialiased is not None:
+        config = replace(config, asset_antialiased=options.antialiased == "yes")
+    return config
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """`v3dg convert`."""
 
 import time
+import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
@@ -14,6 +15,7 @@ from v3dg._progress import waiting
 from v3dg._urls import shown
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Camera
+from v3dg.cleaning import AssetWarning
 from v3dg.cli import _common
 from v3dg.cli._editing import EditOptions, Editor, Edits
 from v3dg.cli._faults import FaultOptions, Faults, checked
@@ -90,7 +92,9 @@ def run(options: Convert) -> None:
     expected = "no scene, camera, tolerance or budget with it; leave out one or the other"
     _common.check_usage("--level", options.level is None or not is_cut, expected)
     start = time.perf_counter()
-    subject, own_cameras = _common.open_subject(options.subject, show=not options.quiet)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AssetWarning)  # the result says it
+        subject, own_cameras = _common.open_subject(options.subject, show=not options.quiet)
     output = options.output
     notes: list[str] = []
     if _is_bundle(output):
@@ -123,8 +127,11 @@ def _written(
     lost, and returns what was written."""
     output = options.output
     name = shown(options.subject)
-    notes += _lines_of_file(name, subject)
+    if isinstance(subject, Gaussians):
+        notes += [f"{name}: {note}" for note in declared_of(subject).notes]
     gaussians = part.gaussians
+    if gaussians.antialiased:
+        notes.append(f"{name}: trained with antialiasing")
     up, reason = up_of(subject)
     if options.view.up is not None:
         gaussians = turned_upright(gaussians, options.view.up)
@@ -150,17 +157,6 @@ def _written(
         notes += [f"{output}: {line}" for line in losses.lines]
         description |= losses.result()
     return _Part(gaussians, description)
-
-
-def _lines_of_file(name: str, subject: Subject) -> list[str]:
-    """What the file of an asset declares beside its axes."""
-    if not isinstance(subject, Gaussians):
-        return []
-    declared = declared_of(subject)
-    lines = [f"{name}: {note}" for note in declared.notes]
-    if declared.antialiased:
-        lines.append(f"{name}: trained with antialiasing")
-    return lines
 
 
 def _lines_of_up(name: str, output: Path, up: Axis, reason: str) -> list[str]:

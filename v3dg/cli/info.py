@@ -182,7 +182,7 @@ def _bundle_info(bundle: Bundle) -> _Description:
 
 def _config_text(config: JsonObject) -> str:
     """The settings of a build that are not the default ones."""
-    defaults = asdict(BuildConfig())
+    defaults = asdict(BuildConfig().of_asset(antialiased=None))
     changes = []
     for name, value in _settings(config):
         if name not in defaults or value != defaults[name]:

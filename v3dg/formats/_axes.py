@@ -111,12 +111,13 @@ def _mirrored(gaussians: Gaussians, signs: Floats) -> Gaussians:
     for row, coordinates in enumerate(_ODD[:num_harmonics]):
         for coordinate in coordinates:
             harmonics[row] *= sign_of_coordinate[coordinate]
-    return replace(
+    mirrored = replace(
         gaussians,
         means=gaussians.means * np.array([x, y, z]),
         quats=gaussians.quats * np.array([1, y * z, x * z, x * y], np.float32),
         sh=gaussians.sh * harmonics,
     )
+    return mirrored.trained(antialiased=gaussians.antialiased)
 
 
 def up_of_ground(points: NDArray[np.floating]) -> Axis | None:

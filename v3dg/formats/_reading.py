@@ -135,11 +135,16 @@ class Claims:
         with self.open(path) as file:
             return file.read()
 
+    @property
+    def num_bytes(self) -> int:
+        """Bytes of all files together."""
+        return sum(self._files.values())
+
     def add(self, path: AnyPath, count: int) -> None:
         """Accept that a file has `count` gaussians, or raise ValueError. Call this
         before allocating memory for them."""
         self._gaussians += count
-        num_bytes = sum(self._files.values())
+        num_bytes = self.num_bytes
         is_plausible = least_bytes(self._gaussians) <= num_bytes
         claim = f"{self._gaussians} gaussians in {num_bytes} bytes"
         check(path, is_plausible, f"a byte a gaussian beyond {_FREE_GAUSSIANS}, got {claim}")

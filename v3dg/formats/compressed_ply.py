@@ -9,15 +9,14 @@ channel, for -4 to 4. See docs/formats.md.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core, _files
-from v3dg.formats import _packing
-from v3dg.formats._declared import Declared
+from v3dg.formats import _packing, _ply_comments
 from v3dg.formats._packing import SH_C0, SQRT2, Floats, assemble
 from v3dg.formats._reading import AnyPath, AssetFile, File, check, listed
 from v3dg.gaussians import Gaussians
@@ -88,7 +87,9 @@ def open_file(path: AnyPath) -> AssetFile:
 
         return assemble(last - first, degree, decode)
 
-    return AssetFile(path, count, degree, read_rows, declared=Declared(notes=_notes(elements)))
+    declared = _ply_comments.declared_by(_core.ply_comments(path))
+    declared = replace(declared, notes=(*declared.notes, *_notes(elements)))
+    return AssetFile(path, count, degree, read_rows, declared=declared)
 
 
 def _notes(elements: Mapping[str, _Element]) -> tuple[str, ...]:
@@ -158,7 +159,7 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
         extent = np.where(high > low, high.astype(np.float64) - low, 1.0)[chunks]
         fractions[kind] = np.clip((array - low[chunks]) / extent, 0.0, 1.0)
     with _files.replacing(path) as temporary, open(temporary, "wb") as file:
-        file.write(_header(count, num_chunks, num_rest))
+        file.write(_header(host, num_chunks))
         file.write(np.concatenate(ranges, axis=1).astype("<f4").tobytes())
         for block in _packing.blocks(count):
             rows = order[block]
@@ -178,11 +179,15 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
                 )
 
 
-def _header(count: int, num_chunks: int, num_rest: int) -> bytes:
+def _header(host: Gaussians, num_chunks: int) -> bytes:
+    count = len(host)
+    num_rest = 3 * (host.sh.shape[1] - 1)
+    comments = _ply_comments.comments_for(host.antialiased)
     lines = [
         "ply",
         "format binary_little_endian 1.0",
         "comment made by v3dg",
+        *(f"comment {comment}" for comment in comments),
         f"element chunk {num_chunks}",
     ]
     lines += [f"property float {name}" for kind in _RANGES for name in _range_names(kind)]

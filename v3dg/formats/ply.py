@@ -1,7 +1,6 @@
 """`.ply`, as trainers write it: the core reads and writes it. See docs/formats.md."""
 
 import os
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal, TypeAlias
@@ -10,15 +9,13 @@ import numpy as np
 
 from v3dg import _core, _files
 from v3dg._numbers import check
-from v3dg.cameras import AXES
-from v3dg.formats import compressed_ply
-from v3dg.formats._declared import NOTHING, Declared
+from v3dg.formats import _ply_comments, compressed_ply
+from v3dg.formats._declared import Declared
 from v3dg.formats._packing import SH_C0
 from v3dg.formats._reading import AnyPath, AssetFile, listed
 from v3dg.gaussians import Gaussians
 
 write_compressed = compressed_ply.write
-_MOST_HEADER = 1 << 16  # bytes in which comments are sought
 PlyEncoding = Literal["binary_little_endian", "binary_big_endian", "ascii"]
 _Elements: TypeAlias = Sequence[tuple[str, int, Sequence[tuple[str, str]]]]
 
@@ -32,9 +29,7 @@ def open_file(path: AnyPath) -> AssetFile:
     name = os.fspath(path)
     _, _, elements = _core.ply_header(name)
     if any("packed_position" in dict(properties) for _, _, properties in elements):
-        axis = _vertical_axis(path)
-        file = compressed_ply.open_file(path)
-        return replace(file, declared=replace(axis, notes=axis.notes + file.declared.notes))
+        return compressed_ply.open_file(path)
     plain = _core.PlyFile(name)
     has_base_colors = "f_dc_0" not in plain.used
 
@@ -49,7 +44,7 @@ def open_file(path: AnyPath) -> AssetFile:
         plain.num_gaussians,
         plain.sh_degree,
         read,
-        declared=_declared(path, elements, set(plain.used)),
+        declared=_declared(_core.ply_comments(name), elements, set(plain.used)),
     )
 
 
@@ -61,26 +56,12 @@ def _check_colors(path: AnyPath, gaussians: Gaussians) -> None:
     check(path, largest <= _MAX_COLOR, f"{expected}, got {largest:g}; {advice}")
 
 
-def _vertical_axis(path: AnyPath) -> Declared:
-    """The axis that the header declares to be up: that of nerfstudio has `comment
-    Vertical Axis: z`."""
-    with open(_files.open_regular(path), "rb") as file:
-        header = file.read(_MOST_HEADER).partition(b"end_header")[0].decode("latin-1")
-    match = re.search(r"^comment\s+Vertical Axis:\s*(\S+)\s*$", header, re.MULTILINE)
-    if match is None:
-        return NOTHING
-    for axis in AXES:
-        if match[1].lower() == axis:
-            return Declared(up=axis, up_reason="as its header says")
-    return Declared(notes=(f"Its header has an unknown vertical axis, {match[1][:20]!a}.",))
-
-
-def _declared(path: AnyPath, elements: _Elements, used: set[str]) -> Declared:
+def _declared(comments: Sequence[str], elements: _Elements, used: set[str]) -> Declared:
     """What a file has beside the numbers that are read as they are meant."""
-    axis = _vertical_axis(path)
+    by_comments = _ply_comments.declared_by(comments)
     vertex = next(properties for name, _, properties in elements if name == "vertex")
     unread = [name for name, _ in vertex if name not in used and name not in _NORMALS]
-    notes = list(axis.notes)
+    notes = list(by_comments.notes)
     if "scale_2" not in used:
         notes.append(
             "scale_2 is missing, so these are the gaussians of 2DGS; "
@@ -88,9 +69,10 @@ def _declared(path: AnyPath, elements: _Elements, used: set[str]) -> Declared:
         )
     if "f_dc_0" not in used:
         notes.append("Red, green and blue were read as base colours, because f_dc_0 is missing.")
-    antialiased = None
+    antialiased = by_comments.antialiased
     if "filter_3D" in used:
-        antialiased = True
+        if antialiased is None:
+            antialiased = True
         notes.append("filter_3D of Mip-Splatting was applied to scales and opacities.")
     high_coefficients = [name for name in unread if name.startswith("f_rest_")]
     if high_coefficients:
@@ -101,7 +83,7 @@ def _declared(path: AnyPath, elements: _Elements, used: set[str]) -> Declared:
     left_out = [name for name, count, _ in elements if name != "vertex" and count]
     if left_out:
         notes.append(f"Elements beside vertex were left out: {listed(left_out)}.")
-    return replace(axis, antialiased=antialiased, notes=tuple(notes))
+    return replace(by_comments, antialiased=antialiased, notes=tuple(notes))
 
 
 def write(
@@ -111,4 +93,5 @@ def write(
     host = gaussians.numpy()
     arrays = (host.means, host.quats, host.scales, host.opacities, host.sh)
     with _files.replacing(path) as temporary:
-        _core.ply_write(temporary, *arrays, encoding=encoding)
+        comments = _ply_comments.comments_for(host.antialiased)
+        _core.ply_write(temporary, *arrays, encoding=encoding, comments=comments)

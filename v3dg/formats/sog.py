@@ -50,6 +50,8 @@ _MOST_PALETTE = 65536  # labels have 16 bits
 _PALETTE_COLUMNS = 64  # entries of the palette side by side in its picture
 _MAX_LOG = 88.0  # about the log of the largest float32
 
+# Models of splat-transform, and whether they are antialiased.
+_MODELS: dict[str, bool | None] = {"default": False, "antialiased": True, "2dgs": None}
 _RESOURCE_FORKS = "__MACOSX/"  # the folder of what the Finder adds to a zip
 
 # Number of pictures of each part of meta.json.
@@ -199,19 +201,22 @@ def _meta(path: Path, text: bytes) -> dict[str, Node]:
 
 
 def _declared(meta: dict[str, Node]) -> Declared:
-    """What `meta.json` declares beside the pictures. `model` is what splat-transform
-    writes, `antialias` what others do."""
+    """What meta.json declares beside the pictures: `antialias`, of the specification,
+    and `model`, of splat-transform, which counts where there are both."""
     notes = []
     antialiased: bool | None = None
-    if "antialias" in meta and isinstance(meta["antialias"].value, bool):
+    if "antialias" in meta:
         antialiased = meta["antialias"].value
+        if not isinstance(antialiased, bool):
+            raise meta["antialias"].error("true or false")
     if "model" in meta:
-        model = meta["model"].value
-        antialiased = {"default": False, "antialiased": True}.get(str(model), antialiased)
+        model = meta["model"].text()
+        if model in _MODELS:
+            antialiased = _MODELS[model]
+        else:
+            notes.append(f"The model {json_text(model)} is not known and was left out.")
         if model == "2dgs":
             notes.append("The gaussians are those of 2DGS; they were read as flat ellipsoids.")
-        elif model not in ("default", "antialiased"):
-            notes.append(f"The model {json_text(model)} is not known and was left out.")
     unread = [name for name in meta if name not in _FIELDS]
     if unread:
         notes.append(f"Fields of meta.json were left out: {listed(unread)}.")
@@ -350,7 +355,6 @@ def encode(gaussians: Gaussians, *, palette_size: int | None = None) -> dict[str
     }
     meta: dict[str, object] = {
         "version": 2,
-        "asset": {"generator": f"v3dg {__version__}"},
         "count": count,
         "means": {
             "mins": low.tolist(),
@@ -360,6 +364,7 @@ def encode(gaussians: Gaussians, *, palette_size: int | None = None) -> dict[str
         "scales": {"codebook": scale_table.tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_table.tolist(), "files": ["sh0.webp"]},
+        **_declarations(gaussians),
     }
     if gaussians.sh_degree:
         part, centroids, labels = _encoded_palette(gaussians, palette_size)
@@ -367,6 +372,16 @@ def encode(gaussians: Gaussians, *, palette_size: int | None = None) -> dict[str
         contents["shN_centroids.webp"] = centroids
         contents["shN_labels.webp"] = picture(labels & 255, labels >> 8, np.zeros(count, np.uint8))
     return {"meta.json": json.dumps(meta, separators=(",", ":")).encode(), **contents}
+
+
+def _declarations(gaussians: Gaussians) -> dict[str, object]:
+    """What meta.json says of gaussians beside their numbers."""
+    declarations: dict[str, object] = {"asset": {"generator": f"v3dg {__version__}"}}
+    if gaussians.antialiased is not None:
+        declarations["antialias"] = gaussians.antialiased
+    if gaussians.antialiased:
+        declarations["model"] = "antialiased"
+    return declarations
 
 
 def _encoded_means(

@@ -14,7 +14,7 @@ import math
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -41,11 +41,15 @@ _MAGIC = 0x5053474E  # NGSP
 _HEADER = struct.Struct("<IIIBBBB")
 _ZSTD_HEADER_BYTES = 32
 _STREAM_SIZES = struct.Struct("<QQ")
+MAX_START = 1 << 16
+"""Bytes that contain the header, also after the optional fields of a gzip header."""
 _MAX_TRAILER = 1 << 20  # bytes after the attributes, for extensions of vendors
 _COLOR_SCALE = 0.15
 _LARGEST_FIXED = (1 << 23) - 1
+# Bits of the flags.
+_ANTIALIASED = 1
+_HAS_EXTENSIONS = 2
 _MOST_POINTS = 100_000  # that a ground is sought among
-_HAS_EXTENSIONS = 2  # the bit of the flags
 _EXTENSION = struct.Struct("<II")  # a type and the bytes that follow
 _AXES_EXTENSION = 0xADBE0003  # SPZ_ADOBE_coordinate_system
 # The axes by their number in that extension, of version 4 of the library.
@@ -66,12 +70,19 @@ LIMITS = _packing.Limits(
 the range, they include that half step."""
 
 
-class _Header(NamedTuple):
+class Header(NamedTuple):
+    """What the first bytes of a file say."""
+
     version: int
     sh_degree: int
     fraction_bits: int  # fraction bits of the fixed-point positions
     num_gaussians: int
     flags: int
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether the gaussians were trained with antialiasing."""
+        return bool(self.flags & _ANTIALIASED)
 
     @property
     def section_bytes(self) -> list[int]:
@@ -91,7 +102,7 @@ class _Header(NamedTuple):
 class _Content:
     """What a file holds, expanded."""
 
-    header: _Header
+    header: Header
     sections: list[memoryview]
     extensions: bytes  # records of a type, a length and a payload
 
@@ -106,9 +117,18 @@ def open_file(path: AnyPath) -> AssetFile:
     def read(_: AnyPath) -> Gaussians:
         return _axes.turned(_decode(content), axes, _axes.MEMORY)
 
-    file = whole_file(path, content.header.num_gaussians, content.header.sh_degree, read)
-    declared = Declared(up=_axes.MEMORY_UP, up_reason=reason, notes=_notes(content))
-    return replace(file, declared=declared)
+    header = content.header
+    declared = Declared(_axes.MEMORY_UP, reason, header.antialiased, _notes(content))
+    return whole_file(path, header.num_gaussians, header.sh_degree, read, declared=declared)
+
+
+def header_of(path: AnyPath, start: bytes | memoryview, claims: Claims) -> Header:
+    """The header in the first `MAX_START` bytes of a `.spz` file's content."""
+    header = bytes(start)
+    if header[:2] == b"\x1f\x8b":
+        with value_errors(path, "a gzip stream that is not damaged"):
+            header = zlib.decompressobj(31).decompress(header, _HEADER.size)
+    return _checked_header(path, header, claims)
 
 
 def decode(path: AnyPath, content: bytes, claims: Claims) -> Gaussians:
@@ -144,15 +164,7 @@ def write(
 def encode(host: Gaussians, version: int = 3, *, axes: str = "") -> Iterator[bytes]:
     """Parts of a `.spz` file, which records its axes if they are given; ``host`` has
     passed `check_writable`."""
-    reach = float(np.abs(host.means).max(initial=0.0))
-    integer_bits = 0
-    if reach > 0:
-        integer_bits = math.ceil(math.log2(reach))
-    # Fraction bits: 12, as in Niantic's writer, or more if a step were above 2^-17 of
-    # the largest coordinate.
-    bits = max(0, min(max(12, 17 - integer_bits), 22 - integer_bits, 24))
-    fits = reach * 2**bits <= _LARGEST_FIXED
-    check("means", fits, f"coordinates within ±{_LARGEST_FIXED} for .spz, got {reach:g}")
+    bits = _fraction_bits(host.means)
 
     def fixed(rows: slice) -> bytes:
         numbers = np.rint(host.means[rows].astype(np.float64) * 2**bits).astype("<i4")
@@ -171,6 +183,8 @@ def encode(host: Gaussians, version: int = 3, *, axes: str = "") -> Iterator[byt
     ]
     flags = 0
     extensions = b""
+    if host.antialiased:
+        flags |= _ANTIALIASED
     if axes:
         flags |= _HAS_EXTENSIONS
         extensions = _EXTENSION.pack(_AXES_EXTENSION, 4) + struct.pack("<I", _AXES.index(axes))
@@ -187,6 +201,19 @@ def encode(host: Gaussians, version: int = 3, *, axes: str = "") -> Iterator[byt
             yield compressor.compress(section(rows))
     yield compressor.compress(extensions)
     yield compressor.flush()
+
+
+def _fraction_bits(means: NDArray[np.float32]) -> int:
+    """12, as in Niantic's writer, or more if a step were above 2^-17 of the largest
+    coordinate."""
+    reach = float(np.abs(means).max(initial=0.0))
+    integer_bits = 0
+    if reach > 0:
+        integer_bits = math.ceil(math.log2(reach))
+    bits = max(0, min(max(12, 17 - integer_bits), 22 - integer_bits, 24))
+    fits = reach * 2**bits <= _LARGEST_FIXED
+    check("means", fits, f"coordinates within ±{_LARGEST_FIXED} for .spz, got {reach:g}")
+    return bits
 
 
 def _zstd_parts(
@@ -264,11 +291,20 @@ def _records(extensions: bytes) -> Iterator[tuple[int, bytes]]:
 
 def _notes(content: _Content) -> tuple[str, ...]:
     """Sentences about what is in the file and was not read."""
-    return tuple(
+    extensions = tuple(
         f"Its extension {kind:#010x}, of {len(payload)} bytes, is not read."
         for kind, payload in _records(content.extensions)
         if kind != _AXES_EXTENSION
     )
+    return (*flag_notes(content.header), *extensions)
+
+
+def flag_notes(header: Header) -> tuple[str, ...]:
+    """Sentences about flags that were not understood."""
+    unknown = header.flags & ~(_ANTIALIASED | _HAS_EXTENSIONS)
+    if not unknown:
+        return ()
+    return (f"Its flags {unknown:#04x} are unknown, and are not read.",)
 
 
 def _decode(content: _Content) -> Gaussians:
@@ -307,7 +343,7 @@ def _quats(rotations: NDArray[np.uint8]) -> Floats:
     return np.roll(_packing.quats_from_three(three, words >> 30), 1, axis=1)
 
 
-def _checked_header(path: AnyPath, header: bytes, claims: Claims) -> _Header:
+def _checked_header(path: AnyPath, header: bytes, claims: Claims) -> Header:
     check(path, len(header) >= _HEADER.size, f"a header of {_HEADER.size} bytes, got {len(header)}")
     magic, version, count, degree, fraction_bits, flags, _ = _HEADER.unpack_from(header)
     check(path, magic == _MAGIC, f".spz, which begins with NGSP, got {header[:4].hex(' ')}")
@@ -315,7 +351,7 @@ def _checked_header(path: AnyPath, header: bytes, claims: Claims) -> _Header:
     check(path, degree <= 3, f"SH degree 0 to 3, got {degree}")
     check(path, fraction_bits <= 24, f"at most 24 fraction bits, got {fraction_bits}")
     claims.add(path, count)
-    return _Header(version, degree, fraction_bits, count, flags)
+    return Header(version, degree, fraction_bits, count, flags)
 
 
 def _sections_of_gzip(path: AnyPath, content: bytes, claims: Claims) -> _Content:

@@ -44,6 +44,7 @@ SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 # The axes of a stage by the one that is up; its cameras look back.
 _AXES = {"Y": _axes.OPENGL, "Z": _axes.Z_UP}
 _Pose: TypeAlias = tuple[tuple[float, float, float, float], Floats, float]
+_ANTIALIASED = "antialiased"  # in the custom data of a prim: the schema has no place for it
 _SH = "radiance:sphericalHarmonics"
 _HALVES = (
     "positions",
@@ -121,7 +122,8 @@ def read(path: AnyPath) -> tuple[Gaussians, Declared]:
         if letter not in _AXES:
             raise ValueError(f"the up axis {letter[:20]!a}; only Y and Z can be read")
         gaussians = _axes.turned(joined, _AXES[letter], _axes.MEMORY)
-        return gaussians, _declared(usd, root.GetStage(), letter, notes)
+        declared = _declared(usd, root.GetStage(), letter, notes)
+        return gaussians, replace(declared, antialiased=gaussians.antialiased)
 
 
 def _declared(usd: ModuleType, stage: Usd.Stage, letter: str, notes: list[str]) -> Declared:
@@ -143,7 +145,8 @@ def _padded(gaussians: Gaussians, degree: int) -> Gaussians:
     if missing == 0:
         return gaussians
     zeros = np.zeros((len(gaussians), missing, 3), np.float32)
-    return replace(gaussians, sh=np.concatenate([gaussians.numpy().sh, zeros], axis=1))
+    padded = replace(gaussians, sh=np.concatenate([gaussians.numpy().sh, zeros], axis=1))
+    return padded.trained(antialiased=gaussians.antialiased)
 
 
 def has_instances(path: AnyPath) -> bool:
@@ -368,7 +371,14 @@ def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]
         opacities=opacities,
         sh=np.ascontiguousarray(sh),
     )
-    return gaussians, notes
+    return gaussians.trained(antialiased=_antialiased(prim)), notes
+
+
+def _antialiased(prim: Usd.Prim) -> bool | None:
+    value = prim.GetCustomDataByKey(_ANTIALIASED)
+    if isinstance(value, bool):
+        return value
+    return None
 
 
 def _degree(usd: ModuleType, prim: Usd.Prim) -> int:
@@ -492,4 +502,6 @@ def define(stage: Usd.Stage, path: str, host: Gaussians) -> Usd.Prim:
     }
     for name, value in values.items():
         prim.GetAttribute(name).Set(value)
+    if host.antialiased is not None:
+        prim.SetCustomDataByKey(_ANTIALIASED, host.antialiased)
     return prim

@@ -86,6 +86,7 @@ def build_bundle(
     leaves = MemoryLeaves(asset, config, unusable, devices[0])
     has_place = executor is None or resume_path is not None
     check("resume_path", has_place, "a file that all workers of the executor reach, got None")
+    config = leaves.settings(config)
     return build_into(
         resume_path, leaves, config, seed, devices, progress, codec=codec, executor=executor
     )

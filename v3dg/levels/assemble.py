@@ -29,14 +29,15 @@ def assemble(
         last_px2 = max(config.filter_px2, 1 / 12)
     coarse_px2 = np.where(level < len(levels) - 1, config.filter_px2, last_px2)
     antialiased = np.ones(len(level), np.uint8)
-    antialiased[level == 0] = config.asset_antialiased
+    asset_filter_px2, is_antialiased = config.asset_look
+    antialiased[level == 0] = is_antialiased
     clusters = Clusters(
         offset=np.concatenate([[0], np.cumsum(sizes)]),
         level=level,
         own_group=_groups_from(num_clusters, num_groups, 0),
         parent_group=_groups_from(num_clusters, num_groups, 1),
         box=np.concatenate([table.box for table in tables]),
-        filter_px2=np.where(level == 0, config.asset_filter_px2, coarse_px2).astype(np.float32),
+        filter_px2=np.where(level == 0, asset_filter_px2, coarse_px2).astype(np.float32),
         antialiased=antialiased,
     )
     groups = Groups(

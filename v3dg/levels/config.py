@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Annotated, Literal, NoReturn, get_args, get_origin
 
 from v3dg._numbers import check, refuse
+from v3dg.gaussians import TRAINED_FILTER_PX2
 
 # Drawing a target cannot be interrupted; this limit keeps it below about a second.
 _MOST_SIDE = 8192
@@ -24,7 +25,7 @@ _KINDS: dict[type, tuple[tuple[type, ...], str]] = {
 }
 _Weight = Annotated[float, (0, 1_000_000)]
 _StepSize = Annotated[float, (0, 1_000_000_000)]
-_Setting = int | float | bool | str
+_Setting = int | float | bool | str | None
 
 
 @dataclass(frozen=True)
@@ -74,12 +75,14 @@ class BuildConfig:
             fitted with a filter, a measurement decides: some groups of level 1 are
             fitted with 0.05 px² and without a filter, and the asset is smooth if the
             filter hardly improves it.
-        asset_filter_px2: The filter of level 0. The filter used for training (0.3 for
-            the original 3DGS) suits pictures of the size of the photographs; without a
-            filter, the asset looks better from farther away. Coarser levels are always
-            fitted to the asset without a filter.
+        asset_filter_px2: The filter of level 0. None means no filter, or the filter of
+            the training if the asset is antialiased. The filter used for training (0.3
+            for the original 3DGS) suits pictures of the size of the photographs;
+            without a filter, the asset looks better from farther away. Coarser levels
+            are always fitted to the asset without a filter.
         asset_antialiased: Whether the asset was trained with opacities that compensate
-            for its filter.
+            for its filter. None means what the asset says (`Gaussians.antialiased`),
+            and False if it says nothing.
         loss_l1, loss_dssim, loss_alpha: Weights of the parts of the loss.
         step_position: Step size of positions, in radii of the group, or in world units
             if `position_in_world`. The other step sizes are those of log scales,
@@ -116,8 +119,8 @@ class BuildConfig:
     distance: Annotated[float, (1.1, 1000)] = 4.0
     filter_px2: _Weight = 0.05
     smooth: Literal["measured", "yes", "no"] = "measured"
-    asset_filter_px2: _Weight = 0.0
-    asset_antialiased: bool = False
+    asset_filter_px2: _Weight | None = None
+    asset_antialiased: bool | None = None
     loss_l1: _Weight = 1.0
     loss_dssim: _Weight = 0.0
     loss_alpha: _Weight = 0.5
@@ -134,12 +137,17 @@ class BuildConfig:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            arguments = get_args(field.type)
-            if get_origin(field.type) is Literal:
+            kind = field.type
+            if type(None) in get_args(kind):
+                if value is None:
+                    continue
+                kind = get_args(kind)[0]
+            arguments = get_args(kind)
+            if get_origin(kind) is Literal:
                 if value not in arguments:
                     self._refuse(field.name, " or ".join(map(repr, arguments)))
                 continue
-            kind, *ranges = arguments or (field.type,)
+            kind, *ranges = arguments or (kind,)
             classes, expected = _KINDS[kind]
             is_kind = isinstance(value, classes) and isinstance(value, bool) == (kind is bool)
             if not is_kind:
@@ -224,6 +232,34 @@ class BuildConfig:
         if self.image_size > 0:  # the ball covers about 0.4 of the picture
             px2 = 0.4 * self.image_size**2 / (self.cluster_size * self.group_size / 2)
         return 1 + max(1, math.ceil(math.log2(px2 * self.supersample**2)))
+
+    def of_asset(self, *, antialiased: bool | None) -> "BuildConfig":
+        """The settings for an asset that says, or does not, that it is antialiased."""
+        if self.asset_antialiased is not None:
+            antialiased = self.asset_antialiased
+        filter_px2 = self.asset_filter_px2
+        if filter_px2 is None:
+            filter_px2 = 0.0
+            if antialiased:
+                filter_px2 = TRAINED_FILTER_PX2
+        return replace(self, asset_antialiased=bool(antialiased), asset_filter_px2=filter_px2)
+
+    def contradiction(self, *, antialiased: bool | None) -> str:
+        """What differs between these settings and what an asset says of itself, as a
+        sentence; empty if nothing does."""
+        setting = self.asset_antialiased
+        if setting is None or antialiased is None or setting == antialiased:
+            return ""
+        if antialiased:
+            return "It says that it was trained with antialiasing, but is built without."
+        return "It says that it was trained without antialiasing, but is built with it."
+
+    @property
+    def asset_look(self) -> tuple[float, bool]:
+        """The filter of level 0, px², and whether its opacities are compensated for
+        it."""
+        config = self.of_asset(antialiased=None)
+        return config.asset_filter_px2 or 0.0, bool(config.asset_antialiased)
 
     @staticmethod
     def leaves_only() -> "BuildConfig":

@@ -155,14 +155,15 @@ class _FileBuild:
     def run(self, source: AbstractContextManager[Leaves], *, resume: bool) -> tuple[Bundle, bool]:
         """Keep or build the bundle; return it, and whether it was built."""
         with source as leaves:
-            if resume and self._is_finished(leaves):
+            config = leaves.settings(self.config)
+            if resume and self._is_finished(leaves, config):
                 with suppress(RuntimeError):  # another build is writing there
                     discard_levels(self.levels_path)
                 return Bundle.open(self.bundle_path), False
             bundle = build_into(
                 self.levels_path,
                 leaves,
-                self.config,
+                config,
                 self.seed,
                 self.devices,
                 self.progress,
@@ -174,13 +175,13 @@ class _FileBuild:
             )
             return bundle, True
 
-    def _is_finished(self, leaves: Leaves) -> bool:
+    def _is_finished(self, leaves: Leaves, config: BuildConfig) -> bool:
         """Return whether the bundle exists, was built from these leaves with these
         settings, and has not been converted to another codec."""
-        config = made_with(leaves, self.config, self.seed, self.codec, self.up)
+        expected = made_with(leaves, config, self.seed, self.codec, self.up)
         try:
             bundle = Bundle.open(self.bundle_path)
-            return bundle.config == config and bundle.codec == self.codec
+            return bundle.config == expected and bundle.codec == self.codec
         except (ValueError, OSError):  # missing, damaged, or of another version: build it again
             return False
 

@@ -36,6 +36,15 @@ class Leaves(ABC):
     digest: str
     resident_bytes: int  # memory of the host that they need as long as they are read
     up: Axis | None  # what is up, if the file of the asset declares it
+    antialiased: bool | None  # as in `Gaussians`
+
+    def settings(self, config: BuildConfig) -> BuildConfig:
+        """The settings with which they are built; an AssetWarning says where these
+        contradict the asset."""
+        contradiction = config.contradiction(antialiased=self.antialiased)
+        if contradiction:
+            warnings.warn(f"asset: {contradiction}", cleaning.AssetWarning, stacklevel=3)
+        return config.of_asset(antialiased=self.antialiased)
 
     @abstractmethod
     def read(self, first: int, last: int) -> Gaussians:
@@ -69,6 +78,7 @@ class MemoryLeaves(Leaves):
             digest=digest_of(host),
             resident_bytes=len(asset) * (gaussian_bytes(asset.sh_degree) + 4),
             up=up or declared_of(asset).up,
+            antialiased=asset.antialiased,
         )
         self._asset = _device.place(asset, _device.of(asset.means))  # without gradients
         self._config = config

@@ -27,7 +27,7 @@ from v3dg._urls import shown
 from v3dg.bundle.codec import Codec
 from v3dg.cameras import Axis
 from v3dg.formats._reading import AssetFile
-from v3dg.gaussians import Gaussians, gaussian_bytes, put
+from v3dg.gaussians import Gaussians, common, gaussian_bytes, put
 from v3dg.io import open_asset
 from v3dg.levels import external_split
 from v3dg.levels.config import BuildConfig
@@ -103,10 +103,7 @@ def leaves_on_disk(
     needed, and removed at the end.
     """
     files = map(open_asset, paths)  # lazy, so that few files are open at once
-    tiles = [
-        _Tile(file.path, file.num_gaussians, file.sh_degree, file.whole_bytes, file.declared.up)
-        for file in files
-    ]
+    tiles = list(map(_Tile.of, files))
     count = sum(tile.num_gaussians for tile in tiles)
     check("asset", count < MOST_GAUSSIANS, f"fewer than 2^32 gaussians, got {count:,}")
     degree = max(tile.sh_degree for tile in tiles)
@@ -121,16 +118,18 @@ def leaves_on_disk(
         progress = False
     with scratch, Bar(2 * count, "reading", progress) as bar:
         if fits:
-            buffer = Codec(degree).empty(count)
+            antialiased = _antialiased(tiles)
+            buffer = Codec(degree).empty(count).trained(antialiased=antialiased)
             for _ in _blocks(tiles, buffer, bar):
                 pass
             bar.close()
-            leaves = MemoryLeaves(buffer, config, unusable, device, tiles[0].up)
+            leaves: Leaves = MemoryLeaves(buffer, config, unusable, device, tiles[0].up)
             del buffer
-            yield leaves
         else:
             _check_disk(folder, scratch_bytes(count, degree))
-            yield _sort_on_disk(tiles, folder, sizes, config, unusable, bar)
+            leaves = _sort_on_disk(tiles, folder, sizes, config, unusable, bar)
+            bar.close()
+        yield leaves
 
 
 def _check_disk(folder: Path, num_bytes: int) -> None:
@@ -151,12 +150,30 @@ class _Tile(NamedTuple):
     sh_degree: int
     whole_bytes: int
     up: Axis | None
+    antialiased: bool | None
+
+    @staticmethod
+    def of(file: AssetFile) -> "_Tile":
+        return _Tile(
+            file.path,
+            file.num_gaussians,
+            file.sh_degree,
+            file.whole_bytes,
+            file.declared.up,
+            file.declared.antialiased,
+        )
 
     def open(self) -> AssetFile:
         file = open_asset(self.path)
         is_same = (file.num_gaussians, file.sh_degree) == (self.num_gaussians, self.sh_degree)
         check(shown(self.path), is_same, _CHANGED)
         return file
+
+
+def _antialiased(tiles: Sequence[_Tile]) -> bool | None:
+    """Whether the gaussians of all files were trained with antialiasing; None if that
+    is not known, or not the same for all."""
+    return common([tile.antialiased for tile in tiles])
 
 
 class _Sizes(NamedTuple):
@@ -272,7 +289,6 @@ def _sort_on_disk(
             second_digest = _write_rows(sizes.blocks(tiles, bar), order_file, ends, row_file)
     order.unlink()
     check(_name_of(tiles), second_digest == digest, _CHANGED)
-    bar.close()
     return DiskLeaves(
         num_gaussians=count,
         asset_gaussians=tally.num_gaussians,
@@ -281,6 +297,7 @@ def _sort_on_disk(
         digest=digest,
         resident_bytes=int(np.diff(offset).max()) * _bytes_in_bucket(degree),
         up=tiles[0].up,
+        antialiased=_antialiased(tiles),
         path=rows.absolute(),
         bucket_offset=offset,
         bucket_depth=depth - bucket_depth,

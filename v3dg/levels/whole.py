@@ -188,8 +188,7 @@ class _Build:
                 level_1.leaf_offset,
                 level_1.group_offset,
                 ball,
-                self.config.asset_filter_px2,
-                self.config.asset_antialiased,
+                *self.config.asset_look,
                 self.config.filter_px2,
             )
         balls = _core.grown_balls([table.ball for table in tables], growth)

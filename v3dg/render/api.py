@@ -74,7 +74,9 @@ def render(
     Clusters whose gaussians each cover at most `tolerance` px² replace finer ones.
     Level 0 is drawn with the asset's own filter, coarser levels with the filter that
     they were made for (V3DG, section 3.4; docs/levels.md defines the metric). An asset
-    is drawn completely, without a filter.
+    is drawn completely and without a filter. One that was trained with antialiasing
+    (`Gaussians.antialiased`) is drawn as it was trained, with 0.3 px² and compensated
+    opacities.
 
     Args:
         subject: What to draw, in world space; or its file, which every call opens

@@ -11,6 +11,7 @@ from v3dg._device import Device
 from v3dg._numbers import check
 from v3dg.cameras import Camera, StereoCamera
 from v3dg.false_color import ColorBy
+from v3dg.gaussians import TRAINED_FILTER_PX2
 from v3dg.image import RenderedImage, Stats
 from v3dg.render.picture import Picture, stats_of
 from v3dg.render.request import CutRequest, FrameRequest
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 
 
 class AssetFrame:
-    """Draws one asset on one device, where it keeps the asset's arrays.
+    """Draws one asset on one device, where it keeps the asset's arrays. An asset that
+    was trained with antialiasing is drawn as it was trained.
 
     Attributes:
         device: The device that draws.
@@ -33,7 +35,14 @@ class AssetFrame:
         check("color_by", color_by == "appearance", expected)
         self.device = device
         self.memory: int | None = None
-        self._core = _core.AssetFrame(_core.Model(_device.place(asset, device).rows))
+        filter_px2 = 0.0
+        if asset.antialiased:
+            filter_px2 = TRAINED_FILTER_PX2
+        self._core = _core.AssetFrame(
+            _core.Model(_device.place(asset, device).rows),
+            filter_px2=filter_px2,
+            antialiased=bool(asset.antialiased),
+        )
 
     def chosen(self, subject: Subject) -> AssetFrame:
         """Return this frame."""

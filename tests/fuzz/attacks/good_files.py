@@ -13,6 +13,7 @@ import torch
 from PIL import Image
 
 import v3dg
+from gltf_files import file_of_every_part
 from random_bundle import random_bundle, random_gaussians
 from test_camera_file import CAPTURE, PATH
 from test_formats import FIXTURES, gsplat_tensors
@@ -96,6 +97,9 @@ def _formats(folder):
         if kind in ("splat", "ksplat", "spz", "sog", "glb"):
             is_hashed = kind == "sog" or path.read_bytes()[:2] == b"\x1f\x8b"
             yield Good(kind, {f"a.{kind}": path.read_bytes()}, is_hashed=is_hashed)
+    file = file_of_every_part()
+    document = file.write(folder / "good.gltf", "a.bin").read_bytes()
+    yield Good("gltf", {"a.gltf": document, "a.bin": bytes(file.blob)})
     parts = sog.encode(random_gaussians(np.random.default_rng(1), 40, 1))
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:

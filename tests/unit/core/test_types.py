@@ -8,6 +8,7 @@ import pytest
 
 import scenes
 from random_bundle import random_bundle
+from reference import sh
 from v3dg import _core
 from v3dg._device import CPU
 from v3dg.residency import residency
@@ -332,3 +333,19 @@ def test_background_has_three_numbers():
     for background in ([0, 0], [0, 0, 0, 0], None, "red"):
         with pytest.raises(TypeError, match="incompatible constructor arguments"):
             _core.Shade(background=background, min_transmittance=1e-3, with_depth=True)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_bases_are_those_of_the_reference(degree):
+    directions = np.random.default_rng(degree).normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    found = _core.sh_bases(degree, directions)
+    np.testing.assert_allclose(found, sh.basis(directions, degree), atol=1e-12)
+    assert _core.sh_bases(degree, np.zeros((0, 3))).shape == (0, (degree + 1) ** 2)
+
+
+def test_bases_of_what_is_no_direction_are_refused():
+    with pytest.raises(ValueError, match="degree: expected 0 to 3, got 4"):
+        _core.sh_bases(4, np.zeros((1, 3)))
+    with pytest.raises(ValueError, match="directions: expected"):
+        _core.sh_bases(1, np.zeros((1, 2)))
