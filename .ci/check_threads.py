@@ -1,15 +1,14 @@
-"""Checks with clang that what a mutex guards is used only while the mutex is held.
+"""Checks with clang that every guarded field is used only while its mutex is held.
 
-Reads the annotations of csrc/base/thread_annotations.h in every source that includes
-base/mutex.h, itself or through a header. Prints what clang found and fails if there is
-anything. Sources of the bindings need pybind11 and are left out where it is not
-installed.
+Clang reads the annotations of csrc/base/thread_annotations.h in every source that
+includes base/mutex.h, directly or through a header. The script prints clang's findings
+and fails if there are any. Sources of the bindings need pybind11, and sources of CUDA
+need the CUDA runtime's header; they are left out if these are not installed.
 
     python .ci/check_threads.py [--csrc FOLDER] [--list] [SOURCE ...]
 
-A SOURCE is named as below csrc/, for example residency/page_pool.cpp; the default is
-all of them.
-CLANG names the compiler (default clang++).
+A SOURCE is a path below csrc/, for example residency/page_pool.cpp; by default all are
+checked. CLANG names the compiler (default clang++).
 """
 
 import argparse
@@ -25,27 +24,56 @@ from pathlib import Path
 
 CSRC = Path(__file__).parent.parent / "csrc"
 MUTEX = "base/mutex.h"
+# Many sources include these headers, whose mutexes are used only in the headers. Clang
+# checks a header in every source that includes it, so one source suffices.
+ENCLOSED = frozenset({"base/first_error.h", "bindings/drawing.h"})
+CUDA_RUNTIME = "cuda_runtime.h"
 OPTIONS = ["-std=c++20", "-fsyntax-only", "-DV3DG_WITH_CUDA=0"]
 WARNINGS = ["-Wno-everything", "-Wthread-safety", "-Wthread-safety-beta", "-Werror"]
 
 
 def included(path: Path) -> set[str]:
-    """Returns the headers of csrc/ that a file includes itself."""
+    """Returns the headers that a file includes directly."""
     text = path.read_text(encoding="utf-8")
-    return set(re.findall(r'^#include "([^"]+)"', text, re.MULTILINE))
+    return set(re.findall(r'^#include ["<]([^">]+)[">]', text, re.MULTILINE))
 
 
-def sources_with_mutexes(csrc: Path) -> list[str]:
-    """Returns the sources that include MUTEX, in any number of steps."""
-    users = {MUTEX}
+def users_of(header: str, csrc: Path, *, without: frozenset[str] = frozenset()) -> set[str]:
+    """Returns the files that include a header, directly or through headers."""
+    users = {header}
     files = {
         str(path.relative_to(csrc)): included(path)
         for path in csrc.rglob("*")
         if path.suffix in {".h", ".cpp"}
     }
+    for name in without:
+        files.pop(name, None)
     while found := {name for name in files.keys() - users if files[name] & users}:
         users |= found
-    return sorted(name for name in users if name.endswith(".cpp"))
+    return users
+
+
+def sources_of(names: set[str]) -> list[str]:
+    return sorted(name for name in names if name.endswith(".cpp"))
+
+
+def sources_with_mutexes(csrc: Path) -> list[str]:
+    """Returns the files to check; a header is one of them if no source includes it."""
+    users = users_of(MUTEX, csrc, without=ENCLOSED)
+    sources = set(sources_of(users))
+    for header in ENCLOSED:
+        sources |= set(sources_of(users_of(header, csrc))[:1])
+    headers = users - sources - {MUTEX}
+    return sorted(sources | {name for name in headers if not sources_of(users_of(name, csrc))})
+
+
+def cuda_headers() -> Path | None:
+    """Returns the folder with the CUDA runtime's header, which is beside nvcc."""
+    nvcc = shutil.which("nvcc")
+    folders = [Path("/usr/local/cuda/include")]
+    if nvcc is not None:
+        folders.insert(0, Path(nvcc).resolve().parent.parent / "include")
+    return next((folder for folder in folders if (folder / CUDA_RUNTIME).is_file()), None)
 
 
 def include_options(csrc: Path) -> list[str]:
@@ -55,7 +83,9 @@ def include_options(csrc: Path) -> list[str]:
 
         options += ["-isystem", pybind11.get_include()]
         options += ["-isystem", sysconfig.get_path("include")]
-    # Clang has a header of OpenMP only with libomp-dev; the one of gcc will do here.
+    if (cuda := cuda_headers()) is not None:
+        options += ["-isystem", str(cuda)]
+    # Clang has a header of OpenMP only with libomp-dev; the one of gcc suffices here.
     if compiler := shutil.which("g++"):
         command = [compiler, "-print-file-name=include"]
         folder = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
@@ -83,6 +113,10 @@ def main() -> int:
     if importlib.util.find_spec("pybind11") is None:
         print("pybind11 is not installed: the bindings are not checked")
         sources = [source for source in sources if not source.startswith("bindings/")]
+    if cuda_headers() is None:
+        print("CUDA's headers are not installed: the sources of CUDA are not checked")
+        of_cuda = users_of(CUDA_RUNTIME, options.csrc)
+        sources = [source for source in sources if source not in of_cuda]
 
     command = [clang, *OPTIONS, *WARNINGS, *include_options(options.csrc)]
 

@@ -79,6 +79,7 @@ class Instances:
         quaternions: Float64,
         scales: Float64,
         importance: Float32,
+        factors: Float32 | None = None,
     ) -> None: ...
 
 class Rows:
@@ -96,6 +97,8 @@ class Rows:
 # Means, quats, scales, opacities and sh.
 Columns: TypeAlias = tuple[Array, Array, Array, Array, Array]
 
+def sh_bases(degree: int, directions: NDArray[np.float64]) -> NDArray[np.float64]: ...
+
 # ply
 class PlyFile:
     """A .ply file of gaussians, read in runs of rows."""
@@ -105,11 +108,16 @@ class PlyFile:
     def num_gaussians(self) -> int: ...
     @property
     def sh_degree(self) -> int: ...
+    @property
+    def used(self) -> list[str]:
+        """Names of the properties that are read."""
+
     def read(self, first: int, last: int) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
 
 def ply_header(
     path: str | PathLike[str],
 ) -> tuple[str, int, list[tuple[str, int, list[tuple[str, str]]]]]: ...
+def ply_comments(path: str | PathLike[str]) -> list[str]: ...
 def ply_write(
     path: str | PathLike[str],
     means: Float32,
@@ -118,6 +126,7 @@ def ply_write(
     opacities: Float32,
     sh: Float32,
     encoding: str,
+    comments: list[str] = [],
 ) -> None: ...
 
 # cluster
@@ -477,6 +486,7 @@ class ResidentScene:
         positions: Array,
         quaternions: Array,
         scales: Array,
+        factors: Float32 | None = None,
     ) -> None: ...
     def set_poses(self, positions: Array, quaternions: Array, scales: Array) -> None: ...
     def select(
@@ -657,7 +667,9 @@ class SceneFrame:
 class AssetFrame:
     """Draws gaussians without levels on the device that they are on."""
 
-    def __init__(self, model: Model) -> None: ...
+    def __init__(
+        self, model: Model, *, filter_px2: float = 0.0, antialiased: bool = False
+    ) -> None: ...
     def draw(self, camera: Camera, shade: Shade, stop: Stop | None = None) -> Drawing: ...
 
 # fit_level

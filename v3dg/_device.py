@@ -19,7 +19,7 @@ _MUCH_MEMORY = 1 << 30
 
 @dataclass(frozen=True)
 class Device:
-    """The CPU, or a CUDA device by its number."""
+    """The CPU, or a CUDA device with its index."""
 
     number: int = -1
 
@@ -33,7 +33,7 @@ class Device:
         return "cpu"
 
     def current(self) -> AbstractContextManager[object]:
-        """Make it torch's current device inside the context; does nothing for the
+        """Make this torch's current device inside the context; does nothing for the
         CPU."""
         if not self.is_cuda:
             return nullcontext()
@@ -46,15 +46,15 @@ CPU = Device()
 
 
 def resolve(device: str | Device) -> Device:
-    """The device that "auto", "cpu", "cuda" or "cuda:1" stands for.
+    """Return the device that "auto", "cpu", "cuda" or "cuda:1" means.
 
-    "cuda" is torch's current device, "auto" the same if nothing is missing for it, else
+    "cuda" means torch's current device. "auto" means the same if CUDA can be used, else
     the CPU.
 
     Raises:
-        ValueError: The name is none of these.
-        RuntimeError: A CUDA device was requested and cannot be used; the CPU does not
-            replace it.
+        ValueError: The name is not one of these.
+        RuntimeError: A CUDA device was requested and cannot be used; there is no
+            fallback to the CPU.
     """
     name = str(device)
     kind, _, number = name.partition(":")
@@ -80,7 +80,8 @@ def resolve(device: str | Device) -> Device:
 
 
 def missing_for_cuda() -> str | None:
-    """The reason why CUDA cannot be used, and what to do; None if it can."""
+    """Return the reason why CUDA cannot be used, and what to do; None if it can be
+    used."""
     if not _core.has_cuda:
         return "v3dg was built without CUDA; install it again where nvcc is found"
     if _core.num_cuda_devices() == 0:
@@ -98,7 +99,7 @@ def missing_for_cuda() -> str | None:
 
 
 def describe(device: Device) -> str:
-    """The kind of a device, on which the last bits of results depend."""
+    """Return the kind of a device, on which the last bits of results depend."""
     if not device.is_cuda:
         return _core.isa()
     import torch
@@ -107,23 +108,25 @@ def describe(device: Device) -> str:
 
 
 def of(array: Array) -> Device:
-    """The device of an array; for a tensor of torch on the host that is the CPU."""
+    """Return the device of an array; a torch tensor on the host is on the CPU."""
     if isinstance(array, np.ndarray) or not array.is_cuda:
         return CPU
     return Device(array.device.index)
 
 
 def place(gaussians: Gaussians, device: Device) -> Gaussians:
-    """The gaussians as NumPy arrays (on the CPU) or as tensors on a CUDA device,
+    """Return the gaussians as NumPy arrays (on the CPU) or as tensors on a CUDA device,
     without gradients."""
     if not device.is_cuda:
         return gaussians.numpy()
-    return Gaussians(*(array.detach() for array in vars(gaussians.torch(str(device))).values()))
+    tensors = vars(gaussians.torch(str(device))).values()
+    placed = Gaussians(*(tensor.detach() for tensor in tensors))
+    return placed.trained(antialiased=gaussians.antialiased)
 
 
 def place_rows(array: Array, rows: npt.NDArray[np.bool_], device: Device) -> Array:
-    """The marked rows of an array, as NumPy's (on the CPU) or as a CUDA tensor, without
-    gradients."""
+    """Return the marked rows of an array, as a NumPy array (on the CPU) or as a CUDA
+    tensor, without gradients."""
     if isinstance(array, np.ndarray) and not device.is_cuda:
         return array[rows]
     import torch
@@ -136,7 +139,8 @@ def place_rows(array: Array, rows: npt.NDArray[np.bool_], device: Device) -> Arr
 
 
 def all_like(device: Device) -> list[Device]:
-    """A CUDA device and then all others of its kind; the CPU alone."""
+    """Return a CUDA device and then all others of its kind; for the CPU, only the
+    CPU."""
     devices = [device]
     if device.is_cuda:
         for number in range(_core.num_cuda_devices()):
@@ -146,7 +150,8 @@ def all_like(device: Device) -> list[Device]:
 
 
 def library_of(array: Array) -> ModuleType:
-    """numpy or torch; many functions have the same names and arguments in both."""
+    """Return numpy or torch; many functions have the same names and arguments in
+    both."""
     if isinstance(array, np.ndarray):
         return np
     import torch
@@ -155,7 +160,7 @@ def library_of(array: Array) -> ModuleType:
 
 
 def to_host(array: Array) -> HostArray:
-    """The array as a NumPy array."""
+    """Return the array as a NumPy array."""
     if isinstance(array, np.ndarray):
         return array
     return cast(HostArray, array.cpu().numpy())
@@ -163,8 +168,8 @@ def to_host(array: Array) -> HostArray:
 
 @contextmanager
 def memory_errors() -> Iterator[None]:
-    """Turn torch's error for too little device memory into MemoryError, which the core
-    raises."""
+    """Turn torch's error about too little device memory into MemoryError, which the
+    core raises."""
     try:
         yield
     except RuntimeError as error:
@@ -184,7 +189,8 @@ def own_stream(device: Device) -> AbstractContextManager[object]:
 
 
 def with_this_stream(work: Callable[[], None], device: Device) -> Callable[[], None]:
-    """Bind work to the stream of this thread, so that it uses that on any thread."""
+    """Return work bound to this thread's stream, so that it uses that stream on any
+    thread."""
     if not device.is_cuda:
         return work
     import torch
@@ -199,7 +205,7 @@ def with_this_stream(work: Callable[[], None], device: Device) -> Callable[[], N
 
 
 def spare_memory(device: Device) -> None:
-    """Have torch free its cached memory on a device if it is much, because the core
+    """Make torch free its cached memory on a device if it is large, because the core
     cannot use it."""
     if not device.is_cuda:
         return

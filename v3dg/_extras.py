@@ -8,7 +8,7 @@ from typing import NamedTuple
 class Extra(NamedTuple):
     """An optional package."""
 
-    requirement: str  # in the syntax of pip
+    requirement: str  # in pip's syntax
     purpose: str
 
 
@@ -19,7 +19,6 @@ EXTRAS = {
     "flip_evaluator": Extra("flip-evaluator>=1.6", "errors by FLIP"),
     "av": Extra("av>=12", "videos"),
     "pxr": Extra("usd-core>=26.11", "OpenUSD"),
-    "pycolmap": Extra("pycolmap>=4.0", "cameras of COLMAP"),
     "fsspec": Extra("fsspec[http]>=2024.2", "files at URLs"),
     "distributed": Extra("distributed>=2024.1", "builds on many machines"),
 }
@@ -27,7 +26,7 @@ EXTRAS = {
 
 
 def missing(module: str) -> str:
-    """The message for a package that is not installed, or too old."""
+    """Return the message about a package that is not installed, or too old."""
     extra = EXTRAS[module]
     packages = [package for package in EXTRAS.values() if package.purpose == extra.purpose]
     needed = " ".join(f"'{package.requirement}'" for package in packages)
@@ -38,7 +37,7 @@ def missing(module: str) -> str:
 
 
 def load(module: str) -> ModuleType:
-    """Import a module; ImportError says how to install its package."""
+    """Import a module; the ImportError says how to install its package."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -1,4 +1,5 @@
-"""Files that are complete or absent, and the first step of reading untrusted files."""
+"""Files that are either complete or absent, and the first steps of reading untrusted
+files."""
 
 import contextlib
 import errno
@@ -22,25 +23,25 @@ _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
-    """Yield the name of an empty file beside `path`; it replaces `path` at the end, or
-    is removed on failure.
+    """Yield the name of an empty file beside `path`. The file replaces `path` at the
+    end, or is removed on failure.
 
-    The content is on the disk before the file gets its name. It has the permissions of
-    the file that it replaces, and the owner and group where the system allows it. A
-    link at `path` stays a link, to the new file; a link at the temporary name is not
-    followed.
+    The content is on the disk before the file gets its final name. The file gets the
+    permissions of the file that it replaces, and the owner and group if the system
+    allows it. If `path` is a link, it stays a link and its target is replaced; a link
+    at the temporary name is not followed.
 
     Raises:
         IsADirectoryError: `path` is a folder.
-        PermissionError: `path` may not be written.
+        PermissionError: Writing to `path` is not permitted.
         ValueError: `path` is a device or a pipe.
-        OSError: Writing failed; its file name is `path`.
+        OSError: Writing failed; the error names `path`.
     """
-    path = os.fspath(path)  # refuses a number, which open() would take for an open file
+    path = os.fspath(path)  # raises for an integer, which open() would use as a file descriptor
     status_of_replaced(path)
     folder, name = os.path.split(os.path.realpath(path))
-    # Only the start of the name: a name may have at most 255 bytes, and a character has
-    # up to four.
+    # Only the start of the name is used: names are limited to 255 bytes, and a
+    # character has up to four bytes.
     temporary = os.path.join(folder, f".{name[:40]}.{secrets.token_hex(8)}.tmp")
     with naming_errors(path, temporary):
         # The file is private until it gets the permissions of the file that it
@@ -75,14 +76,14 @@ def put_in_place(private: str | os.PathLike[str], path: str | os.PathLike[str]) 
 
 
 def file_mode_mask(status_path: str = "/proc/self/status") -> int:
-    """The permissions that new files of this process do not get (umask)."""
+    """Return the permissions that this process removes from new files (umask)."""
     with contextlib.suppress(OSError):
         status = Path(status_path).read_text(encoding="ascii", errors="replace")
         match = re.search(r"^Umask:\s*([0-7]+)$", status, re.MULTILINE)
         if match:
             return int(match[1], 8)
-    # Without /proc it can be read by setting it alone. What another thread makes
-    # meanwhile is private.
+    # Without /proc, the mask can be read only by setting it. Files that other threads
+    # create meanwhile are private.
     with _MASK_LOCK:
         mask = os.umask(0o077)
         os.umask(mask)
@@ -90,8 +91,8 @@ def file_mode_mask(status_path: str = "/proc/self/status") -> int:
 
 
 def status_of_replaced(path: str | os.PathLike[str]) -> os.stat_result | None:
-    """The status of the file that will be replaced, or None if there is none; raises as
-    `replacing`."""
+    """Return the status of the file that will be replaced, or None if it does not
+    exist; raises the errors of `replacing`."""
     try:
         status = os.stat(path)
     except FileNotFoundError:
@@ -99,7 +100,7 @@ def status_of_replaced(path: str | os.PathLike[str]) -> os.stat_result | None:
     if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
     check(path, stat.S_ISREG(status.st_mode), "the path of a file, got a device or a pipe")
-    # Renaming needs only the permissions of the folder; opening the file checks its
+    # Renaming checks only the permissions of the folder; opening the file checks its
     # own.
     os.close(os.open(path, os.O_WRONLY | os.O_CLOEXEC))
     return status
@@ -107,8 +108,8 @@ def status_of_replaced(path: str | os.PathLike[str]) -> os.stat_result | None:
 
 @contextlib.contextmanager
 def naming_errors(path: str | os.PathLike[str], other_name: str | None = None) -> Iterator[None]:
-    """Put the name of the file into the system's errors, which for an open file have
-    none or `other_name`."""
+    """Add the name of the file to system errors, which for an open file contain no name
+    or `other_name`."""
     try:
         yield
     except OSError as error:
@@ -119,8 +120,8 @@ def naming_errors(path: str | os.PathLike[str], other_name: str | None = None) -
 
 @contextlib.contextmanager
 def value_errors(path: str | os.PathLike[str], expected: str) -> Iterator[None]:
-    """Turn every exception of a library into one ValueError: none documents what
-    damaged content raises."""
+    """Turn every exception of a library into a ValueError, because no library documents
+    what it raises for damaged content."""
     try:
         yield
     except MemoryError:
@@ -133,7 +134,7 @@ def value_errors(path: str | os.PathLike[str], expected: str) -> Iterator[None]:
 
 
 def write_at(descriptor: int, data: bytes | bytearray | memoryview, offset: int) -> None:
-    """Write all data from an offset of a file on, in pieces, so that signals are
+    """Write all data to a file from an offset on, in pieces, so that signals are
     handled between them."""
     view = memoryview(data)
     while view:
@@ -143,8 +144,8 @@ def write_at(descriptor: int, data: bytes | bytearray | memoryview, offset: int)
 
 
 def read_at(descriptor: int, out: npt.NDArray[np.generic], offset: int) -> bool:
-    """Fill an array with the bytes from an offset of a file on; False if the file ends
-    before."""
+    """Fill an array with bytes of a file from an offset on; return False if the file
+    ends early."""
     view = out.reshape(-1).view(np.uint8).data
     while view:
         count = os.preadv(descriptor, [view[:_PIECE_BYTES]], offset)
@@ -155,21 +156,31 @@ def read_at(descriptor: int, out: npt.NDArray[np.generic], offset: int) -> bool:
     return True
 
 
-def check_folder(path: Path) -> None:
-    """Refuse an output whose folder does not exist, with ValueError."""
-    check(path, path.parent.is_dir(), f"an existing folder, got {path.parent}; create it first")
+def make_folder(path: str | os.PathLike[str]) -> None:
+    """Create the folder of an output, with the folders above it, unless it exists.
+
+    Raises:
+        OSError: It cannot be created, such as NotADirectoryError for one below a file.
+    """
+    folder = Path(path).parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise NotADirectoryError(
+            errno.ENOTDIR, os.strerror(errno.ENOTDIR), os.fspath(folder)
+        ) from None
 
 
 def check_bundle_name(path: str | os.PathLike[str]) -> None:
-    """Refuse a name that `v3dg.open` would not recognise as a bundle's, with
-    ValueError."""
+    """Raise ValueError for a name that `v3dg.open` would not recognise as a bundle."""
     check(path, Path(path).suffix == ".v3dg", "a file name ending in .v3dg; v3dg.open needs it")
 
 
 def open_regular(path: str | os.PathLike[str]) -> int:
-    """Open a file to read, and return its descriptor; ValueError for a directory, a
-    device or a pipe."""
-    # O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
+    """Open a file for reading and return its descriptor; raise ValueError for a
+    directory, a device or a pipe."""
+    # With O_NONBLOCK, opening a pipe does not wait for a writer; regular files ignore
+    # it.
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)

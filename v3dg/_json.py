@@ -1,7 +1,8 @@
-"""Strict JSON, and values with their place in the file, which errors name."""
+"""Strict JSON, and values with their location in the file, for error messages."""
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
 import os
@@ -15,21 +16,29 @@ from v3dg import _files
 T = TypeVar("T")
 
 Json: TypeAlias = Any
-"""A JSON value. A union would make every use of a field a type error; what is read from
-a file is checked by `Node`."""
+"""A JSON value. It is not a union, which would make every use of a field a type error;
+`Node` checks values that are read from a file."""
 
 JsonObject: TypeAlias = dict[str, Json]
 
 _LARGEST_SIDE = 1 << 20  # px of a picture
+_BYTE_ORDER_MARK = "\ufeff"
+_UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 def parse_json(text: str | bytes) -> Json:
-    """Parse strict JSON: no NaN, no key twice, no unbounded nesting; ValueError
-    otherwise."""
+    """Parse strict JSON, also after a byte order mark: no NaN, no key twice, no
+    unbounded nesting; ValueError otherwise."""
+    if isinstance(text, bytes):
+        text = text.decode("utf-8")
     try:
-        return json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
+        return json.loads(
+            text.removeprefix(_BYTE_ORDER_MARK),
+            object_pairs_hook=_unique_keys,
+            parse_constant=_refuse_constant,
+        )
     except RecursionError:
-        raise ValueError("nested too deep") from None
+        raise ValueError("nested too deeply") from None
 
 
 def _unique_keys(pairs: list[tuple[str, object]]) -> dict[str, object]:
@@ -46,7 +55,7 @@ def _refuse_constant(name: str) -> NoReturn:
 
 
 def json_text(value: object) -> str:
-    """A JSON value as a short text for a message of one line."""
+    """Return a JSON value as a short text for a one-line message."""
     if isinstance(value, dict) and len(value) > 8:
         return f"an object of {len(value)} values"
     if isinstance(value, list) and len(value) > 8:
@@ -61,19 +70,21 @@ def json_text(value: object) -> str:
 
 
 def is_one_line(text: str) -> bool:
-    """Whether text can be part of a message: no control characters, no halves of
-    surrogate pairs."""
+    """Return whether text can be part of a message: it has no control characters and no
+    unpaired surrogates."""
     return not any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in text)
 
 
 def read_json(path: str | os.PathLike[str]) -> Node:
-    """Read a JSON file; ValueError unless it is a regular file with strict JSON in
-    UTF-8."""
+    """Read a JSON file; raise ValueError unless it is a regular file with strict JSON
+    in UTF-8."""
     path = Path(path)
     with _files.naming_errors(path), open(_files.open_regular(path), "rb") as file:
         content = file.read()
     try:
-        return Node(parse_json(content.decode("utf-8")), path.name, "")
+        if content.startswith(_UTF16_MARKS):
+            raise ValueError("it is in UTF-16; save it as UTF-8")
+        return Node(parse_json(content), path.name, "")
     except ValueError as error:
         raise ValueError(
             f"{path.name}: expected JSON, got a file that does not parse: {error}"
@@ -81,13 +92,13 @@ def read_json(path: str | os.PathLike[str]) -> Node:
 
 
 def write_json(path: str | os.PathLike[str], document: object) -> None:
-    """Write a JSON file, which replaces an existing one once it is complete."""
+    """Write a JSON file; it replaces an existing one once it is complete."""
     with _files.replacing(path) as temporary:
         Path(temporary).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
 class Node:
-    """A JSON value with its place: the name of the file, and its path in the
+    """A JSON value with its location: the name of the file, and the path in the
     document."""
 
     def __init__(self, value: Json, file: str, path: str) -> None:
@@ -96,7 +107,7 @@ class Node:
         self.path = path
 
     def problem(self, text: str) -> ValueError:
-        """An error that begins with the place."""
+        """Return an error that begins with the location."""
         return ValueError(f"{self.file}: {self.path or 'top level'}: {text}")
 
     def error(self, expected: str, advice: str = "") -> ValueError:
@@ -106,8 +117,8 @@ class Node:
         return self.problem(text)
 
     def attempt(self, make: Callable[[], T]) -> T:
-        """The result of ``make``; its ValueErrors, which begin with a field, get the
-        place of this value."""
+        """Return the result of ``make``. Its ValueErrors, which begin with a field, are
+        prefixed with this location."""
         try:
             return make()
         except ValueError as error:
@@ -117,7 +128,7 @@ class Node:
             raise ValueError(f"{self.file}: {place}{error}") from error
 
     def field(self, key: str) -> Node:
-        """One of an object's fields."""
+        """Return one of an object's fields."""
         if not isinstance(self.value, dict):
             raise self.error("an object")
         if key not in self.value:
@@ -135,20 +146,20 @@ class Node:
     def items(
         self, expected: str = "an array", min_length: int = 0, max_length: float = math.inf
     ) -> Iterator[Node]:
-        """An array's values, lazily: the nodes of a large array take far more memory
-        than the file."""
+        """Yield the values of an array; the nodes of a large array together would take
+        far more memory than the file."""
         if not isinstance(self.value, list) or not min_length <= len(self.value) <= max_length:
             raise self.error(expected)
         return (Node(value, self.file, f"{self.path}[{i}]") for i, value in enumerate(self.value))
 
     def some_fields(self, required: tuple[str, ...]) -> dict[str, Node]:
-        """An object's fields, which include the required ones."""
+        """Return an object's fields; the required ones must be present."""
         if not isinstance(self.value, dict):
             raise self.error("an object")
         return {key: self.field(key) for key in dict.fromkeys((*required, *self.value))}
 
     def fields(self, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, Node]:
-        """An object's fields, none of them unknown."""
+        """Return an object's fields; unknown ones are an error."""
         fields = self.some_fields(required)
         for key, node in fields.items():
             if key not in required and key not in optional:
@@ -169,7 +180,7 @@ class Node:
         lower_bound: float = -math.inf,
         upper_bound: float = math.inf,
     ) -> float:
-        """A number strictly between two bounds."""
+        """Return a number strictly between two bounds."""
         if isinstance(self.value, bool) or not isinstance(self.value, int | float):
             raise self.error("a number")
         try:
@@ -187,7 +198,8 @@ class Node:
         return self.number("radians between 0 and pi", 0, math.pi)
 
     def size(self) -> int:
-        """A side of a picture in px, also written as 1920.0, as some programs do."""
+        """Return the side of a picture in px; 1920.0 is accepted, too, because some
+        programs write that."""
         side = self.number()
         if side != int(side) or side <= 0:
             raise self.error("a positive whole number")

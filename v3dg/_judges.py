@@ -1,4 +1,5 @@
-"""Measuring many pictures, each on a core of its own, and means of the results."""
+"""Measurements of many pictures, each in a separate process, and means of the
+results."""
 
 import contextlib
 import multiprocessing
@@ -20,7 +21,7 @@ R = TypeVar("R")
 
 
 class _Judge(NamedTuple):
-    """A process that measures, and this process's end of the pipe to it."""
+    """A measuring process, and this process's end of the pipe to it."""
 
     process: SpawnProcess
     pipe: Connection
@@ -35,10 +36,10 @@ class Judges:
         self._judges: list[_Judge] = []
 
     def measured(self, items: Iterable[T], measure: Callable[[T], R]) -> Iterator[tuple[T, R]]:
-        """Items with the result of ``measure`` for each, in order; later items are made
-        meanwhile.
+        """Yield items with the result of ``measure`` for each, in order; later items
+        are produced meanwhile.
 
-        ``measure`` is a function of a module, for other processes import it.
+        ``measure`` must be a function of a module, because other processes import it.
         """
         waiting: deque[tuple[T, Connection]] = deque()
         try:
@@ -53,20 +54,19 @@ class Judges:
                 measured_item, pipe = waiting.popleft()
                 yield measured_item, cast(R, _answer(pipe))
         except BaseException:
-            # answers that are still to come would be taken for those of later items
+            # Answers that are still pending would be mistaken for those of later items.
             self.close()
             raise
 
     def _pipe(self, number: int) -> Connection:
-        """The pipe to a process, which is started if it is the next one."""
+        """Return the pipe to a process, which is started if it does not run yet."""
         if number == len(self._judges):
-            resource_tracker.ensure_running()  # it unblocks signals once it has started
-            # Ctrl-C is for this process alone: a process that starts must not be
-            # interrupted before it can ignore it.
+            resource_tracker.ensure_running()  # starting it unblocks signals
+            # Only this process handles Ctrl-C: a starting process must not be
+            # interrupted before it can ignore the signal.
             previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
             try:
-                # A forked process would inherit CUDA and OpenMP in a state that neither
-                # survives.
+                # A forked process would inherit CUDA and OpenMP in an unusable state.
                 context = multiprocessing.get_context("spawn")
                 pipe, pipe_of_judge = context.Pipe()
                 process = context.Process(target=_judge, args=(pipe_of_judge,), daemon=True)
@@ -86,7 +86,7 @@ class Judges:
 
 
 def _judge(pipe: Connection) -> None:
-    """Measure the items that arrive, until the other end of the pipe is closed."""
+    """Measure the items that arrive until the other end of the pipe is closed."""
     with contextlib.suppress(EOFError, OSError):
         while True:
             measure, item = pipe.recv()
@@ -109,7 +109,7 @@ def _answer(pipe: Connection) -> object:
 
 
 def mean_of(rows: Sequence[Mapping[str, float | None]], *names: str) -> JsonObject:
-    """Means of columns, to six digits; None where every value is missing."""
+    """Return means of columns, to six digits; None if every value is missing."""
     means: dict[str, float | None] = {}
     for name in names:
         values = [value for row in rows if (value := row.get(name)) is not None]

@@ -1,4 +1,5 @@
-"""Checks of numbers that users pass; errors are one line and name the number."""
+"""Checks of numbers from users; errors are one line and contain the name of the
+number."""
 
 import math
 import operator
@@ -27,8 +28,8 @@ class _Tensor(Protocol):
 
 
 def floats(values: object, name: str, expected: str = "numbers") -> Floats:
-    """A new array of doubles, from numbers, arrays or torch's tensors; ValueError
-    unless all are finite."""
+    """Return a new array of doubles, from numbers, arrays or torch tensors; raise
+    ValueError unless all are finite."""
     try:
         if hasattr(values, "detach"):
             array = np.asarray(cast(_Tensor, values).numpy(force=True))
@@ -54,27 +55,27 @@ def floats(values: object, name: str, expected: str = "numbers") -> Floats:
 
 
 def vector(values: object, name: str, shape: tuple[int, ...] = (3,)) -> Floats:
-    """A new array of finite doubles of this shape; see `floats`."""
+    """Return a new array of finite doubles of this shape; see `floats`."""
     if (
         type(values) is np.ndarray
         and values.shape == shape
         and values.dtype == np.float64
         and math.isfinite(sum(values.ravel().tolist()))
     ):
-        return np.array(values, order="C")  # the quick way, for every frame
+        return np.array(values, order="C")  # the fast path, which is used in every frame
     array = floats(values, name, f"numbers of shape {shape}")
     check(name, array.shape == shape, f"shape {shape}, got {array.shape}")
     return array
 
 
 def color(values: object, name: str) -> list[float]:
-    """Three numbers that the core can hold."""
+    """Return three numbers that a float32 can represent."""
     if (
         type(values) is tuple
         and len(values) == 3
         and all(type(v) is float and 0 <= v <= 1 for v in values)
     ):
-        return list(values)  # the quick way, for every frame
+        return list(values)  # the fast path, which is used in every frame
     array = vector(values, name)
     largest = np.abs(array).max()
     check(name, largest <= MOST_FLOAT, f"numbers that a float32 can hold, got {largest}")
@@ -88,7 +89,8 @@ def real(
     lower_bound: float = -math.inf,
     upper_bound: float = math.inf,
 ) -> float:
-    """One number of ``lower_bound`` to ``upper_bound``; ValueError otherwise."""
+    """Return one number from ``lower_bound`` to ``upper_bound``; raise ValueError
+    otherwise."""
     number = math.nan
     try:
         if not getattr(value, "ndim", 0) and not isinstance(value, str):
@@ -105,14 +107,15 @@ def real(
 
 
 def positive(value: object, name: str) -> float:
-    """One positive number that is finite; ValueError otherwise."""
+    """Return one positive finite number; raise ValueError otherwise."""
     return real(value, name, "a positive number", 5e-324, MOST_DOUBLE)
 
 
 def whole(
     value: object, name: str, expected: str, lower_bound: int, upper_bound: int = MOST_INT
 ) -> int:
-    """One whole number of ``lower_bound`` to ``upper_bound``; ValueError otherwise."""
+    """Return one integer from ``lower_bound`` to ``upper_bound``; raise ValueError
+    otherwise."""
     try:
         number = operator.index(cast(SupportsIndex, value))
     except TypeError:
@@ -125,7 +128,7 @@ def whole(
 
 
 def whole_number(value: object, name: str) -> int:
-    """One whole number of any size; TypeError for what is none."""
+    """Return one integer of any size; raise TypeError for other values."""
     try:
         return operator.index(cast(SupportsIndex, value))
     except TypeError:
@@ -133,19 +136,19 @@ def whole_number(value: object, name: str) -> int:
 
 
 def check(name: str | os.PathLike[str], holds: object, expected: str) -> None:
-    """Raise ValueError, whose message is ``name: expected ...``, unless ``holds``."""
+    """Raise ValueError with the message ``name: expected ...`` unless ``holds``."""
     if not holds:
         refuse(name, expected)
 
 
 def refuse(name: str | os.PathLike[str], expected: str) -> NoReturn:
-    """Raise the ValueError of `check`, for callers that compose the message only if it
+    """Raise the ValueError of `check`; for callers that compose the message only if it
     is needed."""
     raise ValueError(f"{os.fspath(name)}: expected {expected}")
 
 
 def check_type(name: str, value: object, kind: type, expected: str) -> None:
-    """Raise TypeError unless a value is an instance of ``kind``, which messages call
+    """Raise TypeError unless a value is an instance of ``kind``; messages call it
     ``expected``."""
     if not isinstance(value, kind):
         advice = ""
@@ -160,9 +163,9 @@ def check_all(
     good: npt.NDArray[np.bool_],
     expected: str | Callable[..., str],
 ) -> None:
-    """Raise ValueError for the first row that is not good.
+    """Raise ValueError for the first row that is invalid.
 
-    ``expected`` is a text, or a function that makes one from the number of the row.
+    ``expected`` is a text, or a function that returns one for the number of the row.
     """
     if not good.all():
         row = int(np.argmin(good.reshape(len(good), -1).all(1)))
@@ -178,7 +181,7 @@ def one_of(value: object, name: str, choices: tuple[str, ...]) -> None:
 
 
 def value_text(value: object) -> str:
-    """A value as text for a message of one line."""
+    """Return a value as text for a one-line message."""
     if isinstance(value, int) and value.bit_length() > 128:
         return f"a whole number of {value.bit_length()} bits"
     text = " ".join(repr(value).split())

@@ -1,8 +1,11 @@
 """Progress of long work: a bar in a terminal, a few lines in a log, or calls of a
 function."""
 
+import contextlib
 import logging
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
@@ -16,12 +19,13 @@ and a text."""
 
 _LOG = logging.getLogger("v3dg")
 _LOG.addHandler(logging.NullHandler())
-_LINES = 4  # lines that a log gets for one piece of work
+_LINES = 4  # number of log lines for one piece of work
 _LEAST_SCALED = 10_000  # from this total on, a bar counts in thousands and millions
+_PATIENCE_SECONDS = 2.0  # work that is done by then shows nothing
 
 
 class Bar:
-    """The display of the work that is done of a total.
+    """The display of how much of a total is done.
 
     Raises:
         TypeError: ``progress`` is neither a boolean nor a function.
@@ -66,7 +70,7 @@ class Bar:
     __exit__ = close
 
     def update(self, count: int, text: str = "") -> None:
-        """Add `count` to the work done, and show `text` about the work in progress."""
+        """Add `count` to the finished work, and show `text` about the current work."""
         self.num_done += count
         if text:
             self._text = f"{self._name}, {text}"
@@ -84,8 +88,42 @@ class Bar:
 
 
 def counted(items: Iterable[T], total: int, name: str, progress: Progress) -> Iterator[T]:
-    """The items, each counted when the next one is asked for."""
+    """Yield the items; each counts as done when the next one is requested."""
     with Bar(total, name, progress) as bar:
         for item in items:
             yield item
             bar.update(1)
+
+
+@contextlib.contextmanager
+def waiting(text: str, *, show: bool) -> Iterator[None]:
+    """Show that work of an unknown amount goes on, from two seconds on: the seconds
+    that it has taken in a terminal, elsewhere one line."""
+    if not show:
+        yield
+        return
+    is_done = threading.Event()
+    thread = threading.Thread(target=_show_waiting, args=(text, is_done), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        is_done.set()
+        thread.join()
+
+
+def _show_waiting(text: str, is_done: threading.Event) -> None:
+    start = time.monotonic()
+    if is_done.wait(_PATIENCE_SECONDS):
+        return
+    is_terminal = sys.stderr.isatty()
+    if not is_terminal:
+        print(f"{text} ...", file=sys.stderr, flush=True)
+        return
+    while True:
+        seconds = time.monotonic() - start
+        print(f"\r{text} ... {seconds:.0f} s", end="", file=sys.stderr, flush=True)
+        if is_done.wait(1.0):
+            # Erases the line.
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+            return

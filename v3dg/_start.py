@@ -1,9 +1,10 @@
-"""The start of a process that is a command: opens closed streams, and handles Ctrl-C.
+"""The start of a process that runs a command: it opens closed streams, and handles
+Ctrl-C.
 
-However often it comes, Ctrl-C ends the process with one line. The package imports this
-module before everything that takes long, so it imports next to nothing itself. Until a
-command runs, Ctrl-C has nothing to clean up and ends the process at once; from then on
-it raises KeyboardInterrupt.
+Ctrl-C, once or repeatedly, ends the process with one line. The package imports this
+module before everything that takes long, so the module itself imports almost nothing.
+Before a command runs there is nothing to clean up, and Ctrl-C ends the process at once;
+from then on it raises KeyboardInterrupt.
 """
 
 from __future__ import annotations
@@ -21,15 +22,15 @@ if TYPE_CHECKING:
 _AGAIN_AFTER_S = 0.02
 
 SIGNALS = (signal.SIGINT, signal.SIGALRM)
-"""The signals of Ctrl-C; the second repeats one that could not be handled, as in the
-midst of an import."""
+"""The signals of Ctrl-C. The second one repeats an interrupt that could not be handled,
+for example during an import."""
 
 
 def refuse_sub_interpreter() -> None:
-    """Raise an ImportError in an interpreter that is not the first of its process.
+    """Raise ImportError in an interpreter that is not the main one of its process.
 
-    The compiled module and NumPy know one interpreter alone; elsewhere, loading them
-    waits without end.
+    The compiled module and NumPy support only one interpreter; in others, loading them
+    would wait forever.
     """
     for name in ("_interpreters", "_xxsubinterpreters"):  # since Python 3.13, and before
         try:
@@ -45,8 +46,8 @@ def refuse_sub_interpreter() -> None:
 
 
 def begin() -> None:
-    """Open closed streams on the null device, and have Ctrl-C end the process."""
-    # Not if the parent ignores Ctrl-C.
+    """Open closed streams on the null device, and make Ctrl-C end the process."""
+    # This is skipped if the parent process ignores Ctrl-C.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end_at_once)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
@@ -56,12 +57,12 @@ def begin() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
-        # Escapes characters that an encoding lacks.
+        # Characters that an encoding lacks are escaped.
         getattr(sys, name).reconfigure(errors="backslashreplace")
 
 
 def _end_at_once(number: int, frame: types.FrameType | None) -> None:
-    signal.signal(signal.SIGINT, lambda *_: None)  # another Ctrl-C must not print a second line
+    signal.signal(signal.SIGINT, lambda *_: None)  # further interrupts must not print a second line
     try:
         os.write(2, b"v3dg: error: interrupted\n")
     finally:
@@ -69,8 +70,8 @@ def _end_at_once(number: int, frame: types.FrameType | None) -> None:
 
 
 def raise_interrupts() -> None:
-    """Have Ctrl-C raise KeyboardInterrupt from now on, if it ended the process at once
-    until now."""
+    """Make Ctrl-C raise KeyboardInterrupt from now on, if it ended the process at once
+    so far."""
     if signal.getsignal(signal.SIGINT) is _end_at_once:
         interrupts = _Interrupts()
         for number in reversed(SIGNALS):
@@ -79,12 +80,12 @@ def raise_interrupts() -> None:
 
 
 class _Interrupt(KeyboardInterrupt):
-    """A KeyboardInterrupt that can be referred to weakly."""
+    """A KeyboardInterrupt that supports weak references."""
 
 
 class _Interrupts:
-    """Raises one interrupt, and no other while that propagates, so that cleaning up is
-    not disturbed."""
+    """Raises one interrupt, and no other while it propagates, so that cleaning up is
+    not interrupted."""
 
     def __init__(self) -> None:
         import weakref
@@ -93,16 +94,17 @@ class _Interrupts:
         self._raised: weakref.ref[_Interrupt] | None = None
 
     def handle(self, number: int, frame: types.FrameType | None) -> None:
-        # Postponed during an import, which would leave half a module, and while this
-        # thread blocks Ctrl-C, when another thread received it.
+        # The interrupt is postponed during an import, which would leave an incomplete
+        # module, and while this thread blocks Ctrl-C, if another thread has received
+        # it.
         if _is_importing(frame) or signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()):
             signal.setitimer(signal.ITIMER_REAL, _AGAIN_AFTER_S)
         elif self._raised is None or self._raised() is None:
             raise self._interrupt()
 
     def _interrupt(self) -> _Interrupt:
-        # Not in `handle`: the exception would hold a frame that holds the exception,
-        # and stay alive.
+        # The exception is not created in `handle`: it would refer to a frame that
+        # refers to it, and stay alive.
         interrupt = _Interrupt()
         self._raised = self._refer(interrupt)
         return interrupt
@@ -125,8 +127,7 @@ def _is_importing(frame: types.FrameType | None) -> bool:
 
 
 refuse_sub_interpreter()
-# The program's name, which precedes the arguments; there is none in an interactive
-# process.
+# The program's name precedes the arguments; an interactive process has none.
 if [os.path.basename(name) for name in sys.orig_argv[-len(sys.argv) :][:1]] in (
     ["v3dg"],
     ["-mv3dg"],

@@ -1,20 +1,19 @@
 """Camera files: the `transforms.json` of nerfstudio, instant-ngp and NeRF's synthetic
-scenes.
+scenes, `cameras.json` of the code of the 3DGS paper, paths of nerfstudio's viewer, and
+models of COLMAP; and folders with one of them, and runs of nerfstudio."""
 
-It also reads folders with cameras: runs of nerfstudio, and models of COLMAP, with
-COLMAP's own library.
-"""
-
+import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from v3dg import _extras
+from v3dg import _files
+from v3dg._colmap import IMAGE_FILES, LENS_FILES, read_model
 from v3dg._json import Node, read_json, write_json
 from v3dg._numbers import check, one_of, refuse
 from v3dg.cameras import (
@@ -23,6 +22,7 @@ from v3dg.cameras import (
     check_cameras,
     intrinsics,
     is_rotation,
+    rigid,
     viewmat_from_blender,
 )
 
@@ -34,7 +34,8 @@ _UNDISTORT = (
     "undistort the pictures first, or leave it out: distortion='ignore', or --distortion ignore"
 )
 _RUN = "config.yml"  # identifies a run of nerfstudio
-_MODEL = ("images.bin", "images.txt")  # identify a model of COLMAP
+_TRAINING = "dataparser_transforms.json"  # from a run's data to its training
+_FRAMES = ("transforms.json", "transforms_train.json")
 _DATA = re.compile(
     r"^\s*data: (?:&\w+ )?!!python/object/apply:pathlib\.\w+\n((?:\s*- .*\n)+)", re.MULTILINE
 )
@@ -53,13 +54,21 @@ def read_cameras(
     """Read the cameras of a nerfstudio `transforms.json`, in file order
     (docs/scene.md).
 
-    ``path`` may also be a folder: a model of COLMAP, binary or text, whose cameras are
-    named after their images, with the extra `colmap`; or a run of nerfstudio (also by
-    its `config.yml`), whose cameras are in the frame of the training.
+    ``path`` may also be
 
-    A camera is named by its `file_path`; if any is missing or repeats, all are named by
-    their number, from 0. Pictures, depths, masks and point clouds that the file names
-    are not read.
+    - the `cameras.json` that the code of the 3DGS paper writes;
+    - a `camera_path.json` of nerfstudio's viewer, whose frames are named by their
+      number unless they have a `file_path`;
+    - a folder with one of these files: where `dataparser_transforms.json` is beside a
+      `transforms.json`, cameras are in the frame of that training;
+    - a model of COLMAP, binary or text, by its folder or its `images` file, whose
+      cameras are named after their images;
+    - the folder of a run of nerfstudio, or its `config.yml`, whose cameras are in the
+      frame of the training.
+
+    A camera is named by its `file_path`, its image, or `img_name`; if any is missing or
+    repeats, all are named by their number, from 0. Pictures, depths, masks and point
+    clouds that the file names are not read.
 
     Args:
         size: Width and height in px for a file that has neither `w` and `h` nor focal
@@ -77,32 +86,152 @@ def read_cameras(
     """
     one_of(distortion, "distortion", ("refuse", "ignore"))
     one_of(applied_transform, "applied_transform", ("keep", "undo"))
-    folder = Path(path)
-    if folder.name in (_RUN, *_MODEL):
-        folder = folder.parent
-    is_run = (folder / _RUN).is_file()
-    if not is_run and folder.is_dir():
-        return _read_colmap(folder, distortion)
-    if is_run:
-        path = _data_of(folder)
-    top = read_json(path).some_fields(("frames",))
+    place = _place_of(Path(path))
+    if place.file.name in IMAGE_FILES:
+        return _read_colmap(place.file, distortion)
+    document = read_json(place.file)
+    if isinstance(document.value, list) and document.value:
+        return _named(map(_read_3dgs, document.items()))
+    if document.has("camera_path") and document.field("camera_path").value != []:
+        return _named(_read_path(document, size))
+    top = _frames_at_top(document)
     transforms = []
-    if is_run or applied_transform == "undo":
+    if place.training is not None or applied_transform == "undo":
         transforms.append(_applied(top))
-    if is_run:
-        transforms.append(_trained(folder))
-    names = []
-    cameras = []
+    if place.training is not None:
+        transforms.append(_trained(place.training))
+    named = []
     for node in top["frames"].items():
         frame = node.some_fields(("transform_matrix",))
-        cameras.append(_read_frame(node, frame, top, transforms, size, distortion))
+        camera = _read_frame(node, frame, top, transforms, size, distortion)
         name = ""
         if "file_path" in frame:
             name = frame["file_path"].text()
+        named.append((name, camera))
+    return _named(named)
+
+
+class _Place(NamedTuple):
+    """The file that has the cameras, and that of the training whose frame they get."""
+
+    file: Path
+    training: Path | None = None
+
+
+def _place_of(path: Path) -> _Place:
+    """Return where the cameras of a file, a folder or a run of nerfstudio are."""
+    folder = path
+    if path.name == _RUN:
+        folder = path.parent
+    if (folder / _RUN).is_file():
+        return _Place(_data_of(folder), folder / _TRAINING)
+    if path.name in LENS_FILES:
+        return _Place(path.with_name(f"images{path.suffix}"))
+    if not path.is_dir():
+        return _Place(path)
+    file = _file_in(path)
+    training = path / _TRAINING
+    if file.name in _FRAMES and training.is_file():
+        return _Place(file, training)
+    return _Place(file)
+
+
+def _named(pairs: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
+    """Return cameras by name, or by number if a name is empty or repeats, so that none
+    replaces another."""
+    names = []
+    cameras = []
+    for name, camera in pairs:
         names.append(name)
+        cameras.append(camera)
     if "" in names or len(set(names)) < len(names):
         names = [str(i) for i in range(len(cameras))]
     return dict(zip(names, cameras, strict=True))
+
+
+def _file_in(folder: Path) -> Path:
+    """Return the camera file in a folder: one of a COLMAP model, or a JSON file."""
+    places = [folder / part for part in ("", "sparse/0", "sparse", "0")]
+    files = [place / name for place in places for name in IMAGE_FILES]
+    files += [folder / name for name in (*_FRAMES, "cameras.json", "camera_path.json")]
+    existing = [file for file in files if file.is_file()]
+    expected = (
+        "a model of COLMAP (images.bin or images.txt), a run of nerfstudio (config.yml), "
+        "transforms.json, cameras.json or camera_path.json"
+    )
+    check(folder, existing, f"{expected}, got a folder without")
+    return existing[0]
+
+
+def _frames_at_top(document: Node) -> dict[str, Node]:
+    """Return the fields of a file with frames; the ValueError for another file says
+    what it is."""
+    if document.has("keyframes") or document.has("camera_path"):
+        advice = "save the path in nerfstudio's viewer, which then writes them, too"
+        raise document.problem(f"expected frames in camera_path, got none; {advice}")
+    if document.has("transform") and document.has("scale"):
+        advice = "give the folder of the run, or put it beside transforms.json"
+        raise document.problem(f"expected cameras, got the transform of a run's training; {advice}")
+    return document.some_fields(("frames",))
+
+
+def _read_3dgs(node: Node) -> tuple[str, Camera]:
+    """Return a camera of the `cameras.json` that the code of the 3DGS paper writes. Its
+    rotation and position take camera to world; x is right, y down, z forward."""
+    if node.has("transform"):
+        raise node.problem(
+            "expected position, rotation, fx and fy, got a pose alone, as ns-export cameras "
+            "writes it; give the folder of the run"
+        )
+    required = ("position", "rotation", "fx", "fy", "width", "height")
+    fields = node.some_fields(required)
+    rotation = np.array(fields["rotation"].matrix(3, 3))
+    viewmat = rigid(rotation.T, np.array(fields["position"].vector(3)))
+    width = fields["width"].size()
+    height = fields["height"].size()
+    K = np.diag([fields["fx"].positive(), fields["fy"].positive(), 1.0])
+    K[0, 2] = 0.5 * width
+    K[1, 2] = 0.5 * height
+    name = ""
+    if "img_name" in fields and fields["img_name"].value != "":
+        name = fields["img_name"].text()
+    return name, node.attempt(partial(Camera, viewmat, K, width, height))
+
+
+def _read_path(document: Node, size: tuple[int, int] | None) -> Iterator[tuple[str, Camera]]:
+    """Yield the frames of a camera path of nerfstudio's viewer, named by `file_path` or
+    else by their number. Matrices take camera to world, with x right, y up, z backward;
+    `fov` is the vertical field of view in degrees, and pixels are square."""
+    for key in ("camera_type", "camera_model"):
+        if document.has(key) and document.field(key).text() != "perspective":
+            raise document.field(key).error('"perspective"')
+    if document.has("render_width") and document.has("render_height"):
+        width = document.field("render_width").size()
+        height = document.field("render_height").size()
+    elif size is None:
+        raise document.problem("expected render_width and render_height; give the size")
+    else:
+        width, height = size
+    for number, node in enumerate(document.field("camera_path").items()):
+        fov_degrees = node.field("fov").number("degrees between 0 and 180", 0, 180)
+        focal = 0.5 * height / math.tan(0.5 * math.radians(fov_degrees))
+        K = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])
+        pose = _flat_or_rows(node.field("camera_to_world"))
+        viewmat = node.attempt(partial(viewmat_from_blender, pose))
+        name = str(number)
+        if node.has("file_path"):
+            name = node.field("file_path").text()
+        yield name, node.attempt(partial(Camera, viewmat, K, width, height))
+
+
+def _flat_or_rows(node: Node) -> Floats:
+    """Return a (4, 4) matrix that is given as 16 numbers, row by row, or as four
+    rows."""
+    if isinstance(node.value, list) and len(node.value) == 16:
+        matrix = np.array(node.vector(16)).reshape(4, 4)
+        matrix[3] = (0, 0, 0, 1)
+        return matrix
+    return _rows(node)
 
 
 def _read_frame(
@@ -113,7 +242,8 @@ def _read_frame(
     size: tuple[int, int] | None,
     distortion: str,
 ) -> Camera:
-    """The camera of a frame; fields that it lacks are those at the top of the file."""
+    """Return the camera of a frame; fields that the frame lacks are read from the top
+    of the file."""
     fields = {**top, **frame}
     _check_is_pinhole(fields, distortion)
     focal = top
@@ -133,7 +263,7 @@ def _read_frame(
 
 
 def _data_of(run: Path) -> Path:
-    """The `transforms.json` of the data that a nerfstudio run was trained on."""
+    """Return the `transforms.json` of the data that a nerfstudio run was trained on."""
     # YAML with Python objects, of which only a path is read.
     text = (run / _RUN).read_text(encoding="utf-8", errors="replace")
     files = []
@@ -154,10 +284,10 @@ def _data_of(run: Path) -> Path:
     return existing
 
 
-def _trained(run: Path) -> tuple[Floats, float]:
-    """The transform from the frame of a run's training to that of its data, as
+def _trained(file: Path) -> tuple[Floats, float]:
+    """Return the transform from the frame of a run's training to that of its data, as
     `_applied` returns it."""
-    top = read_json(run / "dataparser_transforms.json").some_fields(("transform", "scale"))
+    top = read_json(file).some_fields(("transform", "scale"))
     matrix = _rows(top["transform"])
     scale = top["scale"].positive()
     if not is_rotation(matrix[:3, :3]):
@@ -167,37 +297,21 @@ def _trained(run: Path) -> tuple[Floats, float]:
     return np.asarray(inverse, np.float64), 1 / scale
 
 
-def _read_colmap(folder: Path, distortion: str) -> dict[str, Camera]:
-    places = [folder / part for part in ("", "sparse/0", "sparse", "0")]
-    models = [place for place in places for name in _MODEL if (place / name).is_file()]
-    expected = "a model of COLMAP (images.bin or images.txt) or a run of nerfstudio (config.yml)"
-    check(folder, models, f"{expected}, got a folder without")
-    pycolmap = _extras.load("pycolmap")
-    try:
-        model = pycolmap.Reconstruction(os.fspath(models[0]))
-    except (RuntimeError, ValueError, IndexError) as error:
-        raise ValueError(
-            f"{models[0]}: expected a model of COLMAP, got {str(error)[:200]!a}"
-        ) from None
-    cameras = {}
-    for _, image in sorted(model.images.items()):
-        camera = model.cameras[image.camera_id]
-        is_right = camera.is_perspective_pinhole() and (
-            camera.is_undistorted() or distortion == "ignore"
-        )
+def _read_colmap(images: Path, distortion: str) -> dict[str, Camera]:
+    named = []
+    for image in read_model(images):
+        lens = image.lens
+        place = f"{images}: {image.name}"
+        is_plain = distortion == "ignore" or not lens.is_distorted
+        is_right = lens.model.projection == "pinhole" and is_plain
         expected = "a pinhole without lens distortion"
-        check(
-            f"{models[0]}: {image.name}",
-            is_right,
-            f"{expected}, got {camera.model_name}; {_UNDISTORT}",
-        )
-        K = np.diag([camera.focal_length_x, camera.focal_length_y, 1.0])
-        K[0, 2] = camera.principal_point_x
-        K[1, 2] = camera.principal_point_y
-        viewmat = np.eye(4)
-        viewmat[:3] = image.cam_from_world().matrix()
-        cameras[image.name] = Camera(viewmat, K, camera.width, camera.height)
-    return cameras
+        check(place, is_right, f"{expected}, got {lens.model.name}; {_UNDISTORT}")
+        K = np.diag([lens.focal_lengths[0], lens.focal_lengths[-1], 1.0])
+        K[:2, 2] = lens.center
+        with _files.value_errors(place, "a camera"):
+            camera = Camera(image.viewmat, K, lens.width, lens.height)
+        named.append((image.name, camera))
+    return _named(named)
 
 
 def write_cameras(path: str | os.PathLike[str], cameras: Mapping[str, Camera]) -> None:
@@ -241,8 +355,8 @@ def _check_is_pinhole(fields: Mapping[str, Node], distortion: str) -> None:
 
 
 def _rows(node: Node) -> Floats:
-    """A matrix of 3 or 4 rows as (4, 4); a fourth row is ignored, as by other
-    readers."""
+    """Return a matrix that is given as 3 or 4 rows as (4, 4); a fourth row is ignored,
+    as other readers do."""
     num_rows = 4
     if isinstance(node.value, list) and len(node.value) == 3:
         num_rows = 3
@@ -252,8 +366,8 @@ def _rows(node: Node) -> Floats:
 
 
 def _applied(top: Mapping[str, Node]) -> tuple[Floats, float]:
-    """The (4, 4) rotation and translation, then the scale, that were applied to the
-    file's positions."""
+    """Return the (4, 4) rotation and translation, then the scale, that were applied to
+    the file's positions."""
     transform: Floats = np.eye(4)
     if "applied_transform" in top:
         transform = _rows(top["applied_transform"])

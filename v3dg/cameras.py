@@ -21,6 +21,11 @@ Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 AXES: tuple[Axis, ...] = get_args(Axis)
 
 DEFAULT_FOV_X = 0.785398163397448  # 45 degrees
+# The near plane as a share of the distance to the subject, and its bounds in world
+# units; float32 holds the inverse of the smaller one.
+_NEAR_SHARE = 0.01
+_MOST_NEAR = 0.01
+_LEAST_NEAR = 1e-30
 _MAX_TURNTABLE_CAMERAS = 1_000_000  # more would take minutes and is most likely a typo
 # Largest deviation of the rows of a rotation from orthonormal: matrices are often
 # stored as float32 text.
@@ -95,7 +100,7 @@ class Camera:
         *,
         width: int,
         height: int,
-        near: float = 0.01,
+        near: float | None = None,
     ) -> "Camera":
         """Make a camera at ``eye`` that has ``target`` at the image's centre and ``up``
         upwards.
@@ -105,6 +110,8 @@ class Camera:
             target: (3,) point in the world, not at the eye.
             up: (3,) direction in the world, not along the view.
             fov_x: Horizontal field of view in radians; pixels are square.
+            near: See `Camera`; None is a hundredth of the distance to the target, and
+                at most 0.01, so that small subjects are seen from near, too.
 
         Raises:
             ValueError: The target is at the eye, or ``up`` lies along the view
@@ -132,6 +139,8 @@ class Camera:
         )
         right /= length
         rotation = np.stack([right, np.cross(forward, right), forward])
+        if near is None:
+            near = near_of(float(distance))
         return cls(
             rigid(rotation, position), intrinsics(fov_x, None, width, height), width, height, near
         )
@@ -208,8 +217,8 @@ class StereoCamera:
 
     @classmethod
     def of(cls, camera: Camera, eye_distance: float) -> "StereoCamera":
-        """Eyes to the left and the right of a camera, at ``eye_distance`` world units
-        from each other."""
+        """Return eyes to the left and the right of a camera, ``eye_distance`` world
+        units apart."""
         shift = np.zeros((4, 4))
         shift[0, 3] = 0.5 * positive(eye_distance, "eye_distance")
         left = replace(camera, viewmat=camera.viewmat + shift)
@@ -230,7 +239,7 @@ class StereoCamera:
 
 
 def check_camera(camera: object) -> None:
-    """Raise TypeError for what is neither a camera nor a stereo camera."""
+    """Raise TypeError unless a value is a camera or a stereo camera."""
     if not isinstance(camera, StereoCamera):
         check_type("camera", camera, Camera, "a Camera")
 
@@ -239,7 +248,8 @@ def for_each(
     camera: Camera | StereoCamera | Sequence[Camera],
     make: Callable[[Camera | StereoCamera], T],
 ) -> T | list[T]:
-    """The result of ``make`` for one camera, or a list of its results for several."""
+    """Return the result of ``make`` for one camera, or a list of its results for
+    several."""
     if hasattr(camera, "__iter__") and getattr(camera, "ndim", 1) > 0:
         return [make(view) for view in cast(Iterable[Camera], camera)]
     return make(cast(Camera, camera))
@@ -263,7 +273,7 @@ def turntable(
     fov_x: float = DEFAULT_FOV_X,
     width: int = 800,
     height: int = 800,
-    near: float = 0.01,
+    near: float | None = None,
 ) -> list[Camera]:
     """Make ``n`` cameras evenly spaced on a circle around ``center``, all looking at
     it.
@@ -275,6 +285,7 @@ def turntable(
             and π/2.
         up: (3,) axis of the turntable.
         fov_x: Horizontal field of view in radians.
+        near: As in `Camera.look_at`.
     """
     middle = vector(center, "center")
     axis = vector(up, "up")
@@ -305,9 +316,14 @@ def turntable(
     return cameras
 
 
+def near_of(distance: float) -> float:
+    """Return the near plane for a camera whose subject is at this distance."""
+    return max(min(_MOST_NEAR, _NEAR_SHARE * distance), _LEAST_NEAR)
+
+
 def rigid(rotation: Floats, eye: Floats) -> Floats:
-    """(4, 4) world to camera, from the rotation from world to camera and the position
-    of the eye."""
+    """Return the (4, 4) matrix from world to camera, given its rotation and the
+    position of the eye."""
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation
     with np.errstate(over="ignore", invalid="ignore"):  # Camera refuses values that are not finite
@@ -316,7 +332,8 @@ def rigid(rotation: Floats, eye: Floats) -> Floats:
 
 
 def is_rotation(matrix: Floats) -> bool:
-    """Whether a (3, 3) matrix is a rotation, up to the rounding of float32 text."""
+    """Return whether a (3, 3) matrix is a rotation, up to the rounding of float32
+    text."""
     # Written out in Python numbers: every frame of a flight checks a new camera.
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     deviation: float = max(
@@ -337,8 +354,8 @@ def _check_rotation(matrix: Floats, name: str, advice: str = "") -> None:
 
 
 def viewmat_from_blender(transform_matrix: MatrixLike) -> Floats:
-    """(4, 4) world to camera from camera to world in Blender's convention, with the
-    nearest rotation."""
+    """Convert a (4, 4) matrix from camera to world in Blender's convention into one
+    from world to camera, with the nearest rotation."""
     matrix = vector(transform_matrix, "transform_matrix", (4, 4))
     axes = matrix[:3, :3] * [1.0, -1.0, -1.0]
     _check_rotation(axes, "transform_matrix")
@@ -347,8 +364,8 @@ def viewmat_from_blender(transform_matrix: MatrixLike) -> Floats:
 
 
 def intrinsics(fov_x: float, fov_y: float | None, width: int, height: int) -> Floats:
-    """(3, 3) K from fields of view in radians, with a central principal point; fov_y
-    None: square pixels."""
+    """Return (3, 3) K from fields of view in radians, with a central principal point;
+    if fov_y is None, pixels are square."""
     width = _side(width, "width")
     height = _side(height, "height")
     fx = _focal(fov_x, "fov_x", width)
@@ -359,7 +376,8 @@ def intrinsics(fov_x: float, fov_y: float | None, width: int, height: int) -> Fl
 
 
 def _focal(fov: float, name: str, side: int) -> float:
-    """Focal length, px, of a field of view in radians across a side in px."""
+    """Return the focal length in px, from a field of view in radians and the px that it
+    spans."""
     fov = real(fov, name, "radians between 0 and pi")
     focal = math.inf
     if 0 < fov < math.pi:

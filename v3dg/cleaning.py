@@ -37,7 +37,8 @@ _WRONG = (1 << KINDS.index("transparent")) - 1  # the bits of all kinds before i
 
 
 class AssetWarning(UserWarning):
-    """Gaussians of an asset have wrong values and were left out."""
+    """Gaussians of an asset have wrong values and were left out; or something in its
+    file was not understood, or read otherwise than it is written."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +50,18 @@ class Findings:
         drawable: (N,) bool, on the host.
         counts: Number of gaussians of each kind that cannot be drawn; kinds without any
             are left out, and a gaussian can be of several kinds.
-        num_wrong: Gaussians with wrong values; the others that cannot be drawn are
+        wrong: (N,) bool, those with wrong values; the others that cannot be drawn are
             valid, but transparent.
     """
 
     drawable: npt.NDArray[np.bool_]
     counts: dict[str, int]
-    num_wrong: int
+    wrong: npt.NDArray[np.bool_]
+
+    @property
+    def num_wrong(self) -> int:
+        """Gaussians with wrong values."""
+        return int(self.wrong.sum())
 
     @property
     def num_dropped(self) -> int:
@@ -69,7 +75,8 @@ class Findings:
 
 
 def summary(num_dropped: int, num_gaussians: int, counts: Mapping[str, int]) -> str:
-    """One line that says how many of an asset cannot be drawn and why."""
+    """Return one line that says how many gaussians of an asset cannot be drawn, and
+    why."""
     return f"{num_dropped:,} of {num_gaussians:,} gaussians cannot be drawn: {describe(counts)}"
 
 
@@ -87,24 +94,29 @@ def examine(asset: Gaussians) -> Findings:
         count = int((nonzero >> bit & 1).sum())
         if count:
             counts[kind] = count
-    return Findings(
-        drawable=faults == 0, counts=counts, num_wrong=int((nonzero & _WRONG != 0).sum())
-    )
+    return Findings(drawable=faults == 0, counts=counts, wrong=(faults & _WRONG) != 0)
 
 
-def outliers(means: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
-    """(N,) whether each of the finite positions (N, 3) lies far from all others: at
-    more than 20 times the median distance."""
-    if len(means) == 0:
-        return np.zeros(0, bool)
-    exact = means.astype(np.float64)
-    distance = np.linalg.norm(exact - np.median(exact, axis=0), axis=1)
-    return np.asarray(distance > OUTLIER_DISTANCE * np.median(distance))
+def outliers(
+    means: npt.NDArray[np.float32], reference: npt.NDArray[np.float32] | None = None
+) -> npt.NDArray[np.bool_]:
+    """Return (N,) whether each finite position (N, 3) is an outlier: its distance from
+    the median of ``reference`` is more than 20 times the median distance. If
+    ``reference`` is None, it is the positions themselves."""
+    if reference is None:
+        reference = means
+    if len(means) == 0 or len(reference) == 0:
+        return np.zeros(len(means), bool)
+    typical = reference.astype(np.float64)
+    center = np.median(typical, axis=0)
+    median_distance = np.median(np.linalg.norm(typical - center, axis=1))
+    distance = np.linalg.norm(means.astype(np.float64) - center, axis=1)
+    return np.asarray(distance > OUTLIER_DISTANCE * median_distance)
 
 
 def ball_of_most(points: npt.NDArray[np.floating]) -> tuple[npt.NDArray[np.floating], float]:
-    """Centre (3,) and radius, above 0, of a ball around nearly all of N > 0 points (N,
-    3).
+    """Return the centre (3,) and the radius, above 0, of a ball around nearly all of N
+    > 0 points (N, 3).
 
     It is the part to look at: trained assets have a few gaussians far away from all
     others.

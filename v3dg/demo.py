@@ -1,35 +1,48 @@
-"""A demonstration without a download: builds a bundle, places it 2,000 times, and draws
-it from near to far.
+"""A demonstration without a download: it builds a bundle, places it 2,000 times, and
+draws it from near to far.
 
-The result is one picture: the full asset above, the selected cut below, with a column
-for each distance. Every picture has the number of gaussians, the time, and the error
-against the full asset at twice the resolution.
+The result is one picture with a column per distance: the full asset above, the selected
+cut below. Every panel states the number of gaussians, the time, and the error against
+the full asset at twice the resolution.
 """
 
 import math
 import os
 import time
+from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
-from v3dg import _device
+from v3dg import _device, _files
 from v3dg._device import Device
 from v3dg._json import JsonObject
+from v3dg._numbers import check
 from v3dg._progress import Progress, counted
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.donut import make_donut, place_field
+from v3dg.gaussians import Gaussians
+from v3dg.io import write_asset
 from v3dg.levels import build_bundle
 from v3dg.metrics import draw_truth, errors_of
 from v3dg.pictures import Picture, check_picture_path, contact_sheet, to_8bit, write_picture
 from v3dg.render import render
 from v3dg.scene import Scene
+from v3dg.scene.file import write_scene
 from v3dg.select import DEFAULT_TOLERANCE
 
-# Distance from the eye to the donut in the middle, in radii of a donut, and height of
-# the view in radians.
+# Distance from the eye to the central donut, in radii of a donut, and elevation in
+# radians.
 VIEWS = ((3.3, 0.36), (8.0, 0.36), (20.0, 0.36), (46.0, 0.38), (95.0, 0.42))
-_AZIMUTH = 0.80  # rad; the sun is then behind the camera
+_AZIMUTH = 0.80  # radians; the sun is then behind the camera
 _SKY = (0.6, 0.73, 0.85)
+
+
+def _output(path: str | os.PathLike[str]) -> Path:
+    """Return the path of a picture, whose folder is made."""
+    output = check_picture_path(path)
+    _files.make_folder(output)
+    return output
 
 
 def run_demo(
@@ -43,15 +56,18 @@ def run_demo(
     views: tuple[tuple[float, float], ...] = VIEWS,
     progress: Progress = True,
     device: str = "auto",
+    keep: str | os.PathLike[str] | None = None,
 ) -> JsonObject:
-    """Make an asset, build and place it, draw and measure every distance, and write the
-    picture.
+    """Make an asset, build and place it, draw and measure it at every distance, and
+    write the picture.
 
     Args:
-        num_gaussians: Number of gaussians of the asset.
+        num_gaussians: Number of gaussians in the asset.
         size: Width and height of one panel in px.
         views: Distance and elevation of every column.
         device: The device that builds and draws: "auto", "cpu" or "cuda".
+        keep: Folder for the asset, its bundle and the scene with the cameras of the
+            columns, which is created if needed; None keeps nothing.
 
     Returns:
         Sizes, times and errors, as JSON values.
@@ -60,24 +76,23 @@ def run_demo(
         ValueError: The picture cannot be written to ``output``, or an argument is out
             of range.
     """
-    path = check_picture_path(output)
+    path = _output(output)
+    files = _Files.new(keep)
     chosen_device = _device.resolve(device)
     start = time.perf_counter()
     asset = make_donut(num_gaussians, seed=seed)
     bundle = build_bundle(asset, seed=seed, progress=progress, device=chosen_device)
     build_seconds = time.perf_counter() - start
     scene = _field(bundle, instances, seed)
-    columns: list[JsonObject] = []
-    rows: list[list[tuple[str, Picture]]] = [[], []]
-    for distance, elevation in counted(views, len(views), "draw", progress):
-        camera = _camera(distance, elevation, size)
-        full, selected = _panels(scene, camera, tolerance, chosen_device)
-        rows[0].append((f"full, distance {distance:g}: {full.text}", full.picture))
-        rows[1].append((f"bundle, distance {distance:g}: {selected.text}", selected.picture))
-        columns.append({"distance": distance, "full": full.numbers, "bundle": selected.numbers})
-    write_picture(path, contact_sheet(rows))
+    if files is not None:
+        scene = files.write(asset, scene, views, size)
+    panels = []
+    for camera in counted(_cameras(views, size), len(views), "draw", progress):
+        panels.append(_panels(scene, camera, tolerance, chosen_device))
+    write_picture(path, contact_sheet(_rows(views, panels)))
     return {
         "picture": str(path),
+        "kept": list(map(str, files or ())),
         "asset_gaussians": len(asset),
         "instances": instances,
         "levels": bundle.num_levels,
@@ -86,8 +101,80 @@ def run_demo(
         "device": str(chosen_device),
         "build_seconds": build_seconds,
         "seconds": time.perf_counter() - start,
-        "columns": columns,
+        "columns": _columns(views, panels),
     }
+
+
+def _columns(
+    views: Sequence[tuple[float, float]], panels: Sequence[tuple["_Panel", "_Panel"]]
+) -> list[JsonObject]:
+    columns: list[JsonObject] = []
+    for (distance, _), (full, selected) in zip(views, panels, strict=True):
+        columns.append({"distance": distance, "full": full.numbers, "bundle": selected.numbers})
+    return columns
+
+
+def _rows(
+    views: Sequence[tuple[float, float]], panels: Sequence[tuple["_Panel", "_Panel"]]
+) -> list[list[tuple[str, Picture]]]:
+    """Return the rows of the result: the full asset above, the selected cut below."""
+    rows: list[list[tuple[str, Picture]]] = [[], []]
+    for (distance, _), pair in zip(views, panels, strict=True):
+        for row, kind, panel in zip(rows, ("full", "bundle"), pair, strict=True):
+            row.append((f"{kind}, distance {distance:g}: {panel.text}", panel.picture))
+    return rows
+
+
+def _cameras(views: Sequence[tuple[float, float]], size: tuple[int, int]) -> list[Camera]:
+    """The cameras of the columns."""
+    return [_camera(distance, elevation, size) for distance, elevation in views]
+
+
+class _Files(NamedTuple):
+    """Files to go on with."""
+
+    asset: Path
+    bundle: Path
+    scene: Path
+
+    @classmethod
+    def new(cls, keep: str | os.PathLike[str] | None) -> "_Files | None":
+        """Create a folder and return the paths of the files in it, none of which may
+        exist yet; None without a folder."""
+        if keep is None:
+            return None
+        folder = Path(keep)
+        files = cls(folder / "donut.ply", folder / "donut.v3dg", folder / "donuts.json")
+        for file in files:
+            check(file, not os.path.lexists(file), "a new file, got one that exists; remove it")
+        _files.make_folder(files.asset)
+        return files
+
+    def write(
+        self,
+        asset: Gaussians,
+        scene: Scene,
+        views: Sequence[tuple[float, float]],
+        size: tuple[int, int],
+    ) -> Scene:
+        """Write the asset, its bundle, and the scene with the cameras of the columns;
+        returns the scene of the file."""
+        write_asset(self.asset, asset)
+        scene.bundles[0].write(self.bundle)
+        placed = Scene()
+        placed.add(
+            Bundle.open(self.bundle),
+            positions=scene.positions,
+            quaternions=scene.quaternions,
+            scales=scene.scales,
+        )
+        cameras = {}
+        for number, (camera, (distance, _)) in enumerate(
+            zip(_cameras(views, size), views, strict=True)
+        ):
+            cameras[f"{number}, distance {distance:g}"] = camera
+        write_scene(self.scene, placed, cameras=cameras)
+        return placed
 
 
 def _field(bundle: Bundle, count: int, seed: int) -> Scene:
@@ -98,8 +185,8 @@ def _field(bundle: Bundle, count: int, seed: int) -> Scene:
 
 
 def _camera(distance: float, elevation: float, size: tuple[int, int]) -> Camera:
-    """A camera that looks at the middle of the field: at a donut from near, at the
-    whole hill from far."""
+    """Return a camera that looks at the middle of the field: at one donut from near, at
+    the whole hill from far."""
     horizontal = distance * math.cos(elevation)
     target = 0.42 / (1 + (distance / 12) ** 2)
     x = math.sin(_AZIMUTH) * horizontal
@@ -109,7 +196,7 @@ def _camera(distance: float, elevation: float, size: tuple[int, int]) -> Camera:
 
 
 class _Panel(NamedTuple):
-    """One picture of the result, with its measurements."""
+    """One panel of the result, with its measurements."""
 
     numbers: JsonObject
     text: str
@@ -119,7 +206,7 @@ class _Panel(NamedTuple):
 def _panels(
     scene: Scene, camera: Camera, tolerance: float, device: Device
 ) -> tuple[_Panel, _Panel]:
-    """The pictures of the full asset and of the selected cut."""
+    """Return the pictures of the full asset and of the selected cut."""
     truth = draw_truth(scene, camera, device, background=_SKY)
     full = _drawn(scene, camera, 0.0, truth, device)
     selected = _drawn(scene, camera, tolerance, truth, device)

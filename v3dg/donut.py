@@ -1,5 +1,5 @@
 """An asset that needs no download: a glazed donut, made from a seed, and a field of
-many."""
+many donuts."""
 
 import math
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from v3dg import _core
 from v3dg._numbers import Floats, check
 from v3dg.gaussians import Gaussians
 
-_RING = 0.63  # radius of the circle in the middle of the tube
+_RING = 0.63  # radius of the circle at the centre of the tube
 _DOUGH = 0.34  # radius of the tube without icing
 _TUBE = 0.37  # radius of the tube with icing
 _SPRINKLES = 200
@@ -33,8 +33,8 @@ def make_donut(num_gaussians: int = 50_000, *, seed: int = 0) -> Gaussians:
         seed: The same seed gives the same gaussians.
 
     Returns:
-        NumPy gaussians of SH degree 1; z is up, the origin in the middle of the hole,
-        the radius 1.
+        NumPy gaussians of SH degree 1; z is up, the origin is in the middle of the
+        hole, the radius is 1.
 
     Raises:
         ValueError: ``num_gaussians`` is below 1,000.
@@ -64,7 +64,7 @@ def make_donut(num_gaussians: int = 50_000, *, seed: int = 0) -> Gaussians:
 
 @dataclass(frozen=True, eq=False)
 class _Surface:
-    """Points of a surface.
+    """Points on a surface.
 
     Attributes:
         points: (n, 3).
@@ -81,17 +81,17 @@ class _Surface:
     gloss: Floats
 
     def followed_by(self, surface: "_Surface") -> "_Surface":
-        """The points of this surface, then those of another."""
+        """Return the points of this surface, then those of another."""
         pairs = zip(vars(self).values(), vars(surface).values(), strict=True)
         return _Surface(*(np.concatenate(arrays) for arrays in pairs))
 
 
 def _tube(count: int, rng: np.random.Generator) -> _Surface:
-    """The dough with its icing, as this number of points."""
+    """Return the dough with its icing, with this number of points."""
     azimuth = rng.uniform(0, 2 * np.pi, count)
     angles = np.linspace(-np.pi, np.pi, 1000)
-    # The angle in the section of the tube is 0 outside and pi/2 up; points spread
-    # evenly over the surface.
+    # The angle in the cross-section of the tube is 0 at the outside and pi/2 at the
+    # top; points are spread evenly over the surface.
     share = (_RING * (angles + np.pi) + _TUBE * np.sin(angles)) / (2 * np.pi * _RING)
     section_angle = np.interp(rng.random(count), share, angles)
     phase = rng.uniform(0, 2 * np.pi, (2, 4, 1))
@@ -102,7 +102,7 @@ def _tube(count: int, rng: np.random.Generator) -> _Surface:
     points, normals = _on_tube(azimuth, section_angle, _DOUGH + (_TUBE - _DOUGH) * np.sqrt(icing))
     waves = np.sin(points @ rng.normal(scale=9, size=(3, 6)) + rng.uniform(0, 6.28, 6))
     blotch = waves.mean(1, keepdims=True)
-    # The stripe that floats while the dough is baked.
+    # The pale stripe, which stays above the oil during frying.
     pale = np.exp(-((section_angle / 0.3) ** 2))[:, None]
     dough = np.array([0.42, 0.17, 0.035]) * (1 + 0.5 * blotch)
     dough += (np.array([0.7, 0.46, 0.19]) - dough) * pale
@@ -112,7 +112,7 @@ def _tube(count: int, rng: np.random.Generator) -> _Surface:
 
 
 def _on_tube(azimuth: Floats, section_angle: Floats, radius: Floats) -> tuple[Floats, Floats]:
-    """Points and their normals, (n, 3)."""
+    """Return points and their normals, (n, 3)."""
     outwards = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], 1)
     normals = np.cos(section_angle)[:, None] * outwards
     normals = normals + np.sin(section_angle)[:, None] * np.array([0.0, 0.0, 1.0])
@@ -120,7 +120,8 @@ def _on_tube(azimuth: Floats, section_angle: Floats, radius: Floats) -> tuple[Fl
 
 
 def _sprinkles(count: int, rng: np.random.Generator) -> _Surface:
-    """Sugar rods of ``count`` points each, which lie on the icing in all directions."""
+    """Return sugar rods of ``count`` points each, which lie on the icing in all
+    directions."""
     azimuth = rng.uniform(0, 2 * np.pi, _SPRINKLES)
     section_angle = rng.uniform(0.2 * np.pi, 0.8 * np.pi, _SPRINKLES)
     seats, up = _on_tube(azimuth, section_angle, np.full(_SPRINKLES, _TUBE))
@@ -145,8 +146,8 @@ def _sprinkles(count: int, rng: np.random.Generator) -> _Surface:
 
 
 def _quats(normals: Floats, rng: np.random.Generator) -> Floats:
-    """Quaternions (n, 4) of rotations that take z to the normals, after a random turn
-    about z."""
+    """Return quaternions (n, 4) of rotations from z to the normals, after a random
+    rotation about z."""
     half = normals + np.array([0.0, 0.0, 1.0 + 1e-9])
     x, y, z = half.T / np.linalg.norm(half, axis=1)
     turn = rng.uniform(0, np.pi, len(normals))
@@ -156,8 +157,8 @@ def _quats(normals: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _lit(normals: Floats, albedo: Floats, gloss: Floats) -> Floats:
-    """Colours under a sun and a sky, with highlights that lean towards the sun's mirror
-    image, (n, 4, 3)."""
+    """Return colours under a sun and a sky, with highlights towards the mirror image of
+    the sun, (n, 4, 3)."""
     facing = np.maximum(normals @ _TO_SUN, 0)[:, None]
     light = facing * np.array([1.5, 1.4, 1.2]) + (0.45 + 0.3 * normals[:, 2:]) * np.array(
         [0.5, 0.55, 0.62]
@@ -170,7 +171,8 @@ def _lit(normals: Floats, albedo: Floats, gloss: Floats) -> Floats:
 
 
 def place_field(count: int = 2000, *, seed: int = 0) -> tuple[Floats, Floats, Floats]:
-    """Place donuts side by side on a round hill, turned at random, at 3/4 to full size.
+    """Place donuts side by side on a round hill, with random rotations and scales from
+    3/4 to 1.
 
     Returns:
         Positions (count, 3), quaternions (count, 4) w x y z and scales (count,),

@@ -21,11 +21,15 @@ Array: TypeAlias = (
     Any  # numpy.ndarray or torch.Tensor; a union would make every use of a field a type error
 )
 
-_NUM_SH = {1: 0, 4: 1, 9: 2, 16: 3}  # coefficients a channel -> degree
+TRAINED_FILTER_PX2 = 0.3
+"""Variance of the filter that trainers draw with, px²: the value of the code of 3DGS
+and of gsplat, with antialiasing and without."""
+
+_NUM_SH = {1: 0, 4: 1, 9: 2, 16: 3}  # coefficients per channel -> degree
 
 
 def _is_tensor(value: object) -> bool:
-    """Whether `value` is a torch tensor; does not import torch."""
+    """Return whether `value` is a torch tensor, without importing torch."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(value, torch.Tensor)
 
@@ -38,25 +42,40 @@ def _kind(value: object) -> str:
     return type(value).__name__
 
 
+class _Trained:
+    """How gaussians were trained: in a slot, so that `vars` of gaussians has their
+    arrays and nothing else."""
+
+    __slots__ = ("_antialiased",)
+    _antialiased: bool | None
+
+    @property
+    def antialiased(self) -> bool | None:
+        """Whether opacities were trained to be compensated for the filter of the
+        rasterizer; None if that is not known. See `trained`."""
+        return self._antialiased
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Gaussians:
+class Gaussians(_Trained):
     """N 3D Gaussians: NumPy arrays or torch tensors, float32, C-contiguous, all of one
     kind on one device.
 
-    Torch tensors may all be float64 instead, which `rasterize` then computes in; all
-    else takes float32.
+    Torch tensors may all be float64 instead; `rasterize` then computes in float64,
+    other functions require float32.
 
     Args:
         means: (N, 3) centres, in world units of the asset's own frame.
-        quats: (N, 4) rotations as w, x, y, z; need not have length one.
+        quats: (N, 4) rotations as w, x, y, z; they need not be normalised.
         scales: (N, 3) standard deviations along the rotated axes, in world units; not
-            their logs.
+            logarithms.
         opacities: (N,) in [0, 1]; not logits.
         sh: (N, K, 3) spherical harmonics of RGB, K = (degree + 1)², degree 0 to 3;
             colour is their value in the view direction plus ½.
 
     Kinds, shapes, dtypes and layout are checked here, values are not. Nothing is
-    copied.
+    copied. `antialiased` is None until `trained` sets it, as readers of files do; what
+    is made of gaussians by the methods below keeps it.
 
     Raises:
         TypeError: an argument is not an array, or NumPy and torch are mixed.
@@ -70,6 +89,7 @@ class Gaussians:
     sh: Array
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "_antialiased", None)
         for name, array in vars(self).items():
             _check_kind(name, array, self.means)
         shape = tuple(self.means.shape)
@@ -85,6 +105,9 @@ class Gaussians:
         shape = tuple(self.sh.shape)
         fits = any(shape == (num, count, 3) for count in _NUM_SH)
         check("sh", fits, f"shape ({num}, K, 3) with K 1, 4, 9 or 16, got {shape}")
+
+    def __reduce__(self) -> tuple[Callable[..., Gaussians], tuple[object, ...]]:
+        return _restored, (list(vars(self).values()), self.antialiased)
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -102,7 +125,8 @@ class Gaussians:
 
     @property
     def rows(self) -> _core.Rows:
-        """The arrays for the compiled operations, without gradients; they share memory.
+        """The arrays for the compiled operations, without gradients; they share
+        memory.
 
         Tensors on a CUDA device that are not aligned to 16 bytes are copied.
         """
@@ -113,20 +137,39 @@ class Gaussians:
             return _core.Rows(*(tensor.numpy() for tensor in tensors))
         return _core.Rows(*map(_aligned, tensors))
 
-    def subset(self, index: slice | Sequence[int] | Array) -> Gaussians:
-        """Take the gaussians that a slice, an array of M indices or a mask of N
-        booleans names, in its order.
+    def trained(self, *, antialiased: bool | None) -> Gaussians:
+        """The same gaussians, of which it is known whether they were trained with
+        antialiasing, or not known (None); the arrays are shared.
 
-        A slice of step 1 shares memory with this object; everything else is copied.
+        Trainers that antialias draw with a filter and multiply each opacity by
+        sqrt(det before / det after the filter) (Mip-Splatting, eq. 9). Files can say
+        that (docs/formats.md); `v3dg.render` draws such an asset in that way, and
+        `v3dg.write_asset` keeps it.
+
+        Raises:
+            TypeError: ``antialiased`` is neither None nor a bool.
+        """
+        if antialiased is not None:
+            check_type("antialiased", antialiased, bool, "a bool or None")
+        marked = Gaussians(*vars(self).values())
+        object.__setattr__(marked, "_antialiased", antialiased)
+        return marked
+
+    def subset(self, index: slice | Sequence[int] | Array) -> Gaussians:
+        """Return the gaussians selected by a slice, an array of M indices or a mask of
+        N booleans, in its order.
+
+        A slice with step 1 shares memory with this object; all other results are
+        copies.
 
         Raises:
             TypeError: the index is a single number, or not made of integers or
                 booleans.
             ValueError: the index has more than one dimension.
-            IndexError: out of range, or a mask of another length.
+            IndexError: an index is out of range, or a mask has another length.
         """
         if isinstance(index, slice):
-            if index.step not in (None, 1):  # torch knows no negative steps
+            if index.step not in (None, 1):  # torch does not support negative steps
                 index = np.arange(*index.indices(len(self)))
         else:
             index = _checked_index(index)
@@ -136,7 +179,7 @@ class Gaussians:
                 rows = rows.cpu().numpy()
             if isinstance(rows, slice) or rows.dtype == bool:
                 return self._map(lambda array: np.ascontiguousarray(array[rows]))
-            # Unlike [rows], releases the GIL.
+            # take() releases the GIL, unlike [rows].
             return self._map(lambda array: array.take(rows, axis=0))
         if not isinstance(index, slice):
             import torch
@@ -152,10 +195,10 @@ class Gaussians:
         position: Array | npt.ArrayLike = (0.0, 0.0, 0.0),
         scale: float = 1.0,
     ) -> Gaussians:
-        """Return the gaussians in another frame: p goes to scale * rotation p +
-        position; colours rotate.
+        """Return the gaussians transformed by p -> scale * rotation p + position, with
+        rotated colours.
 
-        The result is of the same kind and on the same device, without gradients.
+        The result has the same kind and device, without gradients.
 
         Args:
             quaternion: (4,) w x y z of any length but zero.
@@ -163,23 +206,24 @@ class Gaussians:
             scale: > 0.
 
         Raises:
-            ValueError: A shape or a value is not as above.
+            ValueError: A shape or a value is invalid.
         """
         rotation = vector(quaternion, "quaternion", (4,))
         check("quaternion", rotation.any(), "a rotation, got a quaternion of zeros")
-        rotation /= np.abs(rotation).max()  # squares neither overflow nor underflow
+        rotation /= np.abs(rotation).max()  # so that squares neither overflow nor underflow
         rotation /= np.linalg.norm(rotation)
         translation = vector(position, "position")
         moved = Gaussians(
             *_core.transform(self.rows, rotation, translation, positive(scale, "scale"))
         )
         if _is_tensor(self.means):
-            return moved.torch()
-        return moved
+            moved = moved.torch()
+        return moved.trained(antialiased=self.antialiased)
 
     @staticmethod
     def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
-        """Join sets of gaussians of one SH degree and one kind, in order.
+        """Join sets of gaussians of one SH degree and one kind, in order; whether they
+        are antialiased is known if it is the same for all.
 
         Raises:
             ValueError: no parts, or parts of different degrees.
@@ -197,11 +241,13 @@ class Gaussians:
                 f"parts[{i}]", is_right, f"SH degree {expected} like parts[0], got {part.sh_degree}"
             )
         columns = zip(*(vars(part).values() for part in parts), strict=True)
+        join: Callable[..., Array] = np.concatenate
         if _is_tensor(parts[0].means):
             import torch
 
-            return Gaussians(*map(torch.cat, columns))
-        return Gaussians(*map(np.concatenate, columns))
+            join = torch.cat
+        antialiased = common([part.antialiased for part in parts])
+        return Gaussians(*map(join, columns)).trained(antialiased=antialiased)
 
     def numpy(self) -> Gaussians:
         """Return the same gaussians as NumPy arrays, without gradients; copied only
@@ -211,15 +257,15 @@ class Gaussians:
         return self._map(lambda tensor: tensor.detach().cpu().numpy())
 
     def torch(self, device: str | int | torch.device | None = None) -> Gaussians:
-        """Return the same gaussians as torch tensors on `device`; None: on theirs,
-        NumPy arrays on the CPU.
+        """Return the same gaussians as torch tensors on `device`; with None, on their
+        device, and NumPy arrays on the CPU.
 
-        Copied only when they move or when a NumPy array is read-only; gradients flow
-        through a move.
+        Arrays are copied only if they move or if a NumPy array is read-only; gradients
+        propagate through a move.
 
         Raises:
-            ValueError: torch knows no such device.
-            RuntimeError: The device is not there.
+            ValueError: torch does not know the device.
+            RuntimeError: The device does not exist.
         """
         import torch
 
@@ -244,34 +290,48 @@ class Gaussians:
         return self._map(tensor)
 
     def _map(self, function: Callable[[Array], Array]) -> Gaussians:
-        return Gaussians(*map(function, vars(self).values()))
+        mapped = Gaussians(*map(function, vars(self).values()))
+        return mapped.trained(antialiased=self.antialiased)
+
+
+def _restored(arrays: Sequence[Array], antialiased: bool | None) -> Gaussians:  # noqa: FBT001
+    """Gaussians from what `Gaussians.__reduce__` has."""
+    return Gaussians(*arrays).trained(antialiased=antialiased)
+
+
+def common(values: Sequence[bool | None]) -> bool | None:
+    """The value of all of them; None if there are several or none."""
+    if len(set(values)) == 1:
+        return values[0]
+    return None
 
 
 def _aligned(tensor: Array) -> Array:
-    """The tensor, or a copy if it is not aligned to 16 bytes."""
+    """Return the tensor, or a copy if it is not aligned to 16 bytes."""
     if tensor.data_ptr() % 16 == 0:
         return tensor
     return tensor.clone()
 
 
 def shapes_of(count: int, sh_degree: int) -> list[tuple[int, ...]]:
-    """Shapes of the arrays of ``count`` gaussians, in the order of the fields."""
+    """Return the shapes of the arrays of ``count`` gaussians, in the order of the
+    fields."""
     return [(count, 3), (count, 4), (count, 3), (count,), (count, (sh_degree + 1) ** 2, 3)]
 
 
 def empty(count: int, sh_degree: int) -> Gaussians:
-    """Uninitialised gaussians on the host."""
+    """Return uninitialised gaussians on the host."""
     return Gaussians(*(np.empty(shape, np.float32) for shape in shapes_of(count, sh_degree)))
 
 
 def gaussian_bytes(sh_degree: int) -> int:
-    """Size of one gaussian in memory."""
+    """Return the size of one gaussian in memory."""
     return 4 * sum(map(math.prod, shapes_of(1, sh_degree)))
 
 
 def put(part: Gaussians, out: Gaussians, row: int) -> None:
-    """Copy gaussians on the host into others of the same SH degree or a higher one,
-    from ``row`` on."""
+    """Copy gaussians on the host into others of the same or a higher SH degree, from
+    ``row`` on."""
     for name, values in vars(part).items():
         target = getattr(out, name)[row : row + len(part)]
         if name == "sh":
@@ -285,8 +345,8 @@ def _dtype_name(array: Array) -> str:
 
 
 def _check_kind(name: str, array: Array, first: Array) -> None:
-    """Raise unless `array` is contiguous, float32 (tensors: or float64), of kind and
-    device of `first`."""
+    """Raise unless `array` is contiguous, float32 (tensors: or float64), and of the
+    kind and device of `first`."""
     if not isinstance(array, np.ndarray) and not _is_tensor(array):
         raise TypeError(f"{name}: expected a NumPy array or a torch tensor, got {_kind(array)}")
     if _is_tensor(array) != _is_tensor(first):
@@ -310,7 +370,7 @@ def _check_kind(name: str, array: Array, first: Array) -> None:
 
 
 def _checked_index(index: Array) -> Array:
-    """A mask or int64 indices; a tensor if ``index`` is one, otherwise a NumPy
+    """Return a mask or int64 indices; a tensor if ``index`` is one, otherwise a NumPy
     array."""
     array: Array
     if _is_tensor(index):
@@ -338,8 +398,8 @@ def _checked_index(index: Array) -> Array:
 
 
 def _check_range(index: Array, count: int) -> None:
-    """Raise for a tensor of indices out of range, because on a CUDA device indexing
-    would end the context."""
+    """Raise IndexError for a tensor with indices out of range; on a CUDA device,
+    indexing with them would destroy the context."""
     if str(index.dtype) == "torch.bool" or len(index) == 0:
         return
     for number in (int(index.max()), int(index.min())):

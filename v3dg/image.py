@@ -1,12 +1,13 @@
 """Image: the result of drawing."""
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from v3dg import _core
 from v3dg.gaussians import Array
-from v3dg.pictures import encode_png
+from v3dg.pictures import encode_png, write_picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +40,22 @@ class Image:
     def _repr_png_(self) -> bytes:
         """The picture, for notebooks."""
         return encode_png(self.color)
+
+    def save(self, path: str | os.PathLike[str], *, transparent: bool = False) -> None:
+        """Write the picture as .png or .jpg; its folder is created if needed.
+
+        Args:
+            transparent: Write a PNG with straight alpha, of a picture that was drawn on
+                black, which is the default background.
+
+        Raises:
+            ValueError: The suffix is another one, or the background is not black.
+            OSError: The file cannot be written.
+        """
+        alpha = None
+        if transparent:
+            alpha = self.alpha
+        write_picture(path, self.color, alpha=alpha)
 
     @property
     def color(self) -> Array:

@@ -3,35 +3,57 @@
 import os
 import pathlib
 import re
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Literal, TypeVar, get_args
+from typing import Literal, TypeAlias, TypeVar, get_args
 
+from v3dg import _core
 from v3dg._numbers import check, check_type, one_of
-from v3dg._urls import FileAtUrl, beside, in_parts, reading, shown
-from v3dg.formats import checkpoint, gltf, hier, ksplat, ply, sog, splat, spz, streamed_sog, usd
+from v3dg._urls import FileAtUrl, beside, folder_of, in_parts, reading, shown
+from v3dg.cameras import AXES, Axis
+from v3dg.cleaning import AssetWarning
+from v3dg.formats import (
+    _axes,
+    checkpoint,
+    compressed_ply,
+    gltf,
+    hier,
+    ksplat,
+    ply,
+    sog,
+    splat,
+    spz,
+    streamed_sog,
+    usd,
+)
+from v3dg.formats._declared import declare
+from v3dg.formats._losses import Losses, losses
+from v3dg.formats._packing import Limits
 from v3dg.formats._reading import AnyPath, AssetFile, bytes_of
+from v3dg.formats.content import content_of
 from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
 
 Format = TypeVar("Format")
+_Reader: TypeAlias = Callable[[AnyPath], AssetFile]
 
 # Readers by the end of a file's name; the first that matches is used.
-_READERS: dict[str, Callable[[AnyPath], AssetFile]] = {
+_READERS: dict[str, _Reader] = {
     ".ply": ply.open_file,
     ".splat": splat.open_file,
     ".ksplat": ksplat.open_file,
     ".spz": spz.open_file,
-    ".glb": gltf.open_file,
+    **dict.fromkeys((".glb", ".gltf"), gltf.open_file),
     ".hier": hier.open_file,
     **dict.fromkeys(usd.SUFFIXES, usd.open_file),
     ".sog": sog.open_file,
     "lod-meta.json": streamed_sog.open_file,
     "meta.json": sog.open_file,
-    **dict.fromkeys((".ckpt", ".pt"), checkpoint.open_file),
+    **dict.fromkeys((".ckpt", ".pt", ".pth"), checkpoint.open_file),
 }
-_WRITERS: dict[str, Callable[[AnyPath, Gaussians], None]] = {
+_WRITERS: dict[str, Callable[..., None]] = {
     ".compressed.ply": ply.write_compressed,
     ".ply": ply.write,
     ".spz": spz.write,
@@ -39,11 +61,23 @@ _WRITERS: dict[str, Callable[[AnyPath, Gaussians], None]] = {
     **dict.fromkeys(usd.SUFFIXES, usd.write),
     ".sog": sog.write,
 }
+# Ends of the names of files that have axes, to which gaussians are turned, and the axis
+# that is up there.
+_UP: dict[str, Axis] = dict.fromkeys((".spz", ".glb", *usd.SUFFIXES), "y")
 # Functions that list the files of an asset that may have several.
 _FILES: dict[str, Callable[[pathlib.Path], list[pathlib.Path]]] = {
     "lod-meta.json": streamed_sog.files,
     "meta.json": sog.files,
+    ".gltf": gltf.files,
     "": lambda path: [path],
+}
+
+# Ends of the names of packed files, what these can hold, and whether gaussians are put
+# in the order of a Morton curve.
+_PACKED: dict[str, tuple[Limits, bool]] = {
+    ".compressed.ply": (compressed_ply.LIMITS, True),
+    ".spz": (spz.LIMITS, False),
+    ".sog": (Limits(), True),
 }
 
 # Checkpoints of gsplat, one for each GPU, and of nerfstudio, and what the code of the
@@ -61,6 +95,18 @@ WRITE_SUFFIXES = tuple(_WRITERS)
 """Ends of the names of files that `write_asset` writes."""
 
 
+def subject_name(path: AnyPath) -> str:
+    """Return the name of the subject in a file or at a URL: the file's name without its
+    suffix, or the folder's name if all files of that kind have the same name, such as
+    `lod-meta.json`."""
+    file = beside(path)
+    if file.name.lower() in ("lod-meta.json", "meta.json"):
+        folder = folder_of(path)
+        if folder:
+            return folder
+    return file.stem
+
+
 def read_asset(path: AnyPath) -> Gaussians:
     """Read an asset; the end of the file's name determines the format
     (docs/formats.md):
@@ -72,21 +118,31 @@ def read_asset(path: AnyPath) -> Gaussians:
       those of length zero, which stay as they are. Values that are not finite are
       passed on. Little more memory is needed than for the result. A compressed `.ply`,
       of PlayCanvas and SuperSplat, is recognised by its content.
-    - `.glb`, glTF with KHR_gaussian_splatting, also compressed as `.spz`; the leaves of
-      `.hier`, of H3DG.
-    - `.usd`, `.usda` and `.usdc`, OpenUSD, with the extra `usd`, whose library bounds
-      what is read.
+    - `.glb` and `.gltf`, glTF with KHR_gaussian_splatting, also compressed as `.spz`:
+      the gaussians of the scene, where its nodes place them; the leaves of `.hier`, of
+      H3DG.
+    - `.usd`, `.usda`, `.usdc` and `.usdz`, OpenUSD, with the extra `usd`, whose library
+      bounds what is read.
     - `.splat`, of antimatter15; `.ksplat`, of mkkellogg; `.spz`, of Niantic, version 1
       to 4; `.sog` of PlayCanvas, version 2, or the `meta.json` of one that is not in a
       zip; the finest level of streamed SOG, by its `lod-meta.json`.
-    - `.pt` and `.ckpt`, checkpoints of gsplat's trainer and of nerfstudio's splatfacto,
-      from which nothing but tensors is taken.
+    - `.pt`, `.ckpt` and `.pth`, checkpoints of gsplat's trainer, of nerfstudio's
+      splatfacto and of the code of the 3DGS paper and 2DGS, from which nothing but
+      tensors is taken.
+
+    A file whose bytes are those of another of these formats is read as such.
+
+    Whether the gaussians were trained with antialiasing is read from the files that can
+    say it, see `Gaussians.antialiased`.
 
     With the extra `fsspec`, the file may be at a URL, which is fetched once per
     process, unless it refers to other files.
 
-    Coordinates are those of the file: no axes are turned. Memory and time are bounded
-    by the size of the file (docs/robustness.md).
+    Files of formats that have axes (`.spz`, glTF, OpenUSD) are turned, with their
+    harmonics, to those of trainers' `.ply`: right, down, forward. Coordinates of all
+    others are those of the file. What a file declares that was not understood is a
+    `v3dg.cleaning.AssetWarning` each. Memory and time are bounded by the size of the
+    file (docs/robustness.md).
 
     Raises:
         ValueError: The name is unknown, or the content does not match it; the message
@@ -95,11 +151,14 @@ def read_asset(path: AnyPath) -> Gaussians:
             IsADirectoryError, ...).
     """
     file = open_asset(path)
-    return file.read(0, file.num_gaussians)
+    gaussians = file.read(0, file.num_gaussians)
+    for note in file.declared.notes:
+        warnings.warn(f"{shown(path)}: {note}", AssetWarning, stacklevel=2)
+    return declare(gaussians.trained(antialiased=file.declared.antialiased), file.declared)
 
 
 def loaded(asset: Gaussians | AnyPath) -> Gaussians:
-    """An asset, which is read if it is given by its file."""
+    """Return an asset, after reading it if a file is given."""
     if isinstance(asset, str | os.PathLike):
         return read_asset(asset)
     return asset
@@ -116,14 +175,41 @@ def open_asset(path: AnyPath) -> AssetFile:
     at_url = in_parts(path)
     if isinstance(at_url, FileAtUrl):
         return _open_fetched(at_url, reader)
-    return reader(at_url)
+    reader, notes = _by_content(at_url, reader)
+    return _noted(reader(at_url), notes)
 
 
-def _open_fetched(at_url: FileAtUrl, reader: Callable[[AnyPath], AssetFile]) -> AssetFile:
+def _by_content(path: AnyPath, reader: _Reader) -> tuple[_Reader, tuple[str, ...]]:
+    """The reader of a file whose bytes may be those of another format than its name
+    says, and a note that then says so. ValueError if they are those of a format that is
+    not read."""
+    content = content_of(path)
+    if content is None or _READERS.get(content.suffix) is reader:
+        return reader, ()
+    name = beside(path).name.lower()
+    ending = next(ending for ending in _READERS if name.endswith(ending))
+    is_readable = content.suffix not in ("", *usd.SUFFIXES)  # USD takes it from the name
+    check(path, is_readable, f"a {ending}, got {content.text}")
+    note = f"Its name ends in {ending}, but it is {content.text}, and was read as such."
+    return _READERS[content.suffix], (note,)
+
+
+def _noted(file: AssetFile, notes: tuple[str, ...]) -> AssetFile:
+    """The file, with notes in front of its own."""
+    return replace(file, declared=replace(file.declared, notes=(*notes, *file.declared.notes)))
+
+
+def _open_fetched(at_url: FileAtUrl, reader: _Reader) -> AssetFile:
     """An asset at a URL, whose local copy exists as long as this object; errors name
     the URL."""
     with reading(at_url) as local:
-        file = reader(local)
+        reader, notes = _by_content(local, reader)
+        if reader is gltf.open_file:
+            # Nothing that a document at a URL names is read, here or there.
+            is_alone = len(gltf.files(pathlib.Path(local))) == 1
+            expected = "the URL of an asset in one file, got one that names others"
+            check(shown(at_url), is_alone, f"{expected}; fetch the folder")
+        file = _noted(reader(local), notes)
         whole = None
         if at_url.needs_name:
             whole = file.read(0, file.num_gaussians)
@@ -138,8 +224,8 @@ def _open_fetched(at_url: FileAtUrl, reader: Callable[[AnyPath], AssetFile]) -> 
 
 
 def run_files(folder: pathlib.Path) -> list[pathlib.Path]:
-    """The last checkpoint of a run of gsplat, nerfstudio or the code of the 3DGS paper;
-    its files are one asset."""
+    """Return the last checkpoint of a run of gsplat, nerfstudio or the code of the 3DGS
+    paper; its files are one asset."""
     steps: dict[int, list[pathlib.Path]] = {}
     for pattern in _RUNS:
         for file in sorted(folder.glob(pattern)):
@@ -154,7 +240,8 @@ def run_files(folder: pathlib.Path) -> list[pathlib.Path]:
 
 
 def asset_bytes(path: AnyPath) -> int:
-    """Size on disk of a readable asset, including the existing files that it names."""
+    """Return the size on disk of a readable asset, including the existing files that it
+    names."""
     names = _by_name(path, _FILES)
     at_url = in_parts(path)
     if isinstance(at_url, FileAtUrl):
@@ -166,6 +253,8 @@ def write_asset(
     path: AnyPath,
     gaussians: Gaussians | AnyPath,
     *,
+    up: Axis = _axes.MEMORY_UP,
+    antialiased: bool | None = None,
     encoding: PlyEncoding = "binary_little_endian",
     version: Literal[2, 3, 4] | None = None,
 ) -> None:
@@ -183,12 +272,20 @@ def write_asset(
       order changes.
     - `.spz`: version 3, or another.
     - `.glb`: glTF 2.0 with KHR_gaussian_splatting, of float32 numbers.
-    - `.usd`, `.usda`, `.usdc`: OpenUSD, a ParticleField3DGaussianSplat of float32
-      numbers.
+    - `.usd`, `.usda`, `.usdc`, `.usdz`: OpenUSD, a ParticleField3DGaussianSplat of
+      float32 numbers.
     - `.sog`: version 2. The order changes.
+
+    Gaussians are turned so that what is up is y in `.spz`, `.glb` and OpenUSD; the
+    other formats have no axes, and are written as the gaussians are.
 
     Args:
         gaussians: The asset, or its file.
+        up: The axis that is up among the gaussians; -y as in most trained assets, and
+            in all that `read_asset` has turned.
+        antialiased: Whether the gaussians were trained with antialiasing, which the
+            file then declares (docs/formats.md); None for what the gaussians say, see
+            `Gaussians.trained`.
         encoding: Encoding of a `.ply`; other formats have only one.
         version: Version of a `.spz`; 3 if None. Version 2 is for viewers from before
             2025, 4 for those since 2026.
@@ -201,6 +298,8 @@ def write_asset(
     """
     gaussians = loaded(gaussians)
     check_type("gaussians", gaussians, Gaussians, "Gaussians")
+    if antialiased is not None:
+        gaussians = gaussians.trained(antialiased=antialiased)
     write = _by_name(path, _WRITERS)
     if version is not None:
         check(
@@ -215,7 +314,41 @@ def write_asset(
     else:
         expected = f"the default for {os.fspath(path)}, which is not a .ply, got {encoding!r}"
         check("encoding", encoding == "binary_little_endian", expected)
+    one_of(up, "up", AXES)
+    if turned_up(path) is not None:
+        write = partial(write, up=up)
     write(path, gaussians)
+
+
+def turned_up(path: AnyPath) -> Axis | None:
+    """Return the axis that is up in a file that `write_asset` writes, by its name; None
+    for formats without axes."""
+    name = beside(path).name.lower()
+    for ending, axis in _UP.items():
+        if name.endswith(ending):
+            return axis
+    return None
+
+
+def losses_of(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) -> Losses | None:
+    """Read back the file that `write_asset` wrote, and return what it lacks of the
+    gaussians; None for formats of float32 numbers, which lose nothing.
+
+    Args:
+        up: As it was given to `write_asset`.
+    """
+    name = beside(path).name.lower()
+    for ending, (limits, is_sorted) in _PACKED.items():
+        if not name.endswith(ending):
+            continue
+        written = gaussians.numpy()
+        if turned_up(path) is not None:
+            written = _axes.turned(written, _axes.axes_of_up(up), _axes.MEMORY)
+        if is_sorted:
+            written = written.subset(_core.morton_order(written.means))
+        file = open_asset(path)
+        return losses(written, file.read(0, file.num_gaussians), limits)
+    return None
 
 
 def _by_name(path: AnyPath, formats: Mapping[str, Format]) -> Format:
@@ -226,6 +359,11 @@ def _by_name(path: AnyPath, formats: Mapping[str, Format]) -> Format:
     advice = ""
     if formats is not _WRITERS:
         advice = "; v3dg.open opens bundles (.v3dg) and scenes (.json)"
+        content = content_of(path)
+        if content is not None:
+            advice = f"; this is {content.text}"
+        if content is not None and content.suffix:
+            advice += ", so let its name end so"
     raise ValueError(
         f"{shown(path)}: expected a file name that ends in {', '.join(formats)}{advice}"
     )

@@ -22,8 +22,8 @@ from v3dg.render import render
 from v3dg.scene import Subject
 
 FLIP_PIXELS_PER_DEGREE = 67.0
-"""A 0.7 m wide 4K display seen from 0.7 m: the viewing condition that FLIP's authors
-use."""
+"""Pixels per degree of a 0.7 m wide 4K display seen from 0.7 m, the viewing condition
+of FLIP's authors."""
 
 MIN_TRANSMITTANCE = 1e-4
 """Transmittance at which pixels of the reference stop, a tenth of that of other
@@ -33,8 +33,8 @@ FLIP_MISSING = _extras.missing("flip_evaluator")
 
 
 def _pair(reference: Array, test: Array) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Both pictures as `pictures.checked` returns them; raises unless they are floats
-    and of one size."""
+    """Return both pictures as `pictures.checked` does; raise ValueError unless they are
+    floats of equal size."""
     a = checked("reference", reference)
     b = checked("test", test)
     for name, dtype in (("reference", a.dtype), ("test", b.dtype)):
@@ -49,7 +49,7 @@ def psnr(reference: Array, test: Array) -> float:
     """Compute the peak signal-to-noise ratio in dB, for a peak of 1; infinite for equal
     pictures.
 
-    Values are compared as they are: clip both to [0,1] first to compare what a screen
+    Values are not clipped: clip both pictures to [0,1] first to compare what a screen
     shows.
     """
     a, b = _pair(reference, test)
@@ -65,10 +65,10 @@ def ssim(reference: Array, test: Array) -> float:
 
     Convention (others differ in the third digit): Gaussian window of 11×11 px with
     sigma 1.5 px, population variances, mirrored border, mean over all pixels and
-    channels, values in [0,1] and not clipped.
+    channels, values in [0,1] without clipping.
 
     Raises:
-        ValueError: A side is shorter than 6 px, less than half a window.
+        ValueError: A side is shorter than 6 px, which is less than half a window.
 
     Source: Wang et al., Image quality assessment: from error visibility to structural
     similarity, 2004.
@@ -81,7 +81,7 @@ def ssim(reference: Array, test: Array) -> float:
 
 
 def has_flip() -> bool:
-    """Whether the extra `flip` is installed, without which FLIP cannot be measured."""
+    """Return whether the extra `flip` is installed, which FLIP requires."""
     return importlib.util.find_spec("flip_evaluator") is not None
 
 
@@ -97,8 +97,8 @@ def _flip(reference: Array, test: Array, *, magma: bool) -> NDArray[np.float32]:
 
 
 def flip_map(reference: Array, test: Array) -> NDArray[np.float32]:
-    """Compute LDR-FLIP per pixel at 67 pixels per degree: (H,W), 0 where no difference
-    is seen, at most 1.
+    """Compute LDR-FLIP per pixel at 67 pixels per degree: (H,W), from 0, where no
+    difference is visible, to 1.
 
     Pictures are clipped to [0,1] first.
 
@@ -106,7 +106,7 @@ def flip_map(reference: Array, test: Array) -> NDArray[np.float32]:
         ImportError: The extra `flip` is not installed.
 
     Source: Andersson et al., FLIP: a difference evaluator for alternating images, HPG
-    2020; by its authors' package.
+    2020; computed by the authors' package.
     """
     return _flip(reference, test, magma=False).reshape(reference.shape[0], reference.shape[1])
 
@@ -117,14 +117,14 @@ def flip(reference: Array, test: Array) -> float:
 
 
 def error_image(reference: Array, test: Array) -> NDArray[np.float32]:
-    """Draw `flip_map` in the magma colours that FLIP is usually shown in, (H,W,3):
-    black is no difference."""
+    """Draw `flip_map` in the magma colours that are common for FLIP, (H,W,3): black
+    means no difference."""
     return _flip(reference, test, magma=True)
 
 
 def box_downsample(image: Array, factor: int) -> Array:
-    """Average ``factor`` × ``factor`` blocks: (H,W,...) to (H/factor,W/factor,...), of
-    the same array kind.
+    """Average ``factor`` × ``factor`` blocks: (H,W,...) to (H/factor,W/factor,...),
+    with the same kind of array.
 
     Raises:
         ValueError: ``factor`` is not positive, or does not divide the height and the
@@ -142,8 +142,8 @@ def box_downsample(image: Array, factor: int) -> Array:
 
 
 def errors_of(reference: Picture, test: Picture) -> dict[str, float | None]:
-    """FLIP (None without its extra), PSNR (None for equal pictures) and SSIM of
-    pictures in 8 bits."""
+    """Return FLIP (None without its extra), PSNR (None for equal pictures) and SSIM of
+    8-bit pictures."""
     a, b = (picture.astype(np.float32) / np.float32(255) for picture in (reference, test))
     errors: dict[str, float | None] = {"flip": None, "psnr": None, "ssim": ssim(a, b)}
     if has_flip():
@@ -160,10 +160,10 @@ def draw_truth(
     supersampling: int = 2,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Picture:
-    """Draw the reference picture of comparisons, in 8 bits, from all gaussians.
+    """Draw the 8-bit reference picture of comparisons from all gaussians.
 
     A pixel has ``supersampling`` × ``supersampling`` samples. Each sample is clipped to
-    [0,1] as a screen does, before it is averaged over its pixel.
+    [0,1], as on a screen, before the average over the pixel.
     """
     image = render(
         subject,

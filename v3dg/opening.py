@@ -1,4 +1,4 @@
-"""Files by their names: scenes, bundles and assets."""
+"""Opening of files by their names: scenes, bundles and assets."""
 
 import os
 from pathlib import Path
@@ -15,34 +15,34 @@ from v3dg.scene import Scene, Subject
 from v3dg.scene.file import is_scene, read_scene
 
 File: TypeAlias = str | os.PathLike[str]
-"""The name of a file, which functions accept in place of the subject that `open`
-returns for it."""
+"""The name of a file, which functions accept instead of the subject that `open` returns
+for it."""
 
 
 def open(path: str | os.PathLike[str]) -> Subject:
     """Open a file by its name: a scene (.json), a bundle (.v3dg) or an asset, as
     `read_asset` does.
 
-    `read_scene` also returns the cameras of a scene. A file of OpenUSD with instances
-    is a scene, see `read_usd_scene`.
+    `read_scene` also returns the cameras of a scene. An OpenUSD file with instances is
+    a scene, see `read_usd_scene`.
 
     Raises:
         ValueError: The content does not match the name of the file, or the name is
             unknown.
-        OSError: It cannot be read.
+        OSError: The file cannot be read.
     """
     return open_with_cameras(Path(path))[0]
 
 
 def opened(subject: object) -> Any:
-    """The subject in a file; everything but a file is returned unchecked."""
+    """Return the subject in a file; anything but a file name is returned unchanged."""
     if isinstance(subject, str | os.PathLike):
         return open(subject)
     return subject
 
 
 def open_with_cameras(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
-    """A scene with its cameras, or a bundle or an asset, which have none."""
+    """Return a scene with its cameras, or a bundle or an asset, which have none."""
     if is_scene(path):
         expected = "a scene that is here, got a URL; fetch it with the files that it names"
         check(shown(path), not is_url(path), expected)
@@ -68,7 +68,7 @@ def read_usd_scene(
     is read. Needs the extra `usd`.
 
     Args:
-        config: Settings of the builds; None builds without fitting the levels, which
+        config: Settings of the builds; None builds levels without fitting them, which
             takes seconds.
         device: The device that builds, see `build_bundle`.
 
@@ -76,7 +76,7 @@ def read_usd_scene(
         ImportError: usd-core is not installed.
         ValueError: The file is not OpenUSD with gaussians, or a transform is not a
             rotation, a translation and a uniform scale.
-        OSError: It cannot be read.
+        OSError: The file cannot be read.
     """
     with reading(path) as local:
         assets, asset_from_instance, poses, up = usd.read_world(local)

@@ -1,4 +1,4 @@
-"""Picking: what a pixel shows."""
+"""Picking: the object that a pixel shows."""
 
 import copy
 from dataclasses import dataclass
@@ -20,15 +20,15 @@ from v3dg.select import rule_of, select
 
 @dataclass(frozen=True)
 class Pick:
-    """The gaussian that a pixel shows most of, and what it belongs to.
+    """The gaussian with the largest weight in a pixel, and what it belongs to.
 
     Attributes:
-        instance: Its instance.
-        cluster: Its cluster, within the instance's bundle.
+        instance: The gaussian's instance.
+        cluster: Its cluster, as an index in the instance's bundle.
         level: The cluster's level.
-        weight: Its share of the pixel, 0 to 1.
+        weight: Its blend weight in the pixel, 0 to 1.
         depth: Its depth along the camera's axis, world units.
-        position: (3,) float64, the point of the pixel's ray at that depth, in the
+        position: (3,) float64, the point at that depth on the pixel's ray, in the
             world.
     """
 
@@ -51,21 +51,21 @@ def pick(
     min_level: int = 0,
     renderer: Renderer | None = None,
 ) -> Pick | None:
-    """Return what pixel (x, y) of the picture that `v3dg.render` draws shows most of;
-    None where it is empty.
+    """Return the gaussian with the largest weight in pixel (x, y) of the picture that
+    `v3dg.render` draws; None if the pixel is empty.
 
-    Looks at nothing but the pixel, on the CPU; the cut is the same on every device.
+    Computes only this pixel, on the CPU; the cut is the same on every device.
 
     Args:
-        subject: What the picture shows, or the file of it.
+        subject: The subject of the picture, or its file.
         x: Column, from 0 at the left.
         y: Row, from 0 at the top.
         tolerance: As for the picture; so are `budget` and `min_level`.
-        renderer: With a pool on the CPU, of the same scene: look at what is resident
-            there, and read nothing.
+        renderer: A renderer of the same scene with a pool on the CPU: use only what is
+            resident there, and read nothing.
 
     Raises:
-        ValueError: The pixel is not in the image, or another argument is not as in
+        ValueError: The pixel is not in the image, or another argument is invalid for
             `v3dg.render`.
     """
     check_type("camera", camera, Camera, "a Camera")
@@ -74,7 +74,7 @@ def pick(
     is_inside = x < camera.width and y < camera.height
     check("x, y", is_inside, f"a pixel of {camera.width} x {camera.height}, got ({x}, {y})")
     scene = copy.copy(Scene.of(opened(subject)))  # another thread may change the scene meanwhile
-    if budget is not None:  # the budget is that of the whole picture
+    if budget is not None:  # the budget applies to the whole picture
         cut = select(
             scene, camera, tolerance=tolerance, budget=budget, min_level=min_level, device=CPU
         )
@@ -95,7 +95,7 @@ def pick(
 
 
 def _pick_from_scene(scene: Scene, pixel: _core.Camera, rule: _core.Rule) -> _core.Pick | None:
-    """What a pixel shows most of, from all gaussians."""
+    """Pick from all gaussians of a scene."""
     resident = residency.scene(scene, CPU)
     frame = _core.SceneFrame(CPU.number)
     residency.set_models(frame, resident.bundles, CPU, "appearance")
@@ -105,24 +105,24 @@ def _pick_from_scene(scene: Scene, pixel: _core.Camera, rule: _core.Rule) -> _co
 def _pick_from_pool(
     renderer: Renderer, scene: Scene, pixel: _core.Camera, rule: _core.Rule
 ) -> _core.Pick | None:
-    """As `_pick_from_scene`, from what is resident in the renderer's pool.
+    """Pick from the gaussians that are resident in the renderer's pool.
 
     Raises:
-        TypeError: This is no renderer.
-        ValueError: The renderer is one of another scene, or has no pool on the CPU.
+        TypeError: This is not a renderer.
+        ValueError: The renderer draws another scene, or has no pool on the CPU.
     """
     check_type("renderer", renderer, Renderer, "a Renderer")
     expected = "one of this subject, got one of another; make a renderer of what is picked from"
     check("renderer", _draws(renderer, scene), expected)
     pool = renderer.pool_frame
     if pool is None or pool.device.is_cuda:
-        refuse("renderer", f"one with a pool on the CPU, got {renderer}")
+        refuse("renderer", f"a renderer with a pool on the CPU, got {renderer}")
     return pool.pick(renderer.subject, pixel, rule)
 
 
 def _draws(renderer: Renderer, scene: Scene) -> bool:
-    """Whether a renderer draws the instances of this scene, from the same bundles or
-    the same files."""
+    """Return whether a renderer draws the instances of this scene, from the same
+    bundles or the same files."""
     if isinstance(renderer.subject, Gaussians):
         return False
     drawn = Scene.of(renderer.subject)

@@ -1,5 +1,5 @@
-"""Pictures of 8 bits: made from colours, laid out on contact sheets, and written to
-files that appear when they are complete."""
+"""8-bit pictures: made from colours, arranged on contact sheets, and written to files
+that appear when they are complete."""
 
 import io
 import os
@@ -20,11 +20,11 @@ Picture: TypeAlias = NDArray[np.uint8]
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 MOST_SIDE = 65_500
-"""Largest side of a picture in px, which is the limit of JPEG."""
+"""Largest side of a picture in px, which is JPEG's limit."""
 MOST_PIXELS_DRAWN = 1 << 27
-"""Largest picture that is drawn; each pixel takes 20 bytes of memory."""
+"""Largest picture that is drawn; each pixel needs 20 bytes of memory."""
 MOST_PIXELS_COMPARED = 1 << 25
-"""Largest picture that is compared, a screen of 8K; each pixel takes 200 bytes of
+"""Largest picture that is compared, an 8K screen; each pixel needs 200 bytes of
 memory."""
 
 _GAP_PX = 6
@@ -34,8 +34,8 @@ _INK = (238, 240, 243)
 
 
 def to_8bit(image: Array) -> Picture:
-    """Round display values in [0,1] to 0..255, on the device of the array; values
-    outside are clipped."""
+    """Convert display values in [0,1] to 0..255 by rounding, on the device of the
+    array; values outside are clipped."""
     if hasattr(image, "detach"):
         import torch
 
@@ -45,8 +45,8 @@ def to_8bit(image: Array) -> Picture:
 
 
 def checked(name: str, image: Array) -> NDArray[np.generic]:
-    """A picture as a NumPy array (H,W,3), on the host, without gradient; TypeError or
-    ValueError if none."""
+    """Return a picture as a NumPy array (H,W,3), on the host, without gradient; raise
+    TypeError or ValueError if it is not a picture."""
     if hasattr(image, "detach"):
         image = image.detach().cpu().numpy()
     if not isinstance(image, np.ndarray):
@@ -59,7 +59,7 @@ def checked(name: str, image: Array) -> NDArray[np.generic]:
 
 
 def contact_sheet(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
-    """Lay rows of (text, picture) out as one picture, each text above its picture."""
+    """Arrange rows of (text, picture) as one picture, each text above its picture."""
     from PIL import Image, ImageDraw, ImageFont
 
     heights = [max(picture.shape[0] for _, picture in row) for row in rows]
@@ -80,20 +80,20 @@ def contact_sheet(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
 
 
 def check_picture_path(path: str | os.PathLike[str]) -> Path:
-    """Check, before long work, that a picture can be written there.
+    """Check, before long work, that the name of a picture has a known suffix.
 
     Raises:
-        ValueError: The suffix is not one of ``SUFFIXES``, or the folder does not exist.
+        ValueError: The suffix is not one of ``SUFFIXES``.
     """
     path = Path(path)
     is_known = path.suffix.lower() in SUFFIXES
     check(path, is_known, f"a file name ending in {', '.join(SUFFIXES)}; choose one of them")
-    _files.check_folder(path)
     return path
 
 
 def check_size(name: str, width: int, height: int, most_pixels: int = MOST_PIXELS_DRAWN) -> None:
-    """Refuse, before anything is decoded or drawn, a picture that is too large.
+    """Raise ValueError for a picture that is too large, before anything is decoded or
+    drawn.
 
     Raises:
         ValueError: A side has more than ``MOST_SIDE`` px, or the picture more than
@@ -105,24 +105,24 @@ def check_size(name: str, width: int, height: int, most_pixels: int = MOST_PIXEL
 
 
 def read_picture(path: str | os.PathLike[str]) -> Picture:
-    """Read a PNG or a JPEG to compare it, whatever its name says; transparency is left
-    out.
+    """Read a PNG or a JPEG for a comparison, whatever the name's suffix is;
+    transparency is ignored.
 
     Raises:
         ValueError: The file is not a PNG or a JPEG, is damaged or too large, or has
-            more than 8 bits a channel.
-        OSError: It cannot be read.
+            more than 8 bits per channel.
+        OSError: The file cannot be read.
     """
     from PIL import Image
 
     name = os.fspath(path)
     with warnings.catch_warnings(), open(_files.open_regular(path), "rb") as file:
-        # They concern other content of the file, such as more pictures.
+        # The warnings concern other content of the file, such as further pictures.
         warnings.simplefilter("ignore")
         is_known = file.read(8).startswith((b"\x89PNG\r\n\x1a\n", b"\xff\xd8"))
         check(name, is_known, "a PNG or a JPEG, got another file")
         with _files.value_errors(name, "a PNG or a JPEG that is not damaged"):
-            # For other formats, Pillow starts programs.
+            # Pillow starts external programs for other formats.
             image = Image.open(file, formats=("PNG", "JPEG"))
         check_size(name, *image.size, MOST_PIXELS_COMPARED)
         check(name, not image.mode.startswith("I"), "8 bits a channel, got 16; convert it first")
@@ -131,7 +131,7 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
 
 
 def encode_png(image: Array) -> bytes:
-    """A PNG of (H,W,3) floats in [0,1]."""
+    """Return a PNG of (H,W,3) floats in [0,1]."""
     from PIL import Image
 
     stream = io.BytesIO()
@@ -139,19 +139,53 @@ def encode_png(image: Array) -> bytes:
     return stream.getvalue()
 
 
-def write_picture(path: str | os.PathLike[str], image: Array) -> None:
-    """Write (H,W,3) floats in [0,1] or 8-bit values as PNG or JPEG; the file appears
-    when it is complete."""
+def write_picture(
+    path: str | os.PathLike[str], image: Array, *, alpha: Array | None = None
+) -> None:
+    """Write a picture as PNG or JPEG; the file appears when it is complete.
+
+    Args:
+        path: Its folder is created if needed.
+        image: (H, W, 3) floats in [0, 1], or 8-bit values.
+        alpha: (H, W) coverage in [0, 1], for a transparent PNG; `image` is then the
+            premultiplied colours of a picture that was drawn on black, as floats. The
+            file
+            has straight alpha: colours divided by alpha, as PNG demands.
+
+    Raises:
+        TypeError, ValueError: A shape, a type or a value is not as above, or the suffix
+            is not that of a PNG or a JPEG, or with `alpha` of a PNG.
+        OSError: The file cannot be written.
+    """
     from PIL import Image
 
     path = check_picture_path(path)
     pixels = checked("image", image)
+    if alpha is not None:
+        is_png = path.suffix.lower() == ".png"
+        check(path, is_png, "a file name ending in .png for a transparent picture")
+        pixels = _straight(pixels, alpha)
     if pixels.dtype != np.uint8:
         check("image", pixels.dtype.kind == "f", f"uint8, or floats in [0,1], got {pixels.dtype}")
-        check("image", not np.isnan(pixels).any(), "colours, got some that are no numbers (nan)")
+        check("image", not np.isnan(pixels).any(), "colours, got NaN")
         pixels = to_8bit(pixels)
     kind = "JPEG"
     if path.suffix.lower() == ".png":
         kind = "PNG"
     with _files.replacing(path) as temporary:
         Image.fromarray(pixels).save(temporary, kind, quality=90)  # for JPEG
+
+
+def _straight(premultiplied: NDArray[np.generic], alpha: Array) -> NDArray[np.generic]:
+    """Return (H, W, 4) straight colours and alpha."""
+    if hasattr(alpha, "detach"):
+        alpha = alpha.detach().cpu().numpy()
+    coverage = np.asarray(alpha)
+    shape = premultiplied.shape[:2]
+    check("alpha", coverage.shape == shape, f"shape {shape}, got {coverage.shape}")
+    check("image", premultiplied.dtype.kind == "f", f"floats, got {premultiplied.dtype}")
+    colors = np.asarray(premultiplied, np.float32)
+    is_on_black = not (colors[coverage == 0] != 0).any()
+    check("image", is_on_black, "a picture drawn on black, got one on another background")
+    divided = colors / np.maximum(coverage, np.float32(1e-6))[..., None]
+    return np.concatenate([divided, coverage[..., None].astype(np.float32)], axis=2)

@@ -10,13 +10,14 @@ from v3dg.bundle import Bundle
 from v3dg.levels.memory import free_bytes
 from v3dg.residency import ResidentScene, residency
 
-_RESERVE_BYTES = 1 << 30  # the most that stays free for frames, tables and everything else
-NUM_THREADS = 8  # threads that read pages; a disk answers several at once
-_WAIT_SECONDS = 0.05  # the longest time until Ctrl-C is heard
+# Upper limit of the memory left free for frames, tables and everything else.
+_RESERVE_BYTES = 1 << 30
+NUM_THREADS = 8  # threads that read pages; a disk serves several requests at once
+_WAIT_SECONDS = 0.05  # upper limit of the delay until Ctrl-C is handled
 
 
 def free_on(device: Device) -> int:
-    """Bytes of memory that a device can give."""
+    """Return the bytes of memory that a device has available."""
     if not device.is_cuda:
         return free_bytes()
     import torch
@@ -26,8 +27,8 @@ def free_on(device: Device) -> int:
 
 
 def chosen_bytes(bundles: Sequence[Bundle], device: Device) -> int | None:
-    """Half of the free bytes of the device, for a pool, if not everything fits there;
-    None if it does."""
+    """Return half of the free bytes of the device, for a pool, if not everything fits
+    there; None if it does."""
     for memory, num_bytes in residency.bytes_to_add(bundles, device).items():
         free = free_on(memory)
         if num_bytes > free - min(free // 4, _RESERVE_BYTES):
@@ -36,14 +37,14 @@ def chosen_bytes(bundles: Sequence[Bundle], device: Device) -> int | None:
 
 
 class Pool:
-    """Pages of bundles in a fixed amount of memory of one device, which come and go as
+    """Pages of bundles in memory of a fixed size on one device, which come and go as
     views need them.
 
     Attributes:
         tables: The tables of its bundles.
         num_bytes: The size of its memory.
         lease: Held by a thread from `settle` until its picture is drawn, so that no
-            other thread's view takes the place of what it has settled.
+            view of another thread replaces the pages in between.
     """
 
     def __init__(
@@ -67,13 +68,13 @@ class Pool:
         timeout: float,
         seconds: float,
     ) -> None:
-        """Bring in the pages that a view needs, or as many of them as arrive within
+        """Bring in the pages that a view needs, or those that arrive within
         ``seconds``.
 
         Raises:
             ValueError: A page is damaged.
-            OSError: A page cannot be read; TimeoutError when none came in for `timeout`
-                seconds.
+            OSError: A page cannot be read. TimeoutError if no page arrived for
+                `timeout` seconds.
         """
         core = self.core
         start = time.monotonic()
@@ -100,22 +101,22 @@ class Pool:
                 last_arrival = time_of_step
             elif time_of_step - last_arrival > timeout:
                 raise TimeoutError(
-                    f"settle: {step.num_absent} pages are missing and none came in for {timeout:g} "
-                    "s; is the disk or the server at work?"
+                    f"settle: {step.num_absent} pages are missing and none arrived for {timeout:g} "
+                    "s; does the disk or the server respond?"
                 )
             core.wait(_WAIT_SECONDS)
 
 
 class PoolSlot:
-    """The pool that stills of one subject share on one device: the last one that was
-    asked for."""
+    """The pool that single pictures of one subject share on one device: the one that
+    was requested last."""
 
     def __init__(self) -> None:
         self._pool: Pool | None = None
 
     @property
     def num_bytes(self) -> int | None:
-        """The size of the pool; None without one."""
+        """The size of the pool; None if there is none."""
         if self._pool is None:
             return None
         return self._pool.num_bytes
@@ -127,8 +128,8 @@ class PoolSlot:
         device: Device,
         num_bytes: int,
     ) -> Pool:
-        """A pool of these bundles and of this size. Another one is given up first, for
-        its memory is needed.
+        """Return a pool of these bundles and of this size. A different one is freed
+        first, because its memory is needed.
 
         Requires the lock of `residency`.
         """

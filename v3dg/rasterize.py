@@ -1,4 +1,5 @@
-"""Draw gaussians as they are: project, bin, blend; differentiable on torch tensors."""
+"""Draw gaussians without levels: project, bin, blend; differentiable for torch
+tensors."""
 
 from __future__ import annotations
 
@@ -27,29 +28,31 @@ def rasterize(
     camera: Camera,
     *,
     filter_px2: float = 0.0,
-    antialiased: bool = False,
+    antialiased: bool | None = None,
     background: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Image:
-    """Draw gaussians with the meaning of 3D Gaussian Splatting, as gsplat 1.5 defines
-    it.
+    """Draw gaussians with the semantics of 3D Gaussian Splatting, as gsplat 1.5 defines
+    them.
 
-    Alpha is cut at 0.999, contributions below 1/255 are skipped, a pixel stops before
-    its transmittance would fall to 1e-4, and gaussians are blended in the order of
-    their depth, equal depths by index.
+    Alpha is clamped to 0.999, contributions below 1/255 are skipped, a pixel stops
+    before its transmittance would fall to 1e-4, and gaussians are blended by ascending
+    depth, ties by index.
 
-    On torch tensors the picture is differentiable with respect to the gaussians' means,
-    quats, scales, opacities and sh, and to `background` when that is a tensor; float64
-    tensors on the CPU are computed in float64. Tensors on a CUDA device are drawn
-    there, on its current stream. Pictures and gradients are the same on every run.
+    With torch tensors the picture is differentiable with respect to the gaussians'
+    means, quats, scales, opacities and sh, and to `background` if that is a tensor;
+    float64 tensors on the CPU are computed in float64. Tensors on a CUDA device are
+    drawn there, on its current stream. Pictures and gradients are the same in every
+    run.
 
     Args:
         gaussians: N gaussians in world space; or the file of an asset.
         camera: Pinhole camera.
-        filter_px2: Variance of the low-pass filter in screen space, px²; 0.3 draws
-            assets that were trained with the original 3DGS code as they were trained.
-        antialiased: Scale opacities by sqrt(det before / det after the filter)
-            (Mip-Splatting, eq. 9), so that the filter spreads a gaussian without adding
-            to it.
+        filter_px2: Variance of the low-pass filter in screen space, px²; 0.3 is the
+            value that the original 3DGS code trains with.
+        antialiased: Multiply opacities by sqrt(det before / det after the filter)
+            (Mip-Splatting, eq. 9), so that the filter widens a gaussian without
+            increasing its total opacity. None means what the gaussians say
+            (`Gaussians.antialiased`).
         background: Three numbers, or a tensor of them.
 
     Raises:
@@ -64,13 +67,15 @@ def rasterize(
     check_type("camera", camera, Camera, "a Camera")
     filter_px2 = real(filter_px2, "filter_px2", "a variance of at least 0 px²", 0)
     background_color = color(background, "background")
+    if antialiased is None:
+        antialiased = bool(getattr(gaussians, "antialiased", None))
     means = gaussians.means
     if isinstance(means, np.ndarray):
         drawn = _core.rasterize(
             gaussians.rows,
             camera.core,
             filter_px2=filter_px2,
-            antialiased=bool(antialiased),
+            antialiased=antialiased,
             background=background_color,
             with_depth=True,
             keep_tape=False,
@@ -81,7 +86,7 @@ def rasterize(
     check_device(means)
     arrays = [means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh]
     arrays.append(torch.as_tensor(background, dtype=means.dtype))
-    settings = DrawSettings(filter_px2=filter_px2, antialiased=bool(antialiased))
+    settings = DrawSettings(filter_px2=filter_px2, antialiased=antialiased)
     return Image(*draw_views([camera.core], settings, [[array] for array in arrays]))
 
 
@@ -97,7 +102,7 @@ def check_device(means: Array) -> None:
 
 
 def joined(parts: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Tensors stacked, a single one without a copy."""
+    """Return stacked tensors; a single one is not copied."""
     import torch
 
     if len(parts) == 1:
@@ -112,13 +117,13 @@ class DrawSettings:
     filter_px2: float
     antialiased: bool
     with_depth: bool = True
-    plain_colors: bool = False  # sh holds colours, not coefficients
+    plain_colors: bool = False  # sh has colours instead of coefficients
 
 
 @dataclass(eq=False)
 class CenterGradient:
-    """The gradient with respect to centres on the images, once the backward pass has
-    set it."""
+    """The gradient with respect to centres on the images, which the backward pass
+    sets."""
 
     value: torch.Tensor | None = None
 
@@ -129,14 +134,14 @@ class CenterProbe:
     images.
 
     Attributes:
-        centers: The centres, (V, N, 2)[pairs]. Nothing flows through them, but autograd
-            gives them the gradient.
-        pairs: The index of the rows that `centers` has.
-        with_sizes: Whether `centers.absgrad` becomes the sum of absolute values of each
-            pixel's share.
-        gradient: Gets the gradient with respect to `centers`. It is an object of its
-            own, because the operation that made the centres keeps it: if it kept the
-            centres, too, that were a cycle.
+        centers: The centres, (V, N, 2)[pairs]. They have no effect on the picture, but
+            autograd provides their gradient.
+        pairs: The index that selects the rows in `centers`.
+        with_sizes: Whether `centers.absgrad` becomes the sum over pixels of absolute
+            gradients.
+        gradient: Receives the gradient with respect to `centers`. It is a separate
+            object because the operation that made the centres keeps it: keeping the
+            centres would be a reference cycle.
     """
 
     centers: torch.Tensor
@@ -151,13 +156,13 @@ def draw_views(
     inputs: Sequence[Sequence[torch.Tensor]],
     probe: CenterProbe | None = None,
 ) -> tuple[torch.Tensor, ...]:
-    """Draw tensors; differentiable. Returns colour, alpha and depth (or None) of the
-    first view, the next...
+    """Draw tensors, differentiably. Returns colour, alpha and depth (or None) of the
+    first view, of the next...
 
     Args:
         cameras: V cameras.
-        inputs: Means, quats, scales, opacities, sh, backgrounds: one tensor of each, or
-            several that views use in turn.
+        inputs: Means, quats, scales, opacities, sh, backgrounds: one tensor each, or
+            several that the views use in turn.
         probe: Receives the gradient with respect to the centres on the images.
     """
     import torch
@@ -172,8 +177,8 @@ def draw_views(
 
 
 def _slots_of_view(counts: list[int], view: int) -> list[int]:
-    """For each kind of input, the number of the tensor that a view uses among all
-    tensors."""
+    """Return, for each kind of input, the index among all tensors of the one that a
+    view uses."""
     return [sum(counts[:kind]) + view % count for kind, count in enumerate(counts)]
 
 
@@ -189,7 +194,8 @@ def _to_core(gradient: torch.Tensor | None) -> Array | None:
 def _draw_view(
     camera: _core.Camera, settings: DrawSettings, inputs: Sequence[torch.Tensor], *, keep_tape: bool
 ) -> tuple[list[torch.Tensor | None], _core.Tape | None]:
-    """Colour, alpha and depth of one view, and what its backward pass needs."""
+    """Return colour, alpha and depth of one view, and the data for its backward
+    pass."""
     import torch
 
     *arrays, background = (tensor.detach() for tensor in inputs)
@@ -221,8 +227,8 @@ def _add_to(sums: list[torch.Tensor | None], slot: int, gradient: torch.Tensor) 
 
 
 def _set_probe(probe: CenterProbe, gradients: list[list[torch.Tensor]]) -> torch.Tensor:
-    """Store and return the gradient by the centres, from that of each view with its
-    sizes if wanted."""
+    """Store and return the gradient by the centres, from that of each view, with its
+    sizes if requested."""
     d_centers, *sizes = (joined(parts)[probe.pairs] for parts in zip(*gradients, strict=True))
     probe.gradient.value = d_centers
     if probe.with_sizes:
@@ -231,7 +237,8 @@ def _set_probe(probe: CenterProbe, gradients: list[list[torch.Tensor]]) -> torch
 
 
 def _input_parts(gradients: _core.Gradients) -> list[Array]:
-    """The gradients with respect to the inputs of `draw_views`, in their order."""
+    """Return the gradients with respect to the inputs of `draw_views`, in their
+    order."""
     return [
         gradients.means,
         gradients.quats,
@@ -243,8 +250,8 @@ def _input_parts(gradients: _core.Gradients) -> list[Array]:
 
 
 def _center_parts(gradients: _core.Gradients) -> list[torch.Tensor]:
-    """The gradients with respect to the centres, and their sizes, where they are
-    wanted."""
+    """Return the gradients with respect to the centres and their sizes, if
+    requested."""
     import torch
 
     parts = (gradients.centers, gradients.center_sizes)
@@ -252,7 +259,7 @@ def _center_parts(gradients: _core.Gradients) -> list[torch.Tensor]:
 
 
 class _Context(Protocol):
-    """What autograd keeps from the forward to the backward pass."""
+    """The data that autograd keeps from the forward to the backward pass."""
 
     counts: list[int]
     probe: CenterProbe | None
@@ -273,7 +280,7 @@ def _forward(
     *,
     keep_tape: bool,
 ) -> tuple[torch.Tensor | None, ...]:
-    """The planes of the pictures of all cameras, one picture after another."""
+    """Return the planes of the pictures of all cameras, one picture after another."""
     pictures: list[torch.Tensor | None] = []
     for view, camera in enumerate(cameras):
         inputs_of_view = [inputs[slot] for slot in _slots_of_view(ctx.counts, view)]
@@ -281,7 +288,8 @@ def _forward(
         if tape is not None:
             ctx.tapes.append(tape)
         pictures += planes
-    # The backward pass reads them again on a GPU, so autograd must see later writes.
+    # On a GPU the backward pass reads the inputs again, so autograd must detect later
+    # writes to them.
     if inputs[0].is_cuda:
         ctx.save_for_backward(*inputs[: -ctx.counts[-1]], *pictures)
     return tuple(pictures)
@@ -290,10 +298,10 @@ def _forward(
 def _backward(
     ctx: _Context, gradients: Sequence[torch.Tensor | None]
 ) -> tuple[torch.Tensor | None, ...]:
-    """The gradients with respect to the centres, then to all inputs."""
+    """Return the gradients with respect to the centres, then those to all inputs."""
     import torch
 
-    _ = ctx.saved_tensors  # raises if a saved tensor was written to
+    _ = ctx.saved_tensors  # raises if a saved tensor was overwritten
     wants_centers, *wants_input = ctx.needs_input_grad[5:]
     probe = ctx.probe
     with_sizes = probe is not None and probe.with_sizes
@@ -315,7 +323,7 @@ def _backward(
 
 @functools.cache
 def _function() -> Callable[..., tuple[torch.Tensor, ...]]:
-    """The operation and its gradient, for tensors of torch on any device."""
+    """Return the operation and its gradient, for torch tensors on any device."""
     import torch
 
     class Rasterize(torch.autograd.Function):

@@ -1,8 +1,8 @@
-"""Residency: which data of bundles and scenes is on which device. It is the only cache
-of the package.
+"""Residency: the data of bundles and scenes on devices. It is the only cache of the
+package.
 
-Data is freed with its bundle or scene, or by `residency.clear()`; buffers and slots of
-a `Renderer` are its own and are freed with it. docs/architecture.md, "Memory on the
+Data is freed with its bundle or scene, or by `residency.clear()`. The buffers and slots
+of a `Renderer` belong to it and are freed with it. docs/architecture.md, "Memory on the
 GPU", lists every owner.
 """
 
@@ -29,23 +29,24 @@ from v3dg.scene import Scene, Subject
 
 _T = TypeVar("_T")
 
-# A GPU decodes quantised bundles once, rather than in each frame and for each instance,
-# up to so many bytes: about what its second-level cache holds. Above, codes are as
-# fast, and take a seventh of the memory.
+# A GPU decodes quantised bundles of up to this size once, rather than in each frame and
+# for each instance. The limit is about the size of its second-level cache. Above it,
+# drawing codes is as fast and takes a seventh of the memory.
 MOST_DECODED_BYTES = 48 << 20
-_PACKED_BYTES = 64  # of a gaussian, which frames of a GPU read besides its rows
-_TOO_MANY_BYTES = 1 << 62  # what no memory holds, so that pages come one by one
+_PACKED_BYTES = 64  # per gaussian, in addition to its row, for the frames of a GPU
+_TOO_MANY_BYTES = 1 << 62  # more than any memory has, so that pages are read one by one
 
-# Kinds of entries that a child of a fork makes anew, because threads that it does not
-# have may have been at work on them.
+# Kinds of entries that a child of a fork makes anew, because threads that exist only in
+# the parent may have been using them.
 _NOT_INHERITED = ("frame", "pool", "scene")
 
 _NO_VALUE = object()
-_NO_TURN = nullcontext()  # which any number of threads may be in; made once, for every frame asks
+# Any number of threads may enter it; made once, because every frame needs it.
+_NO_TURN = nullcontext()
 
 
 class _LastResult:
-    """The result for the last value that was asked for."""
+    """The result for the value that was last requested."""
 
     def __init__(self) -> None:
         self.value: Hashable = _NO_VALUE
@@ -57,21 +58,21 @@ class ResidentScene:
     never changes.
 
     Attributes:
-        core: The part of the compiled module.
-        references: Weak references to the bundles; another tuple where the bundles have
-            changed.
-        revision: The revision of the scene whose data this is.
+        core: The corresponding object of the compiled module.
+        references: Weak references to the bundles; a different tuple after the bundles
+            have changed.
+        revision: The revision of the scene that this data belongs to.
     """
 
     def __init__(self, device: Device) -> None:
         self.device = device
         self.core = _core.ResidentScene(device.number)
-        # The references are weak, because a bundle that is drawn by itself would keep
-        # itself alive otherwise.
+        # The references are weak, because a bundle that is drawn by itself would
+        # otherwise keep itself alive.
         self.references: tuple[weakref.ref[Bundle], ...] = ()
-        # Drawings that may be under way.
+        # Drawings that may be in progress.
         self._drawings: weakref.WeakSet[_core.Drawing] = weakref.WeakSet()
-        self._lock = threading.Lock()  # guards that set
+        self._lock = threading.Lock()  # guards _drawings
         self.revision = (-1, -1, -1)
 
     @property
@@ -80,17 +81,18 @@ class ResidentScene:
         return tuple(bundle for reference in self.references if (bundle := reference()) is not None)
 
     def is_of(self, subject: Subject) -> bool:
-        """Whether this is the data of the subject's current revision; a bundle never
-        changes."""
+        """Return whether this is the data of the subject's current revision; a bundle
+        never changes."""
         if isinstance(subject, Scene):
             return self.revision == subject.revision
         return self.revision[0] >= 0
 
     def update(self, scene: Scene, tables: list[_core.ClusterTable]) -> None:
-        """Update what has changed since the last time: the poses, or all instances.
+        """Update what has changed since the last call: only the poses, or all
+        instances.
 
-        Frames under way are finished first: one that found a buffer too small will be
-        drawn again.
+        Frames in progress are finished first, because a frame that found a buffer too
+        small will be drawn again.
 
         Raises:
             RuntimeError: A CUDA graph is being captured.
@@ -116,29 +118,37 @@ class ResidentScene:
         if self.revision[0] == scene.revision[0]:
             self.core.set_poses(*poses)
         else:
-            self.core.set_instances(scene.instance_bundle, scene.importance, *poses)
+            positions, quaternions, scales = poses
+            self.core.set_instances(
+                scene.instance_bundle,
+                scene.importance,
+                positions,
+                quaternions,
+                scales,
+                scene.factors,
+            )
         self.revision = scene.revision
 
     def add_drawing(self, drawing: _core.Drawing) -> None:
-        """Remember a frame that may be under way."""
+        """Remember a frame that may be in progress."""
         if self.device.is_cuda:
             with self._lock:
                 self._drawings.add(drawing)
 
     def _on_device(self, rows: Array) -> Array:
-        """The rows on this device if they are on another CUDA device, else as they
-        are."""
+        """Return the rows on this device if they are on another CUDA device, else
+        unchanged."""
         if getattr(rows, "is_cuda", False) and rows.device.index != self.device.number:
             return rows.to(str(self.device))
         return rows
 
 
 class Residency:
-    """The data of bundles and scenes on devices, as long as the bundle or scene lives.
+    """The data of bundles and scenes on devices, kept as long as the bundle or scene
+    exists.
 
-    Data that is asked for and does not exist yet is made; several devices may hold the
-    same bundle at once. Adding a bundle to a scene leaves the gaussians of the others
-    where they are.
+    Data is made when it is first requested; several devices may hold the same bundle at
+    once. Adding a bundle to a scene does not move the gaussians of the others.
     """
 
     def __init__(self) -> None:
@@ -148,7 +158,8 @@ class Residency:
         os.register_at_fork(after_in_child=self._after_fork)
 
     def table(self, bundle: Bundle) -> _core.ClusterTable:
-        """What selection and drawing read of the bundle's clusters, on the host."""
+        """Return the tables of the bundle's clusters that selection and drawing read,
+        on the host."""
         clusters = bundle.clusters
         groups = bundle.groups
 
@@ -168,8 +179,8 @@ class Residency:
         return self.once(bundle, "table", make)
 
     def turn(self, device: Device) -> AbstractContextManager[object]:
-        """Keep scenes that are on the device unchanged inside the context; on CUDA,
-        other threads wait."""
+        """Keep scenes on the device unchanged inside the context; on CUDA, other
+        threads wait."""
         if device.is_cuda:
             return self.lock
         return _NO_TURN
@@ -177,11 +188,11 @@ class Residency:
     def scene(
         self, subject: Subject, device: Device, last: ResidentScene | None = None
     ) -> ResidentScene:
-        """The data of the current scene on a device; a bundle is a scene of one
-        instance.
+        """Return the data of the current scene on a device; a bundle counts as a scene
+        of one instance.
 
-        It is mostly the same as the last time, so passing that as ``last`` saves the
-        search.
+        Mostly the result is the same as the last time; passing that as ``last`` saves
+        the search.
         """
         if last is not None and last.is_of(subject):
             return last
@@ -194,7 +205,7 @@ class Residency:
             if resident.is_of(subject):
                 return resident
             scene = copy.copy(Scene.of(subject))
-            if resident.revision[0] >= 0 and not device.is_cuda:  # on the CPU it stays as it is
+            if resident.revision[0] >= 0 and not device.is_cuda:  # on the CPU it never changes
                 resident = ResidentScene(device)
             resident.update(scene, [self.table(bundle) for bundle in scene.bundles])
             self._entries[subject]["scene", device] = resident
@@ -203,8 +214,8 @@ class Residency:
     def rows(
         self, bundle: Bundle, clusters: NDArray[np.int32], device: Device
     ) -> tuple[_core.Rows, NDArray[np.int64]]:
-        """Gaussians of the bundle on a device, and the first row of each of S clusters
-        among them, (S,)."""
+        """Return the gaussians of the bundle on a device, and the first row of each of
+        S clusters, (S,)."""
         if not self._draws_codes(bundle, device):
             return self.gaussians(bundle, device).rows, bundle.clusters.offset[clusters]
         ids, place = np.unique(clusters, return_inverse=True)
@@ -212,7 +223,8 @@ class Residency:
         return Gaussians(*self.model(bundle, device).decode(ids)).rows, first[place]
 
     def model(self, bundle: Bundle, device: Device) -> _core.Model:
-        """The bundle's gaussians, or their codes, as frames of a device read them."""
+        """Return the bundle's gaussians, or their codes, in the layout of a device's
+        frames."""
 
         def make() -> _core.Model:
             codes = bundle.codes
@@ -223,7 +235,7 @@ class Residency:
         return self.once(bundle, ("model", device), make)
 
     def gaussians(self, bundle: Bundle, device: Device) -> Gaussians:
-        """All gaussians of the bundle on a device."""
+        """Return all gaussians of the bundle on a device."""
         if not device.is_cuda:
             return bundle.gaussians
         return self.once(bundle, ("gaussians", device), lambda: bundle.gaussians.torch(str(device)))
@@ -231,8 +243,8 @@ class Residency:
     def set_models(
         self, frame: _core.SceneFrame, bundles: Sequence[Bundle], device: Device, color_by: ColorBy
     ) -> None:
-        """Have a frame of a device draw these bundles, their gaussians or clusters in
-        these colours."""
+        """Make a frame draw these bundles, with the colours of gaussians or of
+        clusters."""
         palettes = [
             _core.Palette(self.table(bundle), sh, device.number)
             for bundle in bundles
@@ -241,15 +253,15 @@ class Residency:
         frame.set_models([self.model(bundle, device) for bundle in bundles], palettes)
 
     def palette(self, bundle: Bundle, color_by: ColorBy) -> NDArray[np.float32] | None:
-        """As `palette_of`."""
+        """Return the cached result of `palette_of`."""
         return self.once(bundle, ("palette", color_by), lambda: palette_of(bundle, color_by))
 
     def bytes_to_add(self, bundles: Sequence[Bundle], device: Device) -> dict[Device, int]:
-        """Bytes, by device and host, that the gaussians need which are not on the
+        """Return the bytes, for device and host, of the gaussians that are not on the
         device yet.
 
-        Bundles at URLs count as more than any memory holds: their pages are fetched as
-        pictures need them.
+        Bundles at URLs count as more than any memory has, so that their pages are
+        fetched as pictures need them.
         """
         add = {device: 0, CPU: 0}
         for bundle in bundles:
@@ -260,15 +272,15 @@ class Residency:
                 add[CPU] += _TOO_MANY_BYTES
             elif not bundle.is_in_memory:
                 add[CPU] += bundle.page_bytes
-            if device.is_cuda or not is_coded:  # the CPU draws codes where they are
+            if device.is_cuda or not is_coded:  # the CPU draws codes without copying them
                 add[device] += bundle.page_bytes
             if device.is_cuda and not is_coded:
                 add[device] += _PACKED_BYTES * bundle.num_gaussians
         return add
 
     def num_bytes(self, device: Device) -> int:
-        """Memory that gaussians and tables of all bundles take on a device beside the
-        bundles themselves."""
+        """Return the memory that gaussians and tables of all bundles occupy on a
+        device, without the bundles themselves."""
         with self.lock:
             all_entries = list(self._entries.values())
         num_bytes = 0
@@ -282,12 +294,12 @@ class Residency:
         return num_bytes
 
     def clear(self) -> None:
-        """Free everything; what is asked for later is made again."""
+        """Free everything; data is made again when it is requested."""
         with self.lock:
             self._entries.clear()
 
     def _draws_codes(self, bundle: Bundle, device: Device) -> bool:
-        """Whether a bundle's gaussians are codes on the device, and not rows."""
+        """Return whether a bundle's gaussians are codes on the device, and not rows."""
         if bundle.codes is None or not device.is_cuda:
             return bundle.codes is not None
 
@@ -303,11 +315,11 @@ class Residency:
         return self.once(bundle, ("decoded", device), decoded_bytes) == 0
 
     def once(self, owner: Scene | Bundle, key: Hashable, make: Callable[[], _T]) -> _T:
-        """The entry of a bundle or scene with this key, which is made if there is
+        """Return the entry of a bundle or scene with this key; make it if there is
         none."""
         with self.lock:
             if not isinstance(owner, Bundle):
-                owner = Scene.of(owner)  # raises for what is no scene
+                owner = Scene.of(owner)  # raises if it is not a scene
             entries = self._entries.setdefault(owner, {})
             if key not in entries:
                 entries[key] = make()
@@ -316,8 +328,8 @@ class Residency:
     def last(
         self, owner: Scene | Bundle, key: Hashable, value: Hashable, make: Callable[[], _T]
     ) -> _T:
-        """The result of ``make`` for this value. The result for another value is given
-        up first."""
+        """Return the result of ``make`` for this value. The result for another value is
+        freed first."""
         with self.lock:
             last = self.once(owner, key, _LastResult)
             if last.value != value:
@@ -328,17 +340,17 @@ class Residency:
             return cast(_T, last.result)
 
     def _after_fork(self) -> None:
-        """In the child of a fork: another thread of the parent may have held a lock, or
-        been at work."""
+        """Reset the state in a child of fork(): another thread of the parent may have
+        held a lock or used an entry."""
         self.lock = threading.RLock()
         for entries in self._entries.values():
             for key in [
                 key for key in entries if isinstance(key, tuple) and key[0] in _NOT_INHERITED
             ]:
-                # They are not destroyed: that would wait for threads that the child
-                # does not have.
+                # They are not destroyed, because that would wait for threads that the
+                # child does not have.
                 self._abandoned.append(entries.pop(key))
 
 
 residency = Residency()
-atexit.register(residency.clear)  # while the driver is there
+atexit.register(residency.clear)  # before the driver is unloaded

@@ -1,4 +1,4 @@
-"""Selection: which clusters of a scene one view needs."""
+"""Selection: the clusters of a scene that one view needs."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ if TYPE_CHECKING:
 _Value = TypeVar("_Value", bound=np.generic)
 Footprint: TypeAlias = Literal["solid_angle", "paper"]
 
-# px² of screen that one gaussian of a coarser cluster may stand for; docs/levels.md has
-# the error it gives.
+# px² of screen per gaussian of a coarser cluster; docs/levels.md has the resulting
+# error.
 DEFAULT_TOLERANCE = 3.0
 
-# Fade for pictures of a sequence; docs/fades.md has its cost and its gain.
+# The fade for sequences of pictures; docs/fades.md has its cost and benefit.
 DEFAULT_FADE = 1.02
 _FADE_PX2 = np.float32(_core.fade_filter_px2)
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Clusters that one view needs, in ascending order of instance, then cluster.
+    """The clusters that one view needs, in ascending order of instance, then cluster.
 
     Attributes:
-        scene: The scene that was selected from. It may have moved and grown since; once
-            instances of it were removed, the cut is invalid, and drawing it is a
+        scene: The scene of the selection. It may have moved or grown since. After
+            instances were removed, the cut is invalid, and drawing it raises
             ValueError.
         instance_ids: (S,) int32, read-only.
-        cluster_ids: (S,) int32, within the instance's bundle, read-only.
-        num_gaussians: Gaussians in all selected clusters.
+        cluster_ids: (S,) int32, indices in the instance's bundle, read-only.
+        num_gaussians: Number of gaussians in all selected clusters.
         tolerance: The tolerance in px²; with a budget, the one that meets it.
         seconds: Wall time of the selection.
         revision: Revision of the scene at the selection; the current one if None.
@@ -69,7 +69,7 @@ class Selection:
         if self.given_weights is not None:
             numbers = np.asarray(self.given_weights)
             if numbers.dtype.kind not in "biuf":
-                numbers = np.full(numbers.shape, np.nan)  # the check below refuses NaN
+                numbers = np.full(numbers.shape, np.nan)  # the check below rejects NaN
             object.__setattr__(self, "given_weights", np.ascontiguousarray(numbers, np.float32))
         weights = self.weights
         expected = f"{len(self)} numbers of 0 to 1"
@@ -98,22 +98,26 @@ class Selection:
         """Return the selected gaussians in the world, N in the order of the selection,
         for any rasterizer.
 
-        Spherical harmonics are rotated into the world's frame, which is exact. The
-        degree is the highest of the bundles that are selected from. Opacities are
-        multiplied by the weights of their clusters, so that every rasterizer fades.
+        Spherical harmonics are rotated into the world and multiplied by the tints of
+        the instances, which is exact. The SH degree is the highest of the bundles in
+        the selection. Opacities are multiplied by the weights of their clusters, so
+        that fades work in every rasterizer, and by the opacities of their instances.
 
         Args:
-            origin: (3,) point in the world that means are relative to; use the camera's
+            origin: (3,) point in the world that means are relative to. Use the camera's
                 position if the scene is so far from zero that float32 is not precise
                 enough.
-            device: ``"cpu"`` for NumPy arrays, ``"cuda"`` for torch tensors there,
-                ``"auto"`` for the latter if CUDA works. Both hold the same numbers.
+            device: ``"cpu"`` returns NumPy arrays, ``"cuda"`` torch tensors there,
+                ``"auto"`` the latter if CUDA works. Both have the same values.
         """
         target = _device.resolve(device)
         shift = vector(origin, "origin")
         scene = copy.copy(self.scene)  # other threads may change the original meanwhile
         ids, instance = np.unique(self.instance_ids, return_inverse=True)
         bundle_ids, bundle = np.unique(scene.instance_bundle[ids], return_inverse=True)
+        factors = scene.factors
+        if factors is not None:
+            factors = factors[ids]
         rows = []
         first_row = np.empty(len(self), np.int64)
         self.check(scene.revision)
@@ -134,6 +138,7 @@ class Selection:
                     quaternions=scene.quaternions[ids],
                     scales=scene.scales[ids],
                     importance=scene.importance[ids],
+                    factors=factors,
                 ),
                 instance=instance.astype(np.int32),
                 first_row=first_row,
@@ -145,18 +150,18 @@ class Selection:
 
     @property
     def weights(self) -> npt.NDArray[np.float32]:
-        """(S,) in [0, 1] with which the clusters are drawn."""
+        """(S,) weights in [0, 1] that the clusters are drawn with."""
         if self.given_weights is None:
             return np.ones(len(self), np.float32)
         return self.given_weights
 
     @property
     def filters_px2(self) -> npt.NDArray[np.float32]:
-        """(N,) variance of the screen-space filter that each gaussian is drawn with.
+        """(N,) variance of the screen-space filter of each gaussian.
 
         In a fade, a level 0 without a filter is drawn with 0.05 px² and as
-        `antialiased`. `render` limits it to four times a gaussian's own variance, so
-        that many tiny gaussians stay opaque.
+        `antialiased`. `render` limits this filter to four times a gaussian's own
+        variance, so that many tiny gaussians stay opaque.
         """
 
         def filter_px2(clusters: Clusters) -> npt.NDArray[np.float32]:
@@ -175,19 +180,21 @@ class Selection:
         return self._per_gaussian(antialiased, np.bool_)
 
     def _has_only_fade_filter(self, clusters: Clusters) -> npt.NDArray[np.bool_]:
-        """(C,) whether the fade gives the clusters a filter, because they have none."""
+        """Return (C,) whether the fade gives the clusters a filter, because they have
+        none."""
         fades = self.given_weights is not None
         return np.asarray((clusters.level == 0) & (clusters.filter_px2 == 0) & fades)
 
     def _first(self) -> npt.NDArray[np.int64]:
-        """(S + 1,) first gaussian of each selected cluster, and the number of all."""
+        """Return (S + 1,) the first gaussian of each selected cluster, then their total
+        number."""
         return np.concatenate(
             [[0], np.cumsum(self.per_pair(lambda clusters: np.diff(clusters.offset)))]
         )
 
     def per_pair(self, column: Callable[[Clusters], npt.NDArray[_Value]]) -> npt.NDArray[_Value]:
-        """(S,) values of the selected clusters from a column (C,) of the tables of
-        their bundles."""
+        """Return (S,) values of the selected clusters from a column (C,) of the tables
+        of their bundles."""
         scene = copy.copy(self.scene)
         self.check(scene.revision)
         columns = [column(bundle.clusters) for bundle in scene.bundles]
@@ -201,7 +208,7 @@ class Selection:
     def _per_gaussian(
         self, column: Callable[[Clusters], npt.NDArray[_Value]], dtype: type[_Value]
     ) -> npt.NDArray[_Value]:
-        # The dtype is given, because a scene without bundles has no column.
+        # The dtype is explicit, because a scene without bundles has no column.
         return np.repeat(self.per_pair(column).astype(dtype), np.diff(self._first()))
 
 
@@ -243,39 +250,39 @@ def select(
     """Choose the clusters that are just detailed enough for one view, or for each of
     several.
 
-    Exactly one cluster is chosen on every path from a leaf of an instance to its root,
-    and those that lie outside the frustum are then left out. Turning the camera or
-    moving it together with the scene changes only what is left out.
+    Exactly one cluster is chosen on every path from a leaf of an instance to its root.
+    Clusters outside the frustum are then left out. Rotating the camera, or moving it
+    together with the scene, changes only what is left out.
 
     Args:
         subject: A scene or a bundle, or its file, which every call opens again.
         camera: Pinhole camera. For a stereo camera, the cut is detailed enough for the
-            nearer eye and includes everything that either eye may see; it cannot be
-            combined with the paper's footprint.
-        tolerance: Screen area in px² that one gaussian of a coarser cluster may stand
-            for; 0 chooses the full detail wherever it covers anything, infinity the
-            coarsest clusters. `DEFAULT_TOLERANCE` if None; with a budget, 0.
+            nearer eye and includes everything that either eye may see; this excludes
+            the paper's footprint.
+        tolerance: Screen area in px² per gaussian of a coarser cluster. 0 chooses full
+            detail wherever it covers any area, infinity the coarsest clusters. None
+            means `DEFAULT_TOLERANCE`, or 0 with a budget.
         budget: Largest number of gaussians of one view. The tolerance is raised, by the
-            same factor for all instances, to the least of 2,048 values an octave from
-            which on no cut has more.
-        min_level: No cluster of a finer level is chosen, except where an asset has no
-            coarser one.
+            same factor for all instances, to the smallest of 2,048 values per octave
+            from which on no cut has more.
+        min_level: No cluster of a finer level is chosen, unless an asset has no coarser
+            one.
         footprint: ``"solid_angle"``, or ``"paper"`` for the published formula, with
-            which a path can have more than one cluster.
+            which several clusters on a path may be chosen.
         cull: False keeps clusters outside the frustum.
         fade: Clusters within this factor of the tolerance are drawn on two or more
             levels, with weights that add up to exactly 1 on every path and depend only
-            on the view: one level fades in as the other fades out, so that nothing pops
-            while the camera moves. A level 0 without a filter of its own is drawn with
-            a low-pass filter of 0.05 px², so that it does not flicker. `DEFAULT_FADE`
-            is meant for sequences of pictures; 1 and None choose one cluster on every
-            path. It cannot be combined with the paper's footprint.
+            on the view. One level fades in while the other fades out, so that nothing
+            pops as the camera moves. A level 0 without its own filter is drawn with a
+            low-pass filter of 0.05 px², so that it does not flicker. `DEFAULT_FADE` is
+            meant for sequences of pictures; 1 and None choose one cluster on every
+            path. It excludes the paper's footprint.
         device: The device that selects: ``"cpu"``, ``"cuda"``, or ``"auto"``, which is
             CUDA if it can be used. All give the same cut.
 
     Raises:
         ValueError: The coarsest cut has more gaussians than the budget, ``tolerance``
-            is negative or not a number, or another argument is not one of the above.
+            is negative or not a number, or another argument is invalid.
         RuntimeError: ``device`` is ``"cuda"`` and cannot be used.
 
     Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the
@@ -295,8 +302,8 @@ def select_by(
     device: Device,
     steps: _core.BudgetSteps | None = None,
 ) -> Selection:
-    """Select for one view; with `steps`, which holds the state of the budget, for the
-    next of a sequence."""
+    """Select for one view; with `steps`, the state of a budget, for the next view of a
+    sequence."""
     check_camera(camera)
     start = time.perf_counter()
     with residency.turn(device):
@@ -330,8 +337,8 @@ def rule_of(
     cull: bool = True,
     fade: float | None = None,
 ) -> _core.Rule:
-    """The rule of a selection for the core; ValueError for a number that `select` does
-    not accept."""
+    """Return the rule of a selection for the core; raise ValueError for a number that
+    `select` does not accept."""
     if tolerance is None:
         tolerance = 0.0
         if budget is None:
@@ -361,7 +368,7 @@ def rule_of(
 
 
 def over_budget(budget: int, least: int) -> ValueError:
-    """The error for a budget that the coarsest cut exceeds; ``least`` is the size of
-    that cut."""
+    """Return the error for a budget that the coarsest cut exceeds; ``least`` is the
+    size of that cut."""
     expected = f"at least {least} gaussians, which the coarsest cut of this view has"
     return ValueError(f"budget: expected {expected}, got {budget}")

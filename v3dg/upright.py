@@ -1,15 +1,15 @@
 """The axis that is up: read from a file, or guessed from cameras, from a ground plane,
 or by convention."""
 
-import os
 from collections.abc import Mapping
 
 import numpy as np
 
 from v3dg._numbers import Floats
-from v3dg._urls import beside
 from v3dg.bundle import Bundle
 from v3dg.cameras import AXES, Axis, Camera
+from v3dg.formats import _axes
+from v3dg.formats._declared import Declared, declared_of
 from v3dg.gaussians import Gaussians
 from v3dg.scene import Scene, Subject
 
@@ -36,18 +36,23 @@ def direction_of(axis: Axis) -> tuple[float, float, float]:
 
 
 def up_of(
-    subject: Subject, cameras: Mapping[str, Camera] | None = None, path: str | os.PathLike[str] = ""
+    subject: Subject,
+    cameras: Mapping[str, Camera] | None = None,
+    *,
+    declared: Declared | None = None,
 ) -> tuple[Axis, str]:
     """Return the axis that is up in a subject, and the reason, as a phrase.
 
     The first of these that applies: the axis in the file of a scene or a bundle; the
-    direction in which the tops of three or more cameras point; z for other scenes; y
-    for glTF; the normal of the plane in which the gaussians of level 0 mostly lie, if
-    it is along y or z, as -y or z; else -y, as in most trained assets.
+    direction in which the tops of three or more cameras point; z for other scenes; what
+    the file of an asset declares; the normal of the plane in which the gaussians of
+    level 0 mostly lie, if it is along y or z, as -y or z; else -y, as in most trained
+    assets.
 
     Args:
         cameras: Cameras that look at the subject, by name.
-        path: Its file, whose format may determine the axis.
+        declared: What the file of an asset declares; None for that of the file which
+            `read_asset` read it from.
     """
     recorded: object = None
     if isinstance(subject, Scene):
@@ -64,17 +69,29 @@ def up_of(
             return AXES[int(np.argmax(heights))], f"guessed from {len(tops)} cameras"
     if isinstance(subject, Scene):
         return "z", "as in most scenes"
-    if beside(path).name.lower().endswith(".glb"):
-        return "y", "as in glTF"
+    if declared is None and isinstance(subject, Gaussians):
+        declared = declared_of(subject)
+    if declared is not None and declared.up is not None:
+        return declared.up, declared.up_reason
     flat = _flat_axis(_middles(subject))
     if flat is not None:
         return flat, "guessed from the plane of its gaussians"
     return "-y", ASSUMED
 
 
+def turned_upright(gaussians: Gaussians, up: Axis) -> Gaussians:
+    """Turn gaussians of which an axis is up so that -y is, as `write_asset` and viewers
+    of files without axes take it; colours turn, too.
+
+    Raises:
+        ValueError: `up` is no axis.
+    """
+    return _axes.turned(gaussians.numpy(), _axes.axes_of_up(up), _axes.MEMORY)
+
+
 def _middles(subject: Bundle | Gaussians) -> Floats:
-    """(N, 3) centres of gaussians of level 0, or of the clusters of a bundle, for which
-    no page is read."""
+    """Return the centres (N, 3) of gaussians of level 0, or of the clusters of a
+    bundle, of which no page is read."""
     if isinstance(subject, Gaussians):
         return np.asarray(subject.means[:: max(len(subject) // 100_000, 1)], np.float64)
     if not subject.num_levels:
@@ -83,8 +100,8 @@ def _middles(subject: Bundle | Gaussians) -> Floats:
 
 
 def _flat_axis(points: Floats) -> Axis | None:
-    """The axis along the normal of the plane that the points lie in, ignoring outliers;
-    None without one."""
+    """Return the axis along the normal of the plane that the points lie in, ignoring
+    outliers; None if they lie in no plane."""
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 16:
         return None

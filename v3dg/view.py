@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
 from v3dg._device import Device
 from v3dg._numbers import one_of
-from v3dg._urls import beside
+from v3dg._urls import is_url
 from v3dg.cameras import AXES, Axis, Camera, VectorLike
+from v3dg.io import subject_name
 from v3dg.opening import File, open_with_cameras
 from v3dg.scene import Subject
 from v3dg.upright import ASSUMED, direction_of, up_of
@@ -31,7 +32,9 @@ class _SiteOptions(TypedDict, total=False):
     port: int
     tolerance: float
     budget: int | None
+    background: Sequence[float]
     asks_up: bool
+    edits_folder: Path | None
 
 
 def view(
@@ -54,8 +57,8 @@ def view(
         up: The axis or direction that is up at first; None uses the axis of
             `v3dg.upright.up_of`.
         options: Options of `v3dg.viewer.server.Site`, such as `cameras` by name,
-            `port`, `tolerance` and `budget`. A scene's file may have cameras of its
-            own.
+            `port`, `tolerance`, `budget` and `background`. A scene's file may have
+            cameras of its own.
 
     Raises:
         ImportError: The extra `viewer` is not installed.
@@ -63,14 +66,15 @@ def view(
     from v3dg.viewer.frame import SceneView
     from v3dg.viewer.server import Site
 
-    path = Path()
     if isinstance(subject, str | os.PathLike):
         path = Path(subject)
         subject, cameras = open_with_cameras(path)
-        options.setdefault("name", beside(path).stem)
+        options.setdefault("name", subject_name(path))
         options.setdefault("cameras", cameras)
+        if not is_url(path):
+            options.setdefault("edits_folder", path.absolute().parent)
     if up is None:
-        up, reason = up_of(subject, options.get("cameras"), path)
+        up, reason = up_of(subject, options.get("cameras"))
         options.setdefault("asks_up", reason == ASSUMED)
     if isinstance(up, str):
         one_of(up, "up", AXES)

@@ -1,5 +1,5 @@
-"""The evaluation: speed against error, and peers in the same run; `python -m benchmarks
-evaluate`."""
+"""The evaluation: speed against error, with other tools in the same run; `python -m
+benchmarks evaluate`."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ __all__ = ["NAMES", "PRESETS", "Evaluation", "part", "run"]
 def run(
     evaluation: Evaluation, preset: str, names: Sequence[str], *, quiet: bool = False
 ) -> dict[str, dict[str, Any]]:
-    """Run parts, each of which writes <part>.json as it ends; returns what they
-    measured.
+    """Run parts, each of which writes <part>.json when it ends; return their results.
 
     Raises:
-        ValueError: A name is not of a part.
+        ValueError: A name is not that of a part.
     """
     modules = {name: part(name) for name in names}
     evaluation.folder.mkdir(parents=True, exist_ok=True)

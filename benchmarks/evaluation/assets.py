@@ -1,4 +1,4 @@
-"""Assets to measure with: many copies of a small one, and random gaussians that look
+"""Assets for measurements: many copies of a small one, and random gaussians that look
 trained."""
 
 from __future__ import annotations
@@ -16,16 +16,17 @@ from v3dg.rotations import rotation_from_quaternion
 
 
 def read_layout(path: str | Path, bundle: v3dg.Bundle) -> tuple[v3dg.Scene, dict[str, v3dg.Camera]]:
-    """A published layout of one asset, of which this is the bundle, and its cameras."""
+    """Return a published layout of one asset, whose bundle is given, and its
+    cameras."""
     name = json.loads(Path(path).read_text(encoding="utf-8"))["asset"]
     return v3dg.read_scene(path, bundles={name: bundle})
 
 
 def many_copies(asset: v3dg.Gaussians, num_copies: int, *, seed: int = 0) -> v3dg.Gaussians:
-    """Copies of an asset as one: turned at random, half to twice as large, side by side
-    on a square.
+    """Return copies of an asset as one asset: rotated at random, half to twice as
+    large, side by side on a square.
 
-    What of the colour depends on the view is not turned with them.
+    The view-dependent part of the colour is not rotated with them.
     """
     rng = np.random.default_rng(seed)
     side = math.isqrt(num_copies - 1) + 1
@@ -56,8 +57,7 @@ def many_copies(asset: v3dg.Gaussians, num_copies: int, *, seed: int = 0) -> v3d
 
 
 class _Random:
-    """Seeded float32 numbers where they are needed: NumPy's on the CPU, torch's on
-    another device."""
+    """Seeded float32 numbers on a device: NumPy's on the CPU, torch's on others."""
 
     def __init__(self, device: str, seed: int) -> None:
         self._device = device
@@ -89,16 +89,16 @@ class _Random:
 def like_trained(
     count: int, camera: v3dg.Camera, device: str, *, sh_degree: int = 0, seed: int = 0
 ) -> v3dg.Gaussians:
-    """Random gaussians before a camera with the sizes, shapes and opacities that
-    training leaves.
+    """Return random gaussians before a camera with the sizes, shapes and opacities of
+    training.
 
     The distributions are fitted to a trained asset: logs of sizes are normal with
     deviation 1, logs of the ratios of neighbouring axes are gamma of shape 3 (median
-    ratios 3 and 4), logits of opacities are normal. Training spends gaussians where
-    they show, so sizes on screen do not depend on depth: the longest axis has a median
-    of 2 px (the middle one 0.7 px), and one in a thousand passes 40 px. Depths are
-    log-uniform over a factor of 20, places uniform on the image and a little beyond it.
-    NumPy arrays on the CPU, else tensors.
+    ratios 3 and 4), logits of opacities are normal. Training distributes gaussians by
+    visibility, so sizes on screen do not depend on depth: the longest axis has a median
+    of 2 px (the middle one 0.7 px), and one in a thousand exceeds 40 px. Depths are
+    log-uniform over a factor of 20, positions uniform on the image and slightly beyond
+    it. The result has NumPy arrays on the CPU, else tensors.
     """
     random = _Random(device, seed)
     uniform, normal, array = random.uniform, random.normal, random.array
@@ -110,7 +110,7 @@ def like_trained(
     means = view @ array(camera.viewmat[:3, :3]) + array(camera.position)
 
     longest = 2 * exp(normal(count, 1)) * depth / camera.fx
-    # A uniform number may be 0, one less never is.
+    # A uniform number may be 0, so one minus it is never 0.
     ratios = exp(array([0.4, 0.5]) * random.library.log(1 - uniform(count, 3, 2)).sum(1))
     middle = longest * ratios[:, :1]
     sh = join(
@@ -126,8 +126,8 @@ def like_trained(
 
 
 def hair_lines(count: int, *, seed: int = 0) -> v3dg.Gaussians:
-    """Bent wires within a ball of radius 1, a 3,000th of it thick: what falls between
-    pixels."""
+    """Return bent wires in a ball of radius 1, with a thickness of 1/3,000 of the
+    radius, which fall between pixels."""
     rng = np.random.default_rng(seed)
     wires = max(4, count // 100)
     wire = np.arange(count) % wires
@@ -148,7 +148,7 @@ def hair_lines(count: int, *, seed: int = 0) -> v3dg.Gaussians:
 
 
 def sky_dome(count: int, *, seed: int = 0) -> v3dg.Gaussians:
-    """Huge soft gaussians on half a sphere of radius 1: blue above, haze at the
+    """Return huge soft gaussians on half a sphere of radius 1: blue above, haze at the
     horizon, clouds."""
     rng = np.random.default_rng(seed)
     z = (np.arange(count) + 0.5) / count
@@ -171,7 +171,7 @@ def sky_dome(count: int, *, seed: int = 0) -> v3dg.Gaussians:
 
 
 def _quats_from_x(x: Any) -> Any:
-    """Rotations that take the x axis to unit vectors: half a turn about the middle
+    """Return rotations from the x axis to unit vectors: half a turn about the middle
     between the two."""
     middle = x + np.array([1.0, 0.0, 0.0])
     middle[np.linalg.norm(middle, axis=1) < 1e-6] = [0.0, 1.0, 0.0]

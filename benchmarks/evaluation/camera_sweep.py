@@ -1,5 +1,4 @@
-"""Rows of tables in which each is a build, drawn over the camera sweep: the means over
-the distances."""
+"""Rows of tables about builds: means over the distances of the camera sweep."""
 
 from __future__ import annotations
 
@@ -11,12 +10,12 @@ from v3dg.levels import BuildConfig
 
 
 def full_row(evaluation: Evaluation) -> Row:
-    """Every gaussian, one sample a pixel."""
+    """Return the row for every gaussian at one sample per pixel."""
     return sweep_row(evaluation, "full", 0.0, evaluation.sweep_rows(evaluation.full_sweep, "drawn"))
 
 
 def build_row(evaluation: Evaluation, name: str, config: BuildConfig, tolerance: float) -> Row:
-    """What this build gives at this tolerance, and what it took."""
+    """Return the result of this build at this tolerance, and its cost."""
     built = evaluation.build(config)
     shots = evaluation.shoot_sweep(evaluation.place(built.bundle), tolerance)
     row = sweep_row(evaluation, name, tolerance, evaluation.sweep_rows(shots, "drawn"))
@@ -24,8 +23,8 @@ def build_row(evaluation: Evaluation, name: str, config: BuildConfig, tolerance:
 
 
 def as_many_row(evaluation: Evaluation, name: str, config: BuildConfig, rival: Row) -> Row:
-    """What this build gives with at most as many gaussians as another row has, view by
-    view."""
+    """Return the result of this build with at most as many gaussians as another row,
+    view by view."""
     built = evaluation.build(config)
     scene = evaluation.place(built.bundle)
     shots = [

@@ -21,18 +21,18 @@ class Evaluate:
     preset: Literal["small", "full"] = "small"
     """small takes minutes on two cores, full needs a GPU."""
     parts: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
-    """Which parts of the evaluation; all if not given."""
+    """Parts of the evaluation to run; all if not given."""
     scenes: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
-    """Which composed scenes; all if not given."""
+    """Composed scenes to draw; all if not given."""
     asset: Annotated[Path | None, option("PATH")] = None
     """Trained asset, a .ply file, in place of the one that is made here."""
     layout: Annotated[Path | None, option("PATH")] = None
     """Published layout (.json) of the instances of that asset and of cameras."""
     peers: Annotated[Path | None, option("FOLDER")] = None
-    """What other tools made of that asset (benchmarks/evaluation/parts/merging.py says
-    how)."""
+    """Levels of that asset that other tools made (described in
+    benchmarks/evaluation/parts/merging.py)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to build and draw; auto is a CUDA device where there is one and torch can
+    """Device to build and draw on; auto is a CUDA device if there is one and torch can
     use it."""
     seed: int = 0
     """Seed of assets, layouts and builds."""

@@ -1,5 +1,5 @@
-"""What parts of the evaluation share: assets, bundles, the main scene with its views
-and true pictures."""
+"""The shared state of the evaluation's parts: assets, bundles, and the main scene with
+its views and true pictures."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ from v3dg.render import render
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
 
-FOV_X = math.pi / 4  # the paper's
+FOV_X = math.pi / 4  # the paper's value
 _MOST_PICTURE_PX = 1400, 2000
 PAPER_CLUSTER_SIZE = BuildConfig.paper().cluster_size
 
 
 def paper_tolerance(tau_px2: float) -> float:
-    """Our tolerance, px² a gaussian, for the paper's: px² of a group that is drawn as
-    one cluster."""
+    """Return our tolerance, px² per gaussian, for the paper's, px² of a group that is
+    drawn as one cluster."""
     return tau_px2 / PAPER_CLUSTER_SIZE
 
 
@@ -49,8 +49,8 @@ PAPER_TOLERANCE = paper_tolerance(2048)
 
 @dataclass(frozen=True)
 class View:
-    """A camera that looks at the origin, and from where: degrees, degrees, world
-    units."""
+    """A camera that looks at the origin, and its position: azimuth and elevation in
+    degrees, distance in world units."""
 
     azimuth: float
     elevation: float
@@ -71,13 +71,15 @@ def views_of(cameras: Iterable[Camera]) -> list[View]:
         x, y, z = camera.position
         distance = math.sqrt(x * x + y * y + z * z)
         azimuth, elevation = math.degrees(math.atan2(y, x)), math.degrees(math.asin(z / distance))
-        # Files round: what is just below 0 is not a direction of its own at 360.
+        # Files round angles: a value just below 0 must not become a separate direction
+        # at 360.
         views.append(View(round(azimuth, 2) % 360, elevation, distance, camera))
     return views
 
 
 def orbit_view(azimuth: float, elevation: float, distance: float, size: tuple[int, int]) -> View:
-    """Look at the origin from there; degrees and world units."""
+    """Return a camera that looks at the origin; angles in degrees, distance in world
+    units."""
     a, e = math.radians(azimuth), math.radians(elevation)
     eye = distance * np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
     camera = Camera.look_at(
@@ -87,20 +89,21 @@ def orbit_view(azimuth: float, elevation: float, distance: float, size: tuple[in
 
 
 def resized(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The same view with so many pixels."""
+    """Return the same view with this number of pixels."""
     factors = np.array([[size[0] / camera.width], [size[1] / camera.height], [1.0]])
     return replace(camera, K=camera.K * factors, width=size[0], height=size[1])
 
 
 def close_distance(asset: Gaussians) -> tuple[Any, float]:
-    """The middle of an asset and how far from it a square picture is filled; without
-    its few outliers."""
+    """Return the middle of an asset, and the distance at which it fills a square
+    picture, ignoring outliers."""
     center, radius = ball_of_most(_device.to_host(asset.means))
     return center, radius / math.tan(FOV_X / 2)
 
 
 def close_view(asset: Gaussians, size: tuple[int, int]) -> Camera:
-    """The asset fills the picture, from above its front."""
+    """Return a camera in which the asset fills the picture, from the front and
+    above."""
     center, distance = close_distance(asset)
     eye = center + distance * np.array([0.0, -0.8, 0.6])
     return Camera.look_at(
@@ -116,8 +119,8 @@ class Built:
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture that was drawn twice to the same bytes, what it shows, and how long it
-    took in between."""
+    """A picture that was drawn twice with equal bytes, its statistics, and the time in
+    between."""
 
     view: View
     picture: Picture
@@ -135,7 +138,7 @@ class Shot:
 
 @dataclass
 class Evaluation:
-    """What one evaluation is run with."""
+    """The settings of one evaluation."""
 
     settings: Settings
     device: str
@@ -149,7 +152,7 @@ class Evaluation:
     """Folder with what other tools made of the asset: <asset>_<percent>.ply and so on,
     see part "merging"."""
     pictures: list[str] = field(default_factory=list)
-    """File names of what the part at hand has saved."""
+    """File names that the current part has saved."""
     judge: Judge = field(default_factory=Judge)
     _built: dict[str, Built] = field(default_factory=dict)
     _truths: dict[int, Picture] = field(default_factory=dict)
@@ -165,8 +168,8 @@ class Evaluation:
         return "made_donut" if self.asset_path is None else self.asset_path.stem
 
     def warm_up(self) -> None:
-        """Load what the first build and the first picture load, so that no part pays
-        for it."""
+        """Load everything that the first build and the first picture load, so that no
+        part includes this time."""
         tiny = make_asset(1000)
         bundle = build_bundle(
             tiny, config=BuildConfig(steps=2), progress=False, device=self._device
@@ -178,7 +181,7 @@ class Evaluation:
         return self.device
 
     def build(self, config: BuildConfig | None = None, asset: Gaussians | None = None) -> Built:
-        """Build the main asset, or another; what was built of the main one is kept."""
+        """Build the main asset or another one; bundles of the main asset are cached."""
         config = config or BuildConfig()
         key = json.dumps(asdict(config))
         if asset is None and key in self._built:
@@ -197,8 +200,8 @@ class Evaluation:
         return built
 
     def place(self, bundle: Bundle, instances: int | None = None) -> Scene:
-        """The main scene, made of this bundle; the first few instances if so many are
-        wanted."""
+        """Return the main scene, made of this bundle; with `instances`, only the first
+        ones."""
         scene = Scene()
         positions, quaternions, scales = self._layout[0]
         few = slice(instances)
@@ -226,17 +229,17 @@ class Evaluation:
 
     @cached_property
     def full_scene(self) -> Scene:
-        """The main scene of which only level 0 is ever drawn."""
+        """Return the main scene, restricted to level 0."""
         return self.place(self.build().bundle)
 
     @cached_property
     def all_views(self) -> list[View]:
-        """All of the main scene's that the settings ask for."""
+        """Return all views of the main scene that the settings request."""
         return self._some_of(self._layout[1])
 
     def _some_of(self, views: Sequence[View]) -> list[View]:
-        """Of the paper's 400 views those of the settings' directions, elevations and
-        distances."""
+        """Return those of the paper's 400 views that have the settings' directions,
+        elevations and distances."""
         azimuths = sorted({round(v.azimuth) for v in views})[: self.settings.directions]
         lines: dict[tuple[int, int], list[View]] = {}
         for view in views:
@@ -249,7 +252,8 @@ class Evaluation:
 
     @cached_property
     def camera_sweep(self) -> list[View]:
-        """The views of one direction and the middle elevation, from near to far."""
+        """Return the views of one direction and the middle elevation, from near to
+        far."""
         middle = sorted(self.settings.elevations)[len(self.settings.elevations) // 2]
         first = self.all_views[0].azimuth
         line = [
@@ -260,7 +264,7 @@ class Evaluation:
         return every(line, self.settings.sweep_distances)
 
     def truth(self, index: int) -> Picture:
-        """The true picture of the camera sweep's view."""
+        """Return the true picture of a view of the camera sweep."""
         if index not in self._truths:
             self._truths[index] = draw_truth(
                 self.full_scene, self.camera_sweep[index].camera, self.device
@@ -274,8 +278,8 @@ class Evaluation:
         tolerance: float = DEFAULT_TOLERANCE,
         repeats: int | None = None,
     ) -> Shot:
-        """Draw, time, and draw again: a time counts only if the pictures are the
-        same."""
+        """Draw, measure, and draw again: the time counts only if the pictures are
+        equal."""
 
         def draw() -> Any:
             return render(subject, view.camera, tolerance=tolerance, device=self.device)
@@ -299,17 +303,16 @@ class Evaluation:
 
     @cached_property
     def full_sweep(self) -> list[Shot]:
-        """The camera sweep with all gaussians, one sample a pixel: what level of detail
-        has to beat."""
+        """Return the camera sweep with all gaussians at one sample per pixel, which
+        level of detail has to beat."""
         return self.shoot_sweep(self.full_scene, 0.0)
 
     def judge_sweep(self, shots: Sequence[Shot]) -> list[Row]:
-        """FLIP and PSNR of pictures of the camera sweep, in its order."""
+        """Return FLIP and PSNR of pictures of the camera sweep, in its order."""
         return self.judge.errors((self.truth(i), shot.picture) for i, shot in enumerate(shots))
 
     def sweep_rows(self, shots: Sequence[Shot], name: str) -> list[Row]:
-        """A row a view: where from, what was drawn, how long it took, how far off it
-        is."""
+        """Return a row per view: its position, statistics, time and error."""
         errors = self.judge_sweep(shots)
         return [
             {
@@ -321,7 +324,7 @@ class Evaluation:
         ]
 
     def composed_scenes(self) -> Iterator[tuple[str, Scene, list[View]]]:
-        """The composed scenes and their views, one after another."""
+        """Yield the composed scenes and their views."""
         name = self._main_world.name if self.layout_path is None else self.layout_path.stem
         if not self.scenes or name in self.scenes:
             yield name, self.full_scene, self.all_views
@@ -347,14 +350,14 @@ class Evaluation:
         return self._built[name].bundle
 
     def close_bundles(self) -> Iterator[tuple[str, Bundle]]:
-        """Assets to be seen from near: the main one, and the first of each world."""
+        """Yield assets for close views: the main one, and the first of each world."""
         yield self.asset_name, self.build().bundle
         for world in self._other_worlds:
             name = next(iter(world.assets))
             yield name, self._world_bundle(world, name)
 
     def save(self, name: str, picture: Picture) -> None:
-        """Keep a picture as a JPEG that is small enough for a repository."""
+        """Save a picture as a JPEG that is small enough for a repository."""
         from PIL import Image
 
         image = Image.fromarray(picture)
@@ -364,7 +367,8 @@ class Evaluation:
 
 
 def every(items: Sequence[Any], count: int) -> list[Any]:
-    """So many of them, evenly spread, the last one always; all if there are no more."""
+    """Return this many of the items, evenly spaced and always with the last; all if
+    there are no more."""
     if count >= len(items):
         return list(items)
     return [items[round((i + 1) * len(items) / count) - 1] for i in range(count)]

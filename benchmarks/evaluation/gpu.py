@@ -1,5 +1,5 @@
-"""What benchmarks on a GPU share: memory, errors, and gsplat as the peer to compare
-with."""
+"""Shared parts of the benchmarks on a GPU: memory, errors, and gsplat for
+comparison."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ DEVICE = "cuda"
 
 
 class PeakMemory:
-    """The most memory of the GPU in use within a `with` block, beyond an idle
-    process's: `.gigabytes`.
+    """The peak of GPU memory in a `with` block, without that of an idle process:
+    `.gigabytes`.
 
-    Sampled every few milliseconds, from the driver: it sees everybody's allocations,
-    and what a pool keeps.
+    The driver is sampled every few milliseconds; it reports everybody's allocations,
+    and the memory that pools hold.
     """
 
     _idle = 0
@@ -58,7 +58,7 @@ class PeakMemory:
 
 
 def picture_error(picture: Any, truth: Any) -> dict[str, float]:
-    """How far a picture is from another, both clipped to [0, 1]."""
+    """Return the error of a picture relative to another, both clipped to [0, 1]."""
     import torch
 
     picture, truth = (torch.as_tensor(p, device=DEVICE).clamp(0, 1) for p in (picture, truth))
@@ -73,8 +73,8 @@ def picture_error(picture: Any, truth: Any) -> dict[str, float]:
 
 
 def placed_gaussians(scene: Scene, device: str = DEVICE) -> v3dg.Gaussians:
-    """All instances of a scene of one bundle, in full detail, in the world, as tensors;
-    SH degree 0."""
+    """Return all instances of a scene of one bundle, in full detail, in the world, as
+    tensors of SH degree 0."""
     import torch
 
     asset = scene.bundles[0].level_gaussians(0).torch(device)
@@ -99,7 +99,7 @@ def placed_gaussians(scene: Scene, device: str = DEVICE) -> v3dg.Gaussians:
 
 
 def _left_products(quaternions: Any) -> Any:
-    """(I, 4, 4) matrices that multiply by a quaternion from the left."""
+    """Return (I, 4, 4) matrices that multiply by a quaternion from the left."""
     import torch
 
     w, x, y, z = torch.as_tensor(quaternions).unbind(-1)
@@ -108,13 +108,12 @@ def _left_products(quaternions: Any) -> Any:
 
 
 def has_gsplat() -> bool:
-    """Whether there is a peer to measure; results name its version, or do not have
-    it."""
+    """Return whether gsplat can be measured; results state its version, or omit it."""
     return importlib.util.find_spec("gsplat") is not None
 
 
 def time_gsplat(gaussians: v3dg.Gaussians, camera: Camera, repeats: int) -> Time:
-    """A frame of gsplat's, packed or not: the quicker one counts."""
+    """Measure a frame of gsplat, packed and not; the faster one counts."""
 
     import torch
 
@@ -128,16 +127,16 @@ def time_gsplat(gaussians: v3dg.Gaussians, camera: Camera, repeats: int) -> Time
 def gsplat_picture(
     gaussians: v3dg.Gaussians, camera: Camera, *, packed: bool, eps2d: float = 0.0
 ) -> tuple[Any, Any]:
-    """Colour (H, W, 3) and alpha (H, W) as gsplat draws them; differentiable."""
+    """Return colour (H, W, 3) and alpha (H, W) as gsplat draws them; differentiable."""
     return gsplat_frame(gaussians, camera, packed=packed, eps2d=eps2d)()
 
 
 def gsplat_frame(
     gaussians: v3dg.Gaussians, camera: Camera, *, packed: bool, eps2d: float = 0.0
 ) -> Callable[[], tuple[Any, Any]]:
-    """A call that draws `gsplat_picture`, with all that it needs on the GPU.
+    """Return a call that draws `gsplat_picture`, with all its inputs on the GPU.
 
-    Colours without a view dependence are handed over as they are, which spares gsplat a
+    Colours that do not depend on the view are passed directly, which saves gsplat a
     pass.
     """
     import gsplat

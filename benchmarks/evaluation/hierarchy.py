@@ -2,10 +2,10 @@
 Gaussian Representation.
 
 Written from the paper (SIGGRAPH 2024), without its optimisation against photographs,
-which assets without any cannot have. A binary tree by median splits, down to single
-gaussians; an inner node merges its two children by their moments, weighted by opacity
-times surface; a node is drawn where its size on screen is at most the target and its
-parent's is not, interpolated towards its parent, so that nothing jumps.
+which these assets do not have. A binary tree by median splits, down to single
+gaussians. An inner node merges its two children by their moments, weighted by opacity
+times surface. A node is drawn if its size on screen is at most the target and its
+parent's is not; it is interpolated towards its parent, so that nothing jumps.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ class Hierarchy:
     """M nodes, level by level from the root, on the host.
 
     Attributes:
-        gaussians: What each node draws; opacities of inner nodes may exceed 1, as in
-            the paper.
-        parent: (M,) the node above; the root is its own.
+        gaussians: The gaussian of each node; opacities of inner nodes may exceed 1, as
+            in the paper.
+        parent: (M,) the node above; the root is its own parent.
         num_siblings: (M,) children of the parent, the node itself included.
-        box: (M, 2, 3) around what the leaves below draw.
-        num_leaves: The last so many nodes are the asset's gaussians.
+        box: (M, 2, 3) box around the visible extent of the leaves below.
+        num_leaves: Number of the asset's gaussians, which are the last nodes.
     """
 
     gaussians: Gaussians
@@ -61,8 +61,8 @@ def build_hierarchy(asset: Gaussians) -> Hierarchy:
     leaves = asset.subset(order)
     levels = [leaves]
     boxes = [_core.bound_by_boxes(leaves.rows, np.arange(len(leaves) + 1))]
-    # Of the segments that the last split leaves, some are empty; above it, every node
-    # has two children.
+    # Some of the segments after the last split are empty; above it, every node has two
+    # children.
     parents = [np.repeat(np.arange(len(offset) - 1), np.diff(offset)) // 2]
     for k in range(depth - 1, -1, -1):
         first_child = offset[::2].copy() if k == depth - 1 else 2 * np.arange(2**k + 1)
@@ -87,8 +87,8 @@ def build_hierarchy(asset: Gaussians) -> Hierarchy:
 
 
 def _merge(children: Gaussians, first_child: Ids) -> Gaussians:
-    """Join segments of one or two by their moments; opacity times surface is kept, also
-    beyond 1."""
+    """Join segments of one or two gaussians by their moments; opacity times surface is
+    preserved, even beyond opacity 1."""
     merged = Gaussians(*_core.merge(children.rows, first_child, np.arange(len(first_child))))
     weight = np.add.reduceat(children.opacities * _surface(children.scales), first_child[:-1])
     opacities = weight / np.maximum(_surface(merged.scales), np.float32(1e-30))
@@ -96,14 +96,14 @@ def _merge(children: Gaussians, first_child: Ids) -> Gaussians:
 
 
 def _surface(scales: Any) -> Any:
-    """Of ellipsoids over 4 pi, after Thomsen, within 1.1 %."""
+    """Return the surface area of ellipsoids over 4 pi, after Thomsen, within 1.1 %."""
     p = 1.6075
     x, y, z = (scales**p).T
     return ((x * y + x * z + y * z) / 3) ** (1 / p)
 
 
-# The 24 rotations that take axes to axes, as quaternions, and which axis each puts in
-# which place.
+# The 24 rotations that map axes to axes, as quaternions, and the permutation of axes of
+# each.
 _TURNS = np.array(
     [
         np.array(q) / np.linalg.norm(q)
@@ -115,8 +115,8 @@ _AXIS_AT = np.abs(rotation_from_quaternion(_TURNS)).argmax(axis=1)  # (24, 3)
 
 
 def _match_axes(nodes: Gaussians, level: slice, parent: Ids) -> None:
-    """Name the axes of a level's gaussians so that they are turned least from their
-    parents'."""
+    """Permute the axes of a level's gaussians so that their rotations are closest to
+    their parents'."""
     child = nodes.quats[level] / np.linalg.norm(nodes.quats[level], axis=1, keepdims=True)
     above = nodes.quats[parent[level]]
     back = child * [1, -1, -1, -1]
@@ -142,7 +142,7 @@ def _product(a: Any, b: Any) -> Any:
 
 
 class HierarchyScene:
-    """One hierarchy at all instances of a scene, on a device."""
+    """One hierarchy in all instances of a scene, on a device."""
 
     def __init__(self, hierarchy: Hierarchy, scene: Scene, device: str) -> None:
         self.scene, self._device = scene, _device.resolve(device)
@@ -160,8 +160,8 @@ class HierarchyScene:
         return like(values, self._nodes.means)
 
     def cut(self, camera: Camera, target_px: float) -> tuple[Any, Any, Any]:
-        """Instances, nodes and how far each is on its way to its parent, for nodes at
-        most so large."""
+        """Return instances, nodes, and the interpolation of each towards its parent,
+        for nodes of at most this size."""
         scene = self.scene
         eyes = (
             np.einsum("ij,ijk->ik", camera.position - scene.positions, scene.rotations)
@@ -196,11 +196,12 @@ class HierarchyScene:
         return instance + first, node, way
 
     def gaussians(self, cut: tuple[Any, Any, Any]) -> Gaussians:
-        """The nodes of a cut in the world, interpolated towards their parents."""
+        """Return the nodes of a cut in the world, interpolated towards their
+        parents."""
         instance, node, way = cut
         own, above = self._gather(instance, node), self._gather(instance, self._parent[node])
-        # So many siblings, drawn over each other as their parent, together cover what
-        # it covers.
+        # This opacity makes siblings that are drawn over each other as their parent
+        # cover together what it covers.
         shared = 1 - (1 - above.opacities.clip(0, _MOST_ALPHA)) ** (1 / self._siblings[node])
         to = way[:, None]
         return Gaussians(

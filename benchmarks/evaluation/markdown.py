@@ -11,8 +11,8 @@ from benchmarks.evaluation.measure import Row
 
 @dataclass(frozen=True)
 class Column:
-    """What of a row is shown, under which title and how: a format such as ".3f", or
-    "count"."""
+    """A column of a table: the key in a row, the title, and the format, such as ".3f"
+    or "count"."""
 
     title: str
     key: str
@@ -28,7 +28,7 @@ class Column:
 
 
 def count_text(count: float) -> str:
-    """A count to three digits: 940, 12.3 k, 4.56 M."""
+    """Return a count to three digits: 940, 12.3 k, 4.56 M."""
     for factor, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         if count >= factor:
             return f"{count / factor:.3g}{unit}"

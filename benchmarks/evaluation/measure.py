@@ -1,5 +1,5 @@
-"""What is measured: times of calls, errors of pictures, tolerances at equal counts, who
-a clip leaves out."""
+"""Measurements: times of calls, errors of pictures, tolerances at equal counts, and
+gaussians removed by clipping."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from v3dg.select import select
 Row = dict[str, Any]
 
 COARSEST = 1e9
-"""Tolerance in px² of the coarsest cut that there is, as a number that JSON can hold.
+"""Tolerance in px² of the coarsest cut, as a number that JSON can represent.
 """
 
 _WARM_UPS = 1
 _HALVINGS = 30
-# gsplat 1.5: a gaussian ends where it falls below 1/255, and at 3.33 standard
-# deviations.
+# gsplat 1.5: a gaussian ends at an alpha of 1/255, and at 3.33 standard deviations.
 _MIN_ALPHA, _REACH_SIGMAS = 1 / 255, 3.33
-_FRUSTUM_MARGIN = 0.15  # of half the picture, to either side, on which the projection is linearised
+# Fraction of half the picture, on each side, up to which the projection is linearised.
+_FRUSTUM_MARGIN = 0.15
 
 
 @dataclass(frozen=True)
 class Time:
-    """Milliseconds of one call: the median of several, and the quickest and slowest."""
+    """Milliseconds of one call: the median of several, the minimum and the maximum."""
 
     median: float
     least: float
@@ -50,8 +50,8 @@ class Time:
 
 
 def time_ms(call: Callable[[], Any], device: str, repeats: int) -> Time:
-    """Time single calls from an idle device to an idle device, after a warm-up;
-    Python's share counts."""
+    """Measure single calls from idle device to idle device, after a warm-up, including
+    Python's part."""
     for _ in range(_WARM_UPS):
         call()
     times = times_ms(call, device, repeats)
@@ -59,7 +59,7 @@ def time_ms(call: Callable[[], Any], device: str, repeats: int) -> Time:
 
 
 def times_ms(call: Callable[[], Any], device: str, repeats: int) -> list[float]:
-    """Milliseconds of single calls, each from an idle device to an idle device."""
+    """Return milliseconds of single calls, each from idle device to idle device."""
     clock = _cuda_ms if device == "cuda" else _wall_ms
     return [clock(call) for _ in range(repeats)]
 
@@ -84,7 +84,7 @@ def _cuda_ms(call: Callable[[], Any]) -> float:
 
 
 def crop(picture: Picture, side: int) -> Picture:
-    """The middle of a picture, at most so many px wide and high."""
+    """Return the middle of a picture, at most this many px wide and high."""
     height, width = picture.shape[:2]
     top, left = max(0, (height - side) // 2), max(0, (width - side) // 2)
     return picture[top : top + side, left : left + side]
@@ -96,11 +96,11 @@ def _flip_and_psnr(pair: tuple[Picture, Picture]) -> tuple[float, float]:
 
 
 class Judge(Judges):
-    """FLIP and PSNR of many pairs of pictures, on all cores; never while something is
-    timed."""
+    """FLIP and PSNR of many pairs of pictures, on all cores; must not run during time
+    measurements."""
 
     def errors(self, pairs: Iterable[tuple[Picture, Picture]]) -> list[Row]:
-        """{"flip", "psnr"} of each (truth, picture); PSNR is None for equal
+        """Return {"flip", "psnr"} of each (truth, picture); PSNR is None for equal
         pictures."""
         return [
             {"flip": round(flip, 5), "psnr": round(psnr, 2) if math.isfinite(psnr) else None}
@@ -109,15 +109,16 @@ class Judge(Judges):
 
 
 def tolerance_for(scene: Scene, camera: Camera, count: int) -> float:
-    """The tolerance at which at most `count` gaussians are selected; `COARSEST` where
-    that is not enough."""
+    """Return the tolerance at which at most `count` gaussians are selected; `COARSEST`
+    if none suffices."""
     if select(scene, camera, tolerance=COARSEST, device="cpu").num_gaussians > count:
         return COARSEST
     return select(scene, camera, budget=count, device="cpu").tolerance
 
 
 def _bisect(fits: Callable[[float], bool], low: float, high: float) -> float:
-    """Where `fits` begins to hold, on a logarithmic scale; `high` must."""
+    """Return the value from which on `fits` holds, on a logarithmic scale; it must hold
+    for `high`."""
     for _ in range(_HALVINGS):
         middle = math.sqrt(low * high)
         low, high = (low, middle) if fits(middle) else (middle, high)
@@ -125,7 +126,7 @@ def _bisect(fits: Callable[[float], bool], low: float, high: float) -> float:
 
 
 def like(values: Any, array: Any) -> Any:
-    """Values as an array of the same kind, type and device as another."""
+    """Return values as an array of the same kind, dtype and device as another."""
     if isinstance(array, np.ndarray):
         return np.asarray(values, array.dtype)
     import torch
@@ -134,11 +135,12 @@ def like(values: Any, array: Any) -> Any:
 
 
 def screen_radii(gaussians: Gaussians, camera: Camera) -> Any:
-    """(N,) px: half the larger side of the box in which gsplat 1.5 draws each gaussian;
-    0 outside of it.
+    """Return (N,) px: half the larger side of the box in which gsplat 1.5 draws each
+    gaussian; 0 for those it does not draw.
 
-    Its `radius_clip` leaves out what is not larger. It rounds radii up first; unrounded
-    ones leave room for any count, and to choose among what is of one size.
+    gsplat's `radius_clip` omits gaussians whose radius is not larger. gsplat rounds
+    radii up first; unrounded radii allow any count, and a choice among gaussians of one
+    rounded size.
     """
     library = _device.library_of(gaussians.means)
     viewmat = like(camera.viewmat, gaussians.means)
@@ -152,7 +154,7 @@ def screen_radii(gaussians: Gaussians, camera: Camera) -> Any:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     axes = library.stack([library.stack(row, -1) for row in rows], -2)
-    # Covariance in the view: halves halvesᵀ.
+    # Covariance in view space: halves halvesᵀ.
     halves = world_to_view @ (axes * gaussians.scales[:, None, :])
     centers, variances = [], []
     for axis, size, focal, principal in (
@@ -177,5 +179,5 @@ def screen_radii(gaussians: Gaussians, camera: Camera) -> Any:
 
 
 def clip_radius_for(radii: Any, count: int) -> float:
-    """The smallest clip, in px, that leaves at most `count` gaussians."""
+    """Return the smallest clip, in px, that leaves at most `count` gaussians."""
     return _bisect(lambda clip: int((radii > clip).sum()) <= count, 1e-3, 1e5)

@@ -1,4 +1,4 @@
-"""What every recorded result says of itself: commit, machine, versions, command."""
+"""The provenance in every recorded result: commit, machine, versions, command."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _LIBRARIES = ("numpy", "torch", "gsplat", "flip-evaluator")
 
 
 def provenance(device: str = "cpu") -> dict[str, Any]:
-    """Commit, command, processor, threads, instruction set, versions, and the GPU if
-    that is the device."""
+    """Return commit, command, processor, threads, instruction set, versions, and the
+    GPU if it is the device."""
     names = []
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -41,7 +41,7 @@ def provenance(device: str = "cpu") -> dict[str, Any]:
 
 
 def _command() -> str:
-    """As it was typed, without folders."""
+    """Return the command as it was typed, without folders."""
     words = [Path(word).name if os.sep in word else word for word in sys.argv]
     if words[0] == "__main__.py":
         words[0] = f"python -m {Path(sys.argv[0]).parent.name}"
@@ -49,8 +49,8 @@ def _command() -> str:
 
 
 def _commit() -> str:
-    """Of the checkout that this file is in, "-dirty" if that was changed; elsewhere
-    what V3DG_COMMIT says."""
+    """Return the commit of the checkout of this file, with "-dirty" if it was changed;
+    elsewhere the value of V3DG_COMMIT."""
     done = subprocess.run(
         ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"],
         capture_output=True,
@@ -68,7 +68,7 @@ def _version(library: str) -> str | None:
 
 
 def write(path: str | Path | None, result: dict[str, Any], device: str = "cpu") -> None:
-    """Write a result with its provenance as JSON, whole or not at all; to nowhere if
+    """Write a result with its provenance as JSON, completely or not at all; nothing if
     `path` is None."""
     if path is None:
         return

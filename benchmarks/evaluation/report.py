@@ -1,5 +1,5 @@
-"""`python -m benchmarks report`: from recorded results to a short page, a page of all
-tables, and plots."""
+"""`python -m benchmarks report`: turns recorded results into a short page, a page of
+all tables, and plots."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ HOW = (
 
 
 def read_results(folder: Path) -> dict[str, dict[str, Any]]:
-    """Results by part, in the order of parts.
+    """Return results by part, in the order of parts.
 
     Raises:
-        ValueError: There are none.
+        ValueError: There are no results.
     """
     paths = {name: folder / f"{name}.json" for name in NAMES}
     results = {
@@ -63,12 +63,13 @@ def read_results(folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def page(folders: Sequence[Path], output: Path, tables: Path) -> str:
-    """The short page: a table, a picture, and what each part comes to in a sentence.
+    """Return the short page: a table, a picture, and a sentence per part.
 
-    Pictures and the page of all tables are linked relative to where the page will be.
+    Pictures and the page of all tables are linked relative to the location of the page.
     """
     sections = [(folder, read_results(folder)) for folder in folders]
-    # The first folder counts; the others for parts that it does not have.
+    # Results of the first folder are used; those of others only for parts that it does
+    # not have.
     measured = {
         name: (folder, r) for folder, results in reversed(sections) for name, r in results.items()
     }
@@ -101,7 +102,7 @@ def page(folders: Sequence[Path], output: Path, tables: Path) -> str:
 
 
 def _overview(measured: dict[str, tuple[Path, dict[str, Any]]], output: Path) -> list[str]:
-    """The table and the picture that the short page opens with."""
+    """Return the table and the picture at the beginning of the short page."""
     lines = []
     if "composed" in measured:
         _, result = measured["composed"]
@@ -126,7 +127,8 @@ def _overview(measured: dict[str, tuple[Path, dict[str, Any]]], output: Path) ->
 def _sentences(
     measured: dict[str, tuple[Path, dict[str, Any]]], home: str
 ) -> tuple[list[str], list[str]]:
-    """Lists in Markdown of where we win and where we do not, in the order of parts."""
+    """Return lists in Markdown of where we win and where we do not, in the order of
+    parts."""
     wins: list[str] = []
     losses: list[str] = []
     for name in [name for name in NAMES if name in measured]:
@@ -139,7 +141,8 @@ def _sentences(
 
 
 def tables_page(folders: Sequence[Path], output: Path) -> str:
-    """The page of all tables; pictures are linked relative to where it will be."""
+    """Return the page of all tables; pictures are linked relative to the location of
+    the page."""
     lines = [
         "# The evaluation",
         "",
@@ -158,12 +161,12 @@ def tables_page(folders: Sequence[Path], output: Path) -> str:
 
 
 def place(result: dict[str, Any]) -> str:
-    """The device in a few words."""
+    """Return the device in a few words."""
     return str(result.get("gpu") or f"{result['threads']} CPU threads")
 
 
 def machine(results: Sequence[dict[str, Any]]) -> str:
-    """Device and versions of results from one machine, and all their commits."""
+    """Return device and versions of results from one machine, and all their commits."""
     first = results[0]
     where = first.get("gpu") or f"{first['threads']} threads of {first['processor']}"
     commits = list(dict.fromkeys(result["commit"] for result in results))
@@ -189,7 +192,7 @@ def _part_lines(name: str, result: dict[str, Any], link: Path, folder: Path) -> 
 
 
 def draw_plots(folder: Path) -> None:
-    """Write <part>.png for each result that has something to plot."""
+    """Write <part>.png for each result that has a plot."""
     from matplotlib.figure import Figure
 
     for name, result in read_results(folder).items():
@@ -201,7 +204,8 @@ def draw_plots(folder: Path) -> None:
 
 
 def written_by_hand(page: Path) -> str:
-    """The part of a page behind its marker, with the marker; empty without one."""
+    """Return the part of a page from its marker on, including the marker; empty if
+    there is none."""
     text = page.read_text(encoding="utf-8") if page.exists() else ""
     _, marker, rest = text.partition(BY_HAND)
     return "\n" + marker + rest if marker else ""

@@ -1,4 +1,4 @@
-"""How much each preset measures: all sizes in one place."""
+"""The amount of work of each preset: all sizes in one place."""
 
 from __future__ import annotations
 
@@ -10,35 +10,34 @@ class Settings:
     """Sizes of an evaluation.
 
     Attributes:
-        asset_gaussians: Of the asset that the main scene is made of, where none is
-            given.
-        instances: Of it in the main scene.
-        worlds: Instances and gaussians of an asset of the composed worlds beside the
+        asset_gaussians: Gaussians of the main scene's asset, unless one is given.
+        instances: Instances in the main scene.
+        worlds: Instances, and gaussians per asset, of the composed worlds besides the
             main scene.
-        world_steps: Of the fit of their assets.
+        world_steps: Steps of the fit of their assets.
         size: Width and height of pictures in px.
-        elevations: Degrees above the horizon of the cameras of "composed"; other parts
-            take the middle.
-        directions: How many of the paper's four directions "composed" looks from.
-        distances: Cameras a direction in "composed", and in "large".
-        sweep_distances: Cameras of the one sweep on which the other parts compare.
-        judged_directions: Of how many directions FLIP is taken, which needs a second a
-            picture.
-        repeats: Timed calls, of which the median counts ...
+        elevations: Elevations of the cameras of "composed", in degrees; other parts use
+            the middle one.
+        directions: How many of the paper's four directions "composed" uses.
+        distances: Cameras per direction in "composed", and in "large".
+        sweep_distances: Cameras of the single sweep that the other parts use.
+        judged_directions: Number of directions for which FLIP is computed, which takes
+            a second per picture.
+        repeats: Number of timed calls, of which the median is used ...
         composed_repeats: ... and in "composed", which has by far the most views.
-        steps: Of the fit, in "fit" and "levels"; the paper's \\*0 (nothing grown,
+        steps: Steps of the fit, in "fit" and "levels"; the paper's \\*0 (nothing grown,
             nothing fitted) is added.
-        tree_steps: Of the fit in "tree".
-        large_copies: Of the asset that make the one large asset.
-        large_steps: Of its fit.
-        motion_frames: Of the zoom.
-        hierarchy_instances: In the scene that is compared with single gaussians in a
-            hierarchy.
-        hard_gaussians: Of each hard asset.
-        counts: Gaussians of which the operations are measured alone.
-        close_views: From how many sides an asset is seen from near ...
+        tree_steps: Steps of the fit in "tree".
+        large_copies: Copies of the asset in the large asset.
+        large_steps: Steps of its fit.
+        motion_frames: Frames of the zoom.
+        hierarchy_instances: Instances in the scene that is compared with a hierarchy of
+            single gaussians.
+        hard_gaussians: Gaussians of each hard asset.
+        counts: Numbers of gaussians for which the operations are measured alone.
+        close_views: Number of sides from which an asset is seen from near ...
         close_px: ... in pictures of this side.
-        panel: Side in px of the pictures that are kept.
+        panel: Side in px of the pictures that are saved.
     """
 
     asset_gaussians: int

@@ -1,12 +1,12 @@
-"""How steady pictures of a moving camera are: paths, and what changes between frames
-that should not.
+"""Measures how steady the pictures of a moving camera are: paths, and the changes
+between frames that should not occur.
 
-What a frame is off, less what the frame before it was off, is what an eye sees beside
-the motion: flicker, and levels that are replaced at once. A whole picture hides that,
-for what pops is small; so the worst tile counts. Of quicker motion the same is found
-along the motion: the last error is brought to where its place is seen now, by the depth
-of the picture. What pops, and nothing else, is the difference of two pictures from the
-same place: with the cut of the frame, and with that of the frame before.
+The error of a frame minus the error of the frame before is what an eye sees besides the
+motion: flicker, and levels that are replaced at once. An average over the whole picture
+hides it, because pops are small; so the worst tile counts. For faster motion the
+difference is computed along the motion: the previous error is warped to the current
+picture by the depth. The pops alone are the difference of two pictures from the same
+position: with the cut of this frame, and with that of the frame before.
 """
 
 from __future__ import annotations
@@ -28,29 +28,30 @@ from v3dg.select import Selection, select
 
 TILE_PX = 16
 SUPERSAMPLING = 4
-_DRIFT = 5e-4  # of the distance, a frame: nothing else is seen to move
+_DRIFT = 5e-4  # per frame, as a fraction of the distance: nothing else appears to move
 _ZOOM = 5e-3
-_TURN = 5e-4  # rad a frame
-_SHAKE = 2e-3  # of the distance, to either side
-# Frames a wave of each of the two that make up a shaking hand, so that they do not
-# meet.
+_TURN = 5e-4  # radians per frame
+_SHAKE = 2e-3  # to either side, as a fraction of the distance
+# Frames per period of the two waves of a shaking hand; they differ, so that the waves
+# do not coincide.
 _WAVES = (7.3, 11.9)
-_BOB, _STEP_FRAMES = 2e-3, 30.0  # of who walks: of the distance, up and down, and frames a step
+# For walking: vertical motion as a fraction of the distance, and frames per step.
+_BOB, _STEP_FRAMES = 2e-3, 30.0
 _COVERED = 0.9  # alpha from which on a pixel has a depth
-_SAME_DEPTH = 0.02  # of the depth; what differs more was hidden before
+_SAME_DEPTH = 0.02  # fraction of the depth; a pixel that differs more was hidden before
 
-# Options of `Renderer.render`; or what gives them for a frame.
+# Options of `Renderer.render`, or a function that returns them for a frame.
 Options = dict[str, Any]
 Cut = Options | Callable[[Scene, Camera], Options]
 
 
 @dataclass(frozen=True)
 class Path:
-    """Cameras of frames that follow each other.
+    """Cameras of consecutive frames.
 
     Attributes:
-        is_drift: Whether all is so slow that an eye finds a pop.
-        moves: (F, 3) where all instances are moved to from where they were at first.
+        is_drift: Whether the motion is so slow that an eye notices pops.
+        moves: (F, 3) displacement of all instances from their initial positions.
     """
 
     name: str
@@ -59,17 +60,17 @@ class Path:
     moves: Any
 
     def seen_from(self, k: int) -> Camera:
-        """The camera of a frame as it would look at instances that had stayed."""
+        """Return the camera of a frame relative to instances that have not moved."""
         camera, shift = self.cameras[k], np.eye(4)
         shift[:3, 3] = self.moves[k]
         return replace(camera, viewmat=camera.viewmat @ shift)
 
 
 def paths_from(first: Camera, target: Any, frames: int) -> list[Path]:
-    """Ways to go from a camera that sees the target: so many frames each.
+    """Return paths from a camera that sees the target, with this many frames each.
 
-    It stays where it is in the picture, but where the camera turns; that need not be
-    the middle.
+    The target keeps its position in the picture, except where the camera rotates; it
+    need not be in the middle.
     """
     away = first.position - target
     right, down = first.viewmat[0, :3], first.viewmat[1, :3]
@@ -119,15 +120,14 @@ def paths_from(first: Camera, target: Any, frames: int) -> list[Path]:
 
 
 def true_picture(subject: Any, camera: Camera, device: str, samples: int = SUPERSAMPLING) -> Any:
-    """(H, W, 3) of all gaussians, floats in [0, 1], of so many samples a side that it
-    hardly flickers."""
+    """Return (H, W, 3) floats in [0, 1] of all gaussians, with enough samples per side
+    that the picture hardly flickers."""
     color = render(subject, camera.scaled(samples), tolerance=0.0, device=device).color
     return box_downsample(_device.to_host(color).clip(0, 1), samples)
 
 
 class Warp:
-    """Brings values of one picture to where their places are seen in another, by the
-    depths of both."""
+    """Warps values of one picture to another picture, by the depths of both."""
 
     def __init__(self, before: Camera, after: Camera, images: tuple[Any, Any]) -> None:
         (depth_before, alpha_before), (depth, alpha) = (
@@ -151,8 +151,8 @@ class Warp:
         self.is_valid &= np.abs(self(depth_before) - z) < _SAME_DEPTH * deep
 
     def __call__(self, values: Any) -> Any:
-        """(H, W, ...) values between those of the four nearest pixels; of no use where
-        it is not valid."""
+        """Return (H, W, ...) values interpolated between the four nearest pixels;
+        unusable where they are not valid."""
         height, width = values.shape[:2]
         x, y = np.clip(self._x, 0, width - 1), np.clip(self._y, 0, height - 1)
         left, top = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
@@ -175,8 +175,8 @@ class Steadiness:
         self._mse: list[float] = []
 
     def add(self, picture: Any, truth: Any, warp: Warp | None = None) -> None:
-        """Take the next frame: (H, W, 3) floats in [0, 1], and how the last one comes
-        to it."""
+        """Add the next frame, (H, W, 3) floats in [0, 1], and the warp from the last
+        frame."""
         error = _device.to_host(picture).clip(0, 1) - truth
         self._mse.append(float(np.square(error).mean()))
         if self._last is not None:
@@ -189,8 +189,8 @@ class Steadiness:
         self._last = error
 
     def row(self) -> Row:
-        """Root mean squares in 255ths: of whole pictures, and of the worst tile of
-        each; PSNR in dB."""
+        """Return root mean squares in units of 1/255, of whole pictures and of the
+        worst tile of each; PSNR in dB."""
         row = {
             "rms": round(float(np.mean(self._whole)), 4),
             "tile_mean": round(float(np.mean(self._worst_tile)), 4),
@@ -206,8 +206,8 @@ class Steadiness:
 
 
 def tile_means(values: Any) -> Any:
-    """Means of (H, W) values over the tiles of a picture; those at its right and bottom
-    may be smaller."""
+    """Return means of (H, W) values over the tiles of a picture; tiles at its right and
+    bottom may be smaller."""
     starts = [np.arange(0, side, TILE_PX) for side in values.shape]
     sums = np.add.reduceat(np.add.reduceat(values, starts[0], axis=0), starts[1], axis=1)
     height, width = (
@@ -217,13 +217,14 @@ def tile_means(values: Any) -> Any:
 
 
 def worst_tile(change: Any) -> float:
-    """Of (H, W, 3) differences of colours in [0, 1]: root mean square of the worst
-    tile, in 255ths."""
+    """Return the root mean square of the worst tile, in units of 1/255, of (H, W, 3)
+    differences of colours in [0, 1]."""
     return float(np.sqrt(tile_means(np.square(255.0 * change).mean(-1)).max()))
 
 
 def changed_items(before: Selection, after: Selection) -> int:
-    """How many pairs are drawn with another weight, or come or go."""
+    """Return the number of pairs that are drawn with another weight, appear or
+    disappear."""
     if np.array_equal(before.instance_ids, after.instance_ids) and np.array_equal(
         before.cluster_ids, after.cluster_ids
     ):
@@ -237,7 +238,7 @@ def changed_items(before: Selection, after: Selection) -> int:
 
 
 class _Follower:
-    """What is known of one way to draw a path."""
+    """The state of one way to draw a path."""
 
     def __init__(self, cut: Cut, scene: Scene, device: str) -> None:
         self._cut, self._scene, self._device = cut, scene, device
@@ -265,8 +266,10 @@ class _Follower:
         self._last = items
 
     def _pop(self, camera: Camera, *cuts: Selection) -> float:
-        """Worst tile of what two cuts differ by from the same place."""
-        # Not by the renderer of the path, whose budget goes on from its last frame.
+        """Return the worst tile of the difference of two cuts from the same
+        position."""
+        # This does not use the renderer of the path, whose budget continues from its
+        # last frame.
         pictures = (render(self._scene, camera, cut=cut, device=self._device).color for cut in cuts)
         before, after = map(_device.to_host, pictures)
         return worst_tile(after.clip(0, 1) - before.clip(0, 1))
@@ -293,13 +296,13 @@ def compare(
     along_motion: bool = True,
     samples: int = SUPERSAMPLING,
 ) -> list[Row]:
-    """Draw the frames of a path with several options of `render`: how steady they are,
-    gaussians a frame.
+    """Draw the frames of a path with several options of `render`; return steadiness,
+    and gaussians per frame.
 
     Args:
-        along_motion: Whether errors are followed, too, which draws all gaussians once
-            more.
-        samples: Of the true pictures, a pixel's side.
+        along_motion: Whether errors are also warped along the motion, which draws all
+            gaussians once more.
+        samples: Samples per side of a pixel of the true pictures.
     """
     scene = copy.copy(Scene.of(subject))
     start = scene.positions

@@ -1,4 +1,4 @@
-"""What a result says in a sentence."""
+"""The summary of a result in a sentence."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Summary:
-    """Sentences: where we win, by how much and at which error; and where we do not."""
+    """Sentences about where we win, by how much and at which error, and where we do
+    not."""
 
     wins: list[str] = field(default_factory=list)
     losses: list[str] = field(default_factory=list)

@@ -1,7 +1,7 @@
-"""Forward and backward on CUDA beside gsplat's, in one run: time, ratio, distance of
-the gradients.
+"""Forward and backward on CUDA in comparison with gsplat, in one run: time, ratio,
+distance of the gradients.
 
-With fewer gaussians in a smaller picture, both are also measured against float64 on the
+With fewer gaussians in a smaller picture, both are also compared with float64 on the
 CPU.
 """
 
@@ -80,7 +80,8 @@ def compare(config: Config, count: int) -> dict[str, Any]:
 
 
 def errors_to_float64(config: Config, count: int) -> dict[str, dict[str, float]]:
-    """Relative L2 distance of the gradients of each row, ours and gsplat's."""
+    """Return the relative L2 distance of the gradients of each row, ours and
+    gsplat's."""
     camera, gaussians, weights = inputs(config, count)
     exact = gradients_of(
         ours(config, camera),
@@ -97,7 +98,7 @@ def errors_to_float64(config: Config, count: int) -> dict[str, dict[str, float]]
 
 
 def inputs(config: Config, count: int) -> tuple[Camera, v3dg.Gaussians, tuple[Any, ...]]:
-    """A camera, gaussians, and the random weights of colour and alpha whose weighted
+    """Return a camera, gaussians, and random weights of colour and alpha; the weighted
     sum is the loss."""
     camera = Camera.look_at((0, 0, 0), (0, 1, 0), width=config.width, height=config.height)
     gaussians = like_trained(count, camera, gpu.DEVICE, sh_degree=config.sh_degree)
@@ -124,7 +125,8 @@ def gsplats(config: Config, camera: Camera, packed: bool) -> Draw:
 def measure(
     draw: Draw, gaussians: v3dg.Gaussians, weights: tuple[Any, ...], repeats: int
 ) -> tuple[float, float, dict[str, Any]]:
-    """Milliseconds forward, and forward and backward, and the gradients of the rows."""
+    """Return milliseconds forward, and forward and backward, and the gradients of the
+    rows."""
     leaves = with_gradients(gaussians)
     forward_ms = time_ms(lambda: draw(leaves), gpu.DEVICE, repeats).median
     total_ms = time_ms(lambda: gradients_of(draw, leaves, weights), gpu.DEVICE, repeats).median

@@ -1,8 +1,8 @@
-"""Build bundles: seconds and GPU memory on each device, beside the error of the picture
-that they give.
+"""Builds of bundles: seconds and GPU memory on each device, and the error of the
+resulting picture.
 
 Parts: "default" and "paper" build the asset with our settings and the paper's; "split"
-orders the points of many copies of it, and "large" builds them as one asset. With a
+sorts the points of many copies of it, and "large" builds them as one asset. With a
 layout of instances and its true picture, the first two are also drawn at several
 numbers of gaussians in the frustum.
 """
@@ -28,7 +28,7 @@ from v3dg import _core, metrics
 from v3dg.bundle import Bundle
 from v3dg.levels import BuildConfig, build_bundle
 
-# px², past which every instance is drawn from its last level.
+# px²; above it every instance is drawn from its last level.
 _MOST_TOLERANCE = 1e4
 
 Part = Literal["default", "paper", "split", "large"]
@@ -42,15 +42,16 @@ class Config:
     asset: Path | None = None
     """A .ply file; by default the procedural asset."""
     copies: int = 285
-    """Of the asset, in "split" and "large"; 285 donuts are 13 million gaussians."""
+    """Copies of the asset in "split" and "large"; 285 donuts are 13 million
+    gaussians."""
     layout: Path | None = None
     """A layout of instances of that asset."""
     truth: Path | None = None
     """The true picture of its camera."""
     camera: int = 59
     in_frustum: tuple[float, ...] = (2.9e6, 5.7e6, 11.5e6, 22.9e6)
-    """How many gaussians to draw, as far as the bundle goes down; the tolerance is
-    searched."""
+    """Numbers of gaussians to draw, as far as the bundle permits; the tolerance is
+    searched for."""
     repeats: int = 3
     output: str | None = None
 
@@ -77,8 +78,8 @@ def main(config: Config) -> None:
 def build(
     asset: v3dg.Gaussians, settings: BuildConfig, device: str, repeats: int
 ) -> tuple[dict[str, Any], Bundle]:
-    """Median over the repeats; the first run of a process also loads the kernels, so
-    there is one more."""
+    """Return the median over the repeats; the first run of a process also loads the
+    kernels, so there is one more."""
     seconds = []
     with gpu.PeakMemory() as peak:
         for _ in range(repeats + (repeats > 1)):
@@ -121,8 +122,8 @@ def split(means: Any, device: str, repeats: int) -> dict[str, Any]:
 
 
 def pictures(bundle: Bundle, config: Config) -> list[dict[str, Any]]:
-    """FLIP and PSNR of the layout from this bundle, by the number of gaussians in the
-    frustum."""
+    """Return FLIP and PSNR of the layout with this bundle, by the number of gaussians
+    in the frustum."""
     if config.layout is None or config.truth is None:
         return []
     scene, cameras = read_layout(config.layout, bundle)
@@ -138,7 +139,7 @@ def pictures(bundle: Bundle, config: Config) -> list[dict[str, Any]]:
         if wanted < least:
             continue
         low, high = math.log(1e-3), math.log(_MOST_TOLERANCE)
-        for _ in range(24):  # more gaussians at a lower tolerance
+        for _ in range(24):  # a lower tolerance has more gaussians
             middle = (low + high) / 2
             if draw(math.exp(middle)).stats.gaussians_in_frustum > wanted:
                 low = middle

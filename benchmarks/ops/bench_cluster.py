@@ -1,5 +1,5 @@
-"""How fast assets are cut into clusters, bounded, halved for a coarser level, and
-gathered from instances."""
+"""The speed of cutting assets into clusters, bounding them, halving them for a coarser
+level, and gathering them from instances."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Config:
     num_gaussians: int = 1_000_000
     cluster_size: int = 256
     group_size: int = 397
-    """Gaussians of a group that are halved together."""
+    """Number of gaussians in a group, which are halved together."""
     sh_degree: int = 0
     instances: int = 4
     device: Literal["cpu", "cuda"] = "cpu"
@@ -32,7 +32,7 @@ class Config:
 
 
 def random_gaussians(num: int, degree: int, seed: int) -> v3dg.Gaussians:
-    """On a bumpy shell, as what has been scanned is."""
+    """Return gaussians on a bumpy shell, like a scanned object."""
     rng = np.random.default_rng(seed)
     means = rng.standard_normal((num, 3), np.float32)
     means /= np.linalg.norm(means, axis=1, keepdims=True)
@@ -47,7 +47,7 @@ def random_gaussians(num: int, degree: int, seed: int) -> v3dg.Gaussians:
 
 
 def placements(leaf_offset: np.ndarray, config: Config) -> dict[str, Any]:
-    """Every cluster, in each of some instances."""
+    """Return every cluster, in each of some instances."""
     rng = np.random.default_rng(config.seed)
     count, sizes = config.instances, np.tile(np.diff(leaf_offset), config.instances)
     quaternions = rng.standard_normal((count, 4))
@@ -69,8 +69,8 @@ def placements(leaf_offset: np.ndarray, config: Config) -> dict[str, Any]:
 def operations(
     gaussians: v3dg.Gaussians, config: Config
 ) -> dict[str, tuple[int, Callable[[], tuple[Any, ...]]]]:
-    """What is timed, by name: how many gaussians go in, and a call that returns
-    arrays."""
+    """Return the operations by name: the number of input gaussians, and a call that
+    returns arrays."""
     num = len(gaussians)
     ends, depth = np.array([0, num]), _core.num_halvings(num, config.cluster_size)
     order, leaf_offset = _core.median_split(gaussians.means, ends, depth)
@@ -109,7 +109,7 @@ def to_host(array: Any) -> Any:
 
 
 def check_against_cpu(config: Config) -> None:
-    """Both devices have to give the same bits."""
+    """Check that both devices give the same bits."""
     small = random_gaussians(min(config.num_gaussians, 100_000), config.sh_degree, config.seed)
     on_cpu = operations(small, Config(**{**vars(config), "device": "cpu"}))
     on_device = operations(small.torch(config.device), config)

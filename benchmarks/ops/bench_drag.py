@@ -1,9 +1,9 @@
-"""The viewer under a mouse in Chromium on the same cores: milliseconds from a drag's
-move to its answer.
+"""The viewer with a mouse in Chromium on the same cores: milliseconds from a move to
+its answer.
 
-That is the frame that shows the first picture of the new camera. The server is a
-process of its own, `v3dg view`. Drags begin while the picture at rest is being refined,
-or has just come. Needs playwright, and Chromium where PATH finds it.
+The answer is the browser's frame that shows the first picture of the new camera. The
+server is a separate process, `v3dg view`. Drags begin while the picture at rest is
+being refined, or has just arrived. Needs playwright, and Chromium in PATH.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"
 
 import chromium
 
-# What the page does, by its own clock.
+# Events on the page, with times of its own clock.
 _NOTE = """() => {
     window.log = [];
     const show = viewer.picture.show.bind(viewer.picture);
@@ -44,11 +44,12 @@ _MOVES = 45
 class Config:
     scene: Path
     cameras: tuple[int, ...] = (3, 10, 19, 59)
-    """Places in the file of the cameras to drag from."""
+    """Indices, in the file, of the cameras to drag from."""
     drags: int = 8
-    """From each camera."""
+    """Drags per camera."""
     webgl: bool = False
-    """Have Chromium compose the page with WebGL in software; else it does so without.
+    """Whether Chromium composes the page with WebGL in software; otherwise without
+    WebGL.
     """
     output: str | None = None
     """JSON file for the result."""
@@ -93,8 +94,8 @@ def main(config: Config) -> None:
 
 
 def drags_from(page: Any, camera: int, drags: int) -> dict[str, Any]:
-    """Answers to drags from a camera of the file, gaps between later pictures, widths
-    of the first ones."""
+    """Return the times of answers to drags from a camera of the file, gaps between
+    later pictures, and widths of the first ones."""
     page.evaluate(f"viewer.fileCameras.lookThrough({camera})")
     page.wait_for_timeout(2500)
     answers, gaps, widths = [], [], []

@@ -1,9 +1,8 @@
-"""Our CUDA frame beside gsplat's, in one run: time, ratio, and how far the two pictures
-are apart.
+"""Our CUDA frame in comparison with gsplat's, in one run: time, ratio, and the
+difference of the pictures.
 
 Scenes: a layout of instances in full detail (gsplat gets all of them in the world),
-random gaussians of the sizes that training leaves, and one asset that fills the
-picture.
+random gaussians of the sizes of training, and one asset that fills the picture.
 """
 
 from __future__ import annotations
@@ -34,14 +33,14 @@ class Config:
     layout: Path | None = None
     """A layout of instances of that asset; without one, that part is left out."""
     cameras: tuple[int, ...] = (45, 50, 55, 59)
-    """Which cameras of the layout."""
+    """Indices of the layout's cameras."""
     counts: tuple[int, ...] = (1_000_000, 4_000_000, 20_000_000)
-    """How many random gaussians."""
+    """Number of random gaussians."""
     width: int = 1920
     height: int = 1080
     repeats: int = 11
     gsplat: bool = True
-    """Measure gsplat too, packed and not; the faster one counts."""
+    """Also measure gsplat, packed and not; the faster one counts."""
     output: str | None = None
 
 
@@ -70,7 +69,7 @@ def main(config: Config) -> None:
 
     asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
     if config.layout is not None:
-        # One level is all that is drawn.
+        # The bundle has a single level, because only that is drawn.
         bundle = build_bundle(
             asset, config=BuildConfig(min_clusters=1 << 30), progress=False, device="cpu"
         )

@@ -1,9 +1,9 @@
-"""Scenes of many instances on a GPU: frames beside gsplat's, error, memory, movement,
-budgets.
+"""Scenes of many instances on a GPU: frames in comparison with gsplat, error, memory,
+movement, budgets.
 
 Two parts: a layout of instances of one asset, with a range of its cameras, and fields
-of very many instances in view at once, whose error is measured on crops, since nothing
-draws all of them in full.
+of very many visible instances. The error of fields is measured on crops, because
+nothing can draw all of their gaussians.
 """
 
 from __future__ import annotations
@@ -52,20 +52,20 @@ class Config:
     tolerances: tuple[float, ...] = (DEFAULT_TOLERANCE, 9.0, 9.4)
     budget: int = 3_000_000
     fields: tuple[int, ...] = (100_000, 2_000_000)
-    """Instances of each field."""
+    """Numbers of instances of the fields."""
     crops: int = 4
-    """Crops of a field, each of 64 x 36 px, on which it is compared with all of its
-    gaussians."""
+    """Number of crops of a field, each of 64 x 36 px, on which it is compared with all
+    of its gaussians."""
     repeats: int = 11
     refine: int = 0
-    """Steps by which the levels are refined together, too."""
+    """Numbers of steps of refinements, which are also measured."""
     gsplat: bool = True
     output: str | None = None
 
 
 def main(config: Config) -> None:
     asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
-    with gpu.PeakMemory():  # takes note of an idle process
+    with gpu.PeakMemory():  # measures an idle process
         torch.zeros(1, device=gpu.DEVICE)
     bundle = build_bundle(asset, progress=False, device=gpu.DEVICE)
     result: dict[str, Any] = {"repeats": config.repeats, "refine": config.refine}
@@ -82,7 +82,7 @@ def main(config: Config) -> None:
 
 
 def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge) -> Row:
-    # All that is timed comes before pictures are judged, which takes every core.
+    # Everything that is timed comes before pictures are judged, which uses every core.
     runs = [frames(scene, cameras, {"tolerance": t}, config.repeats) for t in config.tolerances]
     runs.append(frames(scene, cameras, {"budget": config.budget}, config.repeats))
     moving = movement(scene, cameras[-1], config)
@@ -130,8 +130,8 @@ def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge
 def frames(
     scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], repeats: int
 ) -> tuple[Row, list[Picture]]:
-    """Every camera, near to far, with one renderer: as a flight through the scene finds
-    it."""
+    """Return the frames of every camera, near to far, with one renderer, as in a flight
+    through the scene."""
     ms, device_ms, select_ms, counts = [], [], [], []
     renderer, gigabytes = drawn_before(scene, cameras, options, repeats)
     for camera in cameras:
@@ -146,8 +146,8 @@ def frames(
         device_ms.append(statistics.median(s.select_ms + s.draw_ms for s in stats))
         select_ms.append(statistics.median(s.select_ms for s in stats))
         counts.append(stats[-1].gaussians_in_frustum)
-    # Not before, for what a picture takes beside its frame is not the renderer's
-    # memory.
+    # Pictures come last, because their memory besides the frame's is not the
+    # renderer's.
     pictures = [to_8bit(renderer.render(camera, **options).color) for camera in cameras]
     row = {
         **options,
@@ -166,8 +166,8 @@ def frames(
 def drawn_before(
     scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], repeats: int
 ) -> tuple[Renderer, float]:
-    """A renderer that has drawn from every camera, and the most memory that took; no
-    frame is timed then."""
+    """Return a renderer that has drawn every camera, and its peak memory; no frame is
+    timed afterwards."""
     with gpu.PeakMemory() as peak:
         renderer = Renderer(scene, device=gpu.DEVICE)
         for camera in cameras:
@@ -177,8 +177,8 @@ def drawn_before(
 
 
 def gigabytes_alone(bundle: v3dg.Bundle, config: Config) -> list[float]:
-    """Of each tolerance, what a process takes on the device that draws the layout and
-    has built nothing."""
+    """Return, for each tolerance, the memory of a process that draws the layout and has
+    built nothing."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "levels.v3dg"
         bundle.write(path)
@@ -187,7 +187,7 @@ def gigabytes_alone(bundle: v3dg.Bundle, config: Config) -> list[float]:
 
 
 def _drawing_gigabytes(path: Path, config: Config, tolerance: float) -> float:
-    torch.zeros(1, device=gpu.DEVICE)  # as an idle process has
+    torch.zeros(1, device=gpu.DEVICE)  # as in an idle process
     assert config.layout is not None
     scene, cameras = read_layout(config.layout, v3dg.Bundle.open(path))
     chosen = list(cameras.values())[slice(*config.cameras)]
@@ -195,13 +195,13 @@ def _drawing_gigabytes(path: Path, config: Config, tolerance: float) -> float:
 
 
 def flight(scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], repeats: int) -> Row:
-    """Each camera on its way to the side, by 0.5 % of its distance to the middle of the
-    scene a frame."""
+    """Return frames in which each camera moves sideways, by 0.5 % per frame of its
+    distance to the middle of the scene."""
     renderer, middle = Renderer(scene, device=gpu.DEVICE), scene.positions.mean(axis=0)
     ms = []
     for camera in cameras:
         step = _STEP * float(np.linalg.norm(camera.position - middle))
-        # Made before, as all cameras are: a frame goes from the call to the finished
+        # Cameras are made before: a frame is measured from the call to the finished
         # picture.
         views = iter([_aside(camera, step * k) for k in range(3 + repeats)])
 
@@ -219,7 +219,7 @@ def _aside(camera: Camera, distance: float) -> Camera:
 
 
 def movement(scene: Scene, camera: Camera, config: Config) -> Row:
-    """What it costs that every instance has another place and rotation in every
+    """Return the cost of giving every instance another position and rotation in every
     frame."""
     renderer = Renderer(scene, device=gpu.DEVICE)
     tolerance = config.tolerances[-1]
@@ -260,7 +260,7 @@ def gsplat(
 
 
 def field(bundle: v3dg.Bundle, count: int, config: Config, judge: Judge) -> Row:
-    """Instances at random turns and sizes on a square, all in view."""
+    """Return instances with random rotations and sizes on a square, all visible."""
     rng = np.random.default_rng(0)
     side = math.isqrt(count - 1) + 1
     means = bundle.level_gaussians(0).means

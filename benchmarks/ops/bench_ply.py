@@ -1,4 +1,4 @@
-"""How fast .ply files are read and written, and how much memory that takes."""
+"""The speed and memory use of reading and writing .ply files."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def random_gaussians(num: int, degree: int, seed: int) -> v3dg.Gaussians:
 
 
 def peak_growth(run: Callable[[], object]) -> int:
-    """Bytes that the process grows by, at most, while `run` runs (Linux)."""
+    """Return the peak growth of the process in bytes while `run` runs (Linux)."""
 
     def status(key: str) -> int:
         lines = Path("/proc/self/status").read_text().splitlines()
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(key))
 
-    Path("/proc/self/clear_refs").write_text("5")  # forgets the peak so far
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak
     start = status("VmRSS")
     run()
     return status("VmHWM") - start

@@ -1,5 +1,5 @@
-"""One asset that fills the picture: frames a second, stages of a frame, and its error
-to double precision."""
+"""One asset that fills the picture: frames per second, stages of a frame, and the error
+against double precision."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ class Config:
 
 
 def camera_that_fills(gaussians: v3dg.Gaussians, width: int, height: int) -> Camera:
-    """Look at the asset from above its front, so that it fills a picture."""
+    """Return a camera that looks at the asset from the front and above, so that it
+    fills a picture."""
     low, high = np.quantile(gaussians.means, [0.01, 0.99], axis=0)
     center, extent = (low + high) / 2, np.linalg.norm(high - low)
     eye = center + extent * np.array([0.0, -0.42, 0.7])

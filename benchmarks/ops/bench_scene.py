@@ -1,7 +1,7 @@
-"""A layout of many instances from a bundle: Gaussians, time and error of a frame, for
+"""A layout of many instances of a bundle: gaussians, time and error of a frame, for
 several tolerances.
 
-Truth is a picture given by path, or the full asset drawn at twice the size and
+The true picture is given by its path, or is the full asset drawn at twice the size and
 box-averaged.
 """
 
@@ -27,7 +27,7 @@ class Config:
     bundle: Path
     layout: Path
     camera: int = 59
-    """Which camera of the layout."""
+    """Index of the layout's camera."""
     tolerances: tuple[float, ...] = (8.0, 4.4, 3.0, 2.0)
     truth: Path | None = None
     repeats: int = 3

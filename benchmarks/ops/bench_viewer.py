@@ -1,8 +1,8 @@
-"""The viewer under a mouse: milliseconds from a camera's move to the picture that
+"""The viewer with a mouse: milliseconds from a camera's move to the picture that
 answers it.
 
-A client of our own speaks the browser's protocol over a socket of this machine, so all
-but the browser's own work is measured. Each drag orbits the scene, and begins while the
+A client in Python speaks the browser's protocol over a local socket, so everything but
+the browser's own work is measured. Each drag orbits the scene, and begins while the
 picture at rest is being refined.
 """
 
@@ -35,13 +35,13 @@ MOVES_A_SECOND = 60
 class Config:
     scene: Path
     cameras: tuple[int, ...] = (3, 10, 19, 59)
-    """Places in the file of the cameras to drag from."""
+    """Indices, in the file, of the cameras to drag from."""
     drags: int = 8
-    """From each camera."""
+    """Drags per camera."""
     seconds: float = 1.5
     """Length of a drag."""
     size: tuple[int, int] = (1600, 900)
-    """Of the browser's window, px."""
+    """Size of the browser's window, px."""
     device: str = "cpu"
     output: str | None = None
     """JSON file for the result."""
@@ -70,13 +70,13 @@ def main(config: Config) -> None:
 def drag_around(
     browser: Tab, view: View, target: np.ndarray, config: Config, rng: np.random.Generator
 ) -> dict:
-    """Answers to drags around the target."""
+    """Return the times of answers to drags around the target."""
     eye, angle = np.array(view.position), 0.0
     answers, gaps, widths = [], [], []
     browser.look(view, config.size)
     settle(browser, config.size)
     for _ in range(config.drags):
-        # Whose refinement the drag interrupts.
+        # The drag interrupts the refinement of this picture.
         browser.look(turned(eye, target, angle, view), config.size)
         until = time.perf_counter() + rng.uniform(0.3, 1.5)
         browser.pictures(until)
@@ -87,7 +87,7 @@ def drag_around(
             browser.look(turned(eye, target, angle, view), config.size)
             for at, picture in browser.pictures(begin + (move + 1) / MOVES_A_SECOND):
                 if picture.width > 0.8 * config.size[0] and not answered:
-                    continue  # was under way when the drag began
+                    continue  # in progress when the drag began
                 (gaps if answered else answers).append(1e3 * (at - (last if answered else begin)))
                 answered, last = True, at
                 widths.append(picture.width)
@@ -109,7 +109,8 @@ def summary(values: list[float]) -> dict[str, float]:
 
 
 def turned(eye: np.ndarray, target: np.ndarray, angle: float, view: View) -> View:
-    """The view from the eye turned about the upright line through the target."""
+    """Return the view from the eye, rotated about the vertical line through the
+    target."""
     x, y, z = eye - target
     c, s = math.cos(angle), math.sin(angle)
     moved = target + np.array([c * x - s * y, s * x + c * y, z])

@@ -1,9 +1,9 @@
-"""What a build of so many gaussians needs, computed from its plan: nothing is built,
-and no time is told.
+"""The resources of a build of a given size, computed from its plan: nothing is built,
+and no time is measured.
 
-Sizes are in bytes. `disk` is what is on it at once; `read` and `written` is all of it,
-without what a build that is gone on with reads again. `host` is without the interpreter
-and its libraries, about 0.1 GB.
+Sizes are in bytes. `disk` is the peak on disk; `read` and `written` are totals, without
+what a continued build reads again. `host` excludes the interpreter and its libraries,
+about 0.1 GB.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from v3dg.levels.whole import UNIT_LEAVES
 @dataclass
 class Config:
     millions: tuple[float, ...] = (1, 10, 100, 1000)
-    """Gaussians of each build."""
+    """Numbers of gaussians of the builds."""
     sh_degree: tuple[int, ...] = (0, 3)
     memory: str = "8GiB"
-    """What each may use of the host."""
+    """Host memory that each build may use."""
 
 
 def main(options: Config) -> None:
@@ -42,7 +42,7 @@ def main(options: Config) -> None:
 
 
 def needs(num_gaussians: int, sh_degree: int, memory: str) -> dict[str, Any]:
-    """Counts and bytes of a build, as JSON values."""
+    """Return counts and bytes of a build, as JSON values."""
     config = BuildConfig()
     plan = Plan.of(num_gaussians, config)
     units = plan.units(UNIT_LEAVES)
@@ -94,7 +94,7 @@ def arrays_of(level: LevelPlan) -> list[Any]:
 
 
 def record_bytes(num_clusters: int, num_groups: int) -> int:
-    """Boxes, two balls and the error: what is measured of a level."""
+    """Return the size of a level's record: boxes, two balls and the error."""
     return 24 * num_clusters + 40 * num_groups
 
 

@@ -1,12 +1,12 @@
-"""Frames drawn from codes beside frames drawn from float32 rows, on a GPU;
+"""Frames drawn from codes in comparison with frames from float32 rows, on a GPU;
 docs/notes/experiments/2026-11-22-codecs-drawing.md has results.
 
     python -m benchmarks.studies.code_frames donut.ply donutsea.json NAME=OTHER.ply
 
-For the scene and, alone, for each asset: bytes on the GPU for each stored gaussian,
-frame times by turns (of the device and of the wall clock), times of the project stage,
-whether pictures from codes have the bits of pictures of a float32 bundle that holds the
-decoded rows, and how far they are from those of what was built.
+For the scene, and for each asset alone: bytes on the GPU per stored gaussian; frame
+times in alternation (of the device and of the wall clock); times of the project stage;
+whether pictures from codes have the bits of pictures of a float32 bundle with the
+decoded rows; and their difference to those of the original bundle.
 """
 
 from __future__ import annotations
@@ -36,9 +36,10 @@ class Config:
     more: tyro.conf.Positional[tuple[str, ...]] = ()
     """Further assets, each as NAME=FILE."""
     rounds: int = 30
-    """Frames of each kind at each view."""
+    """Number of frames of each kind in each view."""
     decodes_once: bool = False
-    """Decode small bundles once, as renderers do; else all are drawn from codes."""
+    """Whether small bundles are decoded once, as renderers do; otherwise all are drawn
+    from codes."""
 
 
 def memory():
@@ -48,7 +49,8 @@ def memory():
 
 
 def kinds_of(gaussians):
-    """float32 as it is built; codes of it; float32 of what those are decoded to."""
+    """Return the float32 bundle as built, its codes, and a float32 bundle of the
+    decoded codes."""
     built = v3dg.build_bundle(gaussians, device=DEVICE, progress=False)
     codes = Bundle(built.clusters, built.groups, built.gaussians, codec="quantized")
     rows = Bundle(codes.clusters, codes.groups, codes.gaussians)
@@ -60,7 +62,7 @@ def bytes_of(bundle):
     torch.cuda.empty_cache()
     before = memory()
     model, table = residency.model(bundle, _device.resolve(DEVICE)), residency.table(bundle)
-    placed = residency.scene(bundle, _device.resolve(DEVICE))  # which puts the tables there
+    placed = residency.scene(bundle, _device.resolve(DEVICE))  # this puts the tables there
     resident = model.bytes + table.bytes_on(0)
     done = {
         "bytes": resident,
@@ -144,8 +146,8 @@ def compared(subjects, cameras, options, rounds):
 
 
 def views_of(gaussians):
-    """Cameras around an asset, at 1, 2.5 and 8 of the radii that hold 9 of 10
-    gaussians."""
+    """Return cameras around an asset, at distances of 1, 2.5 and 8 radii of the ball
+    with 9 of 10 gaussians."""
     means = np.asarray(gaussians.means, np.float64)
     centre = np.median(means, axis=0)
     radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.9))

@@ -1,4 +1,4 @@
-"""What a bundle's codec costs in bytes and in pictures.
+"""The cost of a bundle's codec in bytes and in pictures.
 
 docs/notes/experiments/2026-11-22-codecs-error-and-size.md has results.
 
@@ -6,10 +6,9 @@ docs/notes/experiments/2026-11-22-codecs-error-and-size.md has results.
 
 Each asset, or the part of it that is nearest to its middle, is built with each codec.
 Pictures of bundles are drawn at the default tolerance from four sides at four
-distances. `psnr` compares the float32 bundle, converted, with itself: the codec's error
-alone. `flip` is that to the whole asset, drawn with several samples a pixel, of
-pictures of 8 bits: of the bundle that was built with each codec, and of the converted
-one.
+distances. `psnr` compares the float32 bundle with its own conversion: the codec's error
+alone. `flip` compares 8-bit pictures with the whole asset, drawn with several samples
+per pixel: for the bundle built with each codec, and for the converted one.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from v3dg.bundle.codec import CODECS
 from v3dg.metrics import box_downsample, flip, psnr
 from v3dg.pictures import to_8bit
 
-DISTANCES = (1.0, 2.5, 8.0, 25.0)  # of the camera, in radii that hold 9 of 10 gaussians
+DISTANCES = (1.0, 2.5, 8.0, 25.0)  # of the camera, in radii of the ball with 9 of 10 gaussians
 WIDTH, HEIGHT = 480, 360
 
 
@@ -38,15 +37,15 @@ class Config:
     assets: tuple[Path, ...]
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     most: int = 100_000
-    """Gaussians that are taken of an asset."""
+    """Largest number of gaussians taken from an asset."""
     steps: int = 600
-    """Most steps of the fits."""
+    """Maximum number of steps of the fits."""
     samples: int = 3
-    """A side of a pixel, for the truth."""
+    """Samples per side of a pixel of the true pictures."""
 
 
 def part_of(asset: v3dg.Gaussians, most: int) -> v3dg.Gaussians:
-    """The gaussians nearest to the median of all, in their order."""
+    """Return the gaussians nearest to the median position, in their order."""
     if len(asset) <= most:
         return asset
     distance = np.linalg.norm(asset.means - np.median(asset.means, axis=0), axis=1)
@@ -56,7 +55,8 @@ def part_of(asset: v3dg.Gaussians, most: int) -> v3dg.Gaussians:
 def cameras_of(
     asset: v3dg.Gaussians, up: Sequence[float], distance: float, samples: int = 1
 ) -> list[v3dg.Camera]:
-    """Four cameras around the asset, for pictures that are `samples` times larger."""
+    """Return four cameras around the asset, for pictures that are `samples` times
+    larger."""
     centre = np.median(asset.means, axis=0).astype(np.float64)
     radius = np.quantile(np.linalg.norm(asset.means - centre, axis=1), 0.9)
     axis = np.asarray(up) / np.linalg.norm(up)
@@ -76,7 +76,7 @@ def pictures(subject: Any, cameras: Sequence[v3dg.Camera]) -> list[Any]:
 
 
 def mean_psnr(references: Sequence[Any], tests: Sequence[Any]) -> float:
-    """Of the mean of the squared errors of all pictures."""
+    """Return the PSNR of the mean squared error over all pictures."""
     errors = [10 ** (-psnr(a, b) / 10) for a, b in zip(references, tests, strict=True)]
     return round(-10 * float(np.log10(np.mean(errors))), 2)
 

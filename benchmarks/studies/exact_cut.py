@@ -1,7 +1,7 @@
-"""Count how often a path from a leaf to a root has not exactly one selected cluster: it
-must be never.
+"""Counts the paths from a leaf to a root on which not exactly one cluster is selected.
+There must be none.
 
-What a trial is, and how it is counted, is in tests/support/exact_cut.py.
+tests/support/exact_cut.py defines a trial and how it is counted.
 """
 
 from __future__ import annotations

@@ -1,16 +1,16 @@
-"""Where a frame's time goes on a GPU: each kernel of it, beside the frame and a digest
+"""The time of each kernel of a frame on a GPU, with the time of the frame and a digest
 of its picture.
 
     python -m benchmarks.studies.frame_kernels --layout donutsea.json --asset donut.ply
     \\
         --captured ASSETS --names Fungi -o frame_kernels_h200
 
-ASSETS is a folder as `pairs` has it. A captured asset is drawn whole, and with levels
-at the default tolerance, random gaussians whole, instances of a layout with levels at
-two tolerances, and whole. A frame is counted from an idle device to an idle device,
-Python included, the median of 25; kernels are the means of a dozen frames under torch's
-profiler. To compare two versions, run it with each in turn on one machine: digests tell
-whether they draw the same bits.
+ASSETS is a folder as for `pairs`. Captured assets are drawn completely, and with levels
+at the default tolerance; random gaussians completely; instances of a layout with levels
+at two tolerances, and completely. A frame is measured from idle device to idle device,
+Python included, as the median of 25; kernel times are means over a dozen frames under
+torch's profiler. To compare two versions, run it with each in alternation on one
+machine: equal digests show that they draw the same bits.
 """
 
 from __future__ import annotations
@@ -36,8 +36,7 @@ from v3dg.cameras import Camera
 
 Row = dict[str, Any]
 Frame = tuple[str, Any, Camera, float | None]
-"""Its name, what draws it, from where, and a tolerance, or None where there are no
-levels."""
+"""Name, renderer, camera, and tolerance, or None if there are no levels."""
 
 _WARM_UPS, _FRAMES, _PROFILED = 4, 25, 12
 _TOLERANCES = 9.4, 3.0
@@ -50,15 +49,15 @@ class Config:
     layout: Path | None = None
     """A layout of instances of that asset; without one, that part is left out."""
     cameras: tuple[int, ...] = (40, 45, 50, 55, 59)
-    """Which cameras of the layout."""
+    """Indices of the layout's cameras."""
     captured: Path | None = None
     """A folder with assets.json; without one, that part is left out."""
     names: tuple[str, ...] = ()
-    """Assets of that folder."""
+    """Names of assets in that folder."""
     counts: tuple[int, ...] = (1_000_000, 4_000_000)
-    """How many random gaussians."""
+    """Number of random gaussians."""
     widths: tuple[int, ...] = (1920, 3840)
-    """px; pictures of captured assets and random gaussians are 16 : 9."""
+    """Width in px; pictures of captured assets and random gaussians are 16 : 9."""
     output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
     """File of the results."""
 
@@ -114,7 +113,7 @@ def _sized(
 
 
 def measure(frame: Frame) -> Row:
-    """Milliseconds of the frame and of its kernels, and what it draws."""
+    """Return milliseconds of the frame and of its kernels, and its statistics."""
     import torch
     from torch.profiler import ProfilerActivity, profile
 
@@ -123,7 +122,7 @@ def measure(frame: Frame) -> Row:
 
     def draw() -> Any:
         image = renderer.render(camera, **options)
-        return image, image.stats  # which waits for it
+        return image, image.stats  # waits for the picture
 
     for _ in range(_WARM_UPS):
         image, stats = draw()
@@ -145,7 +144,7 @@ def measure(frame: Frame) -> Row:
 
 
 def _short(name: str) -> str:
-    """A kernel's name without its namespaces and arguments."""
+    """Return a kernel's name without its namespaces and arguments."""
     found = re.findall(r"(\w+)(?:<|\(|$)", name.replace("(anonymous namespace)::", ""))
     return found[0].removesuffix("_kernel") if found else name
 

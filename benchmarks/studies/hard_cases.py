@@ -1,12 +1,12 @@
-"""How far float32 is from float64 in tests/support/hard_cases.py: histograms of errors,
-and docs/numerics.md.
+"""The errors of float32 against float64 in tests/support/hard_cases.py: histograms, and
+the table of docs/numerics.md.
 
     python -m benchmarks.studies.hard_cases --device cpu --output
     benchmarks/results/hard_cases_cpu.json python -m benchmarks.studies.hard_cases
     --device cuda --output benchmarks/results/hard_cases_h200.json python -m
     benchmarks.studies.hard_cases --docs # write the table again, from those two
 
-The last one measures nothing.
+The last command measures nothing.
 """
 
 from __future__ import annotations
@@ -40,20 +40,21 @@ class Config:
     device: Literal["cpu", "cuda"] = "cpu"
     output: str | None = None
     docs: bool = False
-    """Write docs/numerics.md's table from the recorded results instead."""
+    """Write docs/numerics.md's table from the recorded results, without measuring."""
 
 
 def histogram(errors: np.ndarray) -> dict[str, Any]:
-    """Shares of the errors up to each decade and beyond the last, in per cent, and the
-    largest."""
+    """Return the percentages of errors up to each decade and beyond the last, and the
+    largest error."""
     counts = np.bincount(np.searchsorted(DECADES, errors.ravel()), minlength=len(DECADES) + 1)
     shares = 100 * counts / max(errors.size, 1)
     return {"percent": shares.round(2).tolist(), "largest": float(f"{errors.max(initial=0.0):.1e}")}
 
 
 def gradient_histogram(case: cases.HardCase, device: str) -> dict[str, Any]:
-    """Of the drawn gaussians' gradients by relative changes, in units of each input's
-    root mean square."""
+    """Return a histogram of the errors of the drawn gaussians' gradients. Gradients are
+    by relative changes of the inputs, and errors are in units of the root mean square
+    gradient of each input."""
     import torch
 
     single = cases.gradients(case, cases.draw_core, torch.float32, device)
@@ -75,7 +76,8 @@ def measure(case: cases.HardCase, device: str) -> dict[str, Any]:
 
 
 def text_of(shares: list[float]) -> str:
-    """Whole per cents; what is there but rounds to none is a dot."""
+    """Return whole percentages; a dot stands for a value that rounds to zero but is not
+    zero."""
     return " ".join(f"{s:.0f}" if s >= 0.5 else "." if s > 0 else "0" for s in shares)
 
 

@@ -1,9 +1,9 @@
-"""What large builds take: many copies of an asset as one, built by `v3dg build` in
-processes of their own.
+"""The cost of large builds: many copies of an asset as one asset, built by `v3dg build`
+in separate processes.
 
-Time with reading and writing, the most memory of the host and of the GPU, for each
-number of gaussians and amount of memory given. Copies stand in a grid and are moved a
-little, gaussian by gaussian, so that none are alike.
+It measures the time including reading and writing, and the peak memory of the host and
+of the GPU, for each number of gaussians and memory limit. Copies are in a grid, and
+their gaussians are displaced slightly, so that no two copies are equal.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class Config:
     asset: Path
     """A .ply file of SH degree 0."""
     millions: tuple[float, ...] = (1, 10, 100)
-    """Gaussians of each build."""
+    """Numbers of gaussians of the builds."""
     memory: tuple[str, ...] = ("2GiB", "2GiB", "7GiB")
-    """What each may use of the host."""
+    """Host memory that each build may use."""
     device: str = "cuda"
     output: str | None = None
 
@@ -65,8 +65,8 @@ def main(config: Config) -> None:
 
 
 def write_copies(path: Path, base: v3dg.Gaussians, at_least: int) -> int:
-    """Write copies of an asset, one after the other, as a .ply file; how many gaussians
-    there are."""
+    """Write copies of an asset, one after the other, as a .ply file; return the number
+    of gaussians."""
     copies = -(-at_least // len(base))
     side = int(np.ceil(np.sqrt(copies)))
     rng = np.random.default_rng(5)
@@ -88,8 +88,8 @@ def write_copies(path: Path, base: v3dg.Gaussians, at_least: int) -> int:
 
 
 def watched(command: list[str]) -> dict[str, Any]:
-    """Run a command; its seconds, and the most memory in GB that it, and the first GPU,
-    had."""
+    """Run a command; return its seconds, and its peak memory in GB on the host and on
+    the first GPU."""
     start = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     most = {"host_gb": 0.0, "gpu_gb": 0.0}
@@ -112,7 +112,8 @@ def watched(command: list[str]) -> dict[str, Any]:
 
 
 def gpu_gigabytes() -> float:
-    """Memory in use on the first GPU, by all; 0 where there is none."""
+    """Return the memory in use on the first GPU by all processes; 0 if there is
+    none."""
     query = ["nvidia-smi", "--query-gpu=memory.used", "--format=csv,noheader,nounits", "-i", "0"]
     try:
         done = subprocess.run(query, capture_output=True, text=True, check=True, env=os.environ)

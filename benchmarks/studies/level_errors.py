@@ -1,11 +1,12 @@
-"""Would a metric made of measured error be better than footprint over gaussians?
+"""Would a metric based on measured error be better than footprint per gaussian?
 
-Each group of a bundle is drawn alone, at several sizes, beside its clusters one level
-finer and the leaves under it (4 x 4 samples). What is gained per gaussian by going one
-level finer, at the size at which each group is seen, then decides a cut: the pruning of
+Each group of a bundle is drawn alone, at several sizes, together with its clusters one
+level finer and its leaves (4 x 4 samples). The gain per gaussian of one level more
+detail, at the size at which each group appears, then determines a cut: the pruning of
 the tree with the least sum of error and lambda x gaussians (Chou, Lookabaugh and Gray
-1989). It is compared with the metric at equal numbers of gaussians, from outside of an
-object; docs/notes/experiments/2026-11-22-selection-measured-error.md has the table.
+1989). This cut is compared with the metric at equal numbers of gaussians, from outside
+of an object; docs/notes/experiments/2026-11-22-selection-measured-error.md has the
+table.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from benchmarks.evaluation import record
 from v3dg import _core, metrics
 
 SIZES = {0.5: 4, 1.0: 4, 2.0: 2, 4.0: 2, 8.0: 1}
-"""In units of 2 px² a gaussian, as a side; the samples of a pixel's side that the
-leaves are drawn with."""
-_MOST_SAMPLES = 12_000_000  # of one picture
-# Mean |colour| and half of |alpha|, as the fit has it.
+"""Sizes of groups relative to the native size, measured along a side; and samples per
+side of a pixel for the leaves."""
+_MOST_SAMPLES = 12_000_000  # per picture
+# Weights of |colour| and |alpha|, as in the fit.
 _WEIGHTS = np.array([1, 1, 1, 1.5], np.float32) / 3
 _FOV = 0.3
 
@@ -35,15 +36,15 @@ _FOV = 0.3
 class Config:
     bundle: Path
     views: int = 4
-    """That each group is drawn from."""
+    """Number of views of each group."""
     widths: tuple[int, ...] = (700, 350, 176, 90)
-    """Of the object, px."""
+    """Size of the object, px."""
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     output: str | None = None
 
 
 class Groups:
-    """What is known of the groups of a bundle: their gaussians, smallest balls, and
+    """The data about the groups of a bundle: their gaussians, smallest balls, and
     gains."""
 
     def __init__(self, bundle: v3dg.Bundle) -> None:
@@ -71,8 +72,8 @@ class Groups:
         self.all = bundle.gaussians
 
     def _runs(self, links: Any, clusters: Any, offset: Any) -> Any:
-        """(G, 2) first and end of the gaussians of the clusters that are linked to each
-        group."""
+        """Return (G, 2) first and end of the gaussians of the clusters that are linked
+        to each group."""
         runs = np.tile(np.array([1 << 60, 0]), (len(self.table), 1))
         linked = clusters[links >= 0]
         np.minimum.at(runs[:, 0], links[linked], offset[linked])
@@ -80,8 +81,8 @@ class Groups:
         return runs
 
     def measure(self, num_views: int) -> None:
-        """Find gain (G, S), of error per gaussian, and cover (G,), alpha px at twice
-        its size."""
+        """Compute the gain (G, S), error per gaussian, and the cover (G,), px of alpha
+        at twice the size."""
         self.gain, self.cover = np.zeros((len(self.table), len(SIZES))), np.zeros(len(self.table))
         rng = np.random.default_rng(1)
         turns = [np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(num_views)]
@@ -103,8 +104,8 @@ class Groups:
     def _compare(
         self, groups: Any, level: int, turn: Any, radius_px: float, cell: int, samples: int
     ) -> Any:
-        """What one view of groups side by side gains by one level more, and alpha, in
-        px each."""
+        """Return the gain of one more level in one view of groups side by side, and
+        alpha, in px each."""
         across = math.ceil(math.sqrt(len(groups)))
         spacing = cell / radius_px
         depth = 12 * across * spacing + 20
@@ -138,8 +139,8 @@ class Groups:
         return errors[0] - errors[1], sums(truth[..., 3])
 
     def see(self, cameras: list[v3dg.Camera]) -> None:
-        """Find how much of each group is seen among all, from these cameras: (G,), 1 if
-        nothing hides it."""
+        """Compute how much of each group is visible among all, from these cameras:
+        (G,), 1 if nothing hides it."""
         import torch
 
         asset = self.bundle.level_gaussians(0).torch("cpu")
@@ -156,12 +157,13 @@ class Groups:
         self.visibility = seen / alone
 
     def _size(self, camera: v3dg.Camera) -> Any:
-        """(G,) how large each is seen, in units of 2 px² a gaussian, as a side."""
+        """Return (G,) the size of each group relative to the native size, measured
+        along a side."""
         distance = np.linalg.norm(self.ball[:, :3] - camera.position, axis=1)
         return camera.fx * self.ball[:, 3] / distance / np.sqrt(2 * self.count / math.pi)
 
     def cut(self, rule: str, camera: v3dg.Camera, tolerance: float) -> Any:
-        """The clusters that a rule chooses."""
+        """Return the clusters that a rule chooses."""
         if rule in ("old", "visible"):
             weight = self.table.weight.astype(float)
             if rule == "visible":
@@ -190,8 +192,8 @@ class Groups:
         return values
 
     def _gain_at(self, camera: v3dg.Camera) -> Any:
-        """(G,) gain at the size seen: between two in proportion of logs, past the last
-        as the area."""
+        """Return (G,) the gain at the apparent size: interpolated in logarithms,
+        extrapolated like the area."""
         size, known = np.log2(self._size(camera)), np.log2(list(SIZES))
         inside = np.clip(size, known[0], known[-1])
         step = np.minimum((inside - known[0]).astype(int), len(known) - 2)
@@ -236,7 +238,7 @@ def main(config: Config) -> None:
 
 
 def _mean_flip(groups: Groups, rule: str, cameras: Any, truths: Any, target: float) -> float:
-    """FLIP of the cuts with the most gaussians that are at most so many."""
+    """Return the mean FLIP of the cuts with the most gaussians up to a limit."""
     sizes = np.diff(groups.bundle.clusters.offset)
     scene = v3dg.Scene.of(groups.bundle)
     flips = []

@@ -1,9 +1,9 @@
-"""What each choice of the build gives: one change at a time, drawn in a layout of many
-instances.
+"""The effect of each setting of the build: one change at a time, drawn in a layout of
+many instances.
 
-The table of docs/notes/experiments/2026-11-22-levels-each-setting.md: Gaussians in the
-frustum, FLIP and PSNR against a given picture at three tolerances, and the processor
-seconds of the build.
+It makes the table of docs/notes/experiments/2026-11-22-levels-each-setting.md:
+gaussians in the frustum, FLIP and PSNR against a given picture at three tolerances, and
+the processor seconds of the build.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""How even are the frames of a moving flight? Percentiles of 5,000, and which of them
-were drawn twice."""
+"""How even are the frames of a moving flight? Percentiles over 5,000 frames, and how
+many were drawn twice."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from benchmarks.evaluation.assets import read_layout
 from benchmarks.evaluation.record import write
 from v3dg import Bundle, Camera, Renderer, Scene
 
-_FIRST_FRAMES = 50  # of a renderer, which find no room yet; they are reported apart
+# Frames of a new renderer, whose buffers are still too small; they are reported
+# separately.
+_FIRST_FRAMES = 50
 _NUM_WORST = 10
 
 
@@ -63,8 +65,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def flight(scene: Scene, cameras: list[Camera], count: int) -> list[Camera]:
-    """Two turns around the middle of the scene, from the farthest of the cameras to the
-    nearest and back."""
+    """Return two turns around the middle of the scene, from the farthest of the cameras
+    to the nearest and back."""
     middle = scene.positions.mean(axis=0)
     offsets = np.array([camera.position - middle for camera in cameras])
     distances = np.linalg.norm(offsets, axis=1)
@@ -99,8 +101,8 @@ def flight(scene: Scene, cameras: list[Camera], count: int) -> list[Camera]:
 
 
 def measure(renderer: Renderer, views: list[Camera], options: dict[str, float]) -> dict[str, Any]:
-    """Milliseconds from the call to the finished picture, and how often frames were
-    drawn again."""
+    """Return milliseconds from the call to the finished picture, and how often frames
+    were drawn again."""
     milliseconds = np.empty(len(views))
     draws = np.empty(len(views), np.int64)
     bytes_in = np.empty(len(views), np.int64)

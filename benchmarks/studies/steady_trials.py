@@ -1,11 +1,11 @@
-"""What makes motion steadier beside a fade? A budget in steps, hysteresis, pages that
+"""What makes motion steadier besides a fade? A budget in steps, hysteresis, pages that
 fade in, other ramps.
 
-The first is beside the tolerance that each view would have alone, also in the frames
-after the camera has stopped where steps are farthest behind. Hysteresis is a trial, and
-so are pages beside what a pool does: cuts with a state, made of the metrics that
-selection has. So are ramps, which have none. docs/notes/experiments/index.md
-lists the results.
+A budget in steps is compared with the tolerance of each view alone, also in frames
+after the camera has stopped where steps are farthest behind. Hysteresis is an
+experiment: cuts with a state, computed from the metrics of selection. So are pages that
+fade in, in addition to what a pool does, and ramps, which have no state.
+docs/notes/experiments/index.md lists the results.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from v3dg import (
 from v3dg.residency import residency
 from v3dg.select import rule_of
 
-# how much farther away hysteresis begins to look, so that it is in its stride at the
-# first frame
+# Hysteresis starts at this multiple of the distance, so that its state has settled at
+# the first frame.
 _FAR = 1.15
 _FAR_FRAMES = 30
-_SWAY = 12  # frames to one side
-_ARRIVAL_FRAMES = 8  # as csrc/residency/page_table.h has them
-_HEADROOM_PARTS = 32  # as csrc/select/budget_math.h has them
+_SWAY = 12  # frames in one direction
+_ARRIVAL_FRAMES = 8  # as in csrc/residency/page_table.h
+_HEADROOM_PARTS = 32  # as in csrc/select/budget_math.h
 
 
 @dataclass
@@ -52,28 +52,28 @@ class Config:
     frames: int = 48
     size: int = 160
     side: int = 1
-    """Of a field of copies; 1: a single one."""
+    """Side of a field of copies; 1: a single one."""
     distances: tuple[float, ...] = (3.0,)
     tolerance: float = DEFAULT_TOLERANCE
-    """The budget is what this one comes to in the middle of the path."""
+    """The budget is the count at this tolerance in the middle of the path."""
     fade: float = DEFAULT_FADE
     hysteresis: tuple[float, ...] = (1.05, 1.1)
     arrivals: tuple[int, ...] = (1, 4, 8)
-    """Over how many frames pages fade in."""
+    """Numbers of frames over which pages fade in."""
     rests: tuple[int, ...] = (1, 4, 16, 64)
-    """Over how many frames the tolerance of a budget arrives at rest."""
+    """Numbers of frames in which the tolerance of a budget arrives at rest."""
     bands: tuple[float, ...] = (1.005, 1.01, 1.03, 1.05)
-    """Fades beside the one above, of linear ramps; smooth ones have that and half as
-    much again."""
+    """Further fades with linear ramps; smooth ones have these and half as much
+    again."""
     trials: tuple[str, ...] = ("budget", "rest", "hysteresis", "pages", "ramps")
     paths: tuple[str, ...] = ()
-    """Only these."""
+    """Run only these."""
     device: str = "cpu"
     json: Path | None = None
 
 
 class AtOnce:
-    """The least tolerance of a budget, whatever the frame before had."""
+    """The least tolerance of a budget, regardless of the frame before."""
 
     def __init__(self, budget: int, fade: float) -> None:
         self.budget, self.fade = budget, fade
@@ -84,10 +84,10 @@ class AtOnce:
 
 
 class Rests:
-    """A budget in steps along a path, and after its end, over so many frames, to where
-    it would be at once.
+    """A budget in steps along a path and, after its end, over some frames to its final
+    value.
 
-    As a `Renderer` does if no number of frames is given.
+    Like a `Renderer` if no number of frames is given.
     """
 
     def __init__(
@@ -113,13 +113,14 @@ class Rests:
 
 
 def _goal(scene: Scene, camera: Camera, budget: int, fade: float) -> float:
-    """The tolerance that steps go to."""
+    """Return the tolerance that steps move to."""
     roomy = budget - budget // _HEADROOM_PARTS
     return select(scene, camera, budget=roomy, fade=fade, device="cpu").tolerance
 
 
 def metrics_of(scene: Scene, camera: Camera) -> tuple[Any, Any]:
-    """Metrics of the groups of all instances, px², and where each instance's begin."""
+    """Return the metrics of the groups of all instances, px², and the first index of
+    each instance."""
     instances = _core.Instances(
         bundle=scene.instance_bundle,
         positions=scene.positions,
@@ -133,13 +134,13 @@ def metrics_of(scene: Scene, camera: Camera) -> tuple[Any, Any]:
 
 
 def cut_of(scene: Scene, refinement: Any, offset: Any) -> Selection:
-    """The cut of groups that are refined by 0 to 1, none further than the group above
-    it."""
+    """Return the cut of groups that are refined by 0 to 1, none more than the group
+    above it."""
     instance_ids, cluster_ids, weights, count = [], [], [], 0
     for i, b in enumerate(scene.instance_bundle):
         clusters = scene.bundles[b].clusters
         mine = refinement[offset[i] : offset[i + 1]]
-        # -1 is no group, and the last value is what stands for it.
+        # Index -1 means no group, and refers to the last element.
         weight = (
             np.append(mine, 1.0)[clusters.parent_group] - np.append(mine, 0.0)[clusters.own_group]
         )
@@ -169,13 +170,13 @@ class Sticks:
 
 
 def between(metric: Any, tolerance: float, fade: float) -> Any:
-    """Where metrics lie in the band of a fade: 0 below, 1 above."""
+    """Return the position of metrics in the range of a fade: 0 below, 1 above."""
     low, high = tolerance / fade, tolerance * fade
     return np.clip((np.minimum(metric, 2 * high) - low) / (high - low), 0, 1)
 
 
 class Smooth:
-    """A fade whose ramp begins and ends without a corner."""
+    """A fade whose ramp has a continuous derivative."""
 
     def __init__(self, tolerance: float, fade: float) -> None:
         self.tolerance, self.fade = tolerance, fade
@@ -188,9 +189,9 @@ class Smooth:
 
 class Arrives:
     """A cut with a fade whose pages all come in after the first frame, and fade in over
-    so many frames.
+    some frames.
 
-    All of them together, or those of a level once those above it are there.
+    All pages fade in together, or those of a level once those above have faded in.
     """
 
     def __init__(self, tolerance: float, fade: float, frames: int, *, by_level: bool) -> None:
@@ -206,15 +207,15 @@ class Arrives:
         return {"cut": cut_of(scene, np.minimum(ramp, arrived), offset)}
 
     def arrived(self, scene: Scene, camera: Camera) -> Any:
-        """Shares to which the pages of the groups of all instances have faded in."""
+        """Return how far the pages of the groups of all instances have faded in."""
         levels = [scene.bundles[b].groups.level for b in scene.instance_bundle]
         waits = np.concatenate([level.max() - level for level in levels]) if self.by_level else 0
         return np.clip(self.frame / self.frames - waits, 0.0, 1.0)
 
 
 class ArrivesInPool(Arrives):
-    """The same as a renderer with a pool has it, which reads pages while true pictures
-    are drawn."""
+    """As Arrives, with a renderer's pool, which reads pages while true pictures are
+    drawn."""
 
     def __init__(self, scene: Scene, tolerance: float, fade: float) -> None:
         super().__init__(tolerance, fade, 0, by_level=True)
@@ -261,7 +262,7 @@ def main(config: Config) -> None:
 
 
 def to_and_fro(path: CameraPath) -> CameraPath:
-    """A path of which a few frames are gone again and again, so that the same groups
+    """Return a path that repeats a few frames back and forth, so that the same groups
     come and go."""
     frames = [abs((k + _SWAY) % (2 * _SWAY) - _SWAY) for k in range(len(path.cameras))]
     return replace(
@@ -270,7 +271,7 @@ def to_and_fro(path: CameraPath) -> CameraPath:
 
 
 def up_to_the_rest(scene: Scene, path: CameraPath, config: Config) -> CameraPath:
-    """The path up to where steps are farthest from where they go."""
+    """Return the path up to where steps are farthest from their goal."""
     renderer, budget = Renderer(scene, device="cpu"), budget_of(scene, path.cameras[0], config)
     ways = []
     for camera in path.cameras:
@@ -345,7 +346,7 @@ def ramp_cuts(scene: Scene, path: CameraPath, config: Config) -> dict[str, Cut]:
 
 
 def _depth_of(scene: Scene, camera: Camera) -> float:
-    """How deep the middle of the scene is."""
+    """Return the depth of the middle of the scene."""
     return float((camera.viewmat[:3, :3] @ scene.positions.mean(axis=0) + camera.viewmat[:3, 3])[2])
 
 

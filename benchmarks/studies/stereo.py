@@ -1,5 +1,5 @@
 """How long do both eyes of a headset take? One frame of two pictures that share a cut,
-beside two frames."""
+in comparison with two frames."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from benchmarks.evaluation.measure import time_ms
 from benchmarks.evaluation.record import write
 from v3dg import Bundle, Camera, Renderer, StereoCamera
 
-_FOV = 1.57  # rad, of each eye
+_FOV = 1.57  # radians, of each eye
 _EYE_DISTANCE = 0.064
 
 
@@ -51,7 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def headset(camera: Camera, side: int) -> StereoCamera:
-    """Eyes where a camera is, that look where it looks."""
+    """Return eyes at a camera's position, with its rotation."""
     ahead, top = camera.viewmat[2, :3], -camera.viewmat[1, :3]
     middle = Camera.look_at(
         camera.position, camera.position + ahead, top, _FOV, width=side, height=side
@@ -62,8 +62,8 @@ def headset(camera: Camera, side: int) -> StereoCamera:
 def measure(
     renderer: Renderer, stereo: StereoCamera, tolerance: float, repeats: int
 ) -> dict[str, Any]:
-    """Milliseconds from the call to both pictures, of one frame and of two; gaussians
-    of the shared cut."""
+    """Return milliseconds from the call to both pictures, for one frame and for two;
+    and gaussians of the shared cut."""
 
     def one_frame() -> list[Any]:
         return [picture.color for picture in renderer.render(stereo, tolerance=tolerance)]

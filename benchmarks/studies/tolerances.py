@@ -1,14 +1,14 @@
-"""What error a tolerance stands for: cuts of each asset at several sizes, beside all
-its gaussians.
+"""The error of each tolerance: cuts of each asset at several sizes, in comparison with
+all its gaussians.
 
     python -m benchmarks.studies.tolerances ASSETS -o tolerances_cpu
 
-ASSETS is a folder as `benchmarks.studies.pairs` describes it. An object is drawn so
-wide that its ball fills the picture, a scene from its cameras at the same widths. Cuts
-and every gaussian at one sample a pixel are compared with every gaussian at four by
-four samples, or eight by eight where there are few pixels. The table has FLIP of the
-cut by that of all gaussians, PSNR less theirs, and the share of the gaussians in the
-frustum.
+ASSETS is a folder as for `benchmarks.studies.pairs`. An object is drawn so wide that
+its ball fills the picture, a scene from its cameras at the same widths. Cuts, and every
+gaussian at one sample per pixel, are compared with every gaussian at four by four
+samples, or eight by eight for small pictures. The table has FLIP of the cut relative to
+that of all gaussians, the difference of their PSNR, and the fraction of the gaussians
+in the frustum.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from v3dg.pictures import Picture, to_8bit
 
 Row = dict[str, Any]
 
-_FEW_PX = 128  # of a side: such a picture has the finer truth
+_FEW_PX = 128  # px per side; smaller pictures have the finer truth
 
 
 @dataclass
@@ -49,12 +49,12 @@ class Config:
     """px."""
     views: int = 4
     refine: int = 0
-    """Steps by which the levels are refined together, too."""
+    """Steps of the refinement, which is also measured."""
     device: str = "auto"
 
 
 def measure(config: Config, subject: Subject, judges: Judges) -> list[Row]:
-    """Means over the views, for each width and tolerance; tolerance 0 is every
+    """Return means over the views, for each width and tolerance; tolerance 0 is every
     gaussian."""
     found: dict[tuple[int, float], list[Row]] = {}
     for (about, _, _), errors in judges.measured(_drawn(config, subject), _errors):
@@ -94,8 +94,8 @@ def _errors(item: tuple[Row, Picture, Picture]) -> Row:
 
 
 def summary(rows: list[Row]) -> str:
-    """A row for each tolerance: means over the assets and widths, and where it is
-    worst."""
+    """Return a row per tolerance: means over the assets and widths, and the worst
+    case."""
     whole = {(row["asset"], row["width"]): row for row in rows if row["tolerance"] == 0}
     lines = []
     for tolerance in sorted({row["tolerance"] for row in rows} - {0.0}):

@@ -1,9 +1,9 @@
-"""Does training with v3dg in place of gsplat come to the same, and how long does a step
-take?
+"""Does training with v3dg instead of gsplat give the same result, and how long does a
+step take?
 
-Gaussians are trained from nothing on pictures of an asset with gsplat's own strategies,
-drawn by either of the two, and compared on pictures that were held out. Needs a GPU,
-and gsplat 1.5.3 compiled.
+Gaussians are trained from scratch on pictures of an asset with gsplat's own strategies,
+drawn by either of the two, and compared on held-out pictures. Needs a GPU, and gsplat
+1.5.3 compiled.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from benchmarks.studies.peers.scenes import random as random_scene
 from v3dg.compat.gsplat import rasterization
 
 _DRAWN_BY: dict[str, Callable[..., Any]] = {"v3dg": rasterization, "gsplat": gsplat.rasterization}
-_REPEATS = 31  # of a step that is timed
+_REPEATS = 31  # of a timed step
 _SIDE = 512  # px of a training picture
 _STEP = {
     "means": 1.6e-4,
@@ -70,8 +70,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def times(count: int, num_cameras: int) -> list[dict[str, Any]]:
-    """Milliseconds of a picture, and of one with its gradients, of random gaussians of
-    SH degree 3."""
+    """Return milliseconds of a picture, and of one with its gradients, for random
+    gaussians of SH degree 3."""
     scene = random_scene(count, 3, "cuda")
     camera, gaussians = next(iter(scene.cameras.values())), scene.gaussians
     shifted = [v3dg.StereoCamera.of(camera, 0.01 * (k + 1)).left for k in range(num_cameras)]
@@ -138,7 +138,7 @@ class Views:
         self.held_out, self.trained = numbers[numbers % 8 == 0], numbers[numbers % 8 != 0]
 
     def start(self, count: int) -> dict[str, torch.nn.Parameter]:
-        """Grey gaussians anywhere in the box of the asset."""
+        """Return grey gaussians at random positions in the box of the asset."""
         low, high = (
             torch.tensor(a, dtype=torch.float32, device="cuda") for a in (self.low, self.high)
         )
@@ -167,7 +167,7 @@ def strategy_of(name: str, steps: int, size: float) -> tuple[Any, dict[str, Any]
 def train(
     views: Views, name: str, seed: int, steps: int, draw: Callable[..., Any]
 ) -> dict[str, Any]:
-    """PSNR on the pictures that were held out, gaussians, seconds."""
+    """Return PSNR on the held-out pictures, gaussians, seconds."""
     torch.manual_seed(seed)
     order = torch.Generator().manual_seed(seed)
     params = views.start(20_000)
@@ -228,7 +228,7 @@ def train(
 
 
 def structure(first: Any, second: Any) -> Any:
-    """SSIM of (1, H, W, 3) pictures, 11 px."""
+    """Return the SSIM of (1, H, W, 3) pictures, 11 px."""
     bell = torch.exp(-((torch.arange(11, device="cuda") - 5.0) ** 2) / (2 * 1.5**2))
     bell = bell / bell.sum()
     window = (bell[:, None] * bell).expand(3, 1, 11, 11)

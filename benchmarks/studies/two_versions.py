@@ -1,15 +1,15 @@
-"""What one version of v3dg computes, as digests, and how long it takes, to be compared
-with another.
+"""The results of one version of v3dg, as digests, and their times, for comparison with
+another version.
 
-Run it once or more with each version in turn, on one machine, then compare what they
-wrote:
+Run it once or more with each version in alternation, on one machine, then compare the
+outputs:
 
     PYTHONPATH=old python -m benchmarks.studies.two_versions --output old.json ...
     PYTHONPATH=new python -m benchmarks.studies.two_versions --output new.json ...
     python -m benchmarks.studies.two_versions --compare old.json new.json
 
-It calls nothing but the public interface, so that a version that lays its modules out
-otherwise runs it, too.
+It uses only the public interface, so that a version with a different layout of modules
+can run it, too.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def host(array: Any) -> np.ndarray[Any, Any]:
 
 
 def digest(*arrays: Any) -> str:
-    """Of the arrays' bytes."""
+    """Return a digest of the arrays' bytes."""
     found = hashlib.blake2b(digest_size=8)
     for array in arrays:
         found.update(np.ascontiguousarray(host(array)).tobytes())
@@ -44,7 +44,7 @@ def digest(*arrays: Any) -> str:
 
 
 def random_gaussians(count: int, sh_degree: int, seed: int = 0) -> v3dg.Gaussians:
-    """Gaussians in a ball, of sizes as a training leaves them."""
+    """Return gaussians in a ball, with the sizes of training."""
     rng = np.random.default_rng(seed)
     means = rng.normal(size=(count, 3))
     means *= rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(means, axis=1, keepdims=True)
@@ -131,7 +131,7 @@ class Run:
             self.host_part(name, scene, next(iter(cameras.values())))
 
     def host_part(self, name: str, scene: Any, camera: v3dg.Camera) -> None:
-        """Time until a frame is enqueued, which the device does not wait for."""
+        """Record the time until a frame is enqueued, without waiting for the device."""
         renderer = v3dg.Renderer(scene)
         for _ in range(20):
             renderer.render(camera, tolerance=9.4).stats  # noqa: B018
@@ -167,13 +167,13 @@ class Run:
             return leaves
 
         self.time(f"forward + backward {count}", both)
-        # The sign of a gradient of 0 may differ from run to run of one version; 0 is
-        # added to take it away.
+        # The sign of a zero gradient may differ between runs of one version; adding 0
+        # removes it.
         self.digests[f"gradients {count}"] = digest(*(leaf.grad + 0.0 for leaf in leaves))
 
 
 def compare(old_path: Path, new_path: Path, output: Path | None) -> int:
-    """Print what differs, and write it where that is asked for; the number of digests
+    """Print the differences, and write them if requested; return the number of digests
     that differ."""
     old, new = (json.loads(path.read_text()) for path in (old_path, new_path))
     names = sorted(old["digests"].keys() | new["digests"].keys())
@@ -253,7 +253,7 @@ def main() -> None:
     if arguments.layout:
         from v3dg import read_scene
 
-        read_asset = getattr(v3dg, "read_asset", None) or v3dg.load  # as an older version calls it
+        read_asset = getattr(v3dg, "read_asset", None) or v3dg.load  # the name in an older version
         asset = read_asset(
             arguments.layout.parent / json.loads(arguments.layout.read_text())["asset"]
         )

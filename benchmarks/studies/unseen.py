@@ -1,15 +1,15 @@
-"""What a scene loses when gaussians that are hardly seen are dropped, and what a refit
-brings back.
+"""The error of a scene after dropping gaussians that are hardly visible, and the effect
+of a refit.
 
     python -m benchmarks.studies.unseen ASSETS --only Paljassaare -o unseen_cpu
 
-ASSETS is a folder as `benchmarks.studies.pairs` describes it; its scenes are measured
-from their own cameras. What other cameras, which stand beside those and look elsewhere,
-see least of is dropped, as by `examples/drop_unseen.py`. What is left may be refitted
-to pictures of all gaussians from the same other cameras, 3 x 3 samples a pixel, or be
-drawn with levels. Errors are to all gaussians at 4 x 4 samples a pixel. The table has
-the share of the gaussians in the frustum, and FLIP by that of all gaussians at one
-sample.
+ASSETS is a folder as for `benchmarks.studies.pairs`; its scenes are measured from their
+own cameras. Other cameras, beside those and with other directions, determine which
+gaussians are least visible; these are dropped, as by `examples/drop_unseen.py`. The
+rest may be refitted to pictures of all gaussians from the same other cameras, 3 x 3
+samples per pixel, or be drawn with levels. Errors are against all gaussians at 4 x 4
+samples per pixel. The table has the fraction of the gaussians in the frustum, and FLIP
+relative to that of all gaussians at one sample.
 """
 
 from __future__ import annotations
@@ -37,10 +37,11 @@ from v3dg.pictures import to_8bit
 
 Row = dict[str, Any]
 
-_NARROWEST, _WIDEST = 0.9, 1.25  # of the pictures' tangent, in that of the scene's own cameras
+# The range of the tangent of the field of view, relative to the scene's own cameras.
+_NARROWEST, _WIDEST = 0.9, 1.25
 _PITCH = 0.4  # radians, at most
 _EXAMPLE = Path(__file__).parents[2] / "examples" / "drop_unseen.py"
-# Of a refit, Adam's first step sizes: means in median scales, scales as logarithms,
+# Adam's initial step sizes in a refit: means in median scales, scales as logarithms,
 # opacities as logits.
 _SIZES = {
     "means": 3e-3,
@@ -50,7 +51,7 @@ _SIZES = {
     "sh0": 4.5e-4,
     "rest": 6e-5,
 }
-_LAST_STEP = 0.01  # of the first
+_LAST_STEP = 0.01  # relative to the first step
 _SAMPLES = 3
 
 
@@ -63,31 +64,32 @@ class Config:
     only: tuple[str, ...] = ()
     """Names of scenes; all by default."""
     parts: tuple[float, ...] = (1.0, 0.9, 0.8, 0.7, 0.6)
-    """Of the gaussians that are seen at all: what is kept."""
+    """Fractions of the visible gaussians to keep."""
     refit: tuple[float, ...] = ()
-    """Those of them that are refitted."""
+    """The fractions of `parts` that are also refitted."""
     tolerances: tuple[float, ...] = ()
-    """At which what is kept is also drawn with levels."""
+    """Tolerances at which the rest is also drawn with levels."""
     steps: int = 4000
-    """Of a refit, a picture each."""
+    """Steps of a refit, one picture each."""
     width: int = 384
-    """px of the pictures that weights are measured in and that is fitted to."""
+    """px of the pictures for measuring weights and for refitting."""
     widths: tuple[int, ...] = (384,)
     """px of the pictures that are compared."""
     views: int = 4
-    """From which errors are measured."""
+    """Number of cameras from which errors are measured."""
     others: int = 48
-    """Cameras that weights are measured from."""
+    """Number of cameras from which weights are measured."""
     distance: float = 0.3
-    """World units from a camera of the scene to another, about."""
+    """Approximate distance, in world units, from a camera of the scene to another
+    one."""
     turn: float = math.pi
-    """Radians by which another camera is turned at most."""
+    """Largest rotation of another camera, radians."""
     seed: int = 0
     device: Literal["cpu", "cuda"] = "cpu"
 
 
 def others_of(config: Config, cameras: Sequence[v3dg.Camera]) -> list[v3dg.Camera]:
-    """Cameras beside the given ones, turned by angles that are spread evenly."""
+    """Return cameras beside the given ones, rotated by evenly distributed angles."""
     rng = np.random.default_rng(config.seed)
     poses = [np.linalg.inv(camera.viewmat.astype(np.float64)) for camera in cameras]
     up = -np.mean([pose[:3, 1] for pose in poses], axis=0)
@@ -112,8 +114,8 @@ def others_of(config: Config, cameras: Sequence[v3dg.Camera]) -> list[v3dg.Camer
 def refitted(
     kept: v3dg.Gaussians, asset: v3dg.Gaussians, cameras: Sequence[v3dg.Camera], config: Config
 ) -> v3dg.Gaussians:
-    """What is kept, moved by Adam until pictures of it are those of the asset: a step a
-    picture."""
+    """Return the kept gaussians, fitted by Adam to pictures of the asset, one picture
+    per step."""
     import torch
 
     device, steps = config.device, config.steps
@@ -150,7 +152,7 @@ def refitted(
 
 
 def measure(config: Config, subject: Subject) -> list[Row]:
-    """Means over the views, for each width and what is kept."""
+    """Return means over the views, for each width and fraction."""
     asset = subject.asset.numpy()
     others = others_of(config, subject.cameras)
     weights_in = runpy.run_path(str(_EXAMPLE))["weights_in"]

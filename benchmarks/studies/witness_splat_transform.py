@@ -1,16 +1,16 @@
-"""One asset drawn by us and by splat-transform, a renderer that shares no code with
-this one.
+"""One asset drawn by v3dg and by splat-transform, a renderer that shares no code with
+it.
 
 It needs Node 22 or newer, `npm install @playcanvas/splat-transform@3.7.0`, and a Vulkan
 device; without a GPU the software device that comes with Chromium does (SwiftShader:
 `VK_ICD_FILENAMES` names its vk_swiftshader_icd.json, `XDG_RUNTIME_DIR` a directory).
 
-Both add the 0.3 px² of the original 3DGS code, but splat-transform cuts alpha at 0.99
-and ends each gaussian at three standard deviations, bringing the falloff to 0 there. So
-a third picture is made: the float64 reference of the tests, which the core is held to,
-with splat-transform's falloff in place of ours. It must be theirs but for the rounding
-to 8 bits (58.9 dB); then projection, colour, order and blending are the same, and the
-rest of the difference is the falloff's.
+Both add the 0.3 px² of the original 3DGS code, but splat-transform clamps alpha at 0.99
+and ends each gaussian at three standard deviations, where its falloff reaches 0. So a
+third picture is made: the float64 reference of the tests, which the core is tested
+against, with splat-transform's falloff. It must equal theirs up to the rounding to 8
+bits (58.9 dB); then projection, colour, order and blending are the same, and the
+remaining difference is due to the falloff.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ class Config:
     """Vertical and horizontal field of view in degrees."""
     views: int = 4
     distance: float = 2.0
-    """From the centre of the asset, in radii of the ball that holds nearly all of it.
+    """Distance from the centre of the asset, in radii of the ball that contains nearly
+    all of it.
     """
     background: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))
     keep: Path | None = None
@@ -61,10 +62,10 @@ class Config:
 
 
 def witness(config: Config, camera: v3dg.Camera, target: np.ndarray, path: Path) -> np.ndarray:
-    """Their picture (H,W,3) from the same place."""
+    """Return their picture (H,W,3) from the same position."""
 
     def point(p: np.ndarray) -> str:
-        # Their world is turned by half a turn about z from the file's.
+        # Their world is rotated by half a turn about z relative to the file's.
         return f"{-p[0]:.9g},{-p[1]:.9g},{p[2]:.9g}"
 
     command = [
@@ -94,8 +95,7 @@ def witness(config: Config, camera: v3dg.Camera, target: np.ndarray, path: Path)
 def with_their_falloff(
     asset: v3dg.Gaussians, camera: v3dg.Camera, background: tuple[float, ...]
 ) -> np.ndarray:
-    """The tests' reference picture (H,W,3), each gaussian falling off as in
-    splat-transform."""
+    """Return the tests' reference picture (H,W,3), with splat-transform's falloff."""
     projection = project(asset, camera, filter_px2=FILTER_PX2)
     colors = reference_sh.color(asset.sh, asset.means - camera.position)
     largest = np.linalg.eigvalsh(

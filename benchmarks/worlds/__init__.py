@@ -1,8 +1,8 @@
 """Worlds of about 100 million gaussians, like the four of the V3DG paper, from assets
 made here.
 
-A world says which assets stand where. Making the assets, building their bundles and
-putting them into a scene are steps of their own:
+A world defines the positions of assets. Making the assets, building their bundles and
+placing those in a scene are separate steps:
 
     world = worlds.forest(instances=60, num_gaussians=20_000) bundles = {name:
     v3dg.build_bundle(asset.make()) for name, asset in world.assets.items()} scene =
@@ -37,7 +37,7 @@ from v3dg.scene.file import write_scene
 
 @dataclass(frozen=True)
 class Asset:
-    """An asset that can be made: how, and of how many gaussians."""
+    """An asset to be made: the function that makes it, and its number of gaussians."""
 
     make: Callable[[], Gaussians]
     num_gaussians: int
@@ -45,7 +45,7 @@ class Asset:
 
 @dataclass(frozen=True)
 class Placement:
-    """Where I instances of one asset stand.
+    """The poses of the I instances of one asset.
 
     Attributes:
         positions: (I, 3) world units.
@@ -63,7 +63,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class World:
-    """Assets and where they stand, by the assets' names.
+    """Assets and their placements, by the assets' names.
 
     Attributes:
         extent: Distance of the farthest cameras from the origin.
@@ -86,12 +86,13 @@ class World:
         )
 
     def cameras(self, *, width: int = 1920, height: int = 1080) -> dict[str, Camera]:
-        """The paper's 400 cameras around the origin, up to the world's extent."""
+        """Return the paper's 400 cameras around the origin, up to the world's
+        extent."""
         return trajectories((0.0, 0.0, 0.0), self.extent, width=width, height=height)
 
 
 def scene_of(world: World, bundles: Mapping[str, Bundle]) -> Scene:
-    """Place bundles as a world says.
+    """Place bundles as a world defines.
 
     Args:
         bundles: One for each of the world's assets, by its name.
@@ -111,11 +112,12 @@ def scene_of(world: World, bundles: Mapping[str, Bundle]) -> Scene:
 
 
 def donut_sea(instances: int = 2048, num_gaussians: int = 45_624, *, seed: int = 0) -> World:
-    """Make a pile of donuts that fell onto the ground, at 3/4 to full size.
+    """Make a pile of donuts that have fallen onto the ground, with scales from 3/4 to
+    1.
 
     Args:
-        instances: How many donuts.
-        num_gaussians: Of the one asset.
+        instances: Number of donuts.
+        num_gaussians: Number of gaussians of the single asset.
 
     Raises:
         ValueError: ``instances`` is below 1.
@@ -130,15 +132,15 @@ def donut_sea(instances: int = 2048, num_gaussians: int = 45_624, *, seed: int =
     return World("donut_sea", {"donut": asset}, {"donut": placement}, 2.6 * reach)
 
 
-_FALL_STEPS = 50  # sixtieths of a second: the highest have fallen and the pile is calm
+_FALL_STEPS = 50  # sixtieths of a second: then the highest donuts have fallen and the pile is calm
 
 
 def donut_shower(instances: int, *, seed: int = 0, layers: float = 4.0, gap: float = 0.03) -> Pile:
-    """Hang donuts in the air, about that many above each other, ready to fall; none
-    touches another.
+    """Place donuts in the air, about `layers` above each other, ready to fall, without
+    contacts.
 
     Args:
-        gap: Free space between donuts of full size, however they are turned.
+        gap: Free space between donuts of full size, for any rotation.
     """
     if instances < 1:
         raise ValueError(f"instances: expected at least 1, got {instances}")
@@ -152,8 +154,8 @@ def donut_shower(instances: int, *, seed: int = 0, layers: float = 4.0, gap: flo
     plane = pitch * np.stack([i + 0.5 * j, np.sqrt(0.75) * j], -1)
     plane = plane[np.argsort(np.hypot(*plane.T), kind="stable")[:a_layer]]
     layer, cell = np.divmod(np.arange(instances), a_layer)
-    # Layers lie over the gaps of those below, as in a close packing, and are turned a
-    # little.
+    # Layers are above the gaps of those below, as in a close packing, and slightly
+    # rotated.
     shift = pitch * np.array([0.5, np.sqrt(1 / 12)]) * (layer % 2)[:, None]
     jitter = rng.uniform(-0.4, 0.4, (instances, 3)) * gap / np.sqrt(3)
     height = RING + TUBE + gap + layer * pitch
@@ -164,11 +166,11 @@ def donut_shower(instances: int, *, seed: int = 0, layers: float = 4.0, gap: flo
 
 
 def forest(instances: int = 400, num_gaussians: int = 315_630, *, seed: int = 0) -> World:
-    """Make a forest of eight kinds of trees, turned and sized at random, whose crowns
-    hardly meet.
+    """Make a forest of eight kinds of trees with random rotations and sizes, whose
+    crowns hardly touch.
 
     Args:
-        num_gaussians: Of each of the eight assets, on average: kinds have from 0.6 to
+        num_gaussians: Average number for each of the eight assets; kinds have 0.6 to
             1.4 times as many.
     """
     shares = np.linspace(0.6, 1.4, len(TREE_KINDS))[
@@ -184,11 +186,10 @@ def forest(instances: int = 400, num_gaussians: int = 315_630, *, seed: int = 0)
 
 
 def temples(instances: int = 100, num_gaussians: int = 1_350_487, *, seed: int = 0) -> World:
-    """Make a plain of temples, turned and sized at random, that stand clear of each
-    other.
+    """Make a plain of temples with random rotations and sizes, which do not touch.
 
     Args:
-        num_gaussians: Of the one asset.
+        num_gaussians: Number of gaussians of the single asset.
     """
     asset = Asset(partial(make_temple, num_gaussians, seed=seed), num_gaussians)
     return _scattered("temples", {"temple": asset}, {"temple": 15.8}, instances, (0.7, 1.2), seed)
@@ -197,12 +198,12 @@ def temples(instances: int = 100, num_gaussians: int = 1_350_487, *, seed: int =
 def crowd(
     instances: int = 400, num_gaussians: int = 343_274, *, persons: int = 16, seed: int = 0
 ) -> World:
-    """Make a crowd that stands in a square grid and looks one way, its feet at z =
+    """Make a crowd in a square grid that looks in one direction, with its feet at z =
     -0.85.
 
     Args:
-        num_gaussians: Of each asset.
-        persons: How many different ones there are.
+        num_gaussians: Number of gaussians of each asset.
+        persons: Number of different persons.
 
     Raises:
         ValueError: ``instances`` or ``persons`` is below 1.
@@ -214,11 +215,11 @@ def crowd(
     pitch, side = 1.2, int(np.ceil(np.sqrt(instances)))
     row, column = np.divmod(np.arange(instances), side)
     half = 0.5 * (side - 1)
-    # Cameras look at the origin: halfway up, for between the persons' feet there is
-    # nothing.
+    # Cameras look at the origin, which is at half of the persons' height, because there
+    # is nothing between their feet.
     heights = np.full(instances, -0.85)
     positions = np.stack([pitch * (column - half), pitch * (row - half), heights], -1)
-    # Each person as often as any other, and neighbours differ.
+    # All persons occur equally often, and neighbours differ.
     who = np.concatenate(
         [
             np.random.default_rng([seed, i]).permutation(persons)
@@ -246,8 +247,8 @@ def _scattered(
     scales: tuple[float, float],
     seed: int,
 ) -> World:
-    """Place one asset after the other on the plane, at random, where it is clear of all
-    others."""
+    """Place assets on the plane one after the other, at random positions where they
+    touch no other."""
     if instances < 1:
         raise ValueError(f"instances: expected at least 1, got {instances}")
     rng = np.random.default_rng(seed)
@@ -257,7 +258,7 @@ def _scattered(
     )[:instances]
     size = rng.uniform(*scales, instances)
     room = size * np.array([radii[names[k]] for k in which])
-    # Discs dropped one after the other cover about this share of the plane.
+    # Discs that are dropped one after the other cover about this fraction of the plane.
     extent = np.sqrt((room**2).sum() / 0.50)
     places = np.zeros((instances, 2))
     for i in range(1, instances):
@@ -281,7 +282,7 @@ def _clear_place(
     extent: float,
     rng: np.random.Generator,
 ) -> npt.NDArray[np.float64]:
-    """A place at random where a disc touches no other; the disc of places grows where
+    """Return a random position where a disc touches no other; the search area grows if
     there is none."""
     while True:
         r, a = extent * np.sqrt(rng.random(400)), rng.uniform(0, 2 * np.pi, 400)
@@ -318,22 +319,22 @@ def write_world(
     resume: bool = False,
     progress: bool = True,
 ) -> Path:
-    """Make a world's assets, build their bundles, and write all of it with a scene file
-    and its cameras.
+    """Make a world's assets, build their bundles, and write them with a scene file and
+    its cameras.
 
     Args:
-        folder: Made if it is not there. It gets ASSET.ply and ASSET.v3dg for each
-            asset, and WORLD.json.
-        config: How bundles are built; by default as `build_bundle` does.
-        seed: Of the builds.
-        resume: Keep the bundles and finished levels of a call that was interrupted.
+        folder: Created if necessary. It gets ASSET.ply and ASSET.v3dg for each asset,
+            and WORLD.json.
+        config: Settings of the builds; the defaults of `build_bundle` if None.
+        seed: Seed of the builds.
+        resume: Keep the bundles and finished levels of an interrupted call.
 
     Returns:
         The scene file's path.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C; what is finished can be resumed.
-        ValueError, RuntimeError, OSError, MemoryError: As `build_bundle`.
+        KeyboardInterrupt: Ctrl-C was pressed; finished work can be resumed.
+        ValueError, RuntimeError, OSError, MemoryError: See `build_bundle`.
     """
     from tqdm import tqdm
 
@@ -365,8 +366,8 @@ def write_world(
 
 
 def _is_same(read: Gaussians, made: Gaussians) -> bool:
-    """Whether gaussians read from a file are those that were written; logarithms and
-    logits round."""
+    """Return whether gaussians read from a file are those that were written, up to the
+    rounding of logarithms and logits."""
     return len(read) == len(made) and all(
         np.allclose(a, b, rtol=1e-5, atol=1e-6)
         for a, b in (

@@ -7,7 +7,7 @@ import math
 from v3dg.cameras import DEFAULT_FOV_X, Camera, VectorLike, turntable
 
 ELEVATIONS = (15.0, 30.0, 45.0, 60.0, 75.0)
-"""Degrees above the ground."""
+"""Elevations in degrees above the ground."""
 NUM_DIRECTIONS, NUM_DISTANCES = 4, 20
 
 
@@ -20,8 +20,8 @@ def trajectories(
     height: int = 1080,
     near: float = 0.01,
 ) -> dict[str, Camera]:
-    """Make the paper's 400 cameras: from 4 directions and 5 elevations, at 20
-    distances, all to the centre.
+    """Return the paper's 400 cameras: 4 directions, 5 elevations and 20 distances, all
+    looking at the centre.
 
     The directions are those of +y, -x, -y and +x in this order; for each, elevations of
     15 to 75 degrees; for each, distances of 1/20 to 20/20 of the radius. With the
@@ -33,8 +33,8 @@ def trajectories(
         fov_x: Horizontal field of view in radians.
 
     Returns:
-        Cameras by name in that order, "000_camera_0" to "399_camera_19": the place
-        among all, and the distance's.
+        Cameras by name in that order, "000_camera_0" to "399_camera_19": the index
+        among all cameras, and that of the distance.
 
     Raises:
         ValueError: The radius is not a positive number.

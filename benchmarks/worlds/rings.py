@@ -2,9 +2,9 @@
 other.
 
 Position-based rigid bodies (Müller et al., Detailed Rigid Body Simulation with Extended
-Position Based Dynamics, SCA 2020), all contacts of a substep at once. A contact of two
-rings is where their tubes' axes, circles, come nearest, so rings touch as tori do and
-not as chains of balls.
+Position Based Dynamics, SCA 2020), with all contacts of a substep together. A contact
+of two rings is where the circles at the centres of their tubes are closest, so rings
+touch as tori and not as chains of balls.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from v3dg.rotations import rotation_from_quaternion
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-_GROUND_SAMPLES = 8  # places around a ring where it may touch the ground
-_PAIR_SAMPLES = 6  # and where the search for the nearest places of two rings begins
+_GROUND_SAMPLES = 8  # points around a ring where it may touch the ground
+_PAIR_SAMPLES = 6  # points where the search for the closest points of two rings begins
 _SUBSTEPS = 4
 _FRICTION = 0.5
-_SOFTNESS = 1.5  # of the speed a second, that a touch takes
-_RELAX = 0.7  # of what contacts ask for together, as each is answered without knowing of the others
+_SOFTNESS = 1.5  # fraction of the speed per second that a contact removes
+_RELAX = 0.7  # factor of the summed corrections of contacts, each of which ignores the others
 
 
 class Pile:
@@ -33,7 +33,7 @@ class Pile:
     Attributes:
         positions: (N, 3) centres.
         quaternions: (N, 4) w x y z, unit length; a ring's axis is its own z.
-        scales: (N,) of ring and tube.
+        scales: (N,) scales of ring and tube.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Pile:
             gravity: Length units per s².
 
         Raises:
-            ValueError: Shapes do not go together, or the tube is not thinner than the
+            ValueError: Shapes are inconsistent, or the tube is not thinner than the
                 ring.
         """
         self.positions = np.array(positions, dtype=np.float64)
@@ -78,7 +78,7 @@ class Pile:
         self._gravity = gravity
         self._velocities = np.zeros((count, 3))
         self._spins = np.zeros((count, 3))
-        # A uniform torus of mass 1: moments about a diameter and about the axis.
+        # For a uniform torus of mass 1: moments about a diameter and about the axis.
         about_axis = self.ring**2 + 0.75 * self.tube**2
         about_diameter = 0.5 * self.ring**2 + 0.625 * self.tube**2
         mass = self.scales**3
@@ -89,13 +89,14 @@ class Pile:
         return len(self.scales)
 
     def step(self, seconds: float = 1 / 60) -> None:
-        """Let time pass, at most about a sixtieth of a second for a steady pile."""
+        """Advance the time, at most about a sixtieth of a second for a steady pile."""
         pairs = self._pairs_within(seconds)
         for _ in range(_SUBSTEPS):
             self._substep(seconds / _SUBSTEPS, pairs)
 
     def relax(self, iterations: int = 40) -> None:
-        """Push apart what overlaps, without letting time pass; all come to rest."""
+        """Separate overlapping rings without advancing the time; all are at rest
+        afterwards."""
         self._velocities[:], self._spins[:] = 0, 0
         pairs = self._pairs_within(1 / 60)
         for _ in range(iterations):
@@ -106,8 +107,8 @@ class Pile:
             self._separate(contacts, rotations, self.positions.copy(), self.quaternions.copy())
 
     def deepest_overlap(self) -> float:
-        """How deep any two rings, or a ring and the ground, overlap, relative to the
-        tubes' radius."""
+        """Return the depth of the deepest overlap of two rings, or of a ring and the
+        ground, relative to the tubes' radius."""
         pairs = _near_pairs(self.positions, self.ring + self.tube)
         contacts = _Contacts.of(
             self.positions, rotation_from_quaternion(self.quaternions), self.ring, self.tube, pairs
@@ -115,7 +116,7 @@ class Pile:
         return float((contacts.depth / self.tube[contacts.first]).max(initial=0.0))
 
     def _pairs_within(self, seconds: float) -> tuple[Ints, Ints]:
-        """Pairs that may touch within that time."""
+        """Return the pairs that may touch within that time."""
         reach = self.ring + self.tube
         speed = np.sqrt((self._velocities**2).sum(axis=1)) + reach * np.sqrt(
             (self._spins**2).sum(axis=1)
@@ -139,15 +140,15 @@ class Pile:
         touching = self._separate(contacts, rotations, before, turned_before)
         self._velocities = (self.positions - before) / seconds
         self._spins = _rotation_vector(self.quaternions, turned_before) / seconds
-        # Where donuts touch, motion dies away, as dough is soft.
+        # Contacts damp the motion, because dough is soft.
         self._velocities *= 1 - _SOFTNESS * seconds * touching[:, None]
         self._spins *= 1 - 2 * _SOFTNESS * seconds * touching[:, None]
 
     def _separate(
         self, contacts: _Contacts, rotations: Floats, before: Floats, turned_before: Floats
     ) -> npt.NDArray[np.bool_]:
-        """Push touching bodies apart and hold back their sliding, all contacts at once;
-        tell which touch."""
+        """Separate touching bodies and reduce their sliding, all contacts together;
+        return which bodies touch."""
         first, second, ground = contacts.first, contacts.second, contacts.second < 0
         other = np.where(ground, first, second)
         arm_a = contacts.point - self.positions[first]
@@ -155,7 +156,8 @@ class Pile:
         old = rotation_from_quaternion(turned_before)
 
         def moved(body: Ints, arm: Floats) -> Floats:
-            """How far the body's material at the contact has moved in this substep."""
+            """Return how far the body's material at the contact has moved in this
+            substep."""
             local = np.einsum("nji,nj->ni", rotations[body], arm)
             was = before[body] + np.einsum("nij,nj->ni", old[body], local)
             return np.asarray(self.positions[body] + arm - was)
@@ -191,22 +193,22 @@ class Pile:
                 shift[:, axis] += np.bincount(body, self._lightness[body] * share[:, axis], count)
                 turn[:, axis] += np.bincount(body, twist[:, axis], count)
             touching += np.bincount(body, share.any(axis=1), count)
-        # Contacts that push the same way would together push too far; a mean would
-        # creep.
+        # Contacts that push in the same direction would together push too far; their
+        # mean would converge too slowly.
         weight = _RELAX / np.maximum(np.sqrt(touching), 1)
         self.positions += weight[:, None] * shift
         self.quaternions = _turned(self.quaternions, weight[:, None] * turn)
         return touching > 0
 
     def _give(self, body: Ints, arm: Floats, direction: Floats, rotations: Floats) -> Floats:
-        """How far a unit impulse at the end of the arm moves that end."""
+        """Return how far a unit impulse at the end of the arm moves that end."""
         local = np.einsum("nji,nj->ni", rotations[body], np.cross(arm, direction))
         return np.asarray(self._lightness[body] + np.sum(self._ease[body] * local**2, axis=1))
 
 
 @dataclass
 class _Contacts:
-    """C places where bodies overlap."""
+    """C positions where bodies overlap."""
 
     first: Ints  # (C,)
     second: Ints  # (C,) -1: the ground
@@ -241,7 +243,7 @@ class _Contacts:
             away = on_a - on_b
             distance = np.sqrt((away**2).sum(axis=-1))
             depth = (tube[a] + tube[b])[:, None] - distance
-            # Two rings may touch in two places: the deepest, and the deepest of those
+            # Two rings may touch at two points: the deepest one, and the deepest one
             # elsewhere.
             row = np.arange(len(a))
             deepest = depth.argmax(axis=1)
@@ -264,11 +266,11 @@ class _Contacts:
 def _nearest_on_rings(
     positions: Floats, rotations: Floats, ring: Floats, a: Ints, b: Ints
 ) -> tuple[Floats, Floats]:
-    """Where the circles of pairs come nearest to each other, from several starts,
-    (P,S,3) on each."""
+    """Return the closest points of the circles of pairs, from several starts, (P,S,3)
+    on each."""
 
     def onto(points: Floats, body: Ints) -> Floats:
-        """The nearest points of the bodies' circles."""
+        """Return the closest points of the bodies' circles."""
         axis = rotations[body][:, None, :, 2]
         offset = points - positions[body][:, None]
         offset = offset - axis * (offset * axis).sum(axis=-1, keepdims=True)
@@ -287,8 +289,8 @@ def _nearest_on_rings(
 
 
 def _near_pairs(positions: Floats, reach: Floats) -> tuple[Ints, Ints]:
-    """Pairs a < b of balls that overlap, found on a grid of cells as wide as the
-    largest ball."""
+    """Return pairs a < b of overlapping balls, found on a grid with cells as wide as
+    the largest ball."""
     if not len(positions):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     width = 2 * float(reach.max())
@@ -318,7 +320,8 @@ def _near_pairs(positions: Floats, reach: Floats) -> tuple[Ints, Ints]:
 
 
 def _turned(quaternions: Floats, rotation_vectors: Floats) -> Floats:
-    """Quaternions after small further rotations, given as vectors in the world."""
+    """Return quaternions after small further rotations, given as vectors in the
+    world."""
     w, v = quaternions[:, :1], quaternions[:, 1:]
     r = 0.5 * rotation_vectors
     result = np.concatenate(
@@ -328,7 +331,7 @@ def _turned(quaternions: Floats, rotation_vectors: Floats) -> Floats:
 
 
 def _rotation_vector(after: Floats, before: Floats) -> Floats:
-    """The small rotation from one to the other, as a vector in the world."""
+    """Return the small rotation from one to the other, as a vector in the world."""
     w0, v0, w1, v1 = before[:, :1], before[:, 1:], after[:, :1], after[:, 1:]
     scalar = w1 * w0 + (v1 * v0).sum(axis=1, keepdims=True)
     vector = w0 * v1 - w1 * v0 - np.cross(v1, v0)

@@ -1,24 +1,24 @@
 #pragma once
 
-// Makes things on threads of their own before they are needed.
+// Produces items on background threads before they are needed.
 
 #include <omp.h>
 
-#include <condition_variable>
 #include <cstddef>
 #include <cstdint>
 #include <exception>
 #include <functional>
-#include <mutex>
 #include <thread>
 #include <utility>
 #include <vector>
 
+#include "base/mutex.h"
+
 namespace v3dg {
 
-// Makes things number 0 to count - 1, which are used in that order. Thread i % num_threads makes
-// number i, and OpenMP gives it one thread. Number i alone occupies place i % num_places until it
-// was used.
+// Produces items 0 to count - 1, which are consumed in that order. Thread i %
+// num_threads produces item i, with a single OpenMP thread. Item i is stored in slot i
+// % num_places until it has been consumed.
 class Ahead {
   public:
     Ahead(uint64_t count, unsigned num_threads, unsigned num_places,
@@ -39,16 +39,17 @@ class Ahead {
     Ahead(const Ahead&) = delete;
     Ahead& operator=(const Ahead&) = delete;
 
-    // Waits for the next thing and returns its place. Rethrows what was thrown while it was made.
+    // Waits for the next item and returns its slot. Rethrows an exception thrown while
+    // the item was produced.
     size_t wait_for_next() {
-        std::unique_lock<std::mutex> lock(busy_);
-        changed_.wait(lock, [&] { return is_made_[used_ % num_places_] || error_; });
+        const MutexLock lock(busy_);
+        while (!is_made_[used_ % num_places_] && !error_) changed_.wait(busy_);
         if (error_) std::rethrow_exception(error_);
         return used_ % num_places_;
     }
-    // Releases the place of the next thing for another one.
+    // Releases the slot of the next item for reuse.
     void next_is_used() {
-        const std::lock_guard<std::mutex> lock(busy_);
+        const MutexLock lock(busy_);
         is_made_[used_++ % num_places_] = false;
         changed_.notify_all();
     }
@@ -57,27 +58,35 @@ class Ahead {
     void make_all(uint64_t first, unsigned num_threads) noexcept {
         omp_set_num_threads(1);
         for (uint64_t i = first; i < count_; i += num_threads) {
-            std::unique_lock<std::mutex> lock(busy_);
-            changed_.wait(lock, [&] { return i < used_ + num_places_ || is_over_; });
-            if (is_over_) return;
-            lock.unlock();
+            if (!wait_for_slot(i)) return;
             try {
                 make_(i);
             } catch (...) {
-                lock.lock();
-                error_ = std::current_exception();
-                is_over_ = true;
-                changed_.notify_all();
+                fail(std::current_exception());
                 return;
             }
-            lock.lock();
+            const MutexLock lock(busy_);
             is_made_[i % num_places_] = true;
             changed_.notify_all();
         }
     }
+    // Waits until the slot of an item is free. Returns false if items are no longer
+    // wanted.
+    bool wait_for_slot(uint64_t item) {
+        const MutexLock lock(busy_);
+        while (item >= used_ + num_places_ && !is_over_) changed_.wait(busy_);
+        return !is_over_;
+    }
+    // Clang does not check handlers of exceptions, so the lock is not in the handler.
+    void fail(const std::exception_ptr& error) noexcept {
+        const MutexLock lock(busy_);
+        error_ = error;
+        is_over_ = true;
+        changed_.notify_all();
+    }
     void stop() noexcept {
         {
-            const std::lock_guard<std::mutex> lock(busy_);
+            const MutexLock lock(busy_);
             is_over_ = true;
             changed_.notify_all();
         }
@@ -88,12 +97,12 @@ class Ahead {
     const uint64_t count_;
     const unsigned num_places_;
     const std::function<void(uint64_t)> make_;
-    std::mutex busy_;
-    std::condition_variable changed_;
-    std::vector<bool> is_made_;
-    uint64_t used_ = 0;
-    bool is_over_ = false;
-    std::exception_ptr error_;
+    Mutex busy_;
+    Condition changed_;
+    std::vector<bool> is_made_ V3DG_GUARDED_BY(busy_);
+    uint64_t used_ V3DG_GUARDED_BY(busy_) = 0;
+    bool is_over_ V3DG_GUARDED_BY(busy_) = false;
+    std::exception_ptr error_ V3DG_GUARDED_BY(busy_);
     std::vector<std::thread> threads_;
 };
 

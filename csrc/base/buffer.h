@@ -1,7 +1,7 @@
 #pragma once
 
-// Memory on the host that loses its contents when it grows. The counterpart on a device is
-// DeviceBuffer (device.h).
+// Memory on the host that loses its contents when it grows. The counterpart on a device
+// is DeviceBuffer (device.h).
 
 #include <sys/mman.h>
 
@@ -13,8 +13,9 @@
 
 namespace v3dg {
 
-// Returns memory that begins at a cache line, or null. Large blocks are in huge pages where the
-// system has them, because scattered reads would otherwise wait for the page table.
+// Returns memory that begins at a cache line, or null. Large blocks are in huge pages
+// where the system has them, because scattered reads would otherwise wait for the page
+// table.
 inline void* allocate_pages(size_t bytes) {
     constexpr size_t kHugePage = size_t(2) << 20;
     const size_t alignment = bytes < 2 * kHugePage ? 64 : kHugePage;

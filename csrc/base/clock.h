@@ -1,6 +1,6 @@
 #pragma once
 
-// The clock that durations are measured with.
+// The clock that measures durations.
 
 #include <chrono>
 

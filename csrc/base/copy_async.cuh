@@ -7,8 +7,8 @@
 namespace v3dg {
 namespace cuda {
 
-// Copies 16 or 8 bytes from device to shared memory. They have arrived once the thread has called
-// wait_for_copies().
+// Copies 16 or 8 bytes from device to shared memory. The copies are complete once the
+// thread has called wait_for_copies().
 __device__ inline void copy_async(float4* shared, const float4* from) {
 #ifdef __CUDA_ARCH__
     asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(

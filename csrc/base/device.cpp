@@ -1,9 +1,8 @@
-// Devices, and the pool that their stream-ordered memory comes from.
+// Devices, and the memory pool for stream-ordered allocations.
 
 #include "base/device.h"
 
 #include <map>
-#include <mutex>
 #include <string>
 #include <utility>
 #include <vector>
@@ -11,11 +10,14 @@
 namespace v3dg {
 namespace cuda {
 
-void check(cudaError_t error, const char* what) {
-    if (error == cudaSuccess) return;
+[[noreturn]] static void fail(cudaError_t error, const char* what) {
     cudaGetLastError();  // a later call must not report this error again
     throw std::runtime_error(std::string("cuda: ") + what +
                              " failed: " + cudaGetErrorString(error));
+}
+
+void check(cudaError_t error, const char* what) {
+    if (error != cudaSuccess) fail(error, what);
 }
 
 int num_devices() {
@@ -49,11 +51,11 @@ size_t shared_memory_of_multiprocessor() {
 }
 
 void allow_shared_memory(const void* kernel, size_t bytes, const char* name) {
-    static std::mutex mutex;
-    static std::map<std::pair<int, const void*>, size_t> allowed_bytes;
+    static Mutex mutex;
+    static std::map<std::pair<int, const void*>, size_t> allowed_bytes V3DG_GUARDED_BY(mutex);
     int device = 0;
     check(cudaGetDevice(&device), "cudaGetDevice");
-    const std::lock_guard<std::mutex> lock(mutex);
+    const MutexLock lock(mutex);
     size_t& allowed = allowed_bytes[{device, kernel}];
     if (bytes <= allowed) return;
     check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize,
@@ -63,12 +65,12 @@ void allow_shared_memory(const void* kernel, size_t bytes, const char* name) {
 }
 
 bool can_start_early(const void* kernel) {
-    // The first architecture whose kernels can wait for the one before them.
+    // The first architecture whose kernels can wait for their predecessor.
     constexpr int kFirst = 90;
-    static std::mutex mutex;
-    static std::map<std::pair<int, const void*>, bool> known;
+    static Mutex mutex;
+    static std::map<std::pair<int, const void*>, bool> known V3DG_GUARDED_BY(mutex);
     const int device = current_device();
-    const std::lock_guard<std::mutex> lock(mutex);
+    const MutexLock lock(mutex);
     const auto [found, is_new] = known.try_emplace({device, kernel}, false);
     if (is_new) {
         cudaFuncAttributes attributes{};
@@ -79,12 +81,13 @@ bool can_start_early(const void* kernel) {
     return found->second;
 }
 
-// The package has a pool of its own, so that no other library decides how long memory is kept.
+// The package has its own pool, so that no other library decides how long memory is
+// kept.
 static cudaMemPool_t pool_of_current_device() {
-    static std::mutex mutex;
-    static std::vector<cudaMemPool_t> pools;
+    static Mutex mutex;
+    static std::vector<cudaMemPool_t> pools V3DG_GUARDED_BY(mutex);
     const int device = current_device();
-    const std::lock_guard<std::mutex> lock(mutex);
+    const MutexLock lock(mutex);
     if (pools.size() <= static_cast<size_t>(device)) pools.resize(device + 1, nullptr);
     if (pools[device] == nullptr) {
         cudaMemPoolProps properties{};
@@ -93,8 +96,8 @@ static cudaMemPool_t pool_of_current_device() {
         properties.location.id = device;
         cudaMemPool_t pool;
         check(cudaMemPoolCreate(&pool, &properties), "cudaMemPoolCreate");
-        // Memory that was given back is kept until some allocation fails, because mapping it anew
-        // costs milliseconds.
+        // Freed memory stays in the pool until an allocation fails, because mapping it
+        // again costs milliseconds.
         uint64_t keep = uint64_t(1) << 30;
         check(cudaMemPoolSetAttribute(pool, cudaMemPoolAttrReleaseThreshold, &keep),
               "cudaMemPoolSetAttribute");
@@ -111,8 +114,8 @@ void* allocate(size_t bytes, cudaStream_t stream) {
     void* pointer = nullptr;
     cudaError_t error = cudaMallocFromPoolAsync(&pointer, bytes, pool, stream);
     if (error == cudaErrorMemoryAllocation) {
-        // The pool's free memory may be fragmented, and other streams may be about to give memory
-        // back.
+        // The free memory of the pool may be fragmented, and pending work on other
+        // streams may soon free more.
         cudaGetLastError();
         check(cudaDeviceSynchronize(), "cudaDeviceSynchronize");
         check(cudaMemPoolTrimTo(pool, 0), "cudaMemPoolTrimTo");
@@ -122,8 +125,8 @@ void* allocate(size_t bytes, cudaStream_t stream) {
         cudaGetLastError();
         size_t free_bytes = 0, total = 0;
         check(cudaMemGetInfo(&free_bytes, &total), "cudaMemGetInfo");
-        throw OutOfMemory("cuda: out of memory: asked for " + mebibytes(bytes) + ", free are " +
-                          mebibytes(free_bytes) + " of " + mebibytes(total));
+        throw OutOfMemory("cuda: out of memory: requested " + mebibytes(bytes) +
+                          ", free: " + mebibytes(free_bytes) + " of " + mebibytes(total));
     }
     check(error, "cudaMallocFromPoolAsync");
     return pointer;
@@ -134,7 +137,7 @@ void release(void* pointer, int device, cudaStream_t stream) noexcept {
     int current = device;
     const bool is_elsewhere = cudaGetDevice(&current) == cudaSuccess && current != device &&
                               cudaSetDevice(device) == cudaSuccess;
-    // At exit the driver may be gone already, and then so is the memory.
+    // At exit the driver may already be unloaded, which has freed the memory.
     if (cudaFreeAsync(pointer, stream) != cudaSuccess) cudaGetLastError();
     if (is_elsewhere && cudaSetDevice(current) != cudaSuccess) cudaGetLastError();
 }
@@ -158,8 +161,8 @@ bool is_capturing(cudaStream_t stream) {
 void refuse_capture(cudaStream_t stream) {
     if (is_capturing(stream))
         throw std::runtime_error(
-            "cuda: no memory can be had while a graph is captured; draw it once before the "
-            "capture");
+            "cuda: memory cannot be allocated during the capture of a graph; draw the frame once "
+            "before the capture");
 }
 
 StreamMutex::StreamMutex() {
@@ -168,26 +171,39 @@ StreamMutex::StreamMutex() {
 
 StreamMutex::~StreamMutex() {
     if (cudaEventDestroy(done_) != cudaSuccess)
-        cudaGetLastError();  // the driver may be gone at exit
+        cudaGetLastError();  // the driver may be unloaded at exit
 }
 
 void StreamMutex::wait() const noexcept {
     if (cudaEventSynchronize(done_) != cudaSuccess)
-        cudaGetLastError();  // the driver may be gone at exit
+        cudaGetLastError();  // the driver may be unloaded at exit
 }
 
+void StreamMutex::acquire(cudaStream_t stream, bool is_captured) {
+    busy_.lock();
+    if (is_captured || stream == last_) return;
+    const cudaError_t error = cudaStreamWaitEvent(stream, done_, 0);
+    if (error == cudaSuccess) return;
+    busy_.unlock();
+    fail(error, "cudaStreamWaitEvent");
+}
+
+void StreamMutex::release(cudaStream_t stream, bool is_captured) noexcept {
+    if (!is_captured) {
+        last_ = stream;
+        if (cudaEventRecord(done_, stream) != cudaSuccess)
+            cudaGetLastError();  // the next lock reports it
+    }
+    busy_.unlock();
+}
+
+// Clang checks no constructors and destructors, so these only call functions.
 StreamLock::StreamLock(StreamMutex& mutex, cudaStream_t stream)
-    : lock_(mutex.busy_), mutex_(mutex), stream_(stream), is_captured_(is_capturing(stream)) {
-    if (!is_captured_ && stream != mutex.last_)
-        check(cudaStreamWaitEvent(stream, mutex.done_, 0), "cudaStreamWaitEvent");
+    : mutex_(mutex), stream_(stream), is_captured_(is_capturing(stream)) {
+    mutex.acquire(stream, is_captured_);
 }
 
-StreamLock::~StreamLock() {
-    if (is_captured_) return;
-    mutex_.last_ = stream_;
-    if (cudaEventRecord(mutex_.done_, stream_) != cudaSuccess)
-        cudaGetLastError();  // the next lock will see it
-}
+StreamLock::~StreamLock() { mutex_.release(stream_, is_captured_); }
 
 void trim_pool(cudaStream_t stream) {
     check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");

@@ -1,25 +1,25 @@
 #pragma once
 
-// Memory and errors of the CUDA half. A DeviceBuffer frees itself into a pool of its device;
-// trim_pool() returns the pool's free memory to the driver. docs/architecture.md, "Memory on the
-// GPU", says who owns what and when it is freed. Sources that include this header are built only
-// with CUDA.
+// Memory and errors of the CUDA half. A DeviceBuffer frees itself into a pool of its
+// device; trim_pool() returns the pool's free memory to the driver.
+// docs/architecture.md, "Memory on the GPU", says who owns what and when it is freed.
+// Sources that include this header are built only with CUDA.
 
 #include <cuda_runtime.h>
 
-#include <mutex>
 #include <new>
 #include <stdexcept>
 #include <string>
 #include <utility>
 
+#include "base/mutex.h"
 #include "base/span.h"
 
 namespace v3dg {
 namespace cuda {
 
-// The device has no room; what() names how much was requested and how much was free. Python turns
-// it into a MemoryError, as it does every std::bad_alloc.
+// Reports that the device has no room; what() states the requested and the free bytes.
+// Like every std::bad_alloc, it becomes a MemoryError in Python.
 class OutOfMemory : public std::bad_alloc {
   public:
     explicit OutOfMemory(std::string text) : text_(std::move(text)) {}
@@ -29,8 +29,8 @@ class OutOfMemory : public std::bad_alloc {
     std::string text_;
 };
 
-// Throws std::runtime_error with CUDA's error text unless the call succeeded; `what` names the
-// call.
+// Throws std::runtime_error with CUDA's error text unless the call succeeded; `what`
+// names the call.
 void check(cudaError_t error, const char* what);
 
 // Returns the number of devices; 0 without a driver.
@@ -42,34 +42,35 @@ unsigned num_multiprocessors();
 // Returns the bytes of shared memory of one multiprocessor.
 size_t shared_memory_of_multiprocessor();
 
-// Allows the kernel `bytes` of dynamic shared memory on the current device, which is necessary
-// where that and what the kernel declares exceed 48 KiB. The driver has one limit for all threads,
-// so it is only ever raised: a lower one could be set between another thread's request and its
-// launch. `name` goes into errors.
+// Allows the kernel `bytes` of dynamic shared memory on the current device. This is
+// necessary if these bytes and the kernel's static shared memory together exceed 48
+// KiB. The driver has one limit for all threads, so it is only ever raised: a lower one
+// could be set between another thread's request and its launch. `name` is used in error
+// messages.
 void allow_shared_memory(const void* kernel, size_t bytes, const char* name);
 
-// Returns whether the code that the current device runs for the kernel waits for the kernel before
-// it.
+// Returns whether the kernel, compiled for the current device, waits for its
+// predecessor.
 bool can_start_early(const void* kernel);
 
-// Returns stream-ordered memory of the current device, from a pool that keeps released memory for
-// the next caller. Throws OutOfMemory.
+// Returns stream-ordered memory of the current device, from a pool that keeps released
+// memory for the next caller. Throws OutOfMemory.
 void* allocate(size_t bytes, cudaStream_t stream);
-// Releases memory of `device` on a stream of it, whichever device is current.
+// Releases memory of `device` on one of its streams, whichever device is current.
 void release(void* pointer, int device, cudaStream_t stream) noexcept;
 // Waits for the stream, and returns the pool's free memory to the driver.
 void trim_pool(cudaStream_t stream);
 
-// The memory that the pool of the current device has reserved from the driver, and the part of it
-// that is in use.
+// The memory that the pool of the current device has reserved from the driver, and the
+// part of it that is in use.
 struct PoolBytes {
     size_t reserved, used;
 };
 PoolBytes pool_bytes();
 
 bool is_capturing(cudaStream_t stream);
-// Throws std::runtime_error while the stream is being captured: memory from a graph is gone with
-// the graph.
+// Throws std::runtime_error while the stream is being captured, because memory
+// allocated by a graph is freed with the graph.
 void refuse_capture(cudaStream_t stream);
 
 // Guards memory that several threads and streams use in turn.
@@ -77,38 +78,42 @@ class StreamMutex {
   public:
     StreamMutex();
     ~StreamMutex();
-    // Waits until the device is done with the work that was enqueued under the last lock, and so
-    // with all work before it.
+    // Waits until the device has finished the work that was enqueued under the last
+    // lock, and therefore all work before it.
     void wait() const noexcept;
     StreamMutex(const StreamMutex&) = delete;
     StreamMutex& operator=(const StreamMutex&) = delete;
 
   private:
     friend class StreamLock;
-    std::mutex busy_;
+    void acquire(cudaStream_t stream, bool is_captured) V3DG_ACQUIRE(busy_);
+    void release(cudaStream_t stream, bool is_captured) noexcept V3DG_RELEASE(busy_);
+
+    Mutex busy_;
     cudaEvent_t done_ = nullptr;
-    cudaStream_t last_ = nullptr;
+    cudaStream_t last_ V3DG_GUARDED_BY(busy_) = nullptr;
 };
 
-// Holds a StreamMutex. The memory belongs to one thread meanwhile, and work that this thread
-// enqueues on the stream runs after the work that was enqueued under the lock before. The lock does
-// not order what a graph captures; that is left to the code that replays the graph.
-class StreamLock {
+// Holds a StreamMutex. Meanwhile the memory belongs to one thread, and work that this
+// thread enqueues on the stream runs after the work that was enqueued under the
+// previous lock. The lock does not order captured work; the code that replays the graph
+// has to do so.
+class V3DG_SCOPED_CAPABILITY StreamLock {
   public:
-    StreamLock(StreamMutex& mutex, cudaStream_t stream);
-    ~StreamLock();
+    StreamLock(StreamMutex& mutex, cudaStream_t stream) V3DG_ACQUIRE(mutex.busy_);
+    ~StreamLock() V3DG_RELEASE();
     StreamLock(const StreamLock&) = delete;
     StreamLock& operator=(const StreamLock&) = delete;
 
   private:
-    const std::lock_guard<std::mutex> lock_;
     StreamMutex& mutex_;
     cudaStream_t stream_;
     bool is_captured_;
 };
 
-// Owns elements of a plain type, not initialised, on the device that is current when the buffer
-// grows. Growing loses the contents. Code that uses a buffer on several streams orders them itself.
+// Owns elements of a plain type, not initialised, on the device that is current when
+// the buffer grows. Growing loses the contents. Code that uses a buffer on several
+// streams orders them itself.
 template <class T>
 class DeviceBuffer {
   public:
@@ -122,7 +127,8 @@ class DeviceBuffer {
     }
     ~DeviceBuffer() { release(data_, device_, stream_); }
 
-    // Makes room for `size` elements; memory is allocated and released in the order of `stream`.
+    // Makes room for `size` elements; memory is allocated and released in the order of
+    // `stream`.
     T* reserve(size_t size, cudaStream_t stream) {
         if (size > capacity_) {
             refuse_capture(stream);
@@ -136,7 +142,7 @@ class DeviceBuffer {
         stream_ = stream;
         return data_;
     }
-    // Copies elements of the host, whose memory may be reused on return.
+    // Copies elements from the host, whose memory may be reused on return.
     T* copy_from(Span<const T> host, cudaStream_t stream) {
         reserve(host.size, stream);
         if (host.size > 0)

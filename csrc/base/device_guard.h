@@ -1,14 +1,14 @@
 #pragma once
 
-// Switches the current device of a thread for a while.
+// Switches the current device of a thread for the duration of a scope.
 
 #include "base/device.h"
 
 namespace v3dg {
 namespace cuda {
 
-// Makes a device the current one of this thread for as long as the guard lives. Streams that are
-// used meanwhile have to belong to that device.
+// Makes a device the current one of this thread while the guard exists. Streams used
+// meanwhile must belong to that device.
 class DeviceGuard {
   public:
     explicit DeviceGuard(int device) : device_(device), before_(current_device()) {

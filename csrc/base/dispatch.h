@@ -1,6 +1,6 @@
 #pragma once
 
-// The device that an operation runs on. bindings/backend.h chooses the backend that runs it there.
+// The device on which an operation runs. bindings/backend.h chooses the backend for it.
 
 #include "base/stream.h"
 
@@ -10,7 +10,7 @@
 
 namespace v3dg {
 
-// The host, or a CUDA device by its number.
+// The host, or a CUDA device with its index.
 struct Device {
     int number = -1;
 

@@ -1,13 +1,13 @@
 #pragma once
 
-// An event of CUDA that marks a place in a stream.
+// A CUDA event, which marks a position in a stream.
 
 #include "base/device.h"
 
 namespace v3dg {
 namespace cuda {
 
-// Owns an event without timing. Before it is recorded it counts as happened.
+// Owns an event without timing. An event that was never recorded counts as completed.
 class Event {
   public:
     Event() {
@@ -18,13 +18,15 @@ class Event {
     Event(const Event&) = delete;
     Event& operator=(const Event&) = delete;
 
-    // Marks the end of what has been enqueued on `stream` so far.
+    // Marks the end of the work enqueued on `stream` so far.
     void record(cudaStream_t stream) { check(cudaEventRecord(event_, stream), "cudaEventRecord"); }
-    // Makes what is enqueued on `stream` from now on wait for the event. The host does not wait.
+    // Makes work that is enqueued on `stream` from now on wait for the event. The host
+    // does not wait.
     void hold_back(cudaStream_t stream) const {
         check(cudaStreamWaitEvent(stream, event_, 0), "cudaStreamWaitEvent");
     }
-    // Returns at once. `work` names the work before the event in the error of a kernel that failed.
+    // Returns at once. If a kernel before the event failed, the error names it as
+    // `work`.
     bool has_happened(const char* work) const {
         const cudaError_t state = cudaEventQuery(event_);
         if (state == cudaErrorNotReady) return false;

@@ -4,12 +4,13 @@
 
 #include <cstddef>
 #include <exception>
-#include <mutex>
+
+#include "base/mutex.h"
 
 namespace v3dg {
 
-// Carries an exception out of a parallel loop: of all that were thrown, the one of the lowest
-// index.
+// Carries an exception out of a parallel loop: if several were thrown, the one with the
+// lowest index.
 class FirstError {
   public:
     template <class Body>
@@ -17,21 +18,27 @@ class FirstError {
         try {
             body();
         } catch (...) {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            if (!error_ || index < index_) {
-                error_ = std::current_exception();
-                index_ = index;
-            }
+            keep_lowest(index, std::current_exception());
         }
     }
-    void rethrow() const {
+    // Called after the loop.
+    void rethrow() {
+        const MutexLock lock(mutex_);
         if (error_) std::rethrow_exception(error_);
     }
 
   private:
-    std::mutex mutex_;
-    std::exception_ptr error_;
-    size_t index_ = 0;
+    // Clang does not check handlers of exceptions, so the lock is not in the handler.
+    void keep_lowest(size_t index, const std::exception_ptr& error) noexcept {
+        const MutexLock lock(mutex_);
+        if (error_ && index >= index_) return;
+        error_ = error;
+        index_ = index;
+    }
+
+    Mutex mutex_;
+    std::exception_ptr error_ V3DG_GUARDED_BY(mutex_);
+    size_t index_ V3DG_GUARDED_BY(mutex_) = 0;
 };
 
 }  // namespace v3dg

@@ -1,15 +1,16 @@
 #pragma once
 
-// Sources that are compiled once for each instruction set, and the choice between their versions.
+// Sources that are compiled once for each instruction set, and the choice between their
+// versions.
 
 namespace v3dg {
 
 // The instruction sets that the sources in V3DG_SIMD_SOURCES are compiled for.
 enum class Isa { baseline, avx2, avx512 };
 
-// Returns the widest instruction set that this processor has, or the one that the environment
-// variable V3DG_ISA names, which is read once. Throws std::runtime_error when the variable names an
-// instruction set that the processor lacks.
+// Returns the widest instruction set that this processor has, or the one that the
+// environment variable V3DG_ISA names, which is read once. Throws std::runtime_error
+// when the variable names an instruction set that the processor lacks.
 Isa active_isa();
 const char* isa_name(Isa isa);
 

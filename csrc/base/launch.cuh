@@ -1,6 +1,7 @@
 #pragma once
 
-// Starts kernels, and has the few helpers of blocks and warps that most kernels use.
+// Launches kernels, and provides the helpers for blocks and warps that most kernels
+// use.
 
 #include "base/device.h"
 
@@ -9,8 +10,8 @@ namespace cuda {
 
 constexpr unsigned kAllLanes = 0xffffffffu;
 
-// Starts `kernel` and checks that it started; `name` goes into the error. Does nothing for a grid
-// without blocks.
+// Launches `kernel` and checks for errors; `name` is used in the error message. Does
+// nothing for a grid without blocks.
 template <class... P, class... A>
 void launch(const char* name, void (*kernel)(P...), dim3 grid, dim3 block, size_t shared_bytes,
             cudaStream_t stream, A&&... arguments) {
@@ -21,9 +22,9 @@ void launch(const char* name, void (*kernel)(P...), dim3 grid, dim3 block, size_
     check(cudaGetLastError(), name);
 }
 
-// As launch(), for a kernel that calls await_kernel_before() first in every block. Where the device
-// can do that, the kernel starts before the writes of the kernel before it are visible, and waits
-// for them itself.
+// As launch(), for a kernel in which every block first calls await_kernel_before(). If
+// the device supports it, the kernel starts before the writes of its predecessor are
+// visible, and waits for them itself.
 template <class... P, class... A>
 void launch_early(const char* name, void (*kernel)(P...), dim3 grid, dim3 block,
                   size_t shared_bytes, cudaStream_t stream, A&&... arguments) {
@@ -43,7 +44,8 @@ void launch_early(const char* name, void (*kernel)(P...), dim3 grid, dim3 block,
     check(cudaLaunchKernelEx(&config, kernel, static_cast<P>(arguments)...), name);
 }
 
-// Waits for all writes of the kernel before this one, and so for those of all kernels before that.
+// Waits for all writes of the previous kernel, and therefore of all kernels before
+// that.
 __device__ inline void await_kernel_before() {
 #if __CUDA_ARCH__ >= 900
     cudaGridDependencySynchronize();
@@ -61,15 +63,15 @@ __device__ inline unsigned char* shared_memory() {
     return bytes;
 }
 
-// Returns, in lane 0, the number of the work item that a warp takes next. The first `dealt` items
-// have been assigned, and `taken` counts the others, from 0. Call it early, because the atomic
-// operation has a long latency.
+// Returns, in lane 0, the index of the work item that a warp claims next. The first
+// `dealt` items were assigned statically; `taken` counts the others from 0. Call it
+// early, because the atomic operation has a long latency.
 __device__ inline unsigned take_next(unsigned* taken, unsigned dealt) {
     return threadIdx.x % 32 == 0 ? dealt + atomicAdd(taken, 1u) : 0;
 }
 
-// Reduce over the lanes of a whole warp; every lane gets the result. The order of the additions is
-// fixed.
+// Reduce over the lanes of a whole warp; every lane gets the result. The order of the
+// additions is fixed.
 template <class T>
 __device__ inline T warp_sum(T x) {
 #pragma unroll

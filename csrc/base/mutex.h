@@ -1,7 +1,7 @@
 #pragma once
 
-// A mutex, its locks and its condition variable, as the standard library has them, with the
-// annotations that clang needs to check their use (base/thread_annotations.h).
+// The standard library's mutex, locks and condition variable, with the annotations that
+// clang needs to check their use (base/thread_annotations.h).
 
 #include <chrono>
 #include <condition_variable>
@@ -30,7 +30,7 @@ class V3DG_CAPABILITY("mutex") Mutex {
 class V3DG_SCOPED_CAPABILITY MutexLock {
   public:
     explicit MutexLock(Mutex& mutex) V3DG_ACQUIRE(mutex) : mutex_(mutex) { mutex.lock(); }
-    // The caller holds the mutex already; it is released at the end of the scope.
+    // The caller already holds the mutex, which is released at the end of the scope.
     MutexLock(Mutex& mutex, std::adopt_lock_t) V3DG_REQUIRES(mutex) : mutex_(mutex) {}
     ~MutexLock() V3DG_RELEASE() { mutex_.unlock(); }
     MutexLock(const MutexLock&) = delete;
@@ -40,8 +40,8 @@ class V3DG_SCOPED_CAPABILITY MutexLock {
     Mutex& mutex_;
 };
 
-// Releases a mutex that the caller holds, and takes it again at the end of the scope, however that
-// is left.
+// Releases a mutex that the caller holds, and acquires it again at the end of the
+// scope, whichever way that is left.
 class V3DG_SCOPED_CAPABILITY MutexUnlock {
   public:
     explicit MutexUnlock(Mutex& mutex) V3DG_RELEASE(mutex) : mutex_(mutex) { mutex.unlock(); }
@@ -53,8 +53,8 @@ class V3DG_SCOPED_CAPABILITY MutexUnlock {
     Mutex& mutex_;
 };
 
-// Waits may end without a notification: callers check in a loop what they wait for, which lets
-// clang check the condition, too.
+// Waits may end without a notification. Callers test their condition in a loop, so that
+// clang checks the accesses in it, too.
 class Condition {
   public:
     using Time = std::chrono::steady_clock::time_point;
@@ -66,7 +66,7 @@ class Condition {
         condition_.wait(lock);
         lock.release();
     }
-    // Returns false if the time is up.
+    // Returns false if the time has expired.
     bool wait_until(Mutex& mutex, Time end) V3DG_REQUIRES(mutex) {
         std::unique_lock<std::mutex> lock(mutex.mutex_, std::adopt_lock);
         const std::cv_status status = condition_.wait_until(lock, end);

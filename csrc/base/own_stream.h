@@ -13,8 +13,8 @@ class OwnStream {
     OwnStream() {
         check(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking), "cudaStreamCreate");
     }
-    // Waits for the work on the stream, because that reads memory of the caller; it does so when a
-    // step has failed, too.
+    // Waits for the work on the stream, which reads memory of the caller, even if a
+    // step has failed.
     ~OwnStream() {
         cudaStreamSynchronize(stream_);
         cudaStreamDestroy(stream_);

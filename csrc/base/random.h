@@ -8,8 +8,8 @@
 
 namespace v3dg {
 
-// Returns random bits by counter: the same (seed, stream, counter) gives the same number
-// everywhere.
+// Returns random bits by counter: the same (seed, stream, counter) gives the same
+// number everywhere.
 V3DG_HD inline uint64_t random_bits(uint64_t seed, uint64_t stream, uint64_t counter) {
     // There are three rounds of the splitmix64 finaliser, one for each argument.
     uint64_t x = seed;

@@ -1,15 +1,15 @@
 #pragma once
 
-// Prefix sums over the lanes of a warp, over a block's threads, and over parts that any number of
-// blocks take one after another.
+// Prefix sums over the lanes of a warp, over the threads of a block, and over parts
+// that any number of blocks process one after another.
 
 #include "base/launch.cuh"
 
 namespace v3dg {
 namespace cuda {
 
-// Returns the sum of x over the lanes up to and including this one, in each group of kWidth lanes;
-// called by a whole warp.
+// Returns the sum of x over the lanes up to and including this one, in each group of
+// kWidth lanes. Called by a whole warp.
 template <unsigned kWidth = 32, class T>
 __device__ inline T warp_prefix(T x) {
 #pragma unroll
@@ -20,8 +20,8 @@ __device__ inline T warp_prefix(T x) {
     return x;
 }
 
-// Returns the sum of x over the threads before this one; `total` becomes that of all threads.
-// Called by every thread of a block of whole warps.
+// Returns the sum of x over the threads before this one; `total` becomes the sum over
+// all threads. Called by every thread of a block of whole warps.
 template <class T>
 __device__ inline T block_prefix(T x, T& total) {
     __shared__ T warp_total[32];
@@ -39,7 +39,8 @@ __device__ inline T block_prefix(T x, T& total) {
     return before + sum - x;
 }
 
-// Returns the next number of a counter that starts at 0, the same for the whole block.
+// Returns the next value of a counter that starts at 0, the same value for the whole
+// block.
 __device__ inline unsigned take_ticket(unsigned* counter) {
     __shared__ unsigned ticket;
     if (threadIdx.x == 0) ticket = atomicAdd(counter, 1u);
@@ -49,11 +50,12 @@ __device__ inline unsigned take_ticket(unsigned* counter) {
     return taken;
 }
 
-// Returns the sum of the parts before `part`, whose own sum is `sum` (below 2^62); called by a
-// whole warp, once a part. `state` has a word a part, zero at first. Parts must be begun in
-// ascending order: take them by ticket.
+// Returns the sum of the parts before `part`, whose own sum is `sum` (below 2^62).
+// Called by a whole warp, once per part. `state` has one integer per part, initially
+// zero. Parts must be started in ascending order, which take_ticket() ensures.
 //
-// Source: Merrill and Garland, Single-pass Parallel Prefix Scan with Decoupled Look-back, 2016.
+// Source: Merrill and Garland, Single-pass Parallel Prefix Scan with Decoupled
+// Look-back, 2016.
 __device__ inline unsigned long long prefix_of_part(unsigned long long* state, size_t part,
                                                     unsigned long long sum) {
     constexpr unsigned long long kOwn = 1ull << 62, kAll = 2ull << 62, kValue = kOwn - 1;
@@ -73,13 +75,14 @@ __device__ inline unsigned long long prefix_of_part(unsigned long long* state, s
             is_ready = true;
 #pragma unroll
             for (unsigned k = 0; k < kEach; ++k) {
-                const unsigned back = kEach * lane + k;  // nothing lies before the first part
+                const unsigned back = kEach * lane + k;  // no part precedes the first one
                 seen[k] = back < end ? word[end - 1 - back] : kAll;
             }
 #pragma unroll
             for (unsigned k = 0; k < kEach; ++k) is_ready = is_ready && seen[k] >= kOwn;
         } while (!is_ready);
-        // Each lane adds its parts up to the nearest one that knows the sum of all before it.
+        // Each lane sums its parts back to the nearest one that has published the sum
+        // of all parts before it.
 #pragma unroll
         for (unsigned k = 0; k < kEach; ++k) {
             of_lane += knows_all ? 0 : seen[k] & kValue;

@@ -1,13 +1,13 @@
 #pragma once
 
-// CUDA's stream, for headers that sources without CUDA include.
+// CUDA's stream type, for headers that are also included by sources without CUDA.
 
 struct CUstream_st;
 
 namespace v3dg {
 namespace cuda {
 
-// This is cudaStream_t.
+// The same type as cudaStream_t.
 using Stream = CUstream_st*;
 
 }  // namespace cuda

@@ -4,9 +4,10 @@
 
 namespace v3dg {
 
-// Returns the number of threads that a parallel region requests from OpenMP, at least 1. It is
-// OpenMP's own number, but at most the number of processors that a machine may have, and 1 where
-// the threads' stacks would be too small or too large: OpenMP would end the process.
+// Returns the number of threads that a parallel region requests from OpenMP, at least
+// 1. It is OpenMP's own number, limited to a plausible number of processors, and 1 if
+// the threads' stacks would be too small or too large, because OpenMP would then end
+// the process.
 int most_threads();
 
 }  // namespace v3dg

@@ -1,4 +1,5 @@
-// Arrays of the host: checks and memory. What concerns other devices goes to their backend.
+// Arrays of the host: checks and memory. The functions for other devices call the
+// device's backend.
 
 #include "bindings/array.h"
 
@@ -51,7 +52,7 @@ std::vector<py::ssize_t> shape_of(const py::handle& array, const char* name) {
 py::object cuda_interface_of(const py::handle& array) {
     PyObject* found = PyObject_GetAttrString(array.ptr(), kInterface);
     if (found != nullptr) return py::reinterpret_steal<py::object>(found);
-    // An interrupt may arrive here, too.
+    // The error may also be an interrupt, which must not be swallowed.
     if (!PyErr_ExceptionMatches(PyExc_AttributeError)) throw py::error_already_set();
     PyErr_Clear();
     return py::none();
@@ -84,7 +85,7 @@ Borrowed borrow_on_host(const py::handle& array, const char* name, const Element
         refuse_value(
             name, "expected a C-contiguous array, got a strided one; call numpy.ascontiguousarray");
     if (is_written && !got.writeable())
-        refuse_value(name, "expected an array that can be written to");
+        refuse_value(name, "expected a writable array, got a read-only one");
     return {.data = const_cast<void*>(got.data()), .size = static_cast<size_t>(got.size())};
 }
 

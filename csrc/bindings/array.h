@@ -1,7 +1,8 @@
 #pragma once
 
-// Arrays that users hold: NumPy's on the host, and what a backend takes on a device, such as
-// torch's tensors. They are borrowed after checks of kind, dtype, shape and layout, never copied.
+// Arrays of the caller: NumPy's on the host and, on a device, arrays that its backend
+// accepts, such as torch's tensors. They are borrowed after checks of kind, dtype,
+// shape and layout, and never copied.
 
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
@@ -23,15 +24,16 @@ namespace v3dg {
 namespace py = pybind11;
 using namespace py::literals;
 
-// A shape as it is wanted; -1 stands for any length.
+// An expected shape; -1 stands for any length.
 using Shape = std::initializer_list<py::ssize_t>;
 std::string shape_text(Shape shape);
 std::string shape_text(const py::handle& array);
 
-// TypeError: the argument is another kind of object than is expected.
+// Throws TypeError: the argument is a different kind of object than expected.
 [[noreturn]] void refuse_kind(const char* name, const std::string& expected, const py::handle& got);
 
-// What a Python object holds that is kept as such; TypeError where that is something else.
+// Returns the C++ value of a Python object; throws TypeError if its class is another
+// one.
 template <class T>
 T& held(const py::handle& object, const char* name) {
     if (!py::isinstance<T>(object))
@@ -39,10 +41,10 @@ T& held(const py::handle& object, const char* name) {
     return object.cast<T&>();
 }
 
-// The shape of an array on any device; TypeError where there is none.
+// Returns the shape of an array on any device; throws TypeError if the object has none.
 std::vector<py::ssize_t> shape_of(const py::handle& array, const char* name);
 
-// What elements are, as NumPy and as __cuda_array_interface__ have it.
+// The type of elements, in the notation of NumPy and of __cuda_array_interface__.
 struct Element {
     py::dtype (*dtype)();
     const char* typestr;
@@ -57,7 +59,7 @@ constexpr Element element_of() {
     if constexpr (std::is_same_v<T, uint8_t>) return {&py::dtype::of<T>, "|u1"};
 }
 
-// Memory that is borrowed from an array, in elements.
+// Memory borrowed from an array; sizes count elements.
 struct Borrowed {
     void* data;
     size_t size;
@@ -65,28 +67,29 @@ struct Borrowed {
 
 constexpr Device kHost{};
 
-// Where an array is. TypeError where it is neither NumPy's nor a device's, RuntimeError where it
-// needs a backend that this v3dg was built without.
+// Returns the device of an array. Throws TypeError if the array is neither NumPy's nor
+// a device's, and RuntimeError if its backend was not compiled.
 Device device_of(const py::handle& array, const char* name);
 
-// The description of an array on a CUDA device, __cuda_array_interface__; None where it has none.
+// Returns the description of an array on a CUDA device, __cuda_array_interface__, or
+// None if it has none.
 py::object cuda_interface_of(const py::handle& array);
 
 bool fits_shape(const std::vector<py::ssize_t>& got, Shape wanted);
 
-// ValueError: name, colon, problem.
+// Throws ValueError with the text "name: problem".
 [[noreturn]] void refuse_value(const char* name, const std::string& problem);
 
-// Borrows an array of NumPy's after checks of its dtype and shape.
+// Borrows a NumPy array after checks of its dtype and shape.
 Borrowed borrow_on_host(const py::handle& array, const char* name, const Element& element,
                         Shape shape, bool is_written);
 
-// Borrows an array after checks that it is on this device, and has this dtype and shape. The caller
-// keeps it alive and its stream ordered.
+// Borrows an array after checks of its device, dtype and shape. The caller keeps the
+// array alive and orders its stream.
 Borrowed borrow(Device device, const py::handle& array, const char* name, const Element& element,
                 Shape shape, bool is_written);
 
-// Borrows an array on the host; T is const where it is only read.
+// Borrows an array on the host; T is const if it is only read.
 template <class T>
 Span<T> span_of(const py::handle& array, const char* name, Shape shape) {
     const Borrowed borrowed = borrow_on_host(array, name, element_of<std::remove_const_t<T>>(),
@@ -94,7 +97,7 @@ Span<T> span_of(const py::handle& array, const char* name, Shape shape) {
     return {static_cast<T*>(borrowed.data), borrowed.size};
 }
 
-// Borrows an array that has to be where others are.
+// Borrows an array that must be on the same device as others.
 template <class T>
 Span<T> span_on(Device device, const py::handle& array, const char* name, Shape shape) {
     const Borrowed borrowed = borrow(device, array, name, element_of<std::remove_const_t<T>>(),
@@ -102,14 +105,15 @@ Span<T> span_on(Device device, const py::handle& array, const char* name, Shape 
     return {static_cast<T*>(borrowed.data), borrowed.size};
 }
 
-// A new array, not initialised, and its memory. Too little memory is a MemoryError.
+// A new, uninitialised array and its memory. Throws MemoryError if there is too little
+// memory.
 struct MadeArray {
     py::object object;
     void* data;
 };
 MadeArray make_array(Device device, const Element& element, const std::vector<py::ssize_t>& shape);
 
-// The same, borrowed to be filled in.
+// A new array, borrowed to be filled in.
 template <class T>
 struct NewArray {
     py::object object;
@@ -126,9 +130,9 @@ struct NewArray {
 
 class Backend;
 
-// Work on a device, on the stream that torch uses there; that device is the current one meanwhile.
-// Made and destroyed with Python's lock, which the work itself is done without. RuntimeError where
-// there is no such device.
+// Runs work on a device, on torch's current stream there, and makes the device current
+// meanwhile. It is constructed and destroyed with Python's lock held; the work itself
+// runs without it. Throws RuntimeError if there is no such device.
 class Work {
   public:
     explicit Work(Device device);
@@ -138,7 +142,7 @@ class Work {
 
     Device device() const { return device_; }
     const Backend& backend() const { return backend_; }
-    // What the backend calls a stream; null on the host.
+    // Returns the backend's stream; null on the host.
     void* stream() const { return stream_; }
 
   private:

@@ -1,4 +1,5 @@
-// Which backend a device has. The flag below is the only one of the bindings.
+// The mapping from devices to backends. It contains the only #if of the bindings that
+// depends on a backend.
 
 #include "bindings/backend.h"
 

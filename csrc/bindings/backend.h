@@ -1,38 +1,42 @@
 #pragma once
 
-// The seam between the bindings and what computes: a Backend is the host, or one kind of device.
-// The bindings check what Python gives them, and call the backend that backend_of() names; bound
-// classes hold handles that it made (namespace backend). Nothing but the sources of a backend knows
-// how a device works.
+// The interface between the bindings and the code that computes: a Backend is the host,
+// or one kind of device. The bindings check the arguments from Python and call the
+// backend that backend_of() returns. Bound classes hold handles that the backend made
+// (namespace backend). Only the sources of a backend depend on its kind of device.
 //
-// Add a backend (WebGPU, HIP, Metal):
-// 1. `<name>_backend.cpp` beside this header: a class derived from Backend, and one derived from
-//    each handle of the namespace backend. host_backend.cpp and host_frame.cpp are the model, and
-//    need no device; cuda_backend.cpp and cuda_frame.cpp show what changes on one.
-// 2. A list of its sources in CMakeLists.txt, as V3DG_CUDA_BINDINGS is, which is compiled only
-//    where the device's compiler is found.
-// 3. device_backend() in backend.cpp returns it. That is the only `#if` of the bindings. A module
-//    has the host and at most one kind of device; for two, `Device` (base/dispatch.h) gets a kind,
-//    and backend_of() looks at that.
-// 4. `v3dg/_device.py` finds its devices. The tests of an operation then run on it through their
-//    fixture `device`; agreement is that of STYLE.md: decisions bit by bit, floats within bounds.
+// To add a backend (WebGPU, HIP, Metal):
+// 1. Write `<name>_backend.cpp` beside this header, with a class derived from Backend,
+// and one derived from each handle of the namespace backend. Start from
+// host_backend.cpp and host_frame.cpp, which need no device; cuda_backend.cpp and
+// cuda_frame.cpp show what differs on a device.
+// 2. List its sources in CMakeLists.txt, as V3DG_CUDA_BINDINGS does, so that they are
+// compiled only if the device's compiler is found.
+// 3. Return it from device_backend() in backend.cpp, which contains the only `#if` of
+// the bindings. A module has the host and at most one kind of device; for two kinds,
+// add a kind to `Device` (base/dispatch.h), and let backend_of() read it.
+// 4. Let `v3dg/_device.py` find its devices. The tests of an operation then run on them
+// through the fixture `device`; STYLE.md says how results must agree: decisions bit by
+// bit, floats within bounds.
 //
-// What it must supply, in this order: arrays, work, operations, handles, drawing, fits. Each
-// function below says more.
+// A backend supplies, in this order: arrays, work, operations, handles, drawing, fits.
+// Each function below has its own contract.
 //
-// Python's lock. A function is called with it, unless it is in the part "without Python's lock".
-// Who is called with it and works or waits for long gives it up meanwhile (Unlocked).
-// Streams. Work is queued on `Work::stream()`, which is the caller's, and on no other that the
-// caller would have to wait for. Memory that Python gave may be reused on that stream on return.
-// Waiting. A function returns when its work is queued. Where it says "waits", results are on the
-// host on return.
-// Ownership. Handles are owned by bound objects and destroyed with Python's lock. A handle that
-// borrows from a Python object keeps a reference to it. Spans are good until the function returns,
-// or, of arrays on the device, until what is queued is done, for torch keeps that memory in the
-// stream's order.
-// Errors. What the bindings have checked is not checked again. std::bad_alloc becomes a
-// MemoryError, std::invalid_argument and py::value_error a ValueError, std::runtime_error a
-// RuntimeError.
+// Python's lock: a function is called with it, unless it is in the part "without
+// Python's lock" or its comment says so. A function that works or waits for long
+// releases it meanwhile (Unlocked).
+// Streams: work is queued on `Work::stream()`, the caller's stream, and on no other
+// stream that the caller would have to wait for. Memory that Python gave may be reused
+// on that stream on return.
+// Waiting: a function returns when its work is queued. If its comment says "Waits",
+// results are on the host on return.
+// Ownership: bound objects own the handles, which are destroyed with Python's lock
+// held. A handle that borrows from a Python object keeps a reference to it. Spans are
+// valid until the function returns; those of arrays on the device are valid until the
+// queued work is done, because torch frees that memory in stream order.
+// Errors: a backend does not repeat the checks of the bindings. std::bad_alloc becomes
+// a MemoryError, std::invalid_argument and py::value_error a ValueError,
+// std::runtime_error a RuntimeError.
 
 #include <memory>
 #include <optional>
@@ -47,6 +51,7 @@
 #include "cluster/box.h"
 #include "cluster/cluster.h"
 #include "draw/request.h"
+#include "frame/draw_list.h"
 #include "gather/gather.h"
 #include "levels/fit_level.h"
 #include "levels/refine_cuts.h"
@@ -62,126 +67,138 @@ constexpr const char* kWithoutCuda =
 class BoundTable;
 struct SceneState;
 
-// What Backend::enter() changed and found.
+// The result of Backend::enter().
 struct Entered {
-    int device_before;  // which leave() makes the current one again
+    int device_before;  // leave() makes it the current one again
     void* stream;
 };
 
-// What a backend's arrays can do.
+// The abilities of a backend.
 struct BackendTraits {
-    bool host_reads_arrays;   // so that their values can be checked
+    bool host_reads_arrays;   // if so, the bindings check values
     bool computes_doubles;    // float64 gaussians are drawn and differentiated
-    size_t row_alignment;     // bytes, of quaternions and coefficients
+    size_t row_alignment;     // of quaternions and coefficients, bytes
     bool draws_only_plainly;  // requests are plain (FrameRequest::is_plain), and nothing is picked
 };
 
-// What a pool takes of the memory of a device.
+// The memory of a device that a pool needs.
 struct PoolDemands {
-    size_t most_block_bytes;  // of pages on their way: what comes in while a few frames are drawn
-    size_t row_bytes;         // of a gaussian whose pages are rows
-    size_t most_coded_rows;   // that codes can have places for; 0: as many as PoolMemory says
-    size_t most_frames;       // whose cuts may be under way at once
+    // Limit on the bytes of pages in transfer while a few frames are drawn.
+    size_t most_block_bytes;
+    size_t row_bytes;  // bytes of a gaussian whose page is stored as rows
+    // Limit on the gaussians whose pages are stored as codes; 0: only PoolMemory limits
+    // them.
+    size_t most_coded_rows;
+    size_t most_frames;  // limit on the frames whose cuts are unfinished
     std::shared_ptr<BlockMemory> blocks;
 };
 
 namespace backend {
 
-// Tables of one bundle on a device: selection and drawing read them. All scenes of the device share
-// them.
+// The tables of one bundle on a device, which selection and drawing read. All scenes of
+// the device share them.
 class Tables {
   public:
     virtual ~Tables() = default;
     virtual size_t bytes() const = 0;
 };
 
-// Gaussians of one bundle or asset, as frames read them.
+// The gaussians of one bundle or asset, in the layout that frames read.
 class Model {
   public:
     virtual ~Model() = default;
-    // Memory that it takes beside the arrays that it was made of.
+    // Returns the bytes of memory beside the arrays that the model was made of.
     virtual size_t bytes() const = 0;
-    // Writes the gaussians of clusters, of a model of codes; those of cluster k begin at offset[k].
-    // Without Python's lock.
+    // Decodes the gaussians of clusters of a model of codes; those of cluster k begin
+    // at offset[k]. Called without Python's lock.
     virtual void decode(Span<const int32_t> clusters, Span<const int64_t> offset, const Work& work,
                         const GaussianRows<float>& out) const = 0;
 };
 
-// Colours of the clusters of one bundle.
+// The colours of a bundle's clusters.
 class Palette {
   public:
     virtual ~Palette() = default;
 };
 
-// What selection reads of a scene. `state` is what the host knows of it.
+// The part of a scene that selection reads, on the backend's device. `state` is the
+// scene on the host.
 class Scene {
   public:
     virtual ~Scene() = default;
-    // Takes the place of all bundles; instances come next.
+    // Replaces all bundles. The caller calls set_instances() next.
     virtual void set_bundles(const SceneState& state, const Work& work) = 0;
-    // Instances and poses that `state.arrays` has. A backend whose arrays the host reads puts the
-    // poses into `state.instances`. ValueError or TypeError where an array of poses is wrong, which
-    // then changes nothing.
+    // Sets the instances and poses to those in `state.arrays`. If the host reads the
+    // backend's arrays, it also copies the poses into `state.instances`. Throws
+    // ValueError or TypeError, without changing anything, if an array of poses is
+    // wrong.
     virtual void set_instances(SceneState& state, const Work& work) = 0;
-    // The same, of which only the poses are new.
+    // As set_instances(), if only the poses have changed.
     virtual void set_poses(SceneState& state, const Work& work) = 0;
-    // Waits. `last_bin` as SelectInput has it. Without Python's lock, one thread at a time.
+    // Selects a cut. Waits. `last_bin` is that of SelectInput. Called without Python's
+    // lock, by one thread at a time.
     virtual void select(const SceneState& state, const Eyes& eyes, const SelectRule& rule,
                         uint32_t* last_bin, const Work& work, SelectOutput& out) const = 0;
 };
 
-// The slots of a page pool on the device. Made of a PagePool, which outlives it.
+// The slots of a page pool on the device. It is made from a PagePool, which must
+// outlive it.
 class Pool {
   public:
     virtual ~Pool() = default;
-    // Takes a step towards settling a view: brings all pages that were read, cuts the scene without
-    // drawing it, and waits until the pool has decided about what the cut needs. `begins`: the
-    // first step, which forgets earlier frames (PagePool::begin_settling). Without Python's lock.
+    // Takes a step towards settling a view: brings in all pages that were read, selects
+    // the cut without drawing it, and waits until the pool has decided about the pages
+    // that the cut needs. `begins` says that it is the first step, which forgets
+    // earlier frames (PagePool::begin_settling). Called without Python's lock.
     virtual SettlingStep settle_step(const Scene& scene, const SceneState& state, const Eyes& eyes,
                                      const SelectRule& rule, bool begins, const Work& work) = 0;
 };
 
-// What one picture is drawn from and with, checked to fit each other and the frame.
+// The inputs of one picture; the bindings have checked that they are consistent with
+// each other and with the frame.
 struct FrameInput {
     const FrameRequest& request;
     const Scene& scene;
     std::shared_ptr<const SceneState> state;
-    Pool* pool;                     // null: the models that the frame has
-    BudgetSteps* steps;             // of pictures that follow each other; null: of a single one
-    const std::atomic<bool>* stop;  // where it can: ends the picture early; may be null
+    Pool* pool;                     // null: draw the frame's own models
+    BudgetSteps* steps;             // pacing state of a sequence of pictures; null for a single one
+    const std::atomic<bool>* stop;  // asks to end the picture early, if possible; may be null
 };
 
 // Draws scenes of the same bundles.
 class Frame {
   public:
     virtual ~Frame() = default;
-    // Models of each bundle and, unless there are none, as many palettes, which it shares.
+    // Sets the model of each bundle and, unless empty, the palette of each; the frame
+    // shares them.
     virtual void set_models(std::vector<std::shared_ptr<const Model>> models,
                             std::vector<std::shared_ptr<const Palette>> palettes,
                             const Work& work) = 0;
-    // Draws what is asked for. What it draws from stays as it is until the drawing is finished or
-    // gone: a drawing that is not done on return keeps the frame, the scene, the pool and the
-    // request (BoundDrawing::keep). A backend whose frames share buffers takes a Turn. A given cut
-    // is for one eye.
+    // Draws the picture. A drawing that is unfinished on return keeps the frame, the
+    // scene, the pool and the request alive (BoundDrawing::keep), and they do not
+    // change until it is finished or destroyed. A backend whose frames share buffers
+    // uses a Turn. A given cut has one eye.
     virtual std::unique_ptr<BoundDrawing> draw(const FrameInput& input) = 0;
-    // Finds what the first pixel of a window shows most of; returns whether there is anything.
-    // Waits. Only where draws_only_plainly is false.
+    // Finds the gaussian with the largest weight in the first pixel of the window;
+    // returns false if the pixel is empty. Waits. Called only if draws_only_plainly is
+    // false.
     virtual bool pick(const FrameInput& input, ScenePick& picked) = 0;
-    // Bytes of what it keeps on the device, by part, and of the memory that all parts are from.
+    // Returns the bytes that the frame holds on the device by part, and the bytes of
+    // the memory pool from which all parts are allocated.
     virtual std::vector<std::pair<const char*, size_t>> memory() const = 0;
 };
 
-// Draws all gaussians of one model, which has rows.
+// Draws all gaussians of one model of rows.
 class AssetFrame {
   public:
     virtual ~AssetFrame() = default;
-    // As Frame::draw(), of one camera.
+    // As Frame::draw(), for one camera.
     virtual std::unique_ptr<BoundDrawing> draw(const Camera& camera, const Shade& shade,
                                                const std::atomic<bool>* stop) = 0;
 };
 
-// What groups or cuts are fitted to. The calls wait, and look at FitProgress::cancel now and then.
-// Without Python's lock.
+// The gaussians that groups or cuts are fitted to. The functions wait, and poll
+// FitProgress::cancel. Called without Python's lock.
 class Target {
   public:
     virtual ~Target() = default;
@@ -208,30 +225,32 @@ class Backend {
 
     // ---- arrays
 
-    // How many devices there are.
+    // Returns the number of devices.
     virtual int num_devices() const = 0;
-    // Where an array is; nothing where it is none of this backend's.
+    // Returns the device of an array; nullopt if the array is not one of this
+    // backend's.
     virtual std::optional<Device> device_of(const py::handle& array) const = 0;
     // Borrows an array after checks of its kind, dtype, shape, layout and device.
     virtual Borrowed borrow(Device device, const py::handle& array, const char* name,
                             const Element& element, Shape shape, bool is_written) const = 0;
-    // A new array, not initialised.
+    // Returns a new, uninitialised array.
     virtual MadeArray make_array(Device device, const Element& element,
                                  const std::vector<py::ssize_t>& shape) const = 0;
-    // The same array as one of NumPy's. Waits.
+    // Returns the array as a NumPy array. Waits.
     virtual py::object to_host(const py::object& array) const = 0;
-    // An array of NumPy's on the device.
+    // Returns a NumPy array as an array on the device.
     virtual py::object from_host(const py::object& array, Device device) const = 0;
 
     // ---- work
 
-    // Makes a device the current one of this thread, and finds the stream that torch has there.
+    // Makes a device the current one of this thread, and returns torch's current stream
+    // on it.
     virtual Entered enter(Device device) const = 0;
     virtual void leave(Device device, int device_before) const noexcept = 0;
 
-    // ---- operations, as their headers have them; without Python's lock
+    // ---- operations; their headers have the contracts; without Python's lock
 
-    // Waits, for `leaf_offset` is on the host.
+    // Waits, because `leaf_offset` is on the host.
     virtual void median_split(Span<const Point> points, Span<const int64_t> offset, int depth,
                               Span<int64_t> order, Span<int64_t> leaf_offset,
                               const Work& work) const = 0;
@@ -248,10 +267,10 @@ class Backend {
                         const Work& work) const = 0;
     virtual void ellipses(const EllipsesInput<float>& in, const Ellipses<float>& out,
                           const Work& work) const = 0;
-    // Only where computes_doubles is true.
+    // Called only if computes_doubles is true.
     virtual void ellipses(const EllipsesInput<double>& in, const Ellipses<double>& out,
                           const Work& work) const = 0;
-    // Waits, for the sums are on the host.
+    // Waits, because the sums are on the host.
     virtual void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& gaussians,
                             const CutPictures& pictures, const SeenOfGaussians& seen,
                             FitProgress& progress, const Work& work) const = 0;
@@ -260,44 +279,50 @@ class Backend {
 
     virtual std::shared_ptr<const backend::Tables> make_tables(const BoundTable& table,
                                                                const Work& work) const = 0;
-    // Of rows, which are float32, or of codes (BoundCodes). It keeps what it borrows.
+    // Make a model of float32 rows or of codes (BoundCodes), which borrows them and
+    // keeps them alive.
     virtual std::shared_ptr<const backend::Model> make_model(const Rows& rows,
                                                              const Work& work) const = 0;
     virtual std::shared_ptr<const backend::Model> make_model(const py::object& codes,
                                                              const Work& work) const = 0;
-    // `sh` is (C, 3), coefficients of the constant basis of the clusters of a ClusterTable.
+    // Makes a palette; `sh` is (C, 3), the SH coefficients of degree 0 of the clusters
+    // of a ClusterTable.
     virtual std::shared_ptr<const backend::Palette> make_palette(const py::object& table,
                                                                  const py::array& sh,
                                                                  const Work& work) const = 0;
     virtual std::unique_ptr<backend::Scene> make_scene(const Work& work) const = 0;
     virtual PoolDemands pool_demands(int max_sh_degree) const = 0;
-    // `tables` are ClusterTables, in the order of the pool's bundles.
+    // Makes a pool; `tables` are ClusterTables, in the order of the pool's bundles.
     virtual std::unique_ptr<backend::Pool> make_pool(PagePool& pool, const py::list& tables,
                                                      const Work& work) const = 0;
     virtual std::unique_ptr<backend::Frame> make_frame(const Work& work) const = 0;
     virtual std::unique_ptr<backend::AssetFrame> make_asset_frame(
-        std::shared_ptr<const backend::Model> model, const Work& work) const = 0;
+        std::shared_ptr<const backend::Model> model, Appearance<float> appearance,
+        const Work& work) const = 0;
     virtual std::unique_ptr<backend::Target> make_target(const Rows& rows, float filter_px2,
                                                          bool antialiased) const = 0;
 
     // ---- gradients
 
-    // Draws gaussians without levels. The tape keeps them, and is there if it is asked for.
+    // Draws gaussians without levels. If `keep_tape` is true, the result has a tape,
+    // which keeps the gaussians alive.
     virtual Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera,
                                  const DrawLook& look, bool with_depth, bool keep_tape) const = 0;
 };
 
-// The backend of a device; RuntimeError where it is not compiled in.
+// Returns the backend of a device; throws RuntimeError if it was not compiled.
 const Backend& backend_of(Device device);
 
-// The backend of the host, and the backend of devices, which is null if none is compiled in.
+// Return the backend of the host, and the backend of devices, which is null if none was
+// compiled.
 const Backend& host_backend();
 const Backend* device_backend();
 
-// Of the CUDA half (cuda_backend.cpp), which is there only where it is compiled.
+// Returns the backend of CUDA devices (cuda_backend.cpp); defined only if CUDA was
+// compiled.
 const Backend& cuda_backend();
 
-// ValueError, name: problem, unless this is the host.
+// Throws ValueError with the message "name: problem" unless the device is the host.
 void check_is_on_host(Device device, const char* name, const char* problem);
 
 }  // namespace v3dg

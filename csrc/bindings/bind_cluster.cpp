@@ -28,7 +28,7 @@ void check_finite(Span<const float> means) {
 }
 
 py::tuple median_split(const py::object& means, const py::array& offset, int depth) {
-    constexpr int kDeepest = 32;  // as deep as 2^32 points go
+    constexpr int kDeepest = 32;  // enough for 2^32 points
     const Device device = device_of(means, "means");
     const Span<const float> values = span_on<const float>(device, means, "means", {-1, 3});
     const Span<const Point> points{reinterpret_cast<const Point*>(values.data), values.size / 3};
@@ -53,7 +53,7 @@ py::tuple median_split(const py::object& means, const py::array& offset, int dep
 py::object findings_of(const Rows& gaussians) {
     const GaussianRows<const float> rows = gaussians.read<float>();
     check_is_on_host(gaussians.device(), "gaussians",
-                     "expected arrays on the host, got others; bring them there");
+                     "expected arrays on the host, got arrays on a device; copy them to the host");
     const NewArray<uint16_t> findings({}, {static_cast<py::ssize_t>(rows.size)});
     {
         const Unlocked unlocked;
@@ -160,25 +160,26 @@ void bind_cluster(py::module_& m) {
     m.attr("min_radius") = kMinRadius;
     m.attr("most_length") = kMostLength;
     m.def("examine", &findings_of, "gaussians"_a,
-          "Why gaussians on the host cannot be drawn: (N,) uint16 of bits, 0 where they can.");
+          "Returns why gaussians on the host cannot be drawn: (N,) uint16 of bits, 0 for those "
+          "that can be drawn.");
     m.def("num_halvings", &halvings, "count"_a, "cluster_size"_a,
-          "How often points are halved until no part holds more than cluster_size.");
+          "Returns how often points are halved until no part has more than cluster_size.");
     m.def("median_split", &median_split, "means"_a, "offset"_a, "depth"_a,
-          "Perfect binary tree of each segment's points: (order (N,) int64, leaf_offset (L + 1,) "
-          "int64, which "
-          "is on the host).");
+          "Sorts the points of each segment into the leaves of a perfect binary tree: returns "
+          "order (N,) int64, and leaf_offset (L + 1,) int64 on the host.");
     m.def("morton_order", &order_along_curve, "means"_a,
-          "Indices (N,) that put points on the host along a curve that keeps neighbours together.");
+          "Returns the order (N,) of points on the host along a Morton curve, which keeps "
+          "neighbours together.");
     m.def("bound_spheres", &bound_spheres, "spheres"_a, "offset"_a,
-          "Ball (S, 4) around each segment of spheres (N, 4), with the margin that keeps balls "
-          "nested.");
-    m.def("check_tables", &check_bundle_tables, "offset"_a, "level"_a, "own_group"_a,
-          "parent_group"_a, "box"_a, "filter_px2"_a, "antialiased"_a, "ball"_a, "weight"_a,
-          "parent"_a, "group_level"_a, "error"_a, py::kw_only(), "num_gaussians"_a,
-          "Raise ValueError unless the tables of a bundle fit each other, and its cuts will be "
-          "exact.");
+          "Returns a ball (S, 4) around each segment of spheres (N, 4), with the margin that keeps "
+          "balls nested.");
+    m.def(
+        "check_tables", &check_bundle_tables, "offset"_a, "level"_a, "own_group"_a,
+        "parent_group"_a, "box"_a, "filter_px2"_a, "antialiased"_a, "ball"_a, "weight"_a,
+        "parent"_a, "group_level"_a, "error"_a, py::kw_only(), "num_gaussians"_a,
+        "Raises ValueError unless the tables of a bundle are consistent and guarantee exact cuts.");
     m.def("bound_by_boxes", &bound_by_boxes, "gaussians"_a, "offset"_a,
-          "Lower and upper corner of what each cluster draws: (C, 2, 3).");
+          "Returns the lower and upper corners of the boxes around what clusters draw: (C, 2, 3).");
 }
 
 }  // namespace v3dg

@@ -1,4 +1,5 @@
-// How much larger the balls of level 1 are to be: pictures of both levels are drawn and compared.
+// Computes how much larger the balls of level 1 have to be: draws pictures of both
+// levels and compares them.
 
 #include <algorithm>
 
@@ -25,7 +26,7 @@ struct Colors {
                                     {py::ssize_t(camera.height), py::ssize_t(camera.width), 3})) {}
 };
 
-// The gaussians in black, of SH degree 0.
+// Returns the gaussians in black, of SH degree 0.
 Rows blackened(const Rows& gaussians) {
     const NewArray<float> sh({}, {py::ssize_t(gaussians.size()), 1, 3});
     std::fill(sh.span.begin(), sh.span.end(), 0.0f);
@@ -45,7 +46,8 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
                               of_level = offsets_of(group_offset, level.size());
     const auto num_groups = static_cast<py::ssize_t>(of_level.size) - 1;
     if (num_groups < 1 || of_leaves.size != of_level.size)
-        throw py::value_error("leaf_offset, group_offset: expected those of the same groups");
+        throw py::value_error(
+            "leaf_offset, group_offset: expected boundaries of the same number of groups");
     const Span<const float> balls = span_of<const float>(ball, "ball", {num_groups, 4});
     const py::object means = backend.to_host(leaves.arrays()[0]);
     FirstSelected measured(span_of<const float>(means, "means", {num_leaves, 3}),
@@ -76,8 +78,9 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
             losses_of_pixels({by_leaves.span, by_level.span, truth.span}, width, height,
                              losses.span);
         }
-        // The gradient of the sum of what the leaves show of the losses, by their colours, is their
-        // share.
+        // The sum of the losses, weighted by the leaves' blend weights, is
+        // differentiated by the leaves' colours; the gradient is each leaf's share of
+        // the losses.
         const Rasterized seen = rasterize(black, {{}, camera}, in_black, false, true);
         const Gradients gradients =
             seen.tape->backward(backend.from_host(losses.object, device), py::none(), py::none(),
@@ -89,8 +92,8 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
     return py::array_t<float>(num_groups, growth.data());
 }
 
-// Balls of each level after those of level 1 have grown: those above contain them. Those of level 0
-// stay.
+// Returns the balls of all levels after those of level 1 have grown: the levels above
+// grow to contain them. Balls of level 0 do not change.
 py::list grown_balls(const py::list& balls, const py::array& growth) {
     py::list grown;
     std::vector<Ball> below;
@@ -109,9 +112,9 @@ py::list grown_balls(const py::list& balls, const py::array& growth) {
             for (size_t g = 0; g < here.size; ++g) here[g].radius *= times[g];
         } else {
             if (here.size == 0 || below.size() % here.size != 0)
-                throw py::value_error("balls: expected a part of those of the level below, got " +
-                                      std::to_string(here.size) + " over " +
-                                      std::to_string(below.size()));
+                throw py::value_error(
+                    "balls: expected a count that divides the count of the level below, got " +
+                    std::to_string(here.size) + " over " + std::to_string(below.size()));
             std::vector<int64_t> offset;
             for (size_t g = 0; g <= here.size; ++g)
                 offset.push_back(static_cast<int64_t>(g * (below.size() / here.size)));
@@ -130,11 +133,11 @@ void bind_first_selected(py::module_& m) {
     m.def("first_selected", &first_selected, "leaves"_a, "level"_a, "leaf_offset"_a,
           "group_offset"_a, "ball"_a, "leaf_filter_px2"_a, "leaf_antialiased"_a,
           "level_filter_px2"_a,
-          "How many times larger the balls of level 1 are to be, for its groups to be selected "
-          "where they "
-          "are no worse than their leaves at one sample a pixel.");
-    m.def("grown_balls", &grown_balls, "balls"_a, "growth"_a,
-          "Balls of each level after those of level 1 have grown so many times.");
+          "Returns the factors by which the balls of level 1 have to grow so that its groups are "
+          "selected only where they look no worse than their leaves at one sample per pixel.");
+    m.def(
+        "grown_balls", &grown_balls, "balls"_a, "growth"_a,
+        "Returns the balls of each level after those of level 1 were multiplied by these factors.");
 }
 
 }  // namespace v3dg

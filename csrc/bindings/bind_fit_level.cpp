@@ -1,4 +1,5 @@
-// Fits: of the groups of one level, and of all levels together to pictures of their cuts.
+// Fits for Python: of the groups of one level, and of all levels together by pictures
+// of their cuts.
 
 #include <algorithm>
 #include <memory>
@@ -13,7 +14,7 @@ namespace v3dg {
 
 namespace {
 
-// What groups should look like, as its device reads it.
+// The gaussians that groups are fitted to, on their backend.
 class BoundTarget {
   public:
     BoundTarget(const Rows& rows, float filter_px2, bool antialiased)
@@ -24,7 +25,7 @@ class BoundTarget {
 
     size_t size() const { return size_; }
     const backend::Target& handle() const { return *target_; }
-    // Throws unless the gaussians can be fitted to it.
+    // Throws unless the gaussians can be fitted to this target.
     void check_alike(const Rows& gaussians) const {
         if (gaussians.device() != device_ || gaussians.sh_degree() != sh_degree_)
             throw py::value_error(

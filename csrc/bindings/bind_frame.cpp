@@ -1,4 +1,4 @@
-// Frames as Python has them: checks of what they draw, and calls of their backend.
+// Frames for Python: checks of their inputs, and calls of their backend.
 
 #include <algorithm>
 #include <memory>
@@ -14,7 +14,7 @@ namespace v3dg {
 
 namespace {
 
-// Asks, from any thread, for work under way to end early.
+// Asks work in progress, from any thread, to end early.
 class Stop {
   public:
     void request() { requested_.store(true, std::memory_order_relaxed); }
@@ -42,11 +42,12 @@ Eyes eyes_of(const py::object& camera) {
     return camera.cast<const BoundEyes&>().eyes;
 }
 
-// A cut that was selected before. The arrays are where the frame is, which looks when it draws.
+// A cut that was selected earlier. The arrays must be on the frame's device, which is
+// checked when the frame draws.
 struct BoundGivenCut {
     py::object instance_ids, cluster_ids, weights;
 
-    // Borrows from the arrays. Weights are of 0 to 1, or None where all are 1.
+    // Borrows from the arrays. Weights are from 0 to 1, or None if all are 1.
     GivenCut read(Device device) const {
         GivenCut given{span_on<const int32_t>(device, instance_ids, "instance_ids", {-1}), {}, {}};
         const auto size = static_cast<py::ssize_t>(given.instance.size);
@@ -57,22 +58,24 @@ struct BoundGivenCut {
     }
 };
 
-// What a picture shows in place of the frame's own colours, and of which cut.
+// The content of a picture other than the gaussians' own colours, and the cut that it
+// shows.
 struct BoundLook {
     FrameLook look = FrameLook::appearance;
-    py::list cluster_colors;  // (C, 3) of each bundle, or none
+    py::list cluster_colors;  // (C, 3) per bundle, or none
     std::optional<Eyes> chooser;
     bool is_aside = false;
 };
 
-// A request, without what only the frame can read: the given cut, and colours of clusters.
+// A request, without the parts that only a frame can check: the given cut, and colours
+// of clusters.
 struct BoundRequest {
     FrameRequest plain;
     std::optional<BoundGivenCut> cut;
-    py::object cluster_colors;  // as BoundLook has them; null without a look
+    py::object cluster_colors;  // see BoundLook; null without a look
 
-    // Of a Camera or of Eyes. It looks itself which of the two it is: overloads, or a conversion,
-    // would take longer than all else here.
+    // The camera is a Camera or an Eyes. The constructor tests which it is, because
+    // overloads or implicit conversions would take longer than everything else here.
     BoundRequest(const py::object& camera, const SelectRule* rule, const Shade* shade,
                  const BoundGivenCut* given, const BoundLook* look)
         : plain{.eyes = eyes_of(camera),
@@ -80,7 +83,8 @@ struct BoundRequest {
                 .shade = shade == nullptr ? Shade{} : *shade},
           cluster_colors(look == nullptr ? py::object() : py::object(look->cluster_colors)) {
         if (given != nullptr && plain.eyes.are_two)
-            throw py::value_error("cut: expected one camera, got two eyes; draw each of them");
+            throw py::value_error(
+                "cut: expected one camera, got two eyes; draw each eye separately");
         if (given != nullptr) cut = *given;
         if (look == nullptr) return;
         plain.look = look->look;
@@ -97,7 +101,7 @@ struct BoundRequest {
         const py::list arrays(cluster_colors);
         for (size_t b = 0; b < scene.tables.size(); ++b) {
             if (b >= arrays.size())
-                throw py::value_error("colors: expected none, or of each bundle");
+                throw py::value_error("colors: expected none, or colours of every bundle");
             const auto clusters = static_cast<py::ssize_t>(scene.tables[b].num_clusters());
             const auto colors = arrays[b].cast<py::array>();
             request.cluster_colors.push_back(
@@ -107,7 +111,7 @@ struct BoundRequest {
     }
 };
 
-// Draws scenes of the same bundles, or of the first of them, on one device.
+// Draws scenes with the same bundles, or with the first ones of them, on one device.
 class BoundSceneFrame {
   public:
     explicit BoundSceneFrame(int device) : device_{device} {
@@ -115,7 +119,8 @@ class BoundSceneFrame {
         frame_ = work.backend().make_frame(work);
     }
 
-    // The gaussians of each bundle and, unless there are none, the colours of their clusters.
+    // Sets the gaussians of each bundle and, unless empty, the colours of their
+    // clusters.
     void set_models(const py::list& models, const py::list& palettes) {
         if (!palettes.empty() && palettes.size() != models.size())
             throw py::value_error("palettes: expected none, or one for each model");
@@ -138,8 +143,9 @@ class BoundSceneFrame {
         num_gaussians_ = std::move(num_gaussians);
     }
 
-    // Of the gaussians that were set, or of what is resident in a pool, after bringing in pages
-    // that are ready. With `steps`, one of several pictures that follow each other.
+    // Draws the gaussians that were set, or the resident part of a pool, after bringing
+    // in pages that are ready. `steps`: pacing state of a sequence of pictures; null
+    // for a single one.
     std::unique_ptr<BoundDrawing> draw(const py::object& scene_object,
                                        const py::object& request_object,
                                        const py::object& pool_object, BudgetSteps* steps,
@@ -150,14 +156,15 @@ class BoundSceneFrame {
             input.stop = flag_of(stop);
             drawing = frame_->draw(input);
         });
-        // A drawing that is not done has what it is drawn from.
+        // An unfinished drawing keeps its inputs alive.
         if (drawing->is_under_way())
             drawing->keep(
                 py::make_tuple(py::cast(this), scene_object, request_object, pool_object));
         return drawing;
     }
 
-    // What the first pixel of the window shows most of, or nothing.
+    // Returns the gaussian with the largest weight in the first pixel of the window, or
+    // nothing.
     std::optional<ScenePick> pick(const py::object& scene_object, const py::object& request_object,
                                   const py::object& pool_object) {
         check_is_on_host(device_, "pick", "expected a frame on the CPU, got one on a CUDA device");
@@ -170,7 +177,8 @@ class BoundSceneFrame {
         return picked;
     }
 
-    // Bytes of what it keeps on its device by part, and of the pool that those are of.
+    // Returns the bytes that the frame holds on its device by part, and the bytes of
+    // the memory pool.
     py::dict memory() const {
         py::dict parts;
         const Work work(device_);
@@ -179,7 +187,8 @@ class BoundSceneFrame {
     }
 
   private:
-    // Checks that the scene, the request and the pool belong together, then calls body() with them.
+    // Checks that the scene, the request and the pool are consistent, then calls body()
+    // with them.
     template <class Body>
     void with_input(const py::object& scene_object, const py::object& request_object,
                     const py::object& pool_object, const Body& body) const {
@@ -193,9 +202,11 @@ class BoundSceneFrame {
         if (!bound.is_complete()) completed = bound.completed(device_, *state);
         const FrameRequest& request = completed ? *completed : bound.plain;
         if (has_pool && request.cut)
-            throw py::value_error("cut: expected none for a pool, which has its own, got one");
+            throw py::value_error("cut: a pool selects its own cut; leave out the given one");
         if (backend_of(device_).traits.draws_only_plainly && !request.is_plain())
-            throw py::value_error("shows, colors, chooser, aside: expected none on a CUDA device");
+            throw py::value_error(
+                "shows, colors, chooser, aside: these work only on the CPU; leave them out on a "
+                "CUDA device");
         body(backend::FrameInput{.request = request,
                                  .scene = scene.handle(),
                                  .state = state,
@@ -208,7 +219,7 @@ class BoundSceneFrame {
         const auto& scene = held<BoundScene>(scene_object, "scene");
         auto& pool = held<BoundPool>(pool_object, "pool");
         if (scene.device() != device_ || pool.device() != device_)
-            throw py::value_error("scene, pool: expected them on the frame's device");
+            throw py::value_error("scene, pool: expected both on the frame's device");
         pool.check_scene(*scene.state());
         return pool;
     }
@@ -216,35 +227,36 @@ class BoundSceneFrame {
     const BoundScene& checked(const py::object& scene_object) const {
         const auto& scene = held<BoundScene>(scene_object, "scene");
         if (scene.device() != device_)
-            throw py::value_error("scene: expected one on the frame's device");
+            throw py::value_error("scene: expected a scene on the frame's device");
         const std::vector<size_t>& of_scene = scene.state()->num_gaussians;
         if (of_scene.size() > num_gaussians_.size() ||
             !std::equal(of_scene.begin(), of_scene.end(), num_gaussians_.begin()))
             throw py::value_error(
-                "scene: expected one of the bundles that the frame has the gaussians of");
+                "scene: expected a scene of the bundles whose gaussians the frame has");
         return scene;
     }
 
     void check_device(Device device, const char* name) const {
         if (device != device_)
             throw py::value_error(std::string(name) +
-                                  ": expected what is on the frame's device, got others");
+                                  ": expected objects on the frame's device, got others");
     }
 
     Device device_;
-    std::vector<size_t> num_gaussians_;  // of each bundle
+    std::vector<size_t> num_gaussians_;  // per bundle
     std::unique_ptr<backend::Frame> frame_;
 };
 
 // Draws the gaussians of one asset, which have no levels.
 class BoundAssetFrame {
   public:
-    explicit BoundAssetFrame(const py::object& model_object) {
+    BoundAssetFrame(const py::object& model_object, float filter_px2, bool antialiased) {
         const auto& model = held<BoundModel>(model_object, "model");
         if (model.has_codes())
-            throw py::value_error("model: expected one of rows, got one of codes");
+            throw py::value_error("model: expected a model of rows, got a model of codes");
         const Work work(model.device());
-        frame_ = work.backend().make_asset_frame(model.handle(), work);
+        const Appearance<float> appearance{filter_px2, antialiased, false};
+        frame_ = work.backend().make_asset_frame(model.handle(), appearance, work);
     }
 
     std::unique_ptr<BoundDrawing> draw(const BoundCamera& camera, const Shade& shade,
@@ -261,11 +273,11 @@ class BoundAssetFrame {
 }  // namespace
 
 void bind_frame(py::module_& m) {
-    py::class_<Stop>(m, "Stop", "Asks, from any thread, for a picture under way to be given up.")
+    py::class_<Stop>(m, "Stop", "Asks, from any thread, that a picture in progress be abandoned.")
         .def(py::init<>())
         .def("request", &Stop::request)
         .def_property_readonly("is_requested", &Stop::is_requested);
-    py::class_<FrameStats>(m, "FrameStats", "What a frame came to.")
+    py::class_<FrameStats>(m, "FrameStats", "The statistics of a frame.")
         .def_readonly("gaussians", &FrameStats::gaussians)
         .def_readonly("in_frustum", &FrameStats::in_frustum)
         .def_readonly("records", &FrameStats::records)
@@ -277,9 +289,9 @@ void bind_frame(py::module_& m) {
         .def_readonly("draw_ms", &FrameStats::draw_ms)
         .def_readonly("levels", &FrameStats::levels)
         .def_readonly("num_draws", &FrameStats::num_draws);
-    py::class_<Shade>(
-        m, "Shade",
-        "What is behind a picture, when its pixels stop, and whether their depth is drawn.")
+    py::class_<Shade>(m, "Shade",
+                      "The background of a picture, the transmittance at which pixels stop, and "
+                      "whether depth is drawn.")
         .def(py::init(
                  [](const std::array<double, 3>& background, float min_transmittance,
                     bool with_depth) { return Shade{background, min_transmittance, with_depth}; }),
@@ -293,19 +305,19 @@ void bind_frame(py::module_& m) {
         .def_property_readonly("alpha", [](const BoundDrawing& d) { return d.picture().alpha; })
         .def_property_readonly("depth", [](const BoundDrawing& d) { return d.picture().depth; })
         .def_property_readonly("right", &BoundDrawing::right,
-                               "Of two eyes: what the right one sees.")
+                               "The picture of the right eye, if there are two eyes.")
         .def("finish", &BoundDrawing::finish, py::return_value_policy::copy,
              "Waits for the picture.");
-    py::class_<BoundGivenCut>(m, "GivenCut", "A cut that was selected before; borrows the arrays.")
+    py::class_<BoundGivenCut>(m, "GivenCut", "A cut that was selected earlier; borrows the arrays.")
         .def(py::init([](const py::object& instance_ids, const py::object& cluster_ids,
                          const py::object& weights) {
                  return BoundGivenCut{
                      .instance_ids = instance_ids, .cluster_ids = cluster_ids, .weights = weights};
              }),
              "instance_ids"_a, "cluster_ids"_a, "weights"_a = py::none());
-    py::class_<BoundLook>(m, "Look",
-                          "What a picture shows in place of the frame's own colours, and of which "
-                          "cut.")
+    py::class_<BoundLook>(
+        m, "Look",
+        "What a picture shows instead of the gaussians' own colours, and the cut that it shows.")
         .def(py::init([](const std::string& shows, const py::list& colors, const BoundEyes* chooser,
                          bool aside) {
                  BoundLook look{.look = look_of(shows), .cluster_colors = colors, .chooser = {}};
@@ -315,12 +327,12 @@ void bind_frame(py::module_& m) {
              }),
              "shows"_a = "appearance", "colors"_a = py::list(), "chooser"_a = nullptr,
              "aside"_a = false);
-    py::class_<BoundRequest>(m, "FrameRequest", "One picture that is asked of a frame.")
+    py::class_<BoundRequest>(m, "FrameRequest", "The request for one picture.")
         .def(py::init<const py::object&, const SelectRule*, const Shade*, const BoundGivenCut*,
                       const BoundLook*>(),
              "camera"_a, "rule"_a = nullptr, "shade"_a = nullptr, "cut"_a = nullptr,
              "look"_a = nullptr);
-    py::class_<ScenePick>(m, "Pick", "The gaussian that a pixel shows most of.")
+    py::class_<ScenePick>(m, "Pick", "The gaussian with the largest weight in a pixel.")
         .def_readonly("instance", &ScenePick::instance)
         .def_readonly("cluster", &ScenePick::cluster)
         .def_readonly("weight", &ScenePick::weight)
@@ -332,11 +344,11 @@ void bind_frame(py::module_& m) {
              "steps"_a = nullptr, "stop"_a = nullptr)
         .def("pick", &BoundSceneFrame::pick, "scene"_a, "request"_a, "pool"_a = py::none())
         .def("memory", &BoundSceneFrame::memory,
-             "Bytes that it keeps on a CUDA device, by part; and those of the pool of all frames "
-             "there.");
-    py::class_<BoundAssetFrame>(m, "AssetFrame",
-                                "Draws gaussians without levels on the device that they are on.")
-        .def(py::init<py::object>(), "model"_a)
+             "Returns the bytes that it holds on a CUDA device by part, and the bytes of the "
+             "memory pool that all frames there share.");
+    py::class_<BoundAssetFrame>(m, "AssetFrame", "Draws gaussians without levels on their device.")
+        .def(py::init<py::object, float, bool>(), "model"_a, py::kw_only(), "filter_px2"_a = 0.0f,
+             "antialiased"_a = false)
         .def("draw", &BoundAssetFrame::draw, "camera"_a, "shade"_a, "stop"_a = nullptr);
 }
 

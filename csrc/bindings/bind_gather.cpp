@@ -9,14 +9,14 @@ namespace v3dg {
 
 namespace {
 
-// The clusters that are asked for, each with rows of its instance's bundle.
+// Checks the requested clusters, each of which has rows of its instance's bundle.
 void check_clusters(const GatherInput& in) {
     if (in.offset[0] != 0) throw py::value_error("offset: expected boundaries from 0");
     for (size_t s = 0; s < in.instance.size; ++s) {
         const int32_t i = in.instance[s];
         if (i < 0 || static_cast<size_t>(i) >= in.bundle.size)
-            throw py::value_error("instance: expected one below " + std::to_string(in.bundle.size) +
-                                  ", got " + std::to_string(i));
+            throw py::value_error("instance: expected an index below " +
+                                  std::to_string(in.bundle.size) + ", got " + std::to_string(i));
         const auto rows = static_cast<int64_t>(in.bundles[in.bundle[i]].size);
         const int64_t size = in.offset[s + 1] - in.offset[s];
         if (size < 0 || in.first_row[s] < 0 || in.first_row[s] > rows - size)
@@ -43,7 +43,7 @@ py::tuple gather(const std::vector<std::reference_wrapper<const Rows>>& bundles,
     for (const Rows& bundle : bundles) {
         if (bundle.device() != Device{device})
             throw py::value_error(
-                "bundles: expected gaussians on the device that is asked for, got others");
+                "bundles: expected gaussians on the requested device, got others");
         rows.push_back(bundle.read<float>());
         sh_degree = std::max(sh_degree, bundle.sh_degree());
     }
@@ -55,6 +55,7 @@ py::tuple gather(const std::vector<std::reference_wrapper<const Rows>>& bundles,
     in.position = placed.position;
     in.quaternion = placed.quaternion;
     in.scale = placed.scale;
+    in.factors = placed.factors;
     in.instance = span_of<const int32_t>(instance, "instance", {-1});
     const auto num_clusters = static_cast<py::ssize_t>(in.instance.size);
     in.first_row = span_of<const int64_t>(first_row, "first_row", {num_clusters});
@@ -64,7 +65,7 @@ py::tuple gather(const std::vector<std::reference_wrapper<const Rows>>& bundles,
     return gathered(in, Device{device}, sh_degree);
 }
 
-// All of a bundle as one cluster of one instance.
+// Transforms all gaussians of a bundle, as one cluster of one instance.
 py::tuple transform(const Rows& rows, const py::array& quaternion, const py::array& position,
                     double scale) {
     const GaussianRows<const float> bundle = rows.read<float>();
@@ -86,9 +87,10 @@ py::tuple transform(const Rows& rows, const py::array& quaternion, const py::arr
 void bind_gather(py::module_& m) {
     m.def("gather", &gather, py::kw_only(), "bundles"_a, "instances"_a, "instance"_a, "first_row"_a,
           "offset"_a, "weights"_a = py::none(), "device"_a,
-          "Gaussians of clusters of instances in the world: means, quats, scales, opacities, sh.");
+          "Returns the gaussians of instances' clusters in the world: means, quats, scales, "
+          "opacities, sh.");
     m.def("transform", &transform, "rows"_a, "quaternion"_a, "position"_a, "scale"_a,
-          "Gaussians in another frame, to which points go by scale * rotation p + position.");
+          "Returns gaussians transformed by p -> scale * rotation p + position.");
 }
 
 }  // namespace v3dg

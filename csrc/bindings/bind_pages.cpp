@@ -1,4 +1,4 @@
-// Pages of files: read, verified and hashed, for Python.
+// Pages of files: reading, verifying and hashing, for Python.
 
 #include <algorithm>
 #include <cerrno>
@@ -17,12 +17,12 @@ namespace v3dg {
 
 namespace {
 
-// Neighbouring pages of a file, with the arrays that they are found by.
+// Neighbouring pages of a file, with the arrays that locate them.
 struct BoundPageRun {
     size_t first_page;
     py::array first_cluster, offset, places;
 
-    // Borrows from the arrays; `hashes` are those of these pages.
+    // Borrows from the arrays; `hashes` has the hashes of these pages.
     PageRun read(const py::array& hashes) const {
         constexpr size_t kMost = size_t(1) << 62;
         PageRun run{.first_page = first_page,
@@ -40,8 +40,8 @@ struct BoundPageRun {
     }
 };
 
-// Calls body() without the interpreter lock; what goes wrong with a page gets the file's name,
-// which need not be text that can be encoded.
+// Calls body() without Python's lock. An error about a page gets the file's name, which
+// may not be valid text.
 template <class Body>
 void naming_file(const py::object& path, const Body& body) {
     try {
@@ -86,14 +86,15 @@ void read_rows(const py::object& path, int descriptor, const PageRun& run, PageC
 void read_words(const py::object& path, int descriptor, const PageRun& run, const py::array& out) {
     const int64_t num_bytes = run.places[run.size()] - run.places[0];
     if (num_bytes % 4 != 0)
-        throw py::value_error("places: expected whole words, got " + std::to_string(num_bytes) +
-                              " bytes");
+        throw py::value_error("places: expected a multiple of 4 bytes, got " +
+                              std::to_string(num_bytes));
     const Span<int32_t> words =
         span_of<int32_t>(out, "out", {static_cast<py::ssize_t>(num_bytes / 4)});
     naming_file(path, [&] { read_codes(PosixFile::duplicate(descriptor), run, words); });
 }
 
-// `out` is rows, which are decoded, or an array of words, which are not.
+// Reads pages to `out`: either rows, into which gaussians are decoded, or an array of
+// integers, which receives the codes as they are.
 void read_run(const py::object& path, int descriptor, const py::object& out,
               const std::string& codec, const py::array& hashes, const BoundPageRun& bound) {
     const PageRun run = bound.read(hashes);
@@ -118,7 +119,7 @@ std::vector<py::bytes> hash_messages(const std::vector<py::array>& arrays) {
     return digests;
 }
 
-// With the array that it reads to and hashes.
+// A read together with the array that it reads to and hashes.
 class BoundHashedRead {
   public:
     BoundHashedRead(const py::object& path, int descriptor, size_t offset,
@@ -139,8 +140,8 @@ class BoundHashedRead {
     std::optional<HashedRead> read_;
 };
 
-// Reads parts of several files. Small parts share pieces of memory that are large enough for the
-// system to use huge pages for them.
+// Reads parts of several files. Small parts share blocks of memory that are large
+// enough for huge pages.
 class BoundReader {
   public:
     std::unique_ptr<BoundHashedRead> read(const py::object& path, int descriptor,
@@ -158,11 +159,12 @@ class BoundReader {
     }
 
   private:
-    // Aligned to eight bytes.
+    // Returns memory that is aligned to eight bytes.
     py::array_t<uint8_t> take(size_t num_bytes) {
         const size_t size = (num_bytes + 7) / 8 * 8;
         if (size > left_) {
-            // Of the second, so that one alone takes no more than it has.
+            // The first small part gets memory of its own, so that a single one does
+            // not allocate a whole block.
             const bool is_small = size < HashedRead::kLargeBytes && piece_.size() > 0;
             left_ = is_small ? size * kFilesOfPiece : size;
             piece_ = py::array_t<uint64_t>(static_cast<py::ssize_t>(left_ / 8));
@@ -174,7 +176,7 @@ class BoundReader {
 
     static constexpr size_t kFilesOfPiece = 8;
     py::array piece_;
-    size_t left_ = 0;  // of it
+    size_t left_ = 0;  // bytes left in the block
 };
 
 py::array BoundHashedRead::wait() {
@@ -200,19 +202,19 @@ void bind_pages(py::module_& m) {
     py::class_<BoundHashedRead>(m, "HashedRead",
                                 "A part of a file that is read and hashed at the same time.")
         .def("wait", &BoundHashedRead::wait,
-             "The bytes, once all are there; ValueError if the file has fewer.")
+             "Returns the bytes once all are read; raises ValueError if the file has fewer.")
         .def("is_sound", &BoundHashedRead::is_sound,
-             "Whether all that was read has the hash at its end.");
+             "Returns whether the bytes end with their hash.");
     py::class_<BoundReader>(m, "HashedReader",
-                            "Reads parts of several files, small ones to memory together.")
+                            "Reads parts of several files; small parts share memory.")
         .def(py::init<>())
         .def("read", &BoundReader::read, "path"_a, "descriptor"_a, "before"_a, "offset"_a,
              "num_bytes"_a, "in_pieces"_a,
-             "Bytes at one place of a file that end with the BLAKE2b-128 of `before` and them, or "
-             "of those of "
-             "their pieces. They are aligned to eight if `before` has a multiple of eight.");
+             "Reads bytes of a file that end with a BLAKE2b-128 hash: of `before` and the bytes, "
+             "or of the hashes of their pieces. The bytes are aligned to eight if the size of "
+             "`before` is a multiple of eight.");
     m.def("blake2b", &hash_messages, "messages"_a,
-          "BLAKE2b-128 of several messages, side by side.");
+          "Returns the BLAKE2b-128 of several messages, which are hashed in parallel.");
     m.attr("DAMAGED") = kDamaged;
     m.attr("HASH_PIECE_BYTES") = kHashPieceBytes;
     py::class_<BoundPageRun>(m, "PageRun", "Neighbouring pages of a file; borrows the arrays.")
@@ -226,8 +228,8 @@ void bind_pages(py::module_& m) {
              py::kw_only(), "first_page"_a, "first_cluster"_a, "offset"_a, "places"_a);
     m.def("read_pages", &read_run, "path"_a, "descriptor"_a, "out"_a, "codec"_a, "hashes"_a,
           "run"_a,
-          "Fills rows with the gaussians of a run of pages, which have these hashes (n, 16), or an "
-          "array of words (W,) int32 with the pages as they are.");
+          "Reads a run of pages with these hashes (n, 16): decodes their gaussians into rows, or "
+          "copies the pages unchanged into an array (W,) int32.");
 }
 
 }  // namespace v3dg

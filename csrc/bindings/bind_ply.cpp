@@ -1,4 +1,4 @@
-// Reading and writing of .ply files as Python has them; the work is that of io/ply_*.h.
+// Reading and writing of .ply files for Python; io/ply_*.h do the work.
 
 #include <cerrno>
 #include <cmath>
@@ -12,14 +12,14 @@ namespace v3dg {
 
 namespace {
 
-// A name as text that can be shown; bytes that are no ASCII become question marks.
+// Returns a name as printable text, with question marks for bytes that are not ASCII.
 std::string printable(std::string name) {
     for (char& c : name)
         if (c < ' ' || c > '~') c = '?';
     return name;
 }
 
-// The name of a file as the system takes it, and as messages show it.
+// The name of a file, as the system needs it and as messages show it.
 struct Path {
     explicit Path(py::object path) : shown(path) {
         PyObject* bytes = nullptr;
@@ -30,7 +30,7 @@ struct Path {
     py::bytes encoded;
 };
 
-// Calls body(path) without the interpreter lock and gives what goes wrong the file's name.
+// Calls body(path) without Python's lock, and adds the file's name to errors.
 template <class Body>
 auto with_path(const Path& path, const Body& body) {
     const char* name = PyBytes_AS_STRING(path.encoded.ptr());
@@ -48,14 +48,23 @@ auto with_path(const Path& path, const Body& body) {
     }
 }
 
-// A file that is read in runs of rows; it remembers where the last one ended.
+// A file that is read in runs of rows; it remembers where the last run ended.
 class BoundPlyFile {
   public:
     explicit BoundPlyFile(const py::object& path)
         : path_(path), ply_(with_path(path_, open_ply)), next_(ply_.begin()) {}
 
     size_t num_gaussians() const { return ply_.num_gaussians(); }
-    int sh_degree() const { return static_cast<int>(std::lround(std::sqrt(ply_.num_sh))) - 1; }
+    int sh_degree() const {
+        return static_cast<int>(std::lround(std::sqrt(ply_.layout.num_sh))) - 1;
+    }
+    py::list used() const {
+        py::list names;
+        for (const PlyField& field : ply_.layout.fields)
+            if (field.property != PlyField::kNone)
+                names.append(printable(ply_.vertex.properties[field.property].name));
+        return names;
+    }
 
     py::tuple read(int64_t first, int64_t last) {
         if (first < 0 || last < first || static_cast<size_t>(last) > ply_.num_gaussians())
@@ -63,12 +72,12 @@ class BoundPlyFile {
                 "rows: expected 0 <= first <= last <= " + std::to_string(ply_.num_gaussians()) +
                 ", got " + std::to_string(first) + " to " + std::to_string(last));
         const auto n = static_cast<py::ssize_t>(last - first),
-                   k = static_cast<py::ssize_t>(ply_.num_sh);
+                   k = static_cast<py::ssize_t>(ply_.layout.num_sh);
         const NewArray<float> means({}, {n, 3}), quats({}, {n, 4}), scales({}, {n, 3}),
             opacities({}, {n}), sh({}, {n, k, 3});
         const PlyGaussians<float> out = {means.span, quats.span, scales.span, opacities.span,
                                          sh.span};
-        // Read and set under the interpreter's lock, so that several threads may read.
+        // Read and written with Python's lock held, so that several threads may read.
         const PlyPlace known = next_;
         next_ = with_path(path_, [&](const char*) {
             return read_ply(ply_, static_cast<size_t>(first), known, out);
@@ -84,8 +93,8 @@ class BoundPlyFile {
 };
 
 constexpr const char* kEncodings[] = {"ascii", "binary_little_endian", "binary_big_endian"};
-constexpr const char* kTypes[] = {"char", "uchar", "short", "ushort",
-                                  "int",  "uint",  "float", "double"};
+constexpr const char* kTypes[] = {"char",  "uchar",  "short", "ushort", "int",   "uint",
+                                  "float", "double", "half",  "int64",  "uint64"};
 
 py::tuple ply_header(const py::object& path) {
     const PlyHeader header = with_path(
@@ -103,6 +112,14 @@ py::tuple ply_header(const py::object& path) {
     return py::make_tuple(kEncodings[static_cast<size_t>(header.encoding)], header.size, elements);
 }
 
+py::list ply_comments(const py::object& path) {
+    const PlyHeader header = with_path(
+        Path(path), [](const char* name) { return read_ply_header(open_ply_file(name)); });
+    py::list comments;
+    for (const std::string& comment : header.comments) comments.append(printable(comment));
+    return comments;
+}
+
 PlyEncoding encoding_of(const std::string& name) {
     for (size_t i = 0; i < std::size(kEncodings); ++i)
         if (name == kEncodings[i]) return static_cast<PlyEncoding>(i);
@@ -112,7 +129,10 @@ PlyEncoding encoding_of(const std::string& name) {
 
 void ply_write(const py::object& path, const py::array& means, const py::array& quats,
                const py::array& scales, const py::array& opacities, const py::array& sh,
-               const std::string& encoding) {
+               const std::string& encoding, const std::vector<std::string>& comments) {
+    for (const std::string& comment : comments)
+        if (comment.find_first_of("\r\n") != std::string::npos)
+            throw py::value_error("comments: expected lines, got " + quoted(comment));
     const PlyEncoding chosen = encoding_of(encoding);
     const py::ssize_t n = means.ndim() > 0 ? means.shape(0) : 0;
     const py::ssize_t k = sh.ndim() > 1 ? sh.shape(1) : 0;
@@ -124,8 +144,9 @@ void ply_write(const py::object& path, const py::array& means, const py::array& 
                                           span_of<const float>(scales, "scales", {n, 3}),
                                           span_of<const float>(opacities, "opacities", {n}),
                                           span_of<const float>(sh, "sh", {n, k, 3})};
-    with_path(Path(path),
-              [&](const char* name) { write_ply(name, in, chosen, static_cast<size_t>(k)); });
+    with_path(Path(path), [&](const char* name) {
+        write_ply(name, in, chosen, static_cast<size_t>(k), comments);
+    });
 }
 
 }  // namespace
@@ -135,12 +156,15 @@ void bind_ply(py::module_& m) {
         .def(py::init<const py::object&>(), "path"_a)
         .def_property_readonly("num_gaussians", &BoundPlyFile::num_gaussians)
         .def_property_readonly("sh_degree", &BoundPlyFile::sh_degree)
+        .def_property_readonly("used", &BoundPlyFile::used,
+                               "Names of the properties that are read.")
         .def("read", &BoundPlyFile::read, "first"_a, "last"_a);
     m.def("ply_header", &ply_header, "path"_a,
-          "Encoding, bytes of the header, and elements: name, count, and properties' names and "
-          "types.");
+          "Returns the encoding, the bytes of the header, and the elements: name, count, and names "
+          "and types of properties.");
+    m.def("ply_comments", &ply_comments, "path"_a, "Returns the comments of the header, in order.");
     m.def("ply_write", ply_write, "path"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a,
-          "encoding"_a);
+          "encoding"_a, "comments"_a = std::vector<std::string>());
 }
 
 }  // namespace v3dg

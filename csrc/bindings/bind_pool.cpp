@@ -1,5 +1,4 @@
-// Pools of pages and the sources that they read from, as Python has them; residency/page_pool.h has
-// the pool.
+// Page pools and their sources for Python; residency/page_pool.h implements the pool.
 
 #include <algorithm>
 #include <thread>
@@ -12,10 +11,10 @@ namespace v3dg {
 
 namespace {
 
-// At most this part of a pool's memory is for pages on their way.
+// At most this fraction of a pool's memory is for pages that are being read.
 constexpr size_t kBlockShare = 8;
-// Threads that read do more than wait for the disk: they hash. There are more of them where there
-// are cores.
+// Reading threads do not only wait for the disk but also hash, so machines with more
+// cores get more of them.
 constexpr unsigned kMostThreads = 16;
 
 [[noreturn]] void raise(const PageError& error) {
@@ -23,14 +22,14 @@ constexpr unsigned kMostThreads = 16;
     throw py::error_already_set();
 }
 
-// The file of a bundle as Python has it, with the arrays that pages are found by.
+// The file of a bundle, with the arrays that locate its pages.
 struct BoundFileSource {
     std::string name;
     int descriptor;
     PageCodec codec;
     int sh_degree;
     py::array places, hashes;
-    py::object fetch;  // what fetches parts of the file, or None
+    py::object fetch;  // callable that fetches parts of the file, or None
 };
 
 PageCodec codec_of(const std::string& name) {
@@ -39,16 +38,16 @@ PageCodec codec_of(const std::string& name) {
     throw py::value_error("codec: expected float32 or quantized, got " + name);
 }
 
-// What a source is made of, borrowed from objects of Python.
+// The origin of a source's pages, borrowed from Python objects.
 struct GivenSource {
-    const Rows* rows = nullptr;             // in memory; or
-    const BoundFileSource* file = nullptr;  // in a file:
+    const Rows* rows = nullptr;             // pages in memory, or null
+    const BoundFileSource* file = nullptr;  // else the file
     Fetch fetch = {};
     Span<const int64_t> places = {};
     Span<const uint8_t> hashes = {};
 };
 
-// The text of what was raised, which is raised no longer; with Python's lock.
+// Returns the text of the current Python error and clears it. Requires Python's lock.
 std::string text_of_error() {
     PyObject *type = nullptr, *value = nullptr, *trace = nullptr;
     PyErr_Fetch(&type, &value, &trace);
@@ -61,9 +60,10 @@ std::string text_of_error() {
     return problem.empty() ? "the fetch failed" : problem;
 }
 
-// Asks a Python function for parts of a file. Returns the text of the error that it raises, or an
-// empty text. The caller holds Python's lock; no object here may have a destructor that needs the
-// lock, because Python may end the thread inside the function.
+// Calls a Python function that fetches parts of a file. Returns the text of the error
+// that it raises, or an empty string. The caller holds Python's lock. No object here
+// may have a destructor that needs the lock, because Python may end the thread inside
+// the function.
 std::string told_by(PyObject* function, Span<const int64_t> places) {
     PyObject* const list = PyList_New(static_cast<py::ssize_t>(places.size / 2));
     for (size_t k = 0; list != nullptr && k < places.size / 2; ++k)
@@ -77,9 +77,9 @@ std::string told_by(PyObject* function, Span<const int64_t> places) {
     return done == nullptr ? text_of_error() : std::string();
 }
 
-// Has a function of Python fetch, for threads that have no part in its lock until then: whoever
-// waits for them has to have given that up. The function is kept for ever, for a pool may leave
-// threads behind that call it.
+// Wraps a Python function for threads that Python does not know. They acquire Python's
+// lock for the call; so a thread that waits for them must have released it. The
+// function is never released, because a pool may leave threads behind that call it.
 Fetch fetch_by(const py::object& function) {
     if (function.is_none()) return {};
     PyObject* const kept = function.inc_ref().ptr();
@@ -111,7 +111,7 @@ std::shared_ptr<const PageSource> source_of(const GivenSource& given, const Clus
 
 py::array_t<bool> resident_pages(BoundPool& pool, size_t bundle) {
     if (bundle >= pool.pool().num_bundles())
-        throw py::value_error("bundle: expected one below " +
+        throw py::value_error("bundle: expected an index below " +
                               std::to_string(pool.pool().num_bundles()) + ", got " +
                               std::to_string(bundle));
     const Span<const int64_t> shift = pool.pool().shift(bundle);
@@ -179,14 +179,14 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
 
 BoundPool::~BoundPool() {
     on_device_.reset();
-    const Unlocked unlocked;  // threads that end may be on their way to ask Python for a page
+    const Unlocked unlocked;  // threads that are ending may be about to call Python for a page
     pool_.reset();
 }
 
 void BoundPool::check_scene(const SceneState& scene) const {
     bool fits = scene.bundles.size() == tables_.size();
     for (size_t b = 0; fits && b < tables_.size(); ++b) fits = tables_[b].is(scene.bundles[b]);
-    if (!fits) throw py::value_error("scene: expected one of the bundles that the pool is of");
+    if (!fits) throw py::value_error("scene: expected a scene of the pool's bundles");
 }
 
 SettlingStep BoundPool::settle_step(const py::object& scene_object, const BoundEyes& camera,
@@ -200,7 +200,9 @@ SettlingStep BoundPool::settle_step(const py::object& scene_object, const BoundE
 }
 
 void bind_pool(py::module_& m) {
-    py::class_<PoolStatus>(m, "PoolStatus", "What of the pages is there, and what is missing.")
+    py::class_<PoolStatus>(
+        m, "PoolStatus",
+        "The state of a pool: how many pages are resident and how many are missing.")
         .def_readonly("num_slots", &PoolStatus::num_slots)
         .def_readonly("num_resident", &PoolStatus::num_resident)
         .def_readonly("needed", &PoolStatus::needed)
@@ -211,13 +213,13 @@ void bind_pool(py::module_& m) {
         .def_readonly("least_tolerance_px2", &PoolStatus::least_tolerance_px2)
         .def_readonly("error", &PoolStatus::error)
         .def_readonly("is_damage", &PoolStatus::is_damage);
-    py::class_<SettlingStep>(m, "SettlingStep", "What a step towards a settled view found out.")
+    py::class_<SettlingStep>(m, "SettlingStep", "The result of a step towards a settled view.")
         .def_readonly("tolerance_px2", &SettlingStep::tolerance_px2)
         .def_property_readonly("is_decided",
                                [](const SettlingStep& step) { return step.noted.is_decided; })
         .def_property_readonly("num_absent",
                                [](const SettlingStep& step) { return step.noted.num_absent; });
-    py::class_<BoundFileSource>(m, "FileSource", "The file that pages of a bundle are in.")
+    py::class_<BoundFileSource>(m, "FileSource", "The file that contains the pages of a bundle.")
         .def(py::init([](const std::string& name, int descriptor, const std::string& codec,
                          int sh_degree, const py::array& places, const py::array& hashes,
                          const py::object& fetch) {
@@ -232,24 +234,27 @@ void bind_pool(py::module_& m) {
              py::kw_only(), "name"_a, "descriptor"_a, "codec"_a, "sh_degree"_a, "places"_a,
              "hashes"_a, "fetch"_a = py::none());
     py::class_<BoundPool>(m, "PagePool",
-                          "Pages of bundles in a fixed amount of memory of one device.")
+                          "Pages of bundles in memory of a fixed size on one device.")
         .def(py::init<py::list, py::list, int, size_t, unsigned>(), "tables"_a, "sources"_a,
              "device"_a, "num_bytes"_a, "num_threads"_a)
         .def("settle_step", &BoundPool::settle_step, "scene"_a, "camera"_a, "rule"_a, "begins"_a,
-             "Brings all pages that were read and finds out what a view needs.")
+             "Makes all pages resident that were read, and determines which pages a view needs.")
         .def("status", &BoundPool::status)
-        .def("resident", &resident_pages, "bundle"_a, "(P,) which pages of a bundle are there.")
+        .def("resident", &resident_pages, "bundle"_a,
+             "Returns which pages of a bundle are resident: (P,) bool.")
         .def("arrived", &arrived_pages, "bundle"_a,
-             "(P,) in how many frames of eight pages have faded in, up to the last one.")
+             "Returns for how many of eight frames each page of a bundle has been fading in: (P,) "
+             "int32.")
         .def(
             "raise_tolerance",
             [](BoundPool& p, float from) { return p.pool().raise_tolerance_at_once(from); },
             "from_px2"_a,
-            "Raises it, unless there is room for what the last view needs; whether it did.")
+            "Raises the least tolerance unless the needs of the last view fit; returns whether it "
+            "did.")
         .def(
             "wait", [](BoundPool& p, double seconds) { return p.pool().wait(seconds); },
             "seconds"_a, py::call_guard<Unlocked>(),
-            "Waits for pages; whether there are any to bring.")
+            "Waits for pages; returns whether there are any to make resident.")
         .def(
             "read_one", [](BoundPool& p) { return p.pool().read_one(); },
             py::call_guard<Unlocked>());

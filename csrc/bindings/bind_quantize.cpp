@@ -20,7 +20,7 @@ py::ssize_t num_words(Span<const int64_t> offset, int sh_degree) {
 py::object encode_rows(const Rows& gaussians, const py::array& offset) {
     const GaussianRows<const float> in = gaussians.read<float>();
     check_is_on_host(gaussians.device(), "gaussians",
-                     "expected arrays on the host, got others; bring them there");
+                     "expected arrays on the host, got arrays on a device; copy them to the host");
     const Span<const int64_t> clusters = boundaries_of(offset, "offset", in.size);
     const NewArray<int32_t> page({}, {num_words(clusters, in.sh_degree)});
     {
@@ -33,7 +33,7 @@ py::object encode_rows(const Rows& gaussians, const py::array& offset) {
 void decode_rows(const py::array& page, const py::array& offset, const Rows& out) {
     const GaussianRows<float> rows = out.write();
     check_is_on_host(out.device(), "out",
-                     "expected arrays on the host, got others; bring them there");
+                     "expected arrays on the host, got arrays on a device; copy them to the host");
     const Span<const int64_t> clusters = boundaries_of(offset, "offset", rows.size);
     const auto words = span_of<const int32_t>(page, "page", {num_words(clusters, rows.sh_degree)});
     const Unlocked unlocked;
@@ -69,20 +69,18 @@ py::tuple palette_of(const py::array& vectors, size_t size) {
 
 void bind_quantize(py::module_& m) {
     m.def("page_code_bytes", &page_code_bytes, "sh_degree"_a,
-          "Bytes of a gaussian and of a cluster in a page of codes, and what pages are filled up "
-          "to.");
+          "Returns the bytes of a gaussian and of a cluster in a page of codes, and the alignment "
+          "of pages.");
     m.def("encode_page", &encode_rows, "gaussians"_a, "offset"_a,
-          "Words (W,) int32 of a page: the gaussians from offset[0] on as codes relative to the "
-          "ranges of "
-          "their clusters, which begin at `offset` (K+1,).");
+          "Returns a page as (W,) int32: the gaussians from offset[0] on as codes relative to the "
+          "ranges of their clusters, which begin at `offset` (K+1,).");
     m.def("decode_page", &decode_rows, "page"_a, "offset"_a, "out"_a,
           "Writes the gaussians of a page of codes to rows from offset[0] on.");
     m.def("codebook_of", &codebook_of, "values"_a,
-          "256 ascending numbers near the values (N,), by Lloyd's algorithm; if there are no more "
-          "different "
-          "values, these.");
+          "Returns 256 ascending numbers near the values (N,), by Lloyd's algorithm; exact if "
+          "there are at most 256 different values.");
     m.def("palette_of", &palette_of, "vectors"_a, "size"_a,
-          "At most `size` vectors (K, D) that stand for many (N, D), and which of them for each "
+          "Returns at most `size` vectors (K, D) that represent many (N, D), and the label of each "
           "(N,).");
     py::class_<BoundCodes>(m, "Codes",
                            "All pages of a bundle as codes, on the host; borrows the arrays.")

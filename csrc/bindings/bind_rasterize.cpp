@@ -1,4 +1,4 @@
-// Gaussians without levels, drawn where they are, and their gradients.
+// Draws gaussians without levels on their device, and computes gradients.
 
 #include "bindings/backend.h"
 #include "bindings/operations.h"
@@ -7,14 +7,14 @@ namespace v3dg {
 
 namespace {
 
-// A picture as Python has it: the tape is an object of its own.
+// A picture for Python; the tape is a separate object.
 struct BoundRasterized {
     py::object color, alpha, depth;
     std::optional<RenderCounts> counts;
     py::object tape;
 };
 
-// Where gaussians lie on the image.
+// Projected gaussians on the image.
 struct BoundEllipses {
     py::object centers, depths, conics, opacities, radii;
 };
@@ -69,9 +69,10 @@ Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const Dra
 }
 
 void bind_rasterize(py::module_& m) {
-    py::class_<Tape>(m, "Tape",
-                     "What rasterize leaves for rasterize_backward; it keeps the gaussians.");
-    py::class_<RenderCounts>(m, "RenderCounts", "What a picture came to on the host.")
+    py::class_<Tape>(
+        m, "Tape",
+        "The data that rasterize leaves for rasterize_backward; it keeps the gaussians alive.");
+    py::class_<RenderCounts>(m, "RenderCounts", "The statistics of a picture that the host drew.")
         .def_readonly("in_frustum", &RenderCounts::in_frustum)
         .def_readonly("records", &RenderCounts::records)
         .def_readonly("entries", &RenderCounts::entries)
@@ -82,9 +83,9 @@ void bind_rasterize(py::module_& m) {
         .def_readonly("color", &BoundRasterized::color, "(H, W, 3).")
         .def_readonly("alpha", &BoundRasterized::alpha, "(H, W).")
         .def_readonly("depth", &BoundRasterized::depth, "(H, W), or None.")
-        .def_readonly("counts", &BoundRasterized::counts, "None where a device drew it.")
-        .def_readonly("tape", &BoundRasterized::tape, "None where it is not kept.");
-    py::class_<Gradients>(m, "Gradients", "Gradients of a picture, by what it was drawn of.")
+        .def_readonly("counts", &BoundRasterized::counts, "None if a device drew the picture.")
+        .def_readonly("tape", &BoundRasterized::tape, "None unless it was requested.");
+    py::class_<Gradients>(m, "Gradients", "Gradients of a picture by the gaussians that it shows.")
         .def_readonly("means", &Gradients::means)
         .def_readonly("quats", &Gradients::quats)
         .def_readonly("scales", &Gradients::scales)
@@ -94,9 +95,9 @@ void bind_rasterize(py::module_& m) {
         .def_readonly("centers", &Gradients::centers,
                       "(N, 2), by the centres on the image, or None.")
         .def_readonly("center_sizes", &Gradients::center_sizes,
-                      "(N, 2), the sum of absolute values of each pixel's share, or None.");
-    py::class_<BoundEllipses>(m, "Ellipses",
-                              "Gaussians on an image; zeros for those that are not in sight.")
+                      "(N, 2), sums over pixels of absolute gradients by the centres, or None.");
+    py::class_<BoundEllipses>(
+        m, "Ellipses", "Gaussians projected onto an image; zeros for those that are not visible.")
         .def_readonly("centers", &BoundEllipses::centers, "(N, 2), px.")
         .def_readonly("depths", &BoundEllipses::depths, "(N,).")
         .def_readonly("conics", &BoundEllipses::conics, "(N, 3).")
@@ -120,7 +121,7 @@ void bind_rasterize(py::module_& m) {
         },
         "gaussians"_a, "camera"_a, py::kw_only(), "filter_px2"_a, "antialiased"_a, "background"_a,
         "with_depth"_a, "keep_tape"_a, "plain_colors"_a = false,
-        "Draws gaussians where they are and in the precision that they have.");
+        "Draws gaussians on their device and in their precision.");
     m.def(
         "rasterize_backward",
         [](Tape& tape, const py::object& d_color, const py::object& d_alpha,
@@ -129,10 +130,9 @@ void bind_rasterize(py::module_& m) {
                                  {.sum = with_centers, .size = with_sizes});
         },
         "tape"_a, "d_color"_a, "d_alpha"_a, "d_depth"_a, "with_centers"_a = false,
-        "with_sizes"_a = false,
-        "Goes back from the gradients of a picture to those of what it was drawn of.");
+        "with_sizes"_a = false, "Computes the gradients of gaussians from those of a picture.");
     m.def("ellipses", &ellipses, "gaussians"_a, "camera"_a, py::kw_only(), "filter_px2"_a,
-          "antialiased"_a, "far_depth"_a, "min_radius_px"_a, "Where gaussians lie on the image.");
+          "antialiased"_a, "far_depth"_a, "min_radius_px"_a, "Projects gaussians onto an image.");
 }
 
 }  // namespace v3dg

@@ -1,4 +1,4 @@
-// What is resident, and false colours.
+// Resident objects, and false colours.
 
 #include "bindings/operations.h"
 #include "bindings/resident.h"
@@ -8,7 +8,7 @@ namespace v3dg {
 
 namespace {
 
-// (..., 3) colours of values.
+// Returns (..., 3) colours of values.
 template <class Color>
 py::array_t<float> colors_of(std::vector<py::ssize_t> shape, size_t count, const Color& color) {
     shape.push_back(3);
@@ -26,11 +26,11 @@ void bind_colors(py::module_& m) {
     m.def(
         "level_colors",
         [](size_t count) { return colors_of({py::ssize_t(count)}, count, level_color); }, "count"_a,
-        "Colours of levels, from fine to coarse: (count, 3).");
+        "Returns the colours of levels, from fine to coarse: (count, 3).");
     m.def(
         "cluster_colors",
         [](size_t count) { return colors_of({py::ssize_t(count)}, count, cluster_color); },
-        "count"_a, "Colours of clusters, of which neighbours differ: (count, 3).");
+        "count"_a, "Returns colours of clusters that differ between neighbours: (count, 3).");
     const auto add = [&](const char* name, auto color, const char* doc) {
         m.def(
             name,
@@ -40,10 +40,11 @@ void bind_colors(py::module_& m) {
             },
             "values"_a, doc);
     };
-    add("ramp", ramp_color, "Colours of values of 0 to 1, from dark to bright: (..., 3).");
+    add("ramp", ramp_color,
+        "Returns colours of values from 0 to 1, from dark to bright: (..., 3).");
     add(
         "missing_colors", [](float share) { return missing_color(share, 1.0f); },
-        "Colours of clusters whose metric is this share of the tolerance that is wanted: (..., "
+        "Returns colours of clusters whose metric is this multiple of the wanted tolerance: (..., "
         "3).");
 }
 
@@ -51,29 +52,31 @@ void bind_colors(py::module_& m) {
 
 void bind_scene(py::module_& m) {
     bind_colors(m);
-    py::class_<BoundModel>(m, "Model", "Gaussians as frames of their device read them.")
+    py::class_<BoundModel>(m, "Model", "Gaussians in the layout that frames of their device read.")
         .def(py::init<const Rows&>(), "gaussians"_a)
         .def(py::init<py::object, int>(), "codes"_a, "device"_a)
         .def("decode", &BoundModel::decode, "cluster_ids"_a,
-             "Gaussians of clusters, where they are codes: means, quats, scales, opacities, sh.")
+             "Returns the gaussians of clusters of a coded model: means, quats, scales, opacities, "
+             "sh.")
         .def("__len__", &BoundModel::size)
         .def_property_readonly("bytes", &BoundModel::bytes);
-    py::class_<BoundPalette>(m, "Palette",
-                             "Colours of a bundle's clusters, in which gaussians can be drawn.")
+    py::class_<BoundPalette>(
+        m, "Palette", "Colours of a bundle's clusters, which can replace those of the gaussians.")
         .def(py::init<py::object, py::array, int>(), "table"_a, "sh"_a, "device"_a);
     py::class_<BudgetSteps>(m, "BudgetSteps",
-                            "What pictures with a budget know of the ones before.")
+                            "The state that a sequence of pictures with a budget shares.")
         .def(py::init<>());
-    py::class_<BoundScene>(m, "ResidentScene", "What selection reads of a scene, on one device.")
+    py::class_<BoundScene>(m, "ResidentScene",
+                           "The tables of a scene that selection reads, on one device.")
         .def(py::init<int>(), "device"_a)
         .def("set_bundles", &BoundScene::set_bundles, "tables"_a)
         .def("set_instances", &BoundScene::set_instances, "bundle"_a, "importance"_a, "positions"_a,
-             "quaternions"_a, "scales"_a)
+             "quaternions"_a, "scales"_a, "factors"_a = py::none())
         .def("set_poses", &BoundScene::set_poses, "positions"_a, "quaternions"_a, "scales"_a)
         .def("select", &BoundScene::select, "camera"_a, "rule"_a, "steps"_a = nullptr)
         .def("page_needs", &BoundScene::page_needs, "camera"_a, "rule"_a,
-             "For each bundle how urgently its pages are needed: (G+1,), above 1 where the cut "
-             "misses them.");
+             "Returns the priorities of the pages of each bundle: (G+1,), above 1 for pages that "
+             "the cut misses.");
 }
 
 }  // namespace v3dg

@@ -9,11 +9,11 @@ Span<const int64_t> segments_of(const py::array& offset, const char* name, py::s
     const Span<const int64_t> s = span_of<const int64_t>(offset, name, {length});
     for (size_t i = 0; i + 1 < s.size; ++i)
         if (s[i] > s[i + 1] || s[i] < 0)
-            throw py::value_error(std::string(name) + ": expected numbers that do not fall");
+            throw py::value_error(std::string(name) + ": expected numbers that never decrease");
     return s;
 }
 
-// How many gaussians are taken to fewer, segment by segment.
+// The numbers of gaussians before and after simplification, segment by segment.
 struct Segments {
     Span<const int64_t> in, out;
 
@@ -29,8 +29,8 @@ struct Segments {
             if (out[g + 1] - out[g] > in[g + 1] - in[g] ||
                 (out[g + 1] == out[g] && in[g + 1] > in[g]))
                 throw py::value_error(
-                    "out_offset: expected 1 to as many gaussians as come in, segment " +
-                    std::to_string(g) + " has others");
+                    "out_offset: expected 1 to the number in in_offset, segment " +
+                    std::to_string(g) + " has another number");
     }
     size_t num_out() const { return static_cast<size_t>(out[out.size - 1]); }
 };
@@ -64,11 +64,10 @@ py::tuple merge(const Rows& gaussians, const py::array& in_offset, const py::arr
 
 void bind_simplify(py::module_& m) {
     m.def("prune", &prune, "gaussians"_a, "in_offset"_a, "out_offset"_a,
-          "Rows (M,) int64 of the gaussians of each segment that survive, ascending.");
+          "Returns the rows (M,) int64 of the surviving gaussians of each segment, ascending.");
     m.def("merge", &merge, "gaussians"_a, "in_offset"_a, "out_offset"_a,
-          "Joins pairs of gaussians in each segment until as many are left as wanted: means, "
-          "quats, scales, "
-          "opacities, sh.");
+          "Joins pairs of gaussians in each segment until the wanted number is left: means, quats, "
+          "scales, opacities, sh.");
 }
 
 }  // namespace v3dg

@@ -1,10 +1,11 @@
-// Values that cross between Python and the core: cameras, rules, instances and rows.
+// Values that Python passes to the core: cameras, rules, instances and rows.
 
 #include <algorithm>
 #include <cmath>
 
 #include "bindings/backend.h"
 #include "bindings/operations.h"
+#include "math/sh.h"
 
 namespace v3dg {
 
@@ -68,7 +69,7 @@ py::array_t<double> intrinsics_of(const BoundCamera& bound) {
 
 BoundEyes make_eyes(const BoundCamera& left, const BoundCamera& right) {
     if (!std::equal(left.camera.rotation, left.camera.rotation + 9, right.camera.rotation))
-        throw py::value_error("left, right: expected cameras of the same rotation");
+        throw py::value_error("left, right: expected cameras with the same rotation");
     return {Eyes(left.camera, right.camera)};
 }
 
@@ -125,7 +126,7 @@ Rows::Rows(py::object means, py::object quats, py::object scales, py::object opa
     remember(rows);
     for (const float* start : {rows.quats, rows.sh})
         if (reinterpret_cast<uintptr_t>(start) % traits.row_alignment != 0)
-            throw py::value_error("quats, sh: expected memory that begins at a multiple of " +
+            throw py::value_error("quats, sh: expected memory aligned to " +
                                   std::to_string(traits.row_alignment) + " bytes");
 }
 
@@ -146,14 +147,22 @@ NewRows::NewRows(Device device, size_t size, int sh_degree)
       sh_degree(sh_degree) {}
 
 Instances::Instances(py::array bundle, py::array positions, py::array quaternions, py::array scales,
-                     py::array importance)
-    : arrays_{bundle, positions, quaternions, scales, importance} {
+                     py::array importance, py::object factors)
+    : arrays_{bundle, positions, quaternions, scales, importance, factors} {
     table_.bundle = span_of<const int32_t>(bundle, "bundle", {-1});
     const auto count = static_cast<py::ssize_t>(table_.bundle.size);
     table_.position = span_of<const double>(positions, "positions", {count, 3});
     table_.quaternion = span_of<const double>(quaternions, "quaternions", {count, 4});
     table_.scale = span_of<const double>(scales, "scales", {count});
     table_.importance = span_of<const float>(importance, "importance", {count});
+    table_.factors = factors_of(factors, count);
+}
+
+Span<const InstanceFactors> factors_of(const py::object& factors, py::ssize_t count) {
+    static_assert(sizeof(InstanceFactors) == 4 * sizeof(float), "a row of four numbers");
+    if (factors.is_none()) return {};
+    const Span<const float> rows = span_of<const float>(factors, "factors", {count, 4});
+    return {reinterpret_cast<const InstanceFactors*>(rows.data), static_cast<size_t>(count)};
 }
 
 void Instances::check_bundles(size_t num_bundles) const {
@@ -163,7 +172,7 @@ void Instances::check_bundles(size_t num_bundles) const {
 void check_instance_bundles(Span<const int32_t> bundle, size_t num_bundles) {
     for (const int32_t b : bundle)
         if (b < 0 || static_cast<size_t>(b) >= num_bundles)
-            throw py::value_error("bundle: expected a bundle below " + std::to_string(num_bundles) +
+            throw py::value_error("bundle: expected an index below " + std::to_string(num_bundles) +
                                   ", got " + std::to_string(b));
 }
 
@@ -183,37 +192,56 @@ Window window_of(const Camera& c) {
             static_cast<int>(c.y1)};
 }
 
+py::object sh_bases_of(int degree, const py::array& directions) {
+    if (degree < 0 || degree > kMaxShDegree)
+        throw py::value_error("degree: expected 0 to 3, got " + std::to_string(degree));
+    const Span<const double> in = span_of<const double>(directions, "directions", {-1, 3});
+    const auto count = static_cast<py::ssize_t>(in.size / 3);
+    const int num_bases = num_sh_bases(degree);
+    const NewArray<double> out({}, {count, num_bases});
+    for (size_t i = 0; i < in.size / 3; ++i) {
+        double basis[kMaxShBases];
+        sh_bases(degree, in[3 * i], in[3 * i + 1], in[3 * i + 2], basis);
+        std::copy(basis, basis + num_bases, &out.span[num_bases * i]);
+    }
+    return out.object;
+}
+
 void bind_types(py::module_& m) {
+    m.def("sh_bases", &sh_bases_of, "degree"_a, "directions"_a,
+          "The bases of spherical harmonics in unit directions: (D, (degree + 1)^2).");
     py::class_<BoundCamera>(
-        m, "Camera", "A pinhole camera, or a window of its image, as every operation takes it.")
+        m, "Camera", "A pinhole camera, or a window of its image; the input of every operation.")
         .def(py::init(&make_camera), py::kw_only(), "viewmat"_a, "K"_a, "width"_a, "height"_a,
              "near"_a)
         .def("window", &window_of_camera, "x0"_a, "y0"_a, "x1"_a, "y1"_a,
-             "The same camera, of whose image only the pixels [x0, x1) x [y0, y1) are wanted.")
-        .def_property_readonly("position", &position_of, "Where it is in the world: (3,).")
-        .def_property_readonly("K", &intrinsics_of, "In px: (3, 3).")
+             "Returns the same camera restricted to the pixels [x0, x1) x [y0, y1) of its image.")
+        .def_property_readonly("position", &position_of, "Position in the world: (3,).")
+        .def_property_readonly("K", &intrinsics_of, "Camera matrix in px: (3, 3).")
         .def_property_readonly("width", &BoundCamera::width)
         .def_property_readonly("height", &BoundCamera::height);
-    py::class_<BoundEyes>(m, "Eyes",
-                          "Two cameras that look the same way and share a cut; or a camera.")
+    py::class_<BoundEyes>(
+        m, "Eyes", "Two cameras with the same rotation that share a cut; or a single camera.")
         .def(py::init([](const BoundCamera& only) { return BoundEyes{only.camera}; }), "camera"_a)
         .def(py::init(&make_eyes), "left"_a, "right"_a);
     py::implicitly_convertible<BoundCamera, BoundEyes>();
-    py::class_<SelectRule>(m, "Rule", "What a selection chooses.")
+    py::class_<SelectRule>(m, "Rule",
+                           "The rule of a selection: tolerance, footprint, budget and fade.")
         .def(py::init(&make_rule), py::kw_only(), "tolerance_px2"_a, "budget"_a, "min_level"_a,
              "footprint"_a, "culls"_a, "fade"_a = 1.0, "frame"_a = 0)
         .def_readonly("tolerance_px2", &SelectRule::tolerance_px2);
     py::class_<Instances>(m, "Instances",
                           "Instances of bundles; borrows the arrays, which are on the host.")
-        .def(py::init<py::array, py::array, py::array, py::array, py::array>(), py::kw_only(),
-             "bundle"_a, "positions"_a, "quaternions"_a, "scales"_a, "importance"_a);
+        .def(py::init<py::array, py::array, py::array, py::array, py::array, py::object>(),
+             py::kw_only(), "bundle"_a, "positions"_a, "quaternions"_a, "scales"_a, "importance"_a,
+             "factors"_a = py::none());
     py::class_<Rows>(m, "Rows", "The arrays of gaussians, on the host or on a CUDA device.")
         .def(py::init<py::object, py::object, py::object, py::object, py::object>(), "means"_a,
              "quats"_a, "scales"_a, "opacities"_a, "sh"_a)
         .def("__len__", &Rows::size)
         .def_property_readonly(
             "device", [](const Rows& rows) { return rows.device().number; },
-            "Number of the CUDA device; -1 on the host.")
+            "Index of the CUDA device; -1 on the host.")
         .def_property_readonly("sh_degree", &Rows::sh_degree);
 }
 

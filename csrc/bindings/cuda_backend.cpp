@@ -1,6 +1,6 @@
-// The backend of CUDA's devices: arrays are whatever has __cuda_array_interface__, new ones are
-// torch's, and work is queued on torch's current stream. Compiled only with CUDA; its frames and
-// pools are in cuda_frame.cpp.
+// The backend of CUDA devices. It accepts arrays with __cuda_array_interface__, returns
+// new ones as torch tensors, and queues work on torch's current stream. It is compiled
+// only with CUDA; its frames and pools are in cuda_frame.cpp.
 
 #include <pybind11/gil_safe_call_once.h>
 
@@ -37,8 +37,8 @@ Borrowed borrow_anywhere(const py::handle& array, const char* name, const Elemen
 
 namespace {
 
-// What is asked of torch for every frame, looked up once. It stays to the end of the process, which
-// may come after Python's.
+// The functions of torch that every frame needs, looked up once. The object lives to
+// the end of the process, which may outlive Python.
 struct Torch {
     py::object empty, current_stream;  // current_stream returns the stream as a number
 
@@ -63,7 +63,8 @@ struct Torch {
           int32_(py::module_::import("torch").attr("int32")),
           uint8_(py::module_::import("torch").attr("uint8")) {}
 
-    // Torch, with CUDA ready for what does not see to that itself.
+    // Returns torch after it has initialised CUDA, for callers that do not do so
+    // themselves.
     static py::module_ initialised_cuda() {
         py::module_::import("torch.cuda").attr("init")();
         return py::module_::import("torch");
@@ -264,8 +265,9 @@ class CudaBackend final : public Backend {
         return cuda::make_frame(work);
     }
     std::unique_ptr<backend::AssetFrame> make_asset_frame(
-        std::shared_ptr<const backend::Model> model, const Work& work) const override {
-        return cuda::make_asset_frame(std::move(model), work);
+        std::shared_ptr<const backend::Model> model, Appearance<float> appearance,
+        const Work& work) const override {
+        return cuda::make_asset_frame(std::move(model), appearance, work);
     }
     std::unique_ptr<backend::Target> make_target(const Rows& rows, float filter_px2,
                                                  bool antialiased) const override {
@@ -281,7 +283,7 @@ class CudaBackend final : public Backend {
 }  // namespace
 }  // namespace cuda
 
-// It stays to the end of the process, which may come after Python's.
+// It lives to the end of the process, which may outlive Python.
 const Backend& cuda_backend() {
     static const Backend& backend = *new cuda::CudaBackend;
     return backend;

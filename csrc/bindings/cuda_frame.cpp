@@ -1,10 +1,8 @@
-// Models, scenes, pools and frames of CUDA's devices. Pictures are enqueued on torch's current
-// stream with Python's lock held, for torch gives them their memory meanwhile; a Turn keeps other
-// threads from a frame's buffers.
+// Models, scenes, pools and frames on CUDA devices. Pictures are enqueued on torch's
+// current stream with Python's lock held, because torch allocates their memory
+// meanwhile. A Turn keeps other threads from using a frame's buffers.
 
 #include "bindings/cuda_frame.h"
-
-#include <mutex>
 
 #include "draw/render_backward_cuda.h"
 
@@ -35,7 +33,7 @@ class BackendModel final : public backend::Model {
     }
 
   private:
-    std::optional<Rows> rows_;  // which the packed model reads
+    std::optional<Rows> rows_;  // the packed model reads these rows
     DeviceModel on_device_;
 };
 
@@ -59,7 +57,8 @@ class BackendScene final : public backend::Scene {
     }
     void set_instances(SceneState& state, const Work& work) override {
         const Poses poses(state);
-        tables_.set_instances(state.instances.bundle, state.instances.importance, stream_of(work));
+        tables_.set_instances(state.instances.bundle, state.instances.importance,
+                              state.instances.factors, stream_of(work));
         poses.give_to(tables_, work);
     }
     void set_poses(SceneState& state, const Work& work) override {
@@ -120,7 +119,7 @@ class BackendPool final : public backend::Pool {
 // A frame that was enqueued.
 class EnqueuedDrawing final : public BoundDrawing {
   public:
-    EnqueuedDrawing(NewPictures pictures, Device device, std::shared_ptr<std::mutex> turns,
+    EnqueuedDrawing(NewPictures pictures, Device device, std::shared_ptr<Mutex> turns,
                     std::unique_ptr<Drawing> drawing, const SelectRule& rule, DevicePages* pages)
         : BoundDrawing(std::move(pictures), FrameStats{}),
           device_(device),
@@ -138,7 +137,7 @@ class EnqueuedDrawing final : public BoundDrawing {
             drawing_->wait();
         }
         const Turn turn(*turns_);
-        const FrameCounters& counters = drawing_->finish();  // may draw
+        const FrameCounters& counters = drawing_->finish();  // may draw again
         if (pages_ != nullptr) pages_->note_frames(stream_of(work));
         const FrameTimes times = drawing_->times();
         const bool exceeds = counters.choice.exceeds_budget;
@@ -161,9 +160,9 @@ class EnqueuedDrawing final : public BoundDrawing {
 
   private:
     const Device device_;
-    const std::shared_ptr<std::mutex> turns_;  // of the frame
-    const std::unique_ptr<Drawing> drawing_;   // gone before what it needs
-    DevicePages* const pages_;                 // of the pool that it draws from; null: none
+    const std::shared_ptr<Mutex> turns_;      // belongs to the frame
+    const std::unique_ptr<Drawing> drawing_;  // destroyed before the objects that it uses
+    DevicePages* const pages_;                // the pool that it draws from; null: none
     const SelectRule rule_;
 };
 
@@ -179,7 +178,7 @@ PicturePlanes planes_of(NewPicture& picture, Device device) {
     return {planes.color, planes.alpha, planes.depth};
 }
 
-// Pictures of the eyes on the device, which have no memory yet.
+// Returns the pictures of the eyes on the device, without memory yet.
 EyeImages new_images(const Eyes& eyes, const Shade& shade, NewPictures& pictures) {
     FrameImage image[2]{};
     for (int k = 0; k < eyes.count(); ++k) {
@@ -193,7 +192,8 @@ EyeImages new_images(const Eyes& eyes, const Shade& shade, NewPictures& pictures
                         : EyeImages{{image[0], {}}, 1, stop};
 }
 
-// Allocates the planes through torch; slow, so called after the first kernels are queued.
+// Allocates the planes through torch; slow, so called after the first kernels are
+// queued.
 cuda::Frame::Place place_of(NewPictures& pictures, Device device) {
     return [&pictures, device](PicturePlanes planes[2]) {
         for (size_t k = 0; k < pictures.size(); ++k) planes[k] = planes_of(pictures[k], device);
@@ -250,23 +250,25 @@ class BackendFrame final : public backend::Frame {
         std::unique_ptr<Drawing> drawing =
             frame_.draw(tables_of(input.scene), pages, request, used, images, stream_of(work),
                         place_of(pictures, device_));
-        // Without a pool, the drawing reports the tolerance of the request, else the one in `used`.
+        // Without a pool, the drawing reports the tolerance of the request, else the
+        // one in `used`.
         const SelectRule& reported = pages == nullptr ? request.rule : used;
         return std::make_unique<EnqueuedDrawing>(std::move(pictures), device_, turns_,
                                                  std::move(drawing), reported, pages);
     }
 
     const Device device_;
-    // Drawings have it, too, which may finish after the frame's last one began.
-    const std::shared_ptr<std::mutex> turns_ = std::make_shared<std::mutex>();
+    // Drawings share it, because they may finish after the frame's last drawing began.
+    const std::shared_ptr<Mutex> turns_ = std::make_shared<Mutex>();
     std::vector<std::shared_ptr<const backend::Model>> models_;  // with the rows that they read
     SceneFrame frame_;
 };
 
 class BackendAssetFrame final : public backend::AssetFrame {
   public:
-    BackendAssetFrame(std::shared_ptr<const backend::Model> model, Device device)
-        : device_(device), model_(std::move(model)) {}
+    BackendAssetFrame(std::shared_ptr<const backend::Model> model, Appearance<float> appearance,
+                      Device device)
+        : device_(device), model_(std::move(model)), appearance_(appearance) {}
 
     std::unique_ptr<BoundDrawing> draw(const Camera& camera, const Shade& shade,
                                        const std::atomic<bool>*) override {
@@ -276,17 +278,18 @@ class BackendAssetFrame final : public backend::AssetFrame {
         const EyeImages images = new_images(camera, shade, pictures);
         const PackedModel& packed = *static_cast<const BackendModel&>(*model_).on_device().packed;
         std::unique_ptr<Drawing> drawing =
-            frame_.draw(packed.rows(), view_of_world<float>(camera), 0.0f, false, images.image[0],
-                        stream_of(work), &packed.packed(), images.min_transmittance,
-                        place_of(pictures, device_));
+            frame_.draw(packed.rows(), view_of_world<float>(camera), appearance_.filter_px2,
+                        appearance_.antialiased, images.image[0], stream_of(work), &packed.packed(),
+                        images.min_transmittance, place_of(pictures, device_));
         return std::make_unique<EnqueuedDrawing>(std::move(pictures), device_, turns_,
                                                  std::move(drawing), SelectRule{}, nullptr);
     }
 
   private:
     const Device device_;
-    const std::shared_ptr<std::mutex> turns_ = std::make_shared<std::mutex>();
+    const std::shared_ptr<Mutex> turns_ = std::make_shared<Mutex>();
     const std::shared_ptr<const backend::Model> model_;
+    const Appearance<float> appearance_;
     ModelFrame frame_;
 };
 
@@ -387,8 +390,9 @@ std::unique_ptr<backend::Frame> make_frame(const Work& work) {
 }
 
 std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const backend::Model> model,
+                                                      Appearance<float> appearance,
                                                       const Work& work) {
-    return std::make_unique<BackendAssetFrame>(std::move(model), work.device());
+    return std::make_unique<BackendAssetFrame>(std::move(model), appearance, work.device());
 }
 
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,

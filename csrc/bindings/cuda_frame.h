@@ -1,13 +1,14 @@
 #pragma once
 
-// Models, scenes, pools and frames of CUDA's devices. Only sources of the CUDA backend include it.
+// Models, scenes, pools and frames on CUDA devices. Only sources of the CUDA backend
+// include this file.
 
 #include "bindings/resident.h"
 #include "draw/scene_frame_cuda.h"
 
 namespace v3dg::cuda {
 
-// cudaStream_t is what Work calls a stream here.
+// Returns the stream of Work as a cudaStream_t.
 inline cudaStream_t stream_of(const Work& work) { return static_cast<cudaStream_t>(work.stream()); }
 
 // Borrows an array on any CUDA device.
@@ -23,7 +24,7 @@ class BackendTables final : public backend::Tables {
     const BundleTables tables;
 };
 
-// The tables of a bundle, which live as long as what it returns.
+// Returns the tables of a bundle, which exist as long as the result.
 std::shared_ptr<const BundleTables> tables_on(const BoundTable& table, const Work& work);
 
 std::shared_ptr<const backend::Model> make_model(const Rows& rows, const Work& work);
@@ -34,6 +35,7 @@ std::unique_ptr<backend::Scene> make_scene();
 std::unique_ptr<backend::Pool> make_pool(PagePool& pool, const py::list& tables, const Work& work);
 std::unique_ptr<backend::Frame> make_frame(const Work& work);
 std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const backend::Model> model,
+                                                      Appearance<float> appearance,
                                                       const Work& work);
 
 // As Backend::rasterize().

@@ -1,46 +1,54 @@
 #pragma once
 
-// What drawing a frame gives Python: pictures, and what they came to.
+// The result of drawing a frame for Python: pictures and statistics.
 
 #include <atomic>
 #include <memory>
-#include <mutex>
 #include <utility>
 #include <vector>
 
+#include "base/mutex.h"
 #include "bindings/picture.h"
 #include "draw/scene_frame.h"
 
 namespace v3dg {
 
-// While it lives, one thread draws with a frame. Python's lock alone does not see to that, for
-// torch gives it up while it looks for memory; and so it is given up here, too, where another
-// thread has its turn. For backends whose frames share buffers.
-class Turn {
+// Gives one thread exclusive use of a frame while it exists. Python's lock does not
+// suffice, because torch releases it while it allocates memory. For the same reason the
+// constructor releases Python's lock while it waits for another thread. Used by
+// backends whose frames share buffers.
+class V3DG_SCOPED_CAPABILITY Turn {
   public:
-    explicit Turn(std::mutex& mutex) : lock_(mutex, std::try_to_lock) {
-        if (lock_.owns_lock()) return;
-        const Unlocked unlocked;
-        lock_.lock();
-    }
+    explicit Turn(Mutex& mutex) V3DG_ACQUIRE(mutex) : mutex_(mutex) { wait_for(mutex); }
+    ~Turn() V3DG_RELEASE() { mutex_.unlock(); }
+    Turn(const Turn&) = delete;
+    Turn& operator=(const Turn&) = delete;
 
   private:
-    std::unique_lock<std::mutex> lock_;
+    // Clang checks no constructors, so the lock is not in the constructor.
+    static void wait_for(Mutex& mutex) V3DG_ACQUIRE(mutex) {
+        if (mutex.try_lock()) return;
+        const Unlocked unlocked;
+        mutex.lock();
+    }
+
+    Mutex& mutex_;
 };
 
-// What a frame came to; times in milliseconds.
+// The statistics of a frame; times are in milliseconds.
 struct FrameStats {
-    int64_t gaussians;  // selected; where the budget is exceeded, what the coarsest cut has
+    int64_t gaussians;  // selected gaussians; if the budget is exceeded, those of the coarsest cut
     uint64_t in_frustum, records, entries, items;
     float tolerance_px2;
     bool exceeds_budget;
     double select_ms, draw_ms;
-    std::vector<int64_t> levels;  // on the host, gaussians selected by level
-    int num_draws = 1;  // more where buffers on a device were too small, and it was drawn again
+    std::vector<int64_t> levels;  // on the host: selected gaussians by level
+    // Above 1 if buffers on a device were too small, so that the frame was drawn again.
+    int num_draws = 1;
 };
 
-// A frame that has been drawn, or enqueued on a device, with what it reads and writes. A backend
-// whose drawings are not done when they are made derives from it.
+// A frame that has been drawn, or enqueued on a device, with its inputs and outputs. A
+// backend whose drawings are unfinished on return derives from it.
 class BoundDrawing {
   public:
     BoundDrawing(NewPictures pictures, const FrameStats& stats)
@@ -52,10 +60,10 @@ class BoundDrawing {
     const NewPicture& picture() const { return pictures_.front(); }
     const NewPicture& right() const { return pictures_.back(); }
 
-    // Whether the device may still be at work on it.
+    // Returns whether the device may still be drawing.
     virtual bool is_under_way() const { return false; }
-    // Keeps what it is drawn from until it is gone: the frame, which may have to draw again, and
-    // what that reads.
+    // Keeps an input alive as long as this object: the frame, which may have to draw
+    // again, and what the frame reads.
     void keep(py::object kept) { kept_ = std::move(kept); }
     // Waits for the pictures.
     virtual const FrameStats& finish() { return stats_; }
@@ -65,7 +73,7 @@ class BoundDrawing {
     FrameStats stats_;
 
   private:
-    py::object kept_;  // gone after what a derived class has
+    py::object kept_;  // destroyed after the members of a derived class
 };
 
 }  // namespace v3dg

@@ -1,5 +1,6 @@
-// The backend of the host, which is always there: arrays are NumPy's, there is no stream, and all
-// is done when a call returns. Its frames and pools are in host_frame.cpp.
+// The backend of the host, which is always compiled. Arrays are NumPy's, there is no
+// stream, and all work is done when a call returns. Its frames and pools are in
+// host_frame.cpp.
 
 #include "bindings/backend.h"
 #include "bindings/host_frame.h"
@@ -13,7 +14,7 @@ namespace host {
 
 namespace {
 
-// What selection reads is what the state has of the host's arrays.
+// Selection reads the host arrays of the state, so the handle has no data.
 class HostScene final : public backend::Scene {
   public:
     void set_bundles(const SceneState&, const Work&) override {}
@@ -66,7 +67,7 @@ class HostTarget final : public backend::Target {
     std::unique_ptr<::v3dg::Model<float>> model_;
 };
 
-// Whatever Python runs on can read float32 anywhere.
+// Every processor that runs Python can read float32 at any address.
 constexpr BackendTraits kTraits{.host_reads_arrays = true,
                                 .computes_doubles = true,
                                 .row_alignment = 1,
@@ -155,7 +156,8 @@ class HostBackend final : public Backend {
         return std::make_unique<HostScene>();
     }
     PoolDemands pool_demands(int max_sh_degree) const override {
-        // Places of coefficients have 32 bits here, and each degree has some of its own.
+        // Indices of coefficients have 32 bits here, and each degree has its own index
+        // range.
         const size_t most_coded_rows = UINT32_MAX / static_cast<size_t>(std::max(1, max_sh_degree));
         return {.most_block_bytes = size_t(64) << 20,
                 .row_bytes = sizeof(float) * (11 + 3 * num_sh_bases(max_sh_degree)),
@@ -171,8 +173,9 @@ class HostBackend final : public Backend {
         return host::make_frame();
     }
     std::unique_ptr<backend::AssetFrame> make_asset_frame(
-        std::shared_ptr<const backend::Model> model, const Work&) const override {
-        return host::make_asset_frame(std::move(model));
+        std::shared_ptr<const backend::Model> model, Appearance<float> appearance,
+        const Work&) const override {
+        return host::make_asset_frame(std::move(model), appearance);
     }
     std::unique_ptr<backend::Target> make_target(const Rows& rows, float filter_px2,
                                                  bool antialiased) const override {
@@ -188,7 +191,7 @@ class HostBackend final : public Backend {
 }  // namespace
 }  // namespace host
 
-// It stays to the end of the process, which may come after Python's.
+// It lives to the end of the process, which may outlive Python.
 const Backend& host_backend() {
     static const Backend& backend = *new host::HostBackend;
     return backend;

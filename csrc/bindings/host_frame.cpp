@@ -1,5 +1,5 @@
-// Frames and pools of the host. Everything is drawn when a call returns, in memory of NumPy's, and
-// without Python's lock; frames share no buffers, so they take no turns.
+// Frames and pools on the host. Everything is drawn on return, in NumPy's memory and
+// without Python's lock. Frames share no buffers, so they need no Turn.
 
 #include "bindings/host_frame.h"
 
@@ -13,20 +13,20 @@ namespace v3dg::host {
 
 namespace {
 
-// Frames of a pool: one of a flight; a look at what a view needs, the first or a later one while it
-// settles; and one aside, for which pages neither come nor are asked for: of what was there for the
-// last one, as that was.
+// The kinds of frames of a pool. `flight` is one of a sequence. `first_look` and `look`
+// are steps of settling a view. `aside` uses the resident pages of the last frame,
+// unchanged, and neither brings pages in nor requests any.
 enum class PoolFrame { flight, first_look, look, aside };
 
 class HostPool final : public backend::Pool {
   public:
     explicit HostPool(PagePool& pool) : pool_(pool), pages_(pool), needs_(pool.num_bundles()) {}
 
-    // Brings pages, calls cut(tables, rule, needs), which returns the tolerance that was used, and
-    // takes note of what that needed. Without Python's lock.
+    // Brings pages, calls cut(tables, rule, needs), which returns the tolerance that it
+    // used, and notes the needs of the cut. Called without Python's lock.
     template <class Cut>
     NotedView frame(const SceneState& scene, SelectRule rule, PoolFrame kind, const Cut& cut) {
-        pool_.check_process();  // In a child of fork() the lock may be held for ever.
+        pool_.check_process();  // In a child of fork() the mutex may be locked forever.
         const MutexLock lock(busy_);
         if (kind == PoolFrame::first_look) pool_.begin_settling();
         const bool is_aside = kind == PoolFrame::aside && has_begun_;
@@ -72,7 +72,7 @@ class HostPool final : public backend::Pool {
         return step;
     }
 
-    // The gaussians of each bundle, in the colours that are asked for.
+    // Returns the gaussians of each bundle, in the requested colours.
     std::vector<SceneModel> models(const SceneState& scene, const FrameRequest& request) const {
         std::vector<SceneModel> models;
         for (size_t b = 0; b < scene.tables.size(); ++b) {
@@ -106,8 +106,8 @@ class HostPool final : public backend::Pool {
     PagePool& pool_;
     HostPages pages_;
     Mutex busy_;
-    bool has_begun_ V3DG_GUARDED_BY(busy_) = false;                    // with a frame
-    std::vector<std::vector<uint32_t>> needs_ V3DG_GUARDED_BY(busy_);  // of each bundle
+    bool has_begun_ V3DG_GUARDED_BY(busy_) = false;  // whether any frame has begun
+    std::vector<std::vector<uint32_t>> needs_ V3DG_GUARDED_BY(busy_);  // per bundle
 };
 
 FrameStats stats_of(const SceneFrameCounts& counts) {
@@ -135,7 +135,7 @@ Picture<T> picture_in(NewPicture& made, const Window& window, const Shade& shade
             .min_transmittance = shade.min_transmittance};
 }
 
-// New pictures of the windows of the eyes.
+// New pictures for the windows of the eyes.
 struct HostPictures {
     NewPictures made;
     std::vector<Picture<float>> pictures;
@@ -152,8 +152,8 @@ struct HostPictures {
     Span<const Picture<float>> span() const { return {pictures.data(), pictures.size()}; }
 };
 
-// What a frame draws, without what the scene knows of the clusters. It never changes, so that a
-// frame under way keeps it while another thread sets others.
+// The models of a frame, without the scene's tables. The object never changes, so a
+// frame in progress keeps it while another thread sets other models.
 struct HostModels {
     std::vector<std::shared_ptr<const backend::Model>> models;
     std::vector<std::shared_ptr<const backend::Palette>> palettes;
@@ -219,8 +219,8 @@ class HostFrame final : public backend::Frame {
         return std::make_unique<BoundDrawing>(std::move(out.made), stats_of(counts));
     }
 
-    // Calls body(scene, rule) without Python's lock: of the models that were set, or of what is
-    // resident in the pool. It returns the tolerance that was used.
+    // Calls body(scene, rule) without Python's lock: with the models that were set, or
+    // with the resident part of the pool. body() returns the tolerance that it used.
     template <class Body>
     void with_scene(const backend::FrameInput& input, const SelectRule& rule, PoolFrame kind,
                     uint32_t* last_bin, const Body& body) const {
@@ -254,8 +254,8 @@ class HostFrame final : public backend::Frame {
 
 class HostAssetFrame final : public backend::AssetFrame {
   public:
-    explicit HostAssetFrame(std::shared_ptr<const backend::Model> model)
-        : model_(std::move(model)) {}
+    HostAssetFrame(std::shared_ptr<const backend::Model> model, Appearance<float> appearance)
+        : model_(std::move(model)), appearance_(appearance) {}
 
     std::unique_ptr<BoundDrawing> draw(const Camera& camera, const Shade& shade,
                                        const std::atomic<bool>* stop) override {
@@ -264,13 +264,15 @@ class HostAssetFrame final : public backend::AssetFrame {
         SceneFrameCounts counts;
         {
             const Unlocked unlocked;
-            counts = cpu::draw_model(*model.planes(), model.size(), camera, out.pictures[0], stop);
+            counts = cpu::draw_model(*model.planes(), model.size(), appearance_, camera,
+                                     out.pictures[0], stop);
         }
         return std::make_unique<BoundDrawing>(std::move(out.made), stats_of(counts));
     }
 
   private:
     const std::shared_ptr<const backend::Model> model_;
+    const Appearance<float> appearance_;
 };
 
 template <class T>
@@ -403,8 +405,9 @@ std::unique_ptr<backend::Pool> make_pool(PagePool& pool) {
 
 std::unique_ptr<backend::Frame> make_frame() { return std::make_unique<HostFrame>(); }
 
-std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const backend::Model> model) {
-    return std::make_unique<HostAssetFrame>(std::move(model));
+std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const backend::Model> model,
+                                                      Appearance<float> appearance) {
+    return std::make_unique<HostAssetFrame>(std::move(model), appearance);
 }
 
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,

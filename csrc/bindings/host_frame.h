@@ -1,14 +1,14 @@
 #pragma once
 
-// Frames and pools of the host.
+// Frames and pools on the host.
 
 #include "bindings/resident.h"
 #include "draw/model.h"
 
 namespace v3dg::host {
 
-// Gaussians as frames on the host read them: planes of its own, or the codes of a bundle, where
-// they are.
+// The gaussians that host frames read: planes owned by this object, or the codes of a
+// bundle, which are borrowed.
 class HostModel final : public backend::Model {
   public:
     explicit HostModel(const GaussianRows<const float>& rows);
@@ -27,7 +27,7 @@ class HostModel final : public backend::Model {
   private:
     size_t size_ = 0;
     std::unique_ptr<::v3dg::Model<float>> planes_;
-    py::object codes_object_;  // which `codes_` borrows from
+    py::object codes_object_;  // owner of the memory of `codes_`
     Codes codes_{};
 };
 
@@ -44,9 +44,10 @@ class HostPalette final : public backend::Palette {
 
 std::unique_ptr<backend::Pool> make_pool(PagePool& pool);
 std::unique_ptr<backend::Frame> make_frame();
-std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const backend::Model> model);
+std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const backend::Model> model,
+                                                      Appearance<float> appearance);
 
-// As Backend::rasterize(), of float32 or float64.
+// As Backend::rasterize(), for float32 or float64.
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,
                      bool with_depth, bool keep_tape);
 

@@ -1,4 +1,4 @@
-// The compiled module: what it needs of the process, and its parts in order.
+// The compiled module: its requirements on the process, and its parts in order.
 
 #include <dlfcn.h>
 #include <omp.h>
@@ -14,10 +14,11 @@
 #include "math/gaussian.h"
 #include "residency/cluster_table.h"
 
-// A child of fork() has none of the threads that GNU's OpenMP keeps for the next loop, but would
-// wait for them without end. So the thread that forks lets its own go first; they come back, on
-// either side, with the next loop. LLVM's OpenMP, which may stand in, minds forks itself and then
-// holds locks that this would wait for.
+// GNU's OpenMP keeps idle threads for the next parallel loop. A child of fork() has no
+// such threads, but would wait for them forever. So the forking thread ends its idle
+// threads before the fork; the next loop starts new ones in both processes. LLVM's
+// OpenMP, which may replace GNU's, handles forks itself and then holds locks that this
+// call would wait for.
 static void let_threads_go() { omp_pause_resource_all(omp_pause_hard); }
 static bool must_let_threads_go() {
     Dl_info found;
@@ -30,12 +31,12 @@ static int num_cuda_devices() {
     return backend == nullptr ? 0 : backend->num_devices();
 }
 
-// An object that only `__new__` has made holds nothing. When a function is given one, pybind11 asks
-// its class for memory of that size, whose content nobody has made.
+// Refuses objects that were made by `__new__` alone, which hold no value. If such an
+// object is passed to a function, pybind11 asks its class for memory of the value's
+// size and would use it uninitialised.
 static void* refuse_unmade(size_t) {
     throw v3dg::py::type_error(
-        "self: expected an object that its class has made, got one of __new__ alone; call the "
-        "class instead");
+        "self: this object was made by __new__ alone and has no value; call the class instead");
 }
 static void refuse_unmade_objects(const v3dg::py::module_& m) {
     for (const auto& [name, value] : v3dg::py::dict(m.attr("__dict__"))) {
@@ -57,9 +58,9 @@ PYBIND11_MODULE(_core, m) {
     m.attr("has_cuda") = v3dg::device_backend() != nullptr;
     m.def(
         "isa", [] { return v3dg::isa_name(v3dg::active_isa()); },
-        "Instruction set that the CPU half runs on.");
+        "Instruction set that operations on the CPU use.");
     m.def("num_cuda_devices", &num_cuda_devices,
-          "CUDA devices to run on; 0 without CUDA or a driver.");
+          "Number of CUDA devices; 0 without CUDA or a driver.");
     v3dg::bind_types(m);
     v3dg::bind_ply(m);
     v3dg::bind_cluster(m);

@@ -1,6 +1,6 @@
 #pragma once
 
-// New planes of a picture, where its gaussians are.
+// New planes of a picture, on the device of its gaussians.
 
 #include "bindings/types.h"
 
@@ -13,7 +13,7 @@ struct NewPlanes {
 
 struct NewPicture {
     py::ssize_t height, width;
-    py::object color, alpha, depth;  // the last one None where it is not wanted
+    py::object color, alpha, depth;  // depth is None unless requested
     bool with_depth;
 
     NewPicture(const Window& window, bool with_depth)
@@ -22,7 +22,7 @@ struct NewPicture {
           depth(py::none()),
           with_depth(with_depth) {}
 
-    // Gives the planes their memory.
+    // Allocates the planes.
     template <class T>
     NewPlanes<T> allocate(Device device) {
         const NewArray<T> color_plane(device, {height, width, 3});
@@ -40,7 +40,7 @@ struct NewPicture {
     }
 };
 
-// The pictures of a frame: of a camera, or of two eyes, left first.
+// The pictures of a frame: one for a camera; for two eyes, left first.
 using NewPictures = std::vector<NewPicture>;
 
 }  // namespace v3dg

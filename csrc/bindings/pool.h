@@ -1,6 +1,6 @@
 #pragma once
 
-// The part of bundles that is resident, of a size that does not grow.
+// The resident part of bundles, in memory of a fixed size.
 
 #include <memory>
 #include <vector>
@@ -11,8 +11,8 @@ namespace v3dg {
 
 class BoundPool {
   public:
-    // `sources` has for each table either the arrays of gaussians in memory (Rows), or the file of
-    // the bundle (FileSource).
+    // `sources` has for each table either the arrays of gaussians in memory (Rows), or
+    // the file of the bundle (FileSource).
     BoundPool(const py::list& tables, const py::list& sources, int device, size_t num_bytes,
               unsigned num_threads);
     ~BoundPool();

@@ -12,25 +12,27 @@ namespace {
 
 namespace py = pybind11;
 
-// Of threads that make themselves known to Python, one at a time. What they need for that is gone
-// at some moment of the interpreter's end, so none begins once that is near.
+// Serialises threads that register with Python. Registration uses state that the
+// interpreter destroys at some point of its end, so no thread may start it once the end
+// is near.
 struct Entrance {
     std::mutex busy;
     bool is_closed = false;
 };
 
 Entrance& entrance() {
-    static Entrance& entrance = *new Entrance;  // threads use it to the end of the process
+    // Never destroyed, because threads use it until the process ends.
+    static Entrance& entrance = *new Entrance;
     return entrance;
 }
 
 void close_entrance() {
-    const Unlocked unlocked;  // whoever is in it waits for Python's lock
+    const Unlocked unlocked;  // a thread in the entrance waits for Python's lock
     const std::lock_guard<std::mutex> lock(entrance().busy);
     entrance().is_closed = true;
 }
 
-// A child of fork() has none of the threads that may be in the entrance.
+// A child of fork() has none of the threads that may hold the mutex.
 void renew_entrance() { new (&entrance().busy) std::mutex; }
 
 }  // namespace
@@ -47,7 +49,8 @@ bool call_with_lock(const std::function<void()>& body) {
         return !entrance().is_closed;
     });
     if (!is_open) return false;
-    // A destructor would give the lock back that a thread which is ended does not have.
+    // This is not a destructor, because a thread that Python has ended would release a
+    // lock that it does not hold.
     try {
         staying_if_ended(body);
     } catch (...) {

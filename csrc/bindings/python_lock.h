@@ -1,12 +1,14 @@
 #pragma once
 
-// Python's lock, given up for work and taken again, and taken by threads that Python did not start.
+// Python's lock: released for work and acquired again, and acquired by threads that
+// Python did not start.
 //
-// Up to Python 3.13, a thread that asks for the lock while the interpreter ends is ended by
-// pthread_exit(), which unwinds its stack. That aborts the process at the first frame that may not
-// throw, such as a destructor, and runs other destructors without the lock that they need. So no
-// such thread comes back here: it sleeps until the process ends, which waits for no such thread.
-// From 3.14 on Python does the same.
+// Up to Python 3.13, a thread that requests the lock while the interpreter ends is
+// ended by pthread_exit(), which unwinds its stack. That aborts the process at the
+// first frame that must not throw, such as a destructor, and runs other destructors
+// without the lock that they need. Therefore such a thread never returns to this code:
+// it sleeps until the process ends, which does not wait for it. Python 3.14 and later
+// do the same.
 
 #include <cxxabi.h>
 #include <pybind11/pybind11.h>
@@ -18,8 +20,8 @@ namespace v3dg {
 // Sleeps until the process ends.
 [[noreturn]] void sleep_for_ever() noexcept;
 
-// Calls body(), in which Python may end the thread. Between here and Python nothing may have a
-// destructor that needs the lock.
+// Calls body(), in which Python may end the thread. No object between here and Python
+// may have a destructor that needs the lock.
 template <class Body>
 auto staying_if_ended(const Body& body) {
     try {
@@ -29,7 +31,7 @@ auto staying_if_ended(const Body& body) {
     }
 }
 
-// While it lives, its thread works without Python's lock.
+// Releases Python's lock while it exists.
 class Unlocked {
   public:
     Unlocked() : thread_(PyEval_SaveThread()) {}
@@ -43,12 +45,12 @@ class Unlocked {
     PyThreadState* thread_;
 };
 
-// Has a thread that Python did not start call body() with Python's lock. Returns false, without a
-// call, where the interpreter is about to end or has ended.
+// Calls body() with Python's lock on a thread that Python did not start. Returns false,
+// without a call, if the interpreter is about to end or has ended.
 bool call_with_lock(const std::function<void()>& body);
 
-// Sees to it that call_with_lock() refuses before the interpreter ends. Called once, when the
-// module is loaded.
+// Makes call_with_lock() refuse calls before the interpreter ends. Called once, when
+// the module is loaded.
 void watch_end_of_python();
 
 }  // namespace v3dg

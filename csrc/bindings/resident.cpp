@@ -7,7 +7,7 @@
 namespace v3dg {
 
 BoundModel::BoundModel(const Rows& rows) : device_(rows.device()), size_(rows.size()) {
-    static_cast<void>(rows.read<float>());  // which checks the precision
+    static_cast<void>(rows.read<float>());  // this checks the precision
     const Work work(device_);
     model_ = work.backend().make_model(rows, work);
 }
@@ -24,7 +24,8 @@ BoundModel::BoundModel(const py::object& codes, int device) : device_{device}, i
 }
 
 py::tuple BoundModel::decode(const py::array& cluster_ids) const {
-    if (!has_codes()) throw py::value_error("decode: expected a model of codes, got one of rows");
+    if (!has_codes())
+        throw py::value_error("decode: expected a model of codes, got a model of rows");
     const Span<const int32_t> cluster = span_of<const int32_t>(cluster_ids, "cluster_ids", {-1});
     std::vector<int64_t> offset{0};
     for (const int32_t c : cluster) {
@@ -75,14 +76,15 @@ void BoundScene::set_bundles(const py::list& bundles) {
 
 void BoundScene::set_instances(const py::array& bundle, const py::array& importance,
                                const py::object& positions, const py::object& quaternions,
-                               const py::object& scales) {
+                               const py::object& scales, const py::object& factors) {
     auto state = std::make_shared<SceneState>(*state_);
     InstanceTable& instances = state->instances;
     instances.bundle = span_of<const int32_t>(bundle, "bundle", {-1});
     check_instance_bundles(instances.bundle, state->tables.size());
     const auto count = static_cast<py::ssize_t>(instances.bundle.size);
     instances.importance = span_of<const float>(importance, "importance", {count});
-    state->arrays = py::make_tuple(bundle, importance, positions, quaternions, scales);
+    instances.factors = factors_of(factors, count);
+    state->arrays = py::make_tuple(bundle, importance, positions, quaternions, scales, factors);
     const Work work(device_);
     scene_->set_instances(*state, work);
     state_ = std::move(state);
@@ -91,8 +93,8 @@ void BoundScene::set_instances(const py::array& bundle, const py::array& importa
 void BoundScene::set_poses(const py::object& positions, const py::object& quaternions,
                            const py::object& scales) {
     auto state = std::make_shared<SceneState>(*state_);
-    state->arrays =
-        py::make_tuple(state->arrays[0], state->arrays[1], positions, quaternions, scales);
+    state->arrays = py::make_tuple(state->arrays[0], state->arrays[1], positions, quaternions,
+                                   scales, state->arrays[5]);
     const Work work(device_);
     scene_->set_poses(*state, work);
     state_ = std::move(state);

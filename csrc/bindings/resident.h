@@ -1,7 +1,7 @@
 #pragma once
 
-// What stays on one device from frame to frame: gaussians, palettes and scenes. Each has a handle
-// that its device's backend made.
+// Objects that stay on one device from frame to frame: gaussians, palettes and scenes.
+// Each has a handle that was made by its device's backend.
 
 #include <memory>
 #include <vector>
@@ -11,7 +11,7 @@
 
 namespace v3dg {
 
-// The gaussians of a bundle or an asset as frames of one device read them.
+// The gaussians of a bundle or an asset in the layout of one device's frames.
 class BoundModel {
   public:
     explicit BoundModel(const Rows& rows);
@@ -23,7 +23,8 @@ class BoundModel {
     size_t bytes() const { return model_->bytes(); }
     const std::shared_ptr<const backend::Model>& handle() const { return model_; }
 
-    // The gaussians of clusters, from codes: means, quats, scales, opacities, sh.
+    // Returns the gaussians of clusters of a coded model: means, quats, scales,
+    // opacities, sh.
     py::tuple decode(const py::array& cluster_ids) const;
 
   private:
@@ -31,11 +32,11 @@ class BoundModel {
     size_t size_ = 0;
     bool is_coded_ = false;
     int sh_degree_ = 0;
-    std::vector<uint32_t> num_gaussians_;  // of each cluster of codes
+    std::vector<uint32_t> num_gaussians_;  // size of each cluster of a coded model
     std::shared_ptr<const backend::Model> model_;
 };
 
-// Colours of the clusters of one bundle on one device.
+// The colours of the clusters of one bundle on one device.
 class BoundPalette {
   public:
     BoundPalette(const py::object& table, const py::array& sh, int device);
@@ -48,19 +49,20 @@ class BoundPalette {
     std::shared_ptr<const backend::Palette> palette_;
 };
 
-// A scene as the host knows it. It stays as it is: whoever draws it keeps it, and a change makes
-// another.
+// The host's view of a scene. It never changes: a frame that draws it keeps it, and
+// every change makes another object.
 struct SceneState {
     py::list bundles;
-    py::tuple arrays;  // bundle, importance, positions, quaternions and scales of the instances
+    // Bundle, importance, positions, quaternions, scales and factors of the instances.
+    py::tuple arrays;
     std::vector<ClusterTable> tables;
-    std::vector<size_t> num_gaussians;  // of each bundle
-    InstanceTable instances;            // poses only where the host reads the arrays
+    std::vector<size_t> num_gaussians;  // per bundle
+    InstanceTable instances;            // with poses only if the host can read the arrays
 
     const BoundTable& bundle(size_t b) const { return held<BoundTable>(bundles[b], "tables"); }
 };
 
-// What selection reads of a scene, on one device.
+// The tables of a scene that selection reads, on one device.
 class BoundScene {
   public:
     explicit BoundScene(int device);
@@ -69,18 +71,18 @@ class BoundScene {
     std::shared_ptr<const SceneState> state() const { return state_; }
     const backend::Scene& handle() const { return *scene_; }
 
-    // Takes the place of all bundles; instances come next.
+    // Replaces all bundles; the caller sets instances next.
     void set_bundles(const py::list& bundles);
     void set_instances(const py::array& bundle, const py::array& importance,
                        const py::object& positions, const py::object& quaternions,
-                       const py::object& scales);
-    // New poses of the same instances.
+                       const py::object& scales, const py::object& factors);
+    // Sets new poses of the same instances.
     void set_poses(const py::object& positions, const py::object& quaternions,
                    const py::object& scales);
 
-    // With `steps`, the cut of one of several pictures that follow each other.
+    // `steps`: pacing state of a sequence of pictures; null for a single one.
     BoundCut select(const BoundEyes& camera, const SelectRule& rule, BudgetSteps* steps);
-    // Priorities of the pages of each bundle, on the host.
+    // Returns the priorities of the pages of each bundle, on the host.
     py::list page_needs(const BoundCamera& camera, const SelectRule& rule) const;
 
   private:

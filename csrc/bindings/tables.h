@@ -13,7 +13,7 @@ namespace v3dg {
 
 namespace backend { class Tables; }
 
-// The tables of one bundle with the arrays that they borrow from.
+// The tables of one bundle, with the arrays that they borrow from.
 class BoundTable {
   public:
     BoundTable(py::array ball, py::array weight, py::array level, py::array own_group,
@@ -27,10 +27,11 @@ class BoundTable {
         return static_cast<size_t>(table().offset[table().offset.size - 1]);
     }
 
-    // Memory that the tables take on a device.
+    // Returns the memory of the tables on a device.
     size_t bytes_on(int device) const;
 
-    // The tables on a device, which all scenes there share; made if no scene has them.
+    // Returns the tables on a device, which all scenes there share; makes them if no
+    // scene has them.
     std::shared_ptr<const backend::Tables> on(const Work& work) const;
 
   private:
@@ -39,7 +40,7 @@ class BoundTable {
     mutable std::map<int, std::weak_ptr<const backend::Tables>> on_device_;
 };
 
-// The pairs (instance, cluster) of a selection, and what it came to.
+// The pairs (instance, cluster) of a selection, and its results.
 struct BoundCut {
     py::array_t<int32_t> instance_ids, cluster_ids;
     py::array_t<float> weights;

@@ -1,6 +1,6 @@
 #pragma once
 
-// One picture of gaussians without levels, and its gradients, as backends make them.
+// One picture of gaussians without levels, and its gradients, as backends return them.
 
 #include <optional>
 
@@ -9,19 +9,20 @@
 
 namespace v3dg {
 
-// Which gradients by the gaussians' centres on the image are wanted.
+// The requested gradients by the gaussians' centres on the image.
 struct Centers {
     bool sum, size;
 };
 
-// Gradients of a picture, arrays where its gaussians are; None for those that are not wanted.
+// The gradients of a picture, arrays on the device of its gaussians; None for those not
+// requested.
 struct Gradients {
     py::object means, quats, scales, opacities, sh, background;
     py::object centers = py::none();       // (N, 2), by the centres on the image
     py::object center_sizes = py::none();  // (N, 2), of the absolute values of pixels
 };
 
-// What rasterize leaves for rasterize_backward.
+// The data that rasterize() leaves for its backward pass.
 class Tape {
   public:
     virtual ~Tape() = default;
@@ -29,12 +30,12 @@ class Tape {
                                const py::object& d_depth, Centers wanted) = 0;
 };
 
-// What one picture is drawn with, beside gaussians and camera.
+// The settings of one picture besides gaussians and camera.
 struct DrawLook {
     double filter_px2;
     bool antialiased;
     std::array<double, 3> background;
-    bool plain_colors;  // the coefficients, of degree 0, are colours as they are
+    bool plain_colors;  // the coefficients, of degree 0, are used directly as colours
 
     template <class T>
     GaussianRows<const T> read(const Rows& gaussians) const {
@@ -44,18 +45,18 @@ struct DrawLook {
     }
 };
 
-// A picture, what it came to on the host, and the tape or null.
+// A picture, its statistics on the host, and the tape or null.
 struct Rasterized {
     py::object color, alpha, depth;
     std::optional<RenderCounts> counts;
     std::unique_ptr<Tape> tape;
 };
 
-// Draws with the backend of the gaussians, after checks.
+// Draws with the backend of the gaussians' device, after checks.
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,
                      bool with_depth, bool keep_tape);
 
-// The gradient of a plane of the picture; where none is given, zeros.
+// Returns the gradient of a plane of the picture, or zeros if none is given.
 template <class T>
 struct GradientPlane {
     py::object object;
@@ -70,7 +71,7 @@ struct GradientPlane {
     }
 
   private:
-    // NumPy's arrays are filled, and torch's tensors fill_() themselves.
+    // NumPy arrays are filled here; torch tensors fill themselves with fill_().
     static py::object zeros(Device device, const std::vector<py::ssize_t>& shape) {
         const py::object array = make_array(device, element_of<T>(), shape).object;
         array.attr(py::isinstance<py::array>(array) ? "fill" : "fill_")(0);

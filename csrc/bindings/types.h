@@ -1,7 +1,7 @@
 #pragma once
 
-// Value types that cross between Python and the core. All of them are immutable; those that hold
-// arrays keep them alive.
+// Value types that Python passes to the core. They are immutable; those that borrow
+// from arrays keep these alive.
 
 #include <array>
 
@@ -13,7 +13,7 @@
 
 namespace v3dg {
 
-// A camera that is wanted as a whole or in part, and what it was made of.
+// A camera, for its whole image or a part, and the values that it was made of.
 struct BoundCamera {
     std::array<double, 16> viewmat;
     Camera camera;
@@ -27,8 +27,8 @@ struct BoundEyes {
     Eyes eyes;
 };
 
-// The arrays of gaussians, all on the host or all on one CUDA device, float32 or, on the host,
-// float64.
+// The arrays of gaussians, all on the host or all on one CUDA device; float32 or, on
+// the host, float64.
 class Rows {
   public:
     Rows(py::object means, py::object quats, py::object scales, py::object opacities,
@@ -40,14 +40,14 @@ class Rows {
     bool is_double() const { return is_double_; }
     const std::array<py::object, 5>& arrays() const { return arrays_; }
 
-    // Borrowed, in the precision that they have.
+    // Borrows the arrays in the precision that they have.
     template <class T>
     GaussianRows<const T> read() const {
         check_precision(std::is_same<T, double>::value);
         const auto at = [&](int k) { return static_cast<const T*>(memory_[k]); };
         return {at(0), at(1), at(2), at(3), at(4), size_, sh_degree_};
     }
-    // Borrowed to be written to, float32.
+    // Borrows the arrays for writing; float32.
     GaussianRows<float> write() const { return spans<float>(); }
 
   private:
@@ -97,28 +97,30 @@ struct NewRows {
     }
 };
 
-// Degree of coefficients of shape (N, K, 3).
+// Returns the SH degree of coefficients with shape (N, K, 3).
 int degree_of_bases(py::ssize_t bases, const std::string& shape);
 
 // Instances on the host.
 class Instances {
   public:
     Instances(py::array bundle, py::array positions, py::array quaternions, py::array scales,
-              py::array importance);
+              py::array importance, py::object factors);
     const InstanceTable& table() const { return table_; }
-    // Throws unless every instance shows one of so many bundles.
+    // Throws unless the bundle of every instance is below `num_bundles`.
     void check_bundles(size_t num_bundles) const;
 
   private:
-    std::array<py::array, 5> arrays_;
+    std::array<py::object, 6> arrays_;
     InstanceTable table_;
 };
+// (I, 4) factors of red, green, blue and opacity; empty for None.
+Span<const InstanceFactors> factors_of(const py::object& factors, py::ssize_t count);
 void check_instance_bundles(Span<const int32_t> bundle, size_t num_bundles);
 
-// Boundaries of segments: ascending from 0 to `last`.
+// Returns boundaries of segments: ascending from 0 to `last`.
 Span<const int64_t> offsets_of(const py::handle& offset, size_t last);
 
-// The part of the camera's image that is wanted.
+// Returns the requested part of the camera's image.
 Window window_of(const Camera& camera);
 
 }  // namespace v3dg

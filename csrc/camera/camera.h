@@ -1,66 +1,75 @@
 #pragma once
 
-// The seam for camera models. A model knows how points of view space come onto the image; all of
-// the code but this folder asks it through the concept CameraModel, and names the type that is in
-// use as Intrinsics<T>. The poses of cameras do not depend on the model (math/view.h).
+// The interface of camera models. A model maps view space to the image. All code
+// outside of this folder uses it through the concept CameraModel, and names the type in
+// use Intrinsics<T>. The poses of cameras do not depend on the model (math/view.h).
 //
 // Add a camera model:
-// 1. Write camera/<model>.h beside pinhole.h: a struct template over the scalar, trivially
-//    copyable, with the members that CameraModel lists below. They are called from kernels and from
-//    loops that are compiled per instruction set, so they are V3DG_HD and V3DG_INLINE and take
+// 1. Write camera/<model>.h beside pinhole.h: a struct template over the scalar type,
+//    trivially copyable, with the members below. Kernels and loops that are compiled
+//    per instruction set call them, so they are V3DG_HD and V3DG_INLINE, and take
 //    vectors where CameraModel says V.
-// 2. Check it with a static_assert, as Pinhole is checked below; tests/cpp/second_camera.cpp shows
-//    a small model that goes through projection.
-// 3. Give it its place in Intrinsics<T>, the one dispatch. With a single model that is an alias.
-//    With several it becomes a struct that holds one of them and a tag, and whose members ask the
-//    one that it holds; it models CameraModel itself, so kernels stay as they are.
-// 4. Let users make one: bindings/bind_types.cpp and v3dg/cameras.py. fit_group/ makes pictures of
-//    its own with pinholes and goes on doing so. levels/cut_views.cpp, levels/first_selected.cpp
-//    and levels/refine_cuts_math.h set and scale the numbers of pinholes, and have to refuse
-//    others.
-// 5. Footprint::paper is defined for pinholes alone (select/footprint.h); refuse it for others.
+// 2. Check it with a static_assert, as Pinhole is checked below.
+//    tests/cpp/second_camera.cpp projects gaussians with a small second model.
+// 3. Add it to Intrinsics<T>, the only dispatch. With a single model that is an alias.
+//    With several it becomes a struct with a tag and one of the models, whose members
+//    call those of the model. The struct itself satisfies CameraModel, so kernels do
+//    not change.
+// 4. Let users make one: bindings/bind_types.cpp, v3dg/cameras.py, and
+//    v3dg/camera_file.py if files name it. fit_group/ draws its own pictures with
+//    pinholes and continues to do so. levels/cut_views.cpp, levels/first_selected.cpp
+//    and levels/refine_cuts_math.h set and scale the fields of pinholes, and have to
+//    reject other models.
+// 5. Footprint::paper is defined only for pinholes (select/footprint.h); reject it for
+//    other models.
 //
-// What a model supplies, with T its scalar and V a T or a vector of them:
+// The members of a model, where T is its scalar type, and V is T or a vector of T:
 //
 // Types and constants
-// - Scalar: T. Limits: what linearized() needs that is computed once an image. Point<V>: what the
-//   Jacobian at a point depends on. Sides: the planes of a frustum in camera coordinates.
-//   kNumPlanes: how many planes bound what it sees.
+// - Scalar: T. Limits: values that linearized() needs and that are computed once per
+//   image. Point<V>: the values that the Jacobian at a point depends on. Sides: the
+//   planes of a frustum in camera coordinates. kNumPlanes: the number of planes that
+//   bound what the camera sees.
 //
 // Members
-// - width, height: size of the image, px. near_depth: nothing nearer is drawn; positive.
-// - rounded_to<U>(): the same camera with another scalar.
+// - width, height: size of the image, px. near_depth: nothing nearer is drawn;
+//   positive.
+// - rounded_to<U>(): the same camera with another scalar type.
 //
 // Projection
-// - depth_of(p): the depth of a point in view space, by which gaussians are sorted. A point is
-//   drawn where it is at least near_depth.
+// - depth_of(p): the depth of a point in view space, by which gaussians are sorted. A
+//   point is drawn if its depth is at least near_depth.
 // - limits(): see Limits.
 // - linearized(limits, p): the Jacobian of the projection at p.
 // - to_pixel(at, p, u, v): the image of p.
-// - times_jacobian(at, x, y, z, a1, a2): a column (x, y, z) of a 3x3 matrix times the Jacobian, of
-//   type V or T.
-// - linearized_vjp(at, p, m, a1, a2, d, d_p, d_m): the gradients of p and of the row-major matrix m
-//   from those of the pixel, the depth and the rows a1, a2 of the Jacobian times m.
+// - times_jacobian(at, x, y, z, a1, a2): a column (x, y, z) of a 3x3 matrix times the
+//   Jacobian, of type V or T.
+// - linearized_vjp(at, p, m, a1, a2, d, d_p, d_m): the gradients of p and of the
+//   row-major matrix m from those of the pixel, the depth and the rows a1, a2 of the
+//   Jacobian times m.
 //
-// Bounds, which let kernels skip work and never decide what is drawn
-// - sphere_scale(limits, squared_model_scale): a factor that image_of_sphere() takes, for models
-//   that are scaled by model_scale in view space; NaN where that function bounds nothing.
-// - image_of_sphere(p, radius, sphere_scale, filter_px2): the image of a sphere around p, whose
-//   radius is in the units of the model. `half` is no less than either half extent of a gaussian
-//   that reaches that far from p, with a screen-space filter of variance filter_px2.
+// Bounds, by which kernels skip work. They may be too large, but never too small.
+// - sphere_scale(limits, squared_model_scale): a factor for image_of_sphere(), for
+//   models that are scaled by model_scale in view space; NaN if that function gives no
+//   bound.
+// - image_of_sphere(p, radius, sphere_scale, filter_px2): the image of a sphere around
+//   p, whose radius is in the units of the model. `half` is at least the half extent,
+//   in x and in y, of a gaussian with that reach from p and a screen-space filter of
+//   variance filter_px2.
 //
 // Selection
-// - px2_per_steradian(): the density that footprints are measured with, one number a camera. Any
-//   positive number gives an exact cut. A model of uneven density returns an upper bound over all
-//   directions, which then bounds it over any ball, too.
-// - sides_of(eyes, num_eyes, pad_px): planes, pad_px outside of the part of the image that is
-//   wanted, that hold what any of the eyes sees. An eye is a Camera.
-// - front_offset(axes, inverse_scale): the offset of the near plane, or of what stands for it, for
-//   an instance of this inverse scale.
-// - set_planes(sides, first, second, front_offset, plane): the kNumPlanes planes in the frame of an
-//   instance, from the axes of both eyes, which are the same where there is one. What lies outside
-//   of one of them is not drawn. Plane::guard makes up for the linearisation; INFINITY culls
-//   nothing.
+// - px2_per_steradian(): the density of pixels that footprints use, one number per
+//   camera. Any positive number gives an exact cut. A model with uneven density returns
+//   an upper bound over all directions, which is also a bound over any ball; then the
+//   cut is fine enough everywhere.
+// - sides_of(eyes, num_eyes, pad_px): planes around what any of the eyes sees, pad_px
+//   outside of the requested part of the image. An eye is a Camera.
+// - front_offset(axes, inverse_scale): the offset of the near plane, or of its
+//   equivalent, for an instance of this inverse scale.
+// - set_planes(sides, first, second, front_offset, plane): the kNumPlanes planes in the
+//   frame of an instance, from the axes of both eyes, which are equal if there is one
+//   eye. What lies outside of any plane is not drawn. Plane::guard compensates for the
+//   linearisation; INFINITY culls nothing.
 
 #include <concepts>
 #include <cstring>
@@ -73,14 +82,14 @@
 
 namespace v3dg {
 
-// The model in use: the image side of a camera.
+// The model in use: the part of a camera that maps view space to the image.
 template <class T>
 using Intrinsics = Pinhole<T>;
 
-// A camera in the world, in double precision: where it stands, how it projects, and which part of
-// its image is wanted.
+// A camera in the world, in double precision: its pose, its projection, and the
+// requested part of its image.
 struct Camera : CameraPose, Intrinsics<double>, ImagePart {
-    // The image side with the scalar of a computation.
+    // Returns the projection with the scalar type of a computation.
     template <class T>
     V3DG_HD Intrinsics<T> intrinsics() const {
         return rounded_to<T>();
@@ -88,9 +97,10 @@ struct Camera : CameraPose, Intrinsics<double>, ImagePart {
 };
 static_assert(sizeof(Camera) == 26 * sizeof(double), "nothing but its numbers is compared");
 
-// What one cut is for: a camera, or the two eyes of a stereo camera, whose rotations are equal.
+// The viewpoint of one cut: a camera, or the two eyes of a stereo camera, whose
+// rotations are equal.
 struct Eyes {
-    Camera camera[2];  // the same twice where there is one
+    Camera camera[2];  // both are equal if there is one eye
     bool are_two;
 
     Eyes() : Eyes(Camera{}) {}
@@ -103,7 +113,7 @@ struct Eyes {
     }
 };
 
-// What projection asks of a model.
+// The requirements of projection on a model.
 template <class C>
 concept ProjectingModel =
     std::is_trivially_copyable_v<C> &&
@@ -130,7 +140,7 @@ concept ProjectingModel =
         } -> std::same_as<SphereImage<typename C::Scalar>>;
     };
 
-// What selection asks of a model.
+// The requirements of selection on a model.
 template <class C>
 concept SelectingModel =
     requires(const C& camera, const Camera* eyes, const typename C::Sides& sides,

@@ -1,12 +1,12 @@
 #pragma once
 
-// The pinhole camera model: a point at (x, y, z) in view space has its image at (fx x / z + cx, fy
-// y / z + cy), and its depth is z. camera/camera.h says what each member is for.
+// The pinhole camera model: a point at (x, y, z) in view space has its image at (fx x /
+// z + cx, fy y / z + cy), and its depth is z. camera/camera.h documents each member.
 //
 // The Jacobian of that map is
-//     J = [fx / z, 0, -fx / z sx; 0, fy / z, -fy / z sy]   with sx = x / z, sy = y / z,
-// and the slopes sx and sy in it are clamped outside of the image, where the linearisation would
-// make images far larger than they are (as 3D Gaussian Splatting does).
+//   J = [fx / z, 0, -fx / z sx; 0, fy / z, -fy / z sy]   with sx = x / z, sy = y / z.
+// The slopes sx and sy in it are clamped outside of the image, where the linearisation
+// would make images far too large (as in 3D Gaussian Splatting).
 
 #include <cmath>
 
@@ -34,9 +34,10 @@ struct PinholePoint {
     V slope_x, slope_y;  // x / z and y / z, clamped
 };
 
-// The side planes of a frustum in camera coordinates: right, left, bottom, top. A point is outside
-// when sign * x > slope * z, or with y in place of x. For two eyes each plane has the larger slope,
-// so that what lies outside it as seen from both lies outside of both frusta.
+// The side planes of a frustum in camera coordinates: right, left, bottom, top. A point
+// is outside if sign * x > slope * z, or the same with y. For two eyes each plane has
+// the larger slope; a point outside of the plane as seen from both eyes is outside of
+// both frusta.
 struct FrustumSides {
     double slope[4];
     float guard[4];  // Plane::guard
@@ -139,8 +140,8 @@ struct Pinhole {
         return {.u = u, .v = v, .half = half};
     }
 
-    // The density at the camera's axis. Farther out it grows, which is left out so that turning the
-    // camera changes nothing.
+    // The density at the camera's axis. The density grows away from the axis, which is
+    // ignored so that rotating the camera changes nothing.
     V3DG_HD T px2_per_steradian() const { return fx * fy; }
 
     template <class Eye>
@@ -148,7 +149,7 @@ struct Pinhole {
         FrustumSides sides;
         for (int side = 0; side < 4; ++side) {
             const bool is_x = side < 2, is_positive = side % 2 == 0;
-            double linearised[2];  // the projection is linearised no farther out than this
+            double linearised[2];  // slope up to which the projection is linearised
             for (int k = 0; k < num_eyes; ++k) {
                 const Eye& eye = eyes[k];
                 const double focal = is_x ? eye.fx : eye.fy;
@@ -175,7 +176,7 @@ struct Pinhole {
     static V3DG_HD void set_planes(const FrustumSides& sides, const InstanceAxes& first,
                                    const InstanceAxes& second, double front_offset,
                                    Plane plane[kNumPlanes]) {
-        // A point is outside the near plane when its depth is less than near.
+        // A point is outside of the near plane if its depth is less than near_depth.
         Plane& front = plane[0];
         for (int k = 0; k < 3; ++k) front.normal[k] = static_cast<float>(-first.axes[6 + k]);
         front.offset = static_cast<float>(front_offset);
@@ -195,12 +196,13 @@ struct Pinhole {
     }
 
   private:
-    // Whether slopes are clamped towards the camera's axis, as half_of_sphere() presumes.
+    // Returns whether slopes are clamped towards the camera's axis, as half_of_sphere()
+    // assumes.
     static V3DG_HD V3DG_INLINE bool sees_its_axis(const SlopeLimits<T>& limits) {
         return limits.low_x < 0 && limits.high_x > 0 && limits.low_y < 0 && limits.high_y > 0;
     }
 
-    // The bound of image_of_sphere(). `reach_px` is the reach at depth 1.
+    // Computes the bound of image_of_sphere(). `reach_px` is the reach at depth 1.
     static V3DG_HD V3DG_INLINE T half_of_sphere(T reach_px, T inv_z, T slope_x, T slope_y,
                                                 const T& filter_px2) {
         const T along = reach_px * inv_z;

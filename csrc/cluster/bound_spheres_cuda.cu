@@ -1,6 +1,7 @@
-// Finds the bounding balls of all segments in lockstep: blocks find the sphere of each segment that
-// reaches farthest from its centre, then one warp a segment adds it to the core set and moves the
-// centre. A finished segment costs only the test of a flag.
+// Computes the bounding balls of all segments in lockstep: blocks find the sphere of
+// each segment that reaches farthest from its centre; then one warp per segment adds
+// this sphere to the core set and moves the centre. A finished segment costs only the
+// test of a flag.
 
 #include <vector>
 
@@ -13,20 +14,21 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kBlockSize = 128, kWarps = kBlockSize / 32;
-constexpr size_t kChunkSize = 4096;  // spheres that a block looks at
+constexpr size_t kChunkSize = 4096;  // spheres that a block searches
 static_assert(kCoreSize <= 32, "a lane holds one sphere of the core set");
 
 enum class Phase : int { search, measure, done };
 
 struct Search {
-    Center center;  // the farthest sphere is sought from it
+    Center center;  // centre from which the farthest sphere is searched
     Center best;
     double best_radius, core_radius;
     int core_size;
     Phase phase;
 };
 
-// A sphere of a segment and its farthest distance. Ties go to the lower index.
+// A sphere of a segment and the distance of its farthest point. Ties go to the lower
+// index.
 struct Farthest {
     double distance;
     uint32_t index;
@@ -83,8 +85,8 @@ __global__ void farthest_kernel(const Ball* spheres, const int64_t* offset,
     }
 }
 
-// Moves `center` towards the centre of the smallest ball around the spheres that the first lanes
-// hold; returns its radius.
+// Moves `center` towards the centre of the smallest ball around the spheres that the
+// first lanes hold; returns the radius of that ball.
 __device__ double center_core(const Ball& mine, int count, Center& center) {
     const unsigned lane = threadIdx.x % 32;
     const auto find = [&](const Center& place) {
@@ -180,8 +182,8 @@ void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double 
     DeviceBuffer<Farthest> farthest_of_chunk(segment_of_chunk.size(), stream);
     launch("bound_spheres: start", start_kernel, blocks_for(num_segments, kBlockSize), kBlockSize,
            0, stream, spheres.data, offsets.data(), num_segments, searches.data(), ball.data);
-    // The core set grows from two spheres by one a pass. Two more passes measure it and find the
-    // radius.
+    // The core set has two spheres initially and gains one per pass. Two more passes
+    // measure it and compute the radius.
     for (int pass = 0; pass < kCoreSize + 1; ++pass) {
         launch("bound_spheres: farthest", farthest_kernel,
                static_cast<unsigned>(segment_of_chunk.size()), kBlockSize, 0, stream, spheres.data,

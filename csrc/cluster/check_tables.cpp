@@ -1,4 +1,5 @@
-// Checks tables one property after another, each for all rows; the first wrong row is reported.
+// Checks tables one property after another, each for all rows; reports the first wrong
+// row.
 
 #include "cluster/check_tables.h"
 
@@ -15,7 +16,7 @@ namespace v3dg {
 
 namespace {
 
-// Two computations of the same double may differ in the last bits.
+// Two computations of the same value in double precision may differ in the last bits.
 constexpr double kRounding = 1e-9;
 
 template <class Expected>
@@ -26,15 +27,15 @@ std::string text_of(const Expected& expected, size_t row) {
         return expected;
 }
 
-// Throws for the first row for which `holds` is false. `expected` is a text, or a function that
-// makes one from the row.
+// Throws for the first row for which `holds` is false. `expected` is a text, or a
+// function that returns one for the row.
 template <class Holds, class Expected>
 void check_rows(const char* table, size_t count, const Holds& holds, const Expected& expected) {
     for (size_t row = 0; row < count; ++row)
         if (!holds(row)) throw TableFault{table, static_cast<int64_t>(row), text_of(expected, row)};
 }
 
-// Checks that no value is less than one before it.
+// Checks that values never decrease.
 template <class Value>
 void check_ascends(const char* table, size_t count, const Value& value, const char* expected) {
     check_rows(
@@ -71,8 +72,8 @@ class Checker {
             "the level before, or one more");
     }
 
-    // Every group replaces the clusters of one page and makes clusters of the next level for one
-    // parent.
+    // Every group replaces the clusters of one page and makes clusters of the next
+    // level for one parent.
     void check_tree() const {
         check_links("clusters.own_group", t_.own_group, t_.level, 0, 0);
         check_links("clusters.parent_group", t_.parent_group, t_.level, last_level_, 1);
@@ -81,7 +82,8 @@ class Checker {
             [&](size_t g) { return t_.group_level[g] >= 1 && t_.group_level[g] <= last_level_; },
             "1 to " + std::to_string(last_level_));
         check_links("groups.parent", t_.parent, t_.group_level, last_level_, 1);
-        // The last level's clusters count as having a parent of their own past the others.
+        // The clusters of the last level count as having one more parent, behind all
+        // others.
         check_ascends(
             "clusters.parent_group", num_clusters_,
             [&](size_t c) {
@@ -167,8 +169,8 @@ class Checker {
     }
 
   private:
-    // Checks that each row links to a group of its own level plus `above`, and that rows of level
-    // `without` link to none.
+    // Checks that each row refers to a group whose level is its own plus `above`, and
+    // that rows of level `without` refer to none.
     void check_links(const char* table, Span<const int32_t> links, Span<const int32_t> level,
                      int32_t without, int above) const {
         const auto wanted = [&](size_t row) { return int64_t{level[row]} + above; };

@@ -1,6 +1,7 @@
 #pragma once
 
-// Checks that the tables of a bundle fit each other, and that they guarantee an exact cut.
+// Checks that the tables of a bundle are consistent, and that they guarantee an exact
+// cut.
 
 #include <cstdint>
 #include <string>
@@ -10,8 +11,8 @@
 
 namespace v3dg {
 
-// C clusters, by level, then by parent group; G groups, in the order of the clusters that they
-// replace. Group -1 is none.
+// C clusters, by level, then by parent group; G groups, in the order of the clusters
+// that they replace. Group -1 means none.
 struct GivenTables {
     Span<const int64_t> offset;        // [C + 1]
     Span<const int32_t> level;         // [C]
@@ -27,15 +28,16 @@ struct GivenTables {
     Span<const float> error;           // [G * 2]
 };
 
-// Thrown for the first wrong row; row -1 is the last.
+// Thrown for the first wrong row; -1 means the last row.
 struct TableFault {
-    std::string table;  // its name in files; "groups" for a group that clusters lack
+    std::string table;  // name of the table in files; "groups" for a group without clusters
     int64_t row;
     std::string expected;
 };
 
-// Throws TableFault unless the tables are valid; it trusts nothing in them. A group's ball and
-// weight have to contain those below, so that the metric never decreases towards the root.
+// Throws TableFault unless the tables are valid, whatever their contents. A group's
+// ball and weight must be at least those of the groups below, so that the metric never
+// decreases towards the root.
 void check_tables(const GivenTables& tables, int64_t num_gaussians);
 
 }  // namespace v3dg

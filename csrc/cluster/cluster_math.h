@@ -1,6 +1,6 @@
 #pragma once
 
-// Formulas of bounding balls, for both halves.
+// Formulas of bounding balls, for the CPU and CUDA.
 
 #include <cmath>
 #include <cstddef>
@@ -13,11 +13,12 @@ struct Point {
     float axis[3];
 };
 
-// The relative margin by which a ball contains another, so that rounding in the float32 footprint
-// (about 1e-6) cannot reverse their order.
+// The relative margin by which a ball contains another. Rounding in the float32
+// footprint (about 1e-6) then cannot reverse their order.
 constexpr double kNestingMargin = 4e-6;
 
-// Squares of larger radii are normal numbers, so that they keep their relative precision.
+// Squares of larger radii are normal numbers and therefore keep their relative
+// precision.
 constexpr float kMinRadius = 1e-15f;
 
 struct Center {
@@ -30,31 +31,32 @@ V3DG_HD inline double reach(const Center& center, const Ball& sphere) {
     return sqrt(dx * dx + dy * dy + dz * dz) + sphere.radius;
 }
 
-// The centre of the smallest ball around many spheres is that of a small core set: each sphere in
-// it was the farthest from the centre of those before (Badoiu and Clarkson, Smaller core-sets for
-// balls, SODA 2003).
+// The smallest ball around many spheres is approximately that of a small core set, to
+// which the sphere that is farthest from the current centre is added repeatedly (Badoiu
+// and Clarkson, Smaller core-sets for balls, SODA 2003).
 constexpr int kCoreSize = 24;
 constexpr int kFirstCoreStep = 2, kLastCoreStep = 255;
 constexpr double kCoreTolerance = 1e-4;
 
-// Moves the centre of a core set towards the sphere that reaches farthest from it, to `radius`.
-// Returns false when the two are concentric, so that there is no direction to move in.
+// Moves the centre of a core set towards the sphere that reaches farthest, to `radius`.
+// Returns false if the two are concentric, so that there is no direction to move in.
 V3DG_HD inline bool move_center(const Ball& farthest, double radius, int step, Center& center) {
     const double distance = radius - farthest.radius;
     if (distance <= 0.0) return false;
-    const double move = radius / distance / step;  // the far side of the sphere, not its centre
+    // Towards the far side of the sphere, not its centre.
+    const double move = radius / distance / step;
     center.x += (farthest.x - center.x) * move;
     center.y += (farthest.y - center.y) * move;
     center.z += (farthest.z - center.z) * move;
     return true;
 }
 
-// Returns whether all spheres lie within the core set's ball, or nearly.
+// Returns whether all spheres are inside the core set's ball, or nearly.
 V3DG_HD inline bool core_suffices(double radius, double core_radius, int core_size) {
     return radius <= core_radius * (1.0 + kCoreTolerance) || core_size == kCoreSize;
 }
 
-// Returns a ball in float32 at the centre, whose radius is not yet set.
+// Returns a float32 ball at the centre; its radius is not yet set.
 V3DG_HD inline Ball ball_at(const Center& center) {
     return {static_cast<float>(center.x), static_cast<float>(center.y),
             static_cast<float>(center.z), 0.0f};

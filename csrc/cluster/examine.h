@@ -9,8 +9,8 @@
 
 namespace v3dg {
 
-// Reasons why a gaussian cannot be drawn: bits, of which it may have several. All but the last are
-// invalid values.
+// Bits for the reasons why a gaussian cannot be drawn. All but the last are invalid
+// values.
 enum Finding : uint16_t {
     kMeanNotFinite = 1 << 0,
     kQuatNotFinite = 1 << 1,
@@ -20,13 +20,14 @@ enum Finding : uint16_t {
     kTooLarge = 1 << 5,
     kNegativeScale = 1 << 6,
     kOpacityOutOfRange = 1 << 7,
-    kTransparent = 1 << 8,  // no pixel shows it
+    kTransparent = 1 << 8,  // it is invisible
 };
 
-// The largest coordinate or scale, in world units: squares of larger ones exceed float32.
+// The largest coordinate or scale, in world units: squares of larger ones exceed
+// float32.
 constexpr float kMostLength = 1e18f;
 
-// Sets findings, [N], to 0 where a gaussian can be drawn.
+// Writes [N] findings: 0 if a gaussian can be drawn.
 void examine(const GaussianRows<const float>& in, Span<uint16_t> findings);
 
 }  // namespace v3dg

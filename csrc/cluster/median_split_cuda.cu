@@ -1,9 +1,10 @@
-// The median split handles one level at a time, all nodes at once at a time for all nodes at once.
+// The median split processes one level at a time, all nodes together.
 //
-// There are four lists of the points' indices, sorted within each node: along x, y and z, ties by
-// index, and by index alone. So a node's extent is the difference of two values, its median is the
-// middle of a list, and a split is a stable partition of the lists by the side of each point. At
-// the end the list by index is the order within leaves.
+// There are four lists of the points' indices, sorted within each node: by x, y and z,
+// with ties by index, and by index alone. So a node's extent is the difference of two
+// values, its median is the middle of a list, and a split is a stable partition of the
+// lists by the side of each point. In the end the list by index is the order within
+// leaves.
 
 #include <cub/device/device_radix_sort.cuh>
 
@@ -20,18 +21,19 @@ namespace {
 
 constexpr unsigned kNumLists = 4, kByIndex = 3;  // list l begins at l * count
 constexpr unsigned kBlockSize = 256;
-// A block partitions one tile of a list, a warp 32 points at a time.
+// Each block partitions one tile of a list, each warp 32 points at a time.
 constexpr unsigned kWordsPerTile = 64;
 constexpr unsigned kTileSize = 32 * kWordsPerTile;
 
-// A node has positions first .. last of every list; those before `middle` belong to the left half.
+// A node has positions first .. last of every list; positions before `middle` belong to
+// the left half.
 struct Node {
     uint32_t first, middle, last;
-    uint32_t lefts_before;  // sum of the left halves of the nodes before, in points
+    uint32_t lefts_before;  // total size of the left halves of all earlier nodes, in points
 };
 
-// Returns the last node that begins at or before `position`, between the nodes low and high. An
-// empty node is never returned.
+// Returns the last node that begins at or before `position`, among the nodes low to
+// high. The result is never an empty node.
 __device__ uint32_t node_at(const Node* nodes, uint32_t low, uint32_t high, size_t position) {
     while (low < high) {
         const uint32_t middle = low + (high - low + 1) / 2;
@@ -43,7 +45,8 @@ __device__ uint32_t node_at(const Node* nodes, uint32_t low, uint32_t high, size
     return low;
 }
 
-// The nodes of a tile's first and last positions. The function ends with the block in lockstep.
+// The nodes of a tile's first and last positions. All threads of the block return
+// together.
 struct NodeRange {
     uint32_t low, high;
 };
@@ -59,7 +62,7 @@ __device__ NodeRange nodes_of_tile(const Node* nodes, uint32_t num_nodes, size_t
     return {found[0], found[1]};
 }
 
-// Makes sort keys along one axis: the segment, then the value. -0 counts as 0, as it does in
+// Computes sort keys along one axis: the segment, then the value. -0 counts as 0, as in
 // comparisons.
 __global__ void keys_kernel(const Point* means, size_t count, const Node* segments,
                             uint32_t num_segments, int axis, uint64_t* keys, uint32_t* indices) {
@@ -95,7 +98,7 @@ __global__ void longest_axis_kernel(const Point* means, const Node* nodes, uint3
     axis_of_node[n] = static_cast<uint8_t>(longest);
 }
 
-// Records for every point whether it goes to the left.
+// Writes for every point whether it goes to the left half.
 __global__ void side_kernel(const Node* nodes, uint32_t num_nodes, const uint8_t* axis_of_node,
                             const uint32_t* lists, size_t count, uint8_t* goes_left) {
     const NodeRange range = nodes_of_tile(nodes, num_nodes, blockIdx.x, count);
@@ -107,8 +110,8 @@ __global__ void side_kernel(const Node* nodes, uint32_t num_nodes, const uint8_t
     }
 }
 
-// Writes the sides in the order of each list, a bit a position, and how many of a tile go to the
-// left.
+// Writes the sides in the order of each list, one bit per position, and the number of
+// points per tile that go to the left half.
 __global__ void count_kernel(const uint32_t* lists, unsigned first_list, size_t count,
                              const uint8_t* goes_left, uint32_t* words, uint32_t* tile_lefts) {
     const size_t list = first_list + blockIdx.y;
@@ -131,7 +134,8 @@ __global__ void count_kernel(const uint32_t* lists, unsigned first_list, size_t 
     }
 }
 
-// Turns the counts of each list's tiles into sums of those before. Each block handles a list.
+// Turns the counts of each list's tiles into prefix sums. Each block processes one
+// list.
 __global__ void sum_kernel(uint32_t num_tiles, unsigned first_list, uint32_t* tile_lefts) {
     uint32_t* values = tile_lefts + size_t(first_list + blockIdx.x) * num_tiles;
     uint32_t before = 0;
@@ -144,7 +148,7 @@ __global__ void sum_kernel(uint32_t num_tiles, unsigned first_list, uint32_t* ti
     }
 }
 
-// Moves every point to its half of its node, in the order of the list.
+// Moves every point to its half of its node, preserving the order of the list.
 __global__ void partition_kernel(const Node* nodes, uint32_t num_nodes, const uint32_t* from,
                                  uint32_t* to, unsigned first_list, size_t count,
                                  const uint32_t* words, const uint32_t* tile_lefts) {
@@ -181,7 +185,7 @@ __global__ void widen_kernel(const uint32_t* from, size_t count, int64_t* to) {
     if (i < count) to[i] = from[i];
 }
 
-// Returns the nodes of every level, those of the first level first.
+// Returns the nodes of all levels, those of the first level first.
 std::vector<Node> nodes_of_levels(Span<const int64_t> leaf_offset, int depth) {
     const size_t num_leaves = leaf_offset.size - 1;
     std::vector<Node> nodes;
@@ -248,7 +252,7 @@ void median_split(Span<const Point> means, Span<const int64_t> offset, int depth
     DeviceBuffer<uint32_t> words(kNumLists * size_t(tiles) * kWordsPerTile, stream);
     DeviceBuffer<uint32_t> tile_lefts(kNumLists * size_t(tiles), stream);
     for (int level = 0; level < depth; ++level) {
-        // The order along an axis is not read after the last split.
+        // After the last split, the order along an axis is no longer read.
         const unsigned first_list = level + 1 == depth ? kByIndex : 0;
         const unsigned num_lists = kNumLists - first_list;
         launch("median_split: longest axis", longest_axis_kernel, blocks_for(num_nodes, kBlockSize),

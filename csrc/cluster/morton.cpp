@@ -9,8 +9,8 @@
 
 namespace v3dg {
 
-constexpr size_t kChunk = 4096;  // points that a thread takes together
-constexpr int kBits = 21;        // bits of a coordinate: three fit in a word
+constexpr size_t kChunk = 4096;  // points that a thread processes together
+constexpr int kBits = 21;        // bits per coordinate: three coordinates fit into 64 bits
 
 void morton_order(Span<const Point> points, Span<int64_t> order) {
     Point low = points.empty() ? Point{} : points[0], high = low;
@@ -19,7 +19,8 @@ void morton_order(Span<const Point> points, Span<int64_t> order) {
             low.axis[a] = std::min(low.axis[a], point.axis[a]);
             high.axis[a] = std::max(high.axis[a], point.axis[a]);
         }
-    std::vector<std::pair<uint64_t, int64_t>> keys(points.size);  // ties go by index
+    // Pairs, so that ties are ordered by index.
+    std::vector<std::pair<uint64_t, int64_t>> keys(points.size);
     parallel_for(points.size, kChunk, [&](size_t i) {
         uint64_t code = 0;
         for (int a = 0; a < 3; ++a) {

@@ -9,8 +9,8 @@
 
 namespace v3dg {
 
-// Computes indices that put points along a curve that keeps neighbours together; they are the same
-// on every run. Points are finite.
+// Computes the order of points along a Morton curve, which keeps neighbours together;
+// every run gives the same order. Points must be finite.
 void morton_order(Span<const Point> points, Span<int64_t> order);
 
 }  // namespace v3dg

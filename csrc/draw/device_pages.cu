@@ -1,5 +1,7 @@
-// The slots of a page pool on a CUDA device: bytes of pages go there in a flight before a cut, and
-// kernels unpack or place them; what the cut needed comes back with the flight.
+// The slots of a page pool on a CUDA device. Before a cut, the bytes of arriving pages
+// are copied to the device, where kernels unpack or place them. The needs of the cut
+// come back to the host after the cut. A Flight holds the host memory of both
+// transfers.
 
 #include "draw/device_pages.h"
 
@@ -15,12 +17,13 @@ namespace cuda {
 
 namespace {
 
-// Pages come in for so long before a frame, and so many bytes at least are brought before that is
-// measured.
+// kBringMs is the time per frame that may be spent on copying pages. The speed is
+// measured on frames that copy at least kLeastMeasured bytes.
 constexpr float kBringMs = 2.0f;
 constexpr size_t kLeastMeasured = size_t(4) << 20, kLeastBytesAFrame = size_t(8) << 20;
 
-// A page on its way: bytes of the host that go to the device, and the word that says where it is.
+// A page that one kernel block copies from host memory to the device, with the table
+// entries that say where the page is.
 struct PageMove {
     const uint4* from;
     uint4* to;
@@ -29,7 +32,7 @@ struct PageMove {
     uint32_t *cluster_shift, cluster_value;  // may be null
 };
 
-// A block a page. Reads the host's memory, so that one launch brings all pages.
+// One block per page. It reads host memory, so that one launch copies all pages.
 __global__ void move_kernel(const PageMove* moves) {
     const PageMove move = moves[blockIdx.x];
     for (size_t i = threadIdx.x; i < move.num_vectors; i += blockDim.x) move.to[i] = move.from[i];
@@ -38,7 +41,7 @@ __global__ void move_kernel(const PageMove* moves) {
     if (move.cluster_shift != nullptr) *move.cluster_shift = move.cluster_value;
 }
 
-// A thread a page of which is told when it fades in.
+// One thread per page whose fade changes.
 __global__ void arrivals_kernel(const Arrival* arrivals, unsigned count, int32_t* begins) {
     const unsigned i = blockIdx.x * blockDim.x + threadIdx.x;
     if (i < count) begins[arrivals[i].page] = arrivals[i].begins;
@@ -52,13 +55,14 @@ Pinned<T> pinned(size_t count) {
     if (error == cudaErrorMemoryAllocation) {
         cudaGetLastError();
         throw OutOfMemory("cuda: out of memory: the host has no " + std::to_string(bytes) +
-                          " bytes that a device can read");
+                          " bytes of pinned memory");
     }
     check(error, "cudaMallocHost");
     return Pinned<T>(static_cast<T*>(memory));
 }
 
-// The degree 0 is in the planes. Rows begin at multiples of 16 bytes.
+// The number of floats per row of SH coefficients, without degree 0, which is in the
+// planes. Rows begin at multiples of 16 bytes.
 int stride_of(int sh_degree) {
     return sh_degree == 0 ? 0 : (3 * num_sh_bases(sh_degree) + 3) / 4 * 4;
 }
@@ -67,7 +71,7 @@ int stride_of(int sh_degree) {
 
 void FreePinned::operator()(void* memory) const noexcept {
     if (cudaFreeHost(memory) != cudaSuccess)
-        cudaGetLastError();  // at exit the driver may be gone before us
+        cudaGetLastError();  // at exit the driver may be unloaded before this object
 }
 
 unsigned char* PinnedBlocks::allocate(size_t bytes) {
@@ -78,19 +82,19 @@ size_t packed_row_bytes(int max_sh_degree) {
     return sizeof(float) * (16 + static_cast<size_t>(stride_of(max_sh_degree)));
 }
 
-// What the host keeps of a frame until its cut is over.
+// The host memory of a frame, in use until its cut is done.
 struct DevicePages::Flight {
     const Pinned<PageMove> moves;
-    const Pinned<PageRows> rows;  // pages that come, or
+    const Pinned<PageRows> rows;  // arriving pages of a pool that keeps rows
     const Pinned<SlotPage> codes;
     const Pinned<Arrival> arrivals;
     const Pinned<NeedsReport> report;
     FrameNeeds* needs = nullptr;
-    std::vector<unsigned char*> blocks;  // that `moves` reads
+    std::vector<unsigned char*> blocks;  // the blocks that `moves` reads
     bool is_bounded = false;
     size_t bytes_in = 0;
     cudaEvent_t done = nullptr, begun = nullptr,
-                brought = nullptr;  // bringing pages begins, and is over
+                brought = nullptr;  // before and after copying pages
 
     Flight(size_t most_changes, size_t most_arrivals)
         : moves(pinned<PageMove>(most_changes)),
@@ -105,7 +109,7 @@ struct DevicePages::Flight {
     ~Flight() {
         for (cudaEvent_t event : {done, begun, brought})
             if (event != nullptr && cudaEventDestroy(event) != cudaSuccess)
-                cudaGetLastError();  // as of memory
+                cudaGetLastError();  // as in FreePinned
     }
 };
 
@@ -201,10 +205,11 @@ void DevicePages::make_tables(const std::vector<ClusterTable>& host,
     check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
 }
 
-// Memory goes back in the order of the stream that it was had on, and frames may be on others.
+// Memory is freed in the order of the stream on which it was allocated, and frames may
+// be on other streams.
 DevicePages::~DevicePages() { busy_.wait(); }
 
-// Returns what became of the last of them.
+// Notes the needs of all cuts that are done. Returns the result for the last one.
 NotedView DevicePages::note_flights(bool waits) {
     NotedView noted;
     while (!under_way_.empty()) {
@@ -223,7 +228,7 @@ NotedView DevicePages::note_flights(bool waits) {
         needs->count = std::min<size_t>(flight.report[0].count, pool_.most_needs());
         needs->num_left_out = flight.report[0].count - needs->count;
         needs->tolerance_px2 = flight.report[0].tolerance_px2;
-        // Who waits asks for a tolerance that does not depend on the frames before.
+        // A caller that waits needs a tolerance that does not depend on earlier frames.
         needs->adapts = flight.is_bounded && !waits;
         noted = pool_.note_needs(needs, waits);
         under_way_.pop_front();
@@ -236,7 +241,8 @@ void DevicePages::note_frames(cudaStream_t stream) {
     note_flights(false);
 }
 
-// How many bytes frames may bring, from how long those of one took.
+// Adapts the number of bytes that frames may copy to the time that one frame's copies
+// took.
 void DevicePages::measure(const Flight& flight) {
     if (flight.bytes_in < kLeastMeasured) return;
     float ms = 0;
@@ -258,7 +264,7 @@ const int64_t* DevicePages::offset_on_device(const PageChange& change) const {
            pool_.source(change.bundle).first_cluster(change.page);
 }
 
-// Of a page whose bytes are on the device.
+// Returns the rows of a page whose bytes are on the device.
 PageRows DevicePages::page_rows(const PageChange& change, const unsigned char* bytes) const {
     const PageSource& source = pool_.source(change.bundle);
     PageRows page{rows_of_page(bytes, source.num_rows(change.page), source.sh_degree()),
@@ -329,13 +335,12 @@ void DevicePages::note_arrivals(Flight& flight, cudaStream_t stream) {
 PartlyResident DevicePages::begin_frame(bool is_bounded, Arrive arrive, cudaStream_t stream) {
     if (is_capturing(stream))
         throw std::runtime_error(
-            "memory: expected no CUDA graph of a pool, whose pages come and go; capture a renderer "
-            "without "
-            "memory");
+            "memory: a renderer with a pool cannot be captured in a CUDA graph, because its pages "
+            "change; capture a renderer without memory");
     if (under_way_.size() == kMostFlights)
         check(cudaEventSynchronize(under_way_.front()->done), "a frame");
     note_flights(false);
-    if (current_ != nullptr) {  // its frame was given up before its cut
+    if (current_ != nullptr) {  // the frame was abandoned before its cut
         check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
         pool_.give_up(std::exchange(current_->needs, nullptr));
         pool_.give_back(std::exchange(current_->blocks, {}));

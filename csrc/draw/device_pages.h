@@ -13,7 +13,7 @@
 namespace v3dg {
 namespace cuda {
 
-// Memory of the host that devices read and write.
+// Frees memory of the host that devices can access.
 struct FreePinned {
     void operator()(void* memory) const noexcept;
 };
@@ -28,18 +28,19 @@ class PinnedBlocks : public BlockMemory {
     std::vector<Pinned<unsigned char>> blocks_;
 };
 
-// Frames whose cuts are under way at once; the next one waits for the first of them.
+// The largest number of frames whose cuts are pending. The next frame waits for the
+// first of them.
 constexpr size_t kMostFlights = 4;
 
-// Bytes that a packed row of a pool takes.
+// Returns the size of a packed row in a pool.
 size_t packed_row_bytes(int max_sh_degree);
 
-// Gaussians in slots: codes, or packed rows whatever the codec of their pages is. Frames read them,
-// and those that come and go are brought, in the order of locks of mutex(), on any streams of the
-// device.
+// The gaussians in the slots of a pool: codes, or packed rows for pages of any codec.
+// Frames read the slots and page changes write them, on any streams of the device, in
+// the order in which mutex() is locked.
 class DevicePages {
   public:
-    // `tables` are on the current device, `host` are the same on the host.
+    // `tables` are on the current device, `host` has the same tables on the host.
     DevicePages(PagePool& pool, std::vector<std::shared_ptr<const BundleTables>> tables,
                 const std::vector<ClusterTable>& host,
                 const std::vector<ClusterAppearance>& appearance, cudaStream_t stream);
@@ -48,22 +49,24 @@ class DevicePages {
     DevicePages& operator=(const DevicePages&) = delete;
 
     StreamMutex& mutex() { return busy_; }
-    // Takes note of what frames needed whose cuts are over. Enqueues what brings pages in before a
-    // cut, and returns what that reads. Under the lock. Waits only where kMostFlights cuts are not
-    // over.
+    // Notes the needs of frames whose cuts are done. Enqueues the copies of arriving
+    // pages, which precede the cut, and returns the tables that the cut reads. Requires
+    // the lock. Waits only if kMostFlights cuts are pending.
     PartlyResident begin_frame(bool is_bounded, Arrive arrive, cudaStream_t stream);
-    // The cut is enqueued. Under the lock.
+    // Called after the cut was enqueued. Requires the lock.
     void end_frame(cudaStream_t stream);
-    // Takes note of what frames needed whose cuts are over, before the next one begins.
+    // Notes the needs of frames whose cuts are done, without beginning a new frame.
     void note_frames(cudaStream_t stream);
-    // The models of all bundles, on the device: one of the two, the other is null.
+    // The models of all bundles, on the device. One of the two is null.
     const PackedPlanes* packed() const { return packed_.data(); }
     const CodedGaussians* coded() const { return coded_.data(); }
-    // What the pool says that the frame which began last is drawn with.
+    // Returns the rule with the tolerance that the pool requires for the frame that
+    // began last.
     SelectRule raised(SelectRule rule) const;
 
-    // Cuts the scene without drawing, and waits until the pool has decided about what that needs.
-    // `begins`: it forgets earlier frames before (PagePool::begin_settling).
+    // Cuts the scene without drawing, and waits until the pool has decided about the
+    // needs of the cut. With `begins`, the pool first forgets earlier frames
+    // (PagePool::begin_settling).
     SettlingStep settle_step(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
                              bool begins, cudaStream_t stream);
 
@@ -95,10 +98,10 @@ class DevicePages {
     DeviceBuffer<CodedGaussians> coded_;
     DeviceBuffer<unsigned char> staged_;
     DeviceBuffer<uint8_t> joins_;
-    DeviceBuffer<int64_t> shift_;           // of all bundles
-    DeviceBuffer<uint32_t> cluster_shift_;  // the same, where there are codes
-    DeviceBuffer<int32_t> begins_;          // likewise, as PageTable has them
-    std::vector<size_t> first_page_;        // of each bundle, among those of all
+    DeviceBuffer<int64_t> shift_;           // of the pages of all bundles
+    DeviceBuffer<uint32_t> cluster_shift_;  // likewise, in a pool that keeps codes
+    DeviceBuffer<int32_t> begins_;          // likewise; see PageTable
+    std::vector<size_t> first_page_;        // index of each bundle's first page among all pages
     DeviceBuffer<BundleOnDevice> bundles_;
     DeviceBuffer<uint32_t> words_;
     DeviceBuffer<uint32_t*> need_;
@@ -106,7 +109,7 @@ class DevicePages {
     size_t num_words_ = 0;
     std::vector<std::unique_ptr<Flight>> flights_;
     std::deque<Flight*> under_way_;
-    Flight* current_ = nullptr;  // of the frame that is being enqueued
+    Flight* current_ = nullptr;  // the frame that is being enqueued
     Cut cut_;
 };
 

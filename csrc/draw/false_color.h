@@ -1,6 +1,7 @@
 #pragma once
 
-// Colours that stand for something else: red, green and blue, 0 to 1.
+// False colours for levels, clusters and metrics: red, green and blue, each from 0 to
+// 1.
 
 #include <array>
 #include <cstddef>
@@ -9,19 +10,23 @@ namespace v3dg {
 
 using Rgb = std::array<float, 3>;
 
-// Of levels, from fine to coarse; no two are the same. After nine come the hues between those,
-// darker; then both again, ever nearer to white.
+// Returns the colour of a level, counted from the finest; all levels differ. The first
+// nine levels have distinct hues, the next nine the hues in between, darker. This
+// sequence repeats, each time closer to white.
 Rgb level_color(size_t level);
 
-// Hues a golden ratio apart, so that clusters side by side differ, in three lightnesses.
+// Returns the colour of a cluster. Hues advance by the golden ratio and lightness
+// cycles through three values, so that adjacent clusters differ.
 Rgb cluster_color(size_t cluster);
 
-// From dark to bright, even in lightness, of values 0 to 1.
+// Returns a colour for a value from 0 to 1, from dark to bright, with even steps in
+// lightness.
 constexpr size_t kRampColors = 7;
 Rgb ramp_color(float value);
 
-// Of a cluster whose metric is so many times the tolerance that is wanted: of the right level up to
-// `most`, else as much coarser as pages below it are missing.
+// Returns the colour of a cluster whose metric is `share` times the wanted tolerance.
+// Up to `most` the cluster has the right level; above, it is too coarse because pages
+// below it are missing, and the colour shows by how much.
 Rgb missing_color(float share, float most);
 
 }  // namespace v3dg

@@ -1,5 +1,5 @@
-// A frame on a CUDA device: its buffers, the stages in their order, and drawing again where a
-// buffer was too small. draw/frame_cuda.h says what it promises.
+// A frame on a CUDA device: its buffers, the order of its stages, and drawing again if
+// a buffer was too small. draw/frame_cuda.h has the contract.
 
 #include "draw/frame_cuda.h"
 
@@ -13,17 +13,17 @@
 namespace v3dg {
 namespace cuda {
 
-// What a frame counts, cleared before it.
+// The counters of a frame, which are cleared before it.
 struct Frame::State {
     FrameCounters counters;
     unsigned projected[2], scan_ticket, scattered,
-        spread;  // what blocks and warps have taken of their work
+        spread;  // work items that blocks and warps have claimed
     alignas(8) uint32_t plan_counts[2 * kPlanClasses];
 };
 
-// What the host keeps of a frame in flight.
+// The host's state of a frame in flight.
 struct Frame::Slot {
-    FrameCounters* counters = nullptr;  // pinned
+    FrameCounters* counters = nullptr;  // in pinned memory
     cudaEvent_t begun = nullptr, prepared = nullptr, counted = nullptr, done = nullptr;
 
     Slot() {
@@ -34,7 +34,7 @@ struct Frame::Slot {
             check(cudaEventCreate(event), "cudaEventCreate");
     }
     ~Slot() {
-        // At exit the driver may be gone before us.
+        // At exit the driver may be unloaded before this object.
         for (const cudaEvent_t event : {begun, prepared, counted, done})
             if (event != nullptr) cudaEventDestroy(event);
         cudaFreeHost(counters);
@@ -43,9 +43,12 @@ struct Frame::Slot {
 };
 
 constexpr size_t kEllipseFloats = 8,
-                 kRecordFloats = 10;  // in RecordPlanes::ellipse, and with ::rest
+                 // Floats per record in RecordPlanes::ellipse, and together with
+                 // ::rest.
+    kRecordFloats = 10;
 
-// So many frames can be in flight, or be captured, without a new slot.
+// The number of frames that can be in flight or captured before a new slot is
+// allocated.
 constexpr size_t kSlots = 8;
 
 Frame::Frame(Keeps keeps) : keeps_(keeps) {
@@ -63,7 +66,8 @@ T* Frame::room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing) {
 }
 
 Frame::Slot* Frame::take_slot(bool capturing) {
-    // The oldest is the first to be over. A capture may not ask; nobody draws beside one.
+    // The oldest frame ends first. A thread must not query an event during a capture;
+    // meanwhile no other thread draws.
     const bool waits = !free_slots_.empty() && !capturing &&
                        cudaEventQuery(free_slots_.front()->done) != cudaSuccess;
     if (free_slots_.empty() || waits) {
@@ -83,9 +87,9 @@ void Frame::enlarge(const FrameCounters& counters) {
     if (counters.gaussians > kMostFrameRecords)
         throw std::length_error("gaussians: expected at most " + std::to_string(kMostFrameRecords) +
                                 " in one frame, got " + std::to_string(counters.gaussians));
-    // Growing takes as long as several frames. So buffers grow seldom, all that are nearly full
-    // together, by some more than was counted, and before the next frame of a moving camera exceeds
-    // one and is drawn twice.
+    // Growing a buffer takes as long as several frames. So buffers grow rarely, all
+    // nearly full ones together, by more than the counts require, and before a moving
+    // camera exceeds them, which would cost drawing a frame twice.
     const auto is_full = [](unsigned long long capacity, unsigned long long count,
                             unsigned free_part) { return count > capacity - capacity / free_part; };
     const bool grows = is_full(capacity_.items, counters.items, 32) ||
@@ -98,7 +102,8 @@ void Frame::enlarge(const FrameCounters& counters) {
     const auto grow = [is_full](unsigned long long& capacity, unsigned long long count) {
         if (is_full(capacity, count, 8)) capacity = std::max(capacity, count + count / 8);
     };
-    // What was not projected has no entries yet; most scenes have one or two a gaussian.
+    // Gaussians that were not projected have no entries yet. Most scenes have one or
+    // two entries per gaussian.
     if (counters.gaussians > capacity_.records) grow(capacity_.entries, counters.gaussians);
     grow(capacity_.items, counters.items);
     grow(capacity_.records, counters.gaussians);
@@ -106,12 +111,13 @@ void Frame::enlarge(const FrameCounters& counters) {
     grow(capacity_.entries, counters.entries);
     grow(capacity_.spread, counters.spread);
     capacity_.records = std::min(capacity_.records, kMostFrameRecords);
-    capacity_.spread = std::max(capacity_.spread, capacity_.records);  // which share their memory
-    // Whoever differentiates is told what was counted before lists are spread.
+    capacity_.spread = std::max(capacity_.spread, capacity_.records);  // both use the same memory
+    // A caller that differentiates receives the counts before lists are spread, so
+    // there must be room for all entries.
     if (keeps_ == Keeps::tape) capacity_.spread = std::max(capacity_.spread, capacity_.entries);
     if (was_captured_ || capacity_ == before) return;
-    // Free the largest buffers before larger ones are allocated, and do not leave their memory in
-    // the pool: pieces of the old size are of no use there.
+    // Free the largest buffers before allocating larger ones, and return their memory
+    // to the device: the memory pool could not reuse blocks of the old size.
     records_ = {};
     boxes_ = {};
     entries_ = {};
@@ -125,8 +131,8 @@ std::unique_ptr<Drawing> Frame::draw(const FrameBatch& batch, Prepare prepare, c
     drawing->is_captured_ = is_capturing(stream);
     was_captured_ = was_captured_ || drawing->is_captured_;
     drawing->slot_ = take_slot(drawing->is_captured_);
-    // If the frame before is over and was too large or nearly so, this one is likely to be too
-    // large.
+    // If the last frame is done and exceeded or nearly filled a buffer, this frame is
+    // likely to do so, too.
     if (last_ != nullptr && !last_->is_captured_ && !drawing->is_captured_) {
         const cudaError_t over = cudaEventQuery(last_->slot_->done);
         if (over == cudaSuccess) enlarge(*last_->slot_->counters);
@@ -168,8 +174,8 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     ItemTiles* item_tiles = room(item_tiles_, capacity.items, drawing);
     LargeRecord* large = room(large_, capacity.large, drawing);
     TileEntry* entries = room(entries_, capacity.entries, drawing);
-    // The blend stage overwrites the tiles of records over few tiles, which have all been read by
-    // then.
+    // The blend stage overwrites the tile lists of small records, which all have been
+    // read by then.
     FewTiles* few = room(scratch_, capacity.spread, drawing);
     const bool keeps_tape = keeps_ == Keeps::tape;
     uint32_t* source = keeps_tape ? room(source_, capacity.records, drawing) : nullptr;
@@ -192,7 +198,9 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
              .images = batch.images,
              .items = items,
              .has_shared_items = batch.has_shared_items,
-             .has_faded_items = batch.has_faded_items},
+             .has_faded_items = batch.has_faded_items,
+             .factors = batch.factors,
+             .num_factors = batch.num_factors},
             {.records = planes,
              .few = few,
              .item_records = item_records,
@@ -219,8 +227,8 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     const RasterTape tape{keeps_tape ? room(order_, capacity.entries, drawing) : nullptr,
                           keeps_tape ? room(blended_, batch.num_tiles, drawing) : nullptr};
     FrameLists of_frame = lists(batch);
-    // Whoever differentiates goes on while the pictures are blended; else the blending tells what
-    // was counted.
+    // With a tape, the host gets the counts while the pictures are blended, so that the
+    // caller can go on; otherwise the blend kernel reports them.
     if (keeps_tape) {
         place_slots(items, item_records, planes.box, room(first_slot_, capacity.records, drawing),
                     stream);
@@ -241,8 +249,9 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     if (!capturing) check(cudaEventRecord(slot.done, stream), "cudaEventRecord");
     last_stream_ = stream;
     last_batch_ = batch;
-    // The next frame begins sooner if it finds what it counts cleared. A graph is replayed at any
-    // time, and a backward pass reads what was counted.
+    // The next frame starts sooner if its counters are already cleared. They are not
+    // cleared now if a graph exists, which may be replayed at any time, or a tape,
+    // because the backward pass reads the counters.
     if (was_captured_ || keeps_tape) return;
     check(cudaMemsetAsync(cleared, 0, cleared_bytes, stream), "cudaMemsetAsync");
     num_zero_bytes_ = num_zero_bytes;
@@ -296,7 +305,7 @@ Drawing::Drawing(Frame& frame, const FrameBatch& batch, Frame::Prepare prepare, 
 
 Drawing::~Drawing() {
     if (frame_.last_ == this) frame_.last_ = nullptr;
-    // A graph goes on writing to its slot.
+    // A graph continues to write to its slot.
     if (slot_ != nullptr && !is_captured_) frame_.free_slots_.push_back(slot_);
 }
 
@@ -310,9 +319,8 @@ const FrameCounters& Drawing::finish() {
     if (is_captured_) {
         if (!was_drawn())
             throw std::runtime_error(
-                "frame: a captured graph met more than it has room for; draw once outside of the "
-                "capture "
-                "what it will meet, and capture it again");
+                "frame: a captured graph exceeded its buffers; draw the largest frame once outside "
+                "of a capture, then capture again");
         return *slot_->counters;
     }
     settle();

@@ -1,6 +1,6 @@
 #pragma once
 
-// Frames on a CUDA device, from items to pixels, and drawings that are under way.
+// Frames on a CUDA device, from items to pixels, and drawings in progress.
 
 #include <deque>
 #include <functional>
@@ -17,35 +17,40 @@
 namespace v3dg {
 namespace cuda {
 
-// What a frame draws; device memory that stays as it is until the frame is drawn.
+// The input of a frame; device memory in it must stay unchanged until the frame is
+// drawn.
 struct FrameBatch {
     const GaussianRows<const float>* models;
     const Placement* placements;
     const FrameImage* images;
-    uint32_t num_images, num_tiles;  // of all images together
-    // As ProjectInput has them.
+    uint32_t num_images, num_tiles;  // sum over all images
+    // See ProjectInput.
     const PackedPlanes* packed = nullptr;
     const CodedGaussians* coded = nullptr;
-    bool has_shared_items = false;  // whether there may be any; a frame that keeps a tape has none
+    bool has_shared_items = false;           // whether any may be shared; never with a tape
     float min_transmittance = kStopsBefore;  // of the images
-    bool has_faded_items = false;  // the same as of shared ones; these are of scenes and not shared
-    // Where the models change from frame to frame: what guards them. Whoever draws has it locked.
+    // Whether any may be faded; only items of scenes, which are not shared.
+    bool has_faded_items = false;
+    const InstanceFactors* factors = nullptr;  // [num_factors], or null
+    uint32_t num_factors = 0;
+    // The mutex that guards the models, if these change from frame to frame. The caller
+    // holds it while it draws.
     StreamMutex* guards_models = nullptr;
-    size_t num_zeros = 0;  // that ItemList is to have
-    // Whether an image that says where it is may be drawn with depth: true if one is.
+    size_t num_zeros = 0;  // size of ItemList::zeros
+    // Whether any image that has a destination is drawn with depth.
     bool has_depth = true;
 };
 
-// What a frame leaves for its backward pass, valid until the next frame is drawn.
+// The output of a frame for its backward pass, valid until the next frame is drawn.
 struct FrameTape {
     FrameLists lists;
     RasterTape raster;
     const GaussianRows<const float>* models;
     const Placement* placements;
-    const DrawItem* items;         // counters->items
-    const uint32_t* item_records;  // how many of an item's gaussians became records
-    const uint32_t* source;        // of each record, its gaussian's place in the model
-    const uint32_t* first_slot;    // of each record, as place_slots() gives them
+    const DrawItem* items;         // counters->items elements
+    const uint32_t* item_records;  // number of records per item
+    const uint32_t* source;        // of each record: index of its gaussian in the model
+    const uint32_t* first_slot;    // of each record, set by place_slots()
 };
 
 struct FrameTimes {
@@ -54,11 +59,13 @@ struct FrameTimes {
 
 class Drawing;
 
-// Draws batches of pictures: project, bin, blend. Keeps its buffers from frame to frame.
+// Draws batches of pictures: project, bin, blend. It reuses its buffers from frame to
+// frame.
 //
-// Counts stay on the device, so drawing waits for nothing. A frame that found a buffer too small
-// draws nothing; finish() of its Drawing sees that, enlarges the buffer and draws it again, so look
-// at pictures after finish(). Frames may be enqueued on any streams, one after the other.
+// Counts stay on the device, so draw() never waits. A frame whose buffers are too small
+// draws nothing. finish() of its Drawing detects that, enlarges the buffers and draws
+// again; hence pictures must be read only after finish(). Frames may be enqueued on any
+// streams, one after another.
 class Frame {
   public:
     enum class Keeps { nothing, tape };
@@ -68,23 +75,25 @@ class Frame {
     Frame(const Frame&) = delete;
     Frame& operator=(const Frame&) = delete;
 
-    // Enqueues what writes the batch's items, and its tables where they are not there yet. Called
-    // again when a frame is drawn again. The counters are zero before.
+    // Enqueues the work that writes the batch's items and, unless they exist, its
+    // tables. It is called again when a frame is drawn again. The counters are zero at
+    // that point.
     using Prepare = std::function<void(const ItemList& items, cudaStream_t stream)>;
 
-    // Says where the pictures of images without a place are. Called once, when the device has
-    // something to do.
+    // Provides the destinations of images that have none. It is called once, after work
+    // for the device was enqueued.
     using Place = std::function<void(PicturePlanes planes[2])>;
 
-    // Enqueues a frame. While `stream` captures a graph nothing is allocated: draw as much once
-    // before. The frame's buffers then live as long as this object.
+    // Enqueues a frame. While `stream` captures a graph nothing is allocated; so draw a
+    // frame of the same size before the capture. The buffers of a captured frame exist
+    // as long as this object.
     std::unique_ptr<Drawing> draw(const FrameBatch& batch, Prepare prepare, cudaStream_t stream,
                                   const Place& place = {});
 
-    // Bytes of what it keeps on the device, by part.
+    // Returns the bytes on the device by part.
     std::vector<std::pair<const char*, size_t>> bytes() const;
 
-    // Of the last frame that was drawn; needs Keeps::tape.
+    // Returns the tape of the last frame; requires Keeps::tape.
     FrameTape tape() const;
 
   private:
@@ -92,7 +101,7 @@ class Frame {
     struct Slot;
     struct State;
     void enqueue(Drawing& drawing, const Place& place);
-    // Of the buffers as they are now.
+    // Returns the lists in the current buffers.
     FrameLists lists(const FrameBatch& batch) const;
     RecordPlanes records() const;
     void enlarge(const FrameCounters& counters);
@@ -110,16 +119,15 @@ class Frame {
     DeviceBuffer<LargeRecord> large_;
     DeviceBuffer<TileEntry> entries_;
     DeviceBuffer<unsigned long long>
-        scratch_;  // the few tiles of records, then lists that are spread
+        scratch_;  // tile lists of small records, later lists that are spread
     DeviceBuffer<unsigned long long> tile_first_;
     DeviceBuffer<TilePlan> plans_;
     uint32_t num_plans_ = 0;
-    DeviceBuffer<unsigned char>
-        cleared_;                // State, states of the scan, zeros of items, counts of the tiles
-    size_t num_zero_bytes_ = 0;  // of these, that are zero when the next frame begins
+    DeviceBuffer<unsigned char> cleared_;  // State, scan states, zeros of items, tile counts
+    size_t num_zero_bytes_ = 0;  // bytes of `cleared_` that are zero when the next frame begins
 
     std::vector<std::unique_ptr<Slot>> slots_;
-    std::deque<Slot*> free_slots_;                // their frames may not be over yet
+    std::deque<Slot*> free_slots_;                // slots whose frames may still be in flight
     std::vector<std::shared_ptr<void>> retired_;  // buffers that captured graphs still use
     bool was_captured_ = false;
     Drawing* last_ = nullptr;
@@ -135,19 +143,21 @@ class Drawing {
     Drawing(const Drawing&) = delete;
     Drawing& operator=(const Drawing&) = delete;
 
-    // Waits until the device is done with it; finish() may draw it again.
+    // Waits until the device has finished the drawing; finish() may still draw it
+    // again.
     void wait() const;
-    // As finish(), but the pictures may still be on their way: where the frame keeps a tape, it
-    // waits no longer than until everything is counted. Not of a captured frame.
+    // Like finish(), but the pictures may still be in progress. With a tape, it waits
+    // only until all counts are known. Not allowed for a captured frame.
     const FrameCounters& settle();
-    // Waits until the pictures are drawn, drawing again if a buffer was too small. Throws
-    // OutOfMemory, or std::length_error past kMostFrameRecords.
+    // Waits until the pictures are drawn, and draws again if a buffer was too small.
+    // Throws OutOfMemory, or std::length_error beyond kMostFrameRecords.
     //
-    // Of a captured frame: of its last replay, which must be over; throws std::runtime_error if a
-    // buffer was too small.
+    // For a captured frame, it reports the last replay, which must have ended; throws
+    // std::runtime_error if a buffer was too small.
     const FrameCounters& finish();
     FrameTimes times() const;
-    // More than 1 where buffers were too small; known once it is finished.
+    // Returns how often the frame was drawn: more than once if buffers were too small.
+    // Known after finish().
     int num_draws() const { return num_draws_; }
 
   private:
@@ -160,7 +170,7 @@ class Drawing {
     Frame::Prepare prepare_;
     cudaStream_t stream_;
     Frame::Slot* slot_ = nullptr;
-    Capacity capacity_{};  // that it was drawn with
+    Capacity capacity_{};  // capacity with which it was drawn
     PicturePlanes planes_[2]{};
     bool is_captured_ = false, is_settled_ = false;
     int num_draws_ = 1;

@@ -6,7 +6,7 @@
 
 namespace v3dg {
 
-// Gaussians as the rasterizer reads them: owned planes.
+// Gaussians in planes that the rasterizer reads; owns the planes.
 template <class T>
 class Model {
   public:

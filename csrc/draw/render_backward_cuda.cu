@@ -20,7 +20,7 @@ DifferentiableFrame::DifferentiableFrame() : frame_(Frame::Keeps::tape) {
 DifferentiableFrame::~DifferentiableFrame() {
     for (const cudaEvent_t event : {drawn_, gone_back_})
         if (event != nullptr) cudaEventDestroy(event);
-    cudaGetLastError();  // at exit the driver may be gone before us
+    cudaGetLastError();  // at exit the driver may be unloaded before this object
 }
 
 void DifferentiableFrame::draw(const ModelPicture& in, cudaStream_t stream) {
@@ -65,7 +65,8 @@ struct IdleFrames {
 };
 
 IdleFrames& idle_frames() {
-    static IdleFrames& frames = *new IdleFrames;  // stays: at exit the driver may be gone first
+    // Never destroyed, because at exit the driver may be unloaded first.
+    static IdleFrames& frames = *new IdleFrames;
     return frames;
 }
 

@@ -17,8 +17,8 @@ struct ModelPicture {
     FrameImage image;
 };
 
-// Draws a model and can go back from the picture to the model. Keeps its buffers from picture to
-// picture.
+// Draws a model and computes gradients of the model from those of the picture. It
+// reuses its buffers from picture to picture.
 class DifferentiableFrame {
   public:
     DifferentiableFrame();
@@ -26,12 +26,13 @@ class DifferentiableFrame {
     DifferentiableFrame(const DifferentiableFrame&) = delete;
     DifferentiableFrame& operator=(const DifferentiableFrame&) = delete;
 
-    // Returns when it is sure that the picture will be drawn. Throws what Drawing::finish throws.
+    // Returns once it is certain that the picture will be drawn. Throws the exceptions
+    // of Drawing::finish().
     void draw(const ModelPicture& in, cudaStream_t stream);
 
-    // Enqueues the gradients of the gaussians and the background (3) of the picture last drawn; its
-    // arrays and the gaussians are still as they were. Every element is written, the same on every
-    // run.
+    // Enqueues the gradients of the gaussians and the background (3) of the last
+    // picture. Its arrays and the gaussians must be unchanged since draw(). Every
+    // element is written; every run gives the same bits.
     void backward(const PictureGradient<float>& d_picture, const GaussianRows<float>& out,
                   const CenterGradients<float>& centers, float* d_background, cudaStream_t stream);
 
@@ -45,8 +46,8 @@ class DifferentiableFrame {
     cudaEvent_t drawn_ = nullptr, gone_back_ = nullptr;
 };
 
-// A frame of the current device, if possible one that was given back with its buffers. Whoever has
-// one that failed drops it.
+// Returns a frame for the current device, if possible one that was given back with its
+// buffers. A caller whose frame failed must not give it back.
 std::unique_ptr<DifferentiableFrame> take_frame();
 void give_back(std::unique_ptr<DifferentiableFrame> frame);
 

@@ -1,5 +1,5 @@
-// Draws pictures on the CPU, and their gradients: projects and bins draws piece by piece, then
-// blends tile after tile.
+// Draws pictures on the CPU and computes their gradients: it projects and bins the
+// draws in pieces, then blends tile by tile.
 
 #include "base/threads.h"
 #include "draw/render.h"
@@ -22,18 +22,19 @@
 
 namespace v3dg {
 
-// Gaussians that are projected together: a run of one draw, short enough that it reaches few rows
-// of tiles where neighbours in memory are neighbours in space.
+// The size of a piece: gaussians of one draw that are projected together. It is small
+// enough that a piece meets few rows of tiles, provided that neighbours in memory are
+// neighbours in space.
 constexpr uint64_t kPieceSize = 4096;
 
 struct Piece {
     size_t draw;
-    uint64_t skip, count;  // in the draw
-    uint64_t first;        // among the gaussians of all draws
+    uint64_t skip, count;  // range in the draw
+    uint64_t first;        // index of the first gaussian, counted through all draws
     Reach reach;           // known after the first band
 };
 
-// Pieces [first, last), whose records one thread makes.
+// Pieces [first, last), whose records one thread computes.
 struct Chunk {
     size_t first, last;
 };
@@ -51,7 +52,8 @@ static std::vector<Piece> pieces_of(const std::vector<Draw<T>>& draws) {
     return pieces;
 }
 
-// Enough chunks to spread over threads, few enough that a chunk's counters stay small beside it.
+// Returns enough chunks to spread over the threads, but so few that the counters of a
+// chunk stay small compared to its records.
 static std::vector<Chunk> chunks_of(const std::vector<Piece>& pieces, size_t num_tiles) {
     const uint64_t total = pieces.empty() ? 0 : pieces.back().first + pieces.back().count;
     const uint64_t size = std::min(
@@ -66,9 +68,9 @@ static std::vector<Chunk> chunks_of(const std::vector<Piece>& pieces, size_t num
     return chunks;
 }
 
-// Where the records of chunks go. A thread takes a strip of the room and puts one chunk behind the
-// other, so that the memory that is used has few gaps, and that which no record reaches is never
-// touched.
+// Assigns memory to the records of chunks. Each thread allocates strips and writes its
+// chunks one behind the other, so that used memory has few gaps and unused memory is
+// never touched.
 class RecordRoom {
   public:
     RecordRoom(const std::vector<Piece>& pieces, const std::vector<Chunk>& chunks)
@@ -79,7 +81,7 @@ class RecordRoom {
             longest_ = std::max(longest_, end - pieces[c.first].first);
             total = end;
         }
-        // All strips but a thread's last are filled up to the longest chunk.
+        // A strip is abandoned when less than the longest chunk is left of it.
         strip_ = 8 * longest_;
         size_ = total + total / 7 + (mine_.size() + 1) * strip_;
         if (size_ > UINT32_MAX)
@@ -89,7 +91,7 @@ class RecordRoom {
     }
     uint64_t size() const { return size_; }
     uint64_t used() const { return used_; }
-    // Where this thread's next chunk goes, and how many records it has.
+    // Returns where this thread's next chunk begins.
     uint64_t take() {
         Strip& mine = mine_[omp_get_thread_num()];
         if (mine.left < longest_)
@@ -111,7 +113,8 @@ class RecordRoom {
     std::vector<Strip> mine_;
 };
 
-// Most crowded tiles first, so that no thread is left with one of them at the end.
+// Returns the tiles with the longest lists first, so that no thread starts a long one
+// at the end.
 static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_tiles) {
     std::vector<uint32_t> order(num_tiles);
     std::iota(order.begin(), order.end(), 0);
@@ -121,20 +124,22 @@ static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_ti
     return order;
 }
 
-// Bytes of records and entries that a frame holds at once, or about: few, because they are read
-// here and there, but so many that a band has tiles for all threads. With a stop, which is seldom
-// looked at while a band is binned, the least.
+// The approximate size of the records and entries that a frame holds at once. It is
+// small because they are accessed randomly, yet large enough that a band has tiles for
+// all threads. With a `stop` flag it is the minimum, because the flag is rarely checked
+// while a band is binned.
 constexpr double kLeastBandBytes = 96 << 20, kMostBandBytes = 768 << 20,
                  kThreadBandBytes = 48 << 20;
 static double band_bytes_of(const std::atomic<bool>* stop) {
     if (stop != nullptr) return kLeastBandBytes;
     return std::clamp(kThreadBandBytes * most_threads(), kLeastBandBytes, kMostBandBytes);
 }
-// So few gaussians need no look at how much they cover.
+// Up to this number of gaussians, one band is used without estimating their coverage.
 constexpr uint64_t kFewGaussians = 65536;
 
-// Bands of tile rows with about as many bytes each; a single one where memory holds all. The first
-// few gaussians of a piece tell where it is drawn and how much it covers.
+// Returns bands of tile rows of about equal size in bytes; a single band if memory
+// holds everything. The first few gaussians of a piece give an estimate of its location
+// and coverage.
 template <class T>
 static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws,
                                     const std::vector<Piece>& pieces, const Intrinsics<T>& camera,
@@ -180,7 +185,8 @@ static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws,
     return bands;
 }
 
-// Draws one band; `is_first` of a picture's bands finds out what each piece reaches.
+// Draws one band. The first band of a picture (`is_first`) also determines the reach of
+// each piece.
 template <class T>
 static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& pieces,
                         bool is_first, const Intrinsics<T>& camera, const Picture<T>& picture,
@@ -244,7 +250,7 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
     counts.rasterize_seconds += now() - binned;
 }
 
-// The part of a picture that lies in a band of it.
+// Returns the part of a picture inside a band.
 template <class T>
 static Picture<T> band_of(const Picture<T>& picture, const Window& band) {
     const size_t skip = static_cast<size_t>(band.y0 - picture.window.y0) *
@@ -292,8 +298,8 @@ void render_backward(const Draw<T>& draw, const Intrinsics<T>& camera, const Pic
     const Record<T>* records = ws.records.data();
     const uint64_t* offset = ws.lists.offset.data();
     const uint64_t* entry = ws.lists.entry.data();
-    // Each tile of a record has a gradient slot, the slots of a record side by side in the order of
-    // the tiles, so the sum over tiles does not depend on which thread came first.
+    // A record has a gradient slot for each of its tiles, adjacent and in tile order,
+    // so the sum over tiles does not depend on the order of threads.
     std::vector<uint64_t> first_slot(ws.room);
     uint64_t num_slots = 0;
     for (size_t c = 0; c < ws.num_chunks; ++c)

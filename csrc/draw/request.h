@@ -1,7 +1,7 @@
 #pragma once
 
-// What is asked of a frame, on every device: one value that goes from Python through the bindings
-// to a backend, and is not changed on its way.
+// The request for a frame, the same on every device: one value that Python creates,
+// that passes through the bindings to a backend, and that nobody changes on the way.
 
 #include <array>
 #include <optional>
@@ -13,16 +13,16 @@
 
 namespace v3dg {
 
-// What the colours of a picture say.
+// What the colours of a picture show.
 enum class FrameLook {
-    appearance,  // what the gaussians, or the palette of their clusters, have
-    missing,     // where finer pages are missing (see missing_color())
-    metrics,     // the share of the tolerance that each pair's metric takes, as grey
-    count        // as appearance; the number of gaussians of a pixel takes the place of depth
+    appearance,  // the gaussians' colours, or a palette of cluster colours
+    missing,     // where finer pages are missing; see missing_color()
+    metrics,     // each pair's metric as a fraction of the tolerance, in grey
+    count        // as appearance, but the depth is replaced by the number of gaussians per pixel
 };
 
-// What is behind the gaussians of a pixel, when it stops (frame/image.h), and whether its depth is
-// drawn, too.
+// The background, the transmittance at which pixels stop (frame/image.h), and whether
+// depth is drawn.
 struct Shade {
     std::array<double, 3> background;
     float min_transmittance = kStopsBefore;
@@ -30,20 +30,21 @@ struct Shade {
 };
 
 struct FrameRequest {
-    Eyes eyes;        // that see the pictures
-    SelectRule rule;  // of the cut; with a given cut, the tolerance that metrics are compared with
+    Eyes eyes;        // the cameras of the pictures
+    SelectRule rule;  // of the cut; with a given cut, the tolerance to compare metrics with
     Shade shade;
     FrameLook look = FrameLook::appearance;
-    std::optional<GivenCut> cut = {};  // drawn in place of what the rule selects
-    std::optional<Eyes> chooser = {};  // that the cut is selected for; none: the eyes
-    // From a pool: the pages that the last frame had; none come in, and none are asked for.
+    std::optional<GivenCut> cut = {};  // drawn instead of a selected cut
+    std::optional<Eyes> chooser = {};  // eyes that the cut is selected for; if absent, `eyes`
+    // With a pool: use the resident pages of the last frame, and neither bring pages in
+    // nor request any.
     bool is_aside = false;
-    // [C][3] of each bundle, coefficients of the constant basis: colours of clusters that lie here
-    // and there. Empty: none.
+    // [C][3] per bundle, SH coefficients of degree 0: the colours of clusters in host
+    // memory. Empty: none.
     std::vector<const float*> cluster_colors = {};
 
     const Eyes& choosing_eyes() const { return chooser ? *chooser : eyes; }
-    // Whether any backend can draw it: the others show what only the host computes.
+    // Whether every backend can draw it. Other requests are drawn on the host only.
     bool is_plain() const {
         return look == FrameLook::appearance && !is_aside && !chooser && cluster_colors.empty();
     }

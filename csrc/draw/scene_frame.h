@@ -1,6 +1,7 @@
 #pragma once
 
-// Frames of a scene on the host: a request in, pictures and what they came to out.
+// Frames of a scene on the host: the input is a request, the output are pictures and
+// counts.
 
 #include <atomic>
 #include <vector>
@@ -10,38 +11,38 @@
 
 namespace v3dg {
 
-// The gaussians of one bundle on the host, and how its clusters are drawn.
+// The gaussians of one bundle on the host, and the appearance of its clusters.
 struct SceneModel {
-    const GaussianPlanes<float>* planes;  // null where there are codes
+    const GaussianPlanes<float>* planes;  // null if the gaussians are codes
     ClusterAppearance appearance;
     Palette palette;
     const Codes* codes = nullptr;
-    // [C][3] coefficients of the constant basis, in place of the palette where clusters lie here
-    // and there.
+    // [C][3] SH coefficients of degree 0, which replace the palette of clusters; null:
+    // none.
     const float* cluster_sh = nullptr;
 };
 
-// A scene on the host: what selection reads of its bundles, their gaussians, and its instances.
+// A scene on the host: the bundle tables that selection reads, the gaussians, and the
+// instances.
 struct HostScene {
     Span<const ClusterTable> tables;
     Span<const SceneModel> models;  // of the same bundles
     InstanceTable instances;
-    // As SelectInput has them.
+    // See SelectInput.
     Span<const Span<uint32_t>> needs = {};
     uint32_t* last_bin = nullptr;
 };
 
-// What one frame came to.
+// The counts of one frame.
 struct SceneFrameCounts {
-    int64_t
-        gaussians;  // that were selected; where the budget is exceeded, what the coarsest cut has
-    float tolerance_px2;  // that was used
-    bool exceeds_budget;  // nothing was drawn then
+    int64_t gaussians;  // selected gaussians; if the budget is exceeded, those of the coarsest cut
+    float tolerance_px2;  // the tolerance that was used
+    bool exceeds_budget;  // if so, nothing was drawn
     double select_seconds, draw_seconds;
-    RenderCounts render;          // of two pictures, the sums
-    std::vector<int64_t> levels;  // gaussians that were selected, of a scene by level
+    RenderCounts render;          // sums over both pictures, if there are two
+    std::vector<int64_t> levels;  // selected gaussians by level; for scenes only
 
-    // What another picture of the same frame came to.
+    // Adds the counts of another picture of the same frame.
     void add_picture(const SceneFrameCounts& other) {
         draw_seconds += other.draw_seconds;
         render.in_frustum += other.render.in_frustum;
@@ -50,32 +51,33 @@ struct SceneFrameCounts {
     }
 };
 
-// The gaussian that a pixel shows most of, and the pair that it belongs to.
+// The gaussian with the largest weight in a pixel, and its pair.
 struct ScenePick {
     int32_t instance, cluster;
-    float weight;  // its share of the pixel
+    float weight;  // its blend weight
     float depth;
 };
 
 namespace cpu {
 
-// Metrics are shown up to so many times the tolerance.
+// Metrics are shown up to this multiple of the tolerance.
 constexpr float kMostShare = 2.0f;
 
-// Draws what is asked for, a picture for each eye. `rule` is the one of the request, as a pool or
-// the pacing of a budget has changed it. A given cut has a picture for the first eye alone; throws
-// std::out_of_range where one of its pairs is not of the scene. Once `stop` is true, returns soon
-// and leaves the pictures unfinished.
+// Draws a request, one picture per eye. `rule` is the rule of the request after changes
+// by a pool or by the pacing of a budget. A given cut is drawn for the first eye only;
+// throws std::out_of_range if one of its pairs is not in the scene. Once `stop` is
+// true, it returns soon and leaves the pictures unfinished.
 SceneFrameCounts draw_scene(const HostScene& scene, const FrameRequest& request,
                             const SelectRule& rule, Span<const Picture<float>> pictures,
                             const std::atomic<bool>* stop = nullptr);
 
-// Draws all gaussians of one model, in the world, without a filter.
-SceneFrameCounts draw_model(const GaussianPlanes<float>& model, size_t count, const Camera& camera,
+// Draws all gaussians of one model, in world coordinates.
+SceneFrameCounts draw_model(const GaussianPlanes<float>& model, size_t count,
+                            const Appearance<float>& appearance, const Camera& camera,
                             const Picture<float>& picture, const std::atomic<bool>* stop = nullptr);
 
-// Finds the gaussian that the first pixel of the first eye's window shows most of, of the cut that
-// draw_scene() would draw. Returns whether there is any.
+// Finds the gaussian with the largest weight in the first pixel of the first eye's
+// window, for the cut that draw_scene() would draw. Returns whether there is any.
 bool pick_scene(const HostScene& scene, const FrameRequest& request, const SelectRule& rule,
                 ScenePick& picked);
 

@@ -1,5 +1,5 @@
-// Frames of a scene on the host: the clusters of a cut as draws, their false colours, and what
-// draw/scene_frame.h promises.
+// Frames of a scene on the host: the clusters of a cut as draws, their false colours,
+// and the functions of draw/scene_frame.h.
 
 #include "draw/scene_frame.h"
 
@@ -16,18 +16,18 @@ namespace v3dg {
 
 namespace {
 
-// A workspace lent to one caller at a time, kept from frame to frame; a second caller gets one of
-// its own. Without a lock, which a fork() in the middle would leave closed.
+// A workspace that is lent to one caller at a time and reused from frame to frame; a
+// concurrent caller gets a workspace of its own. It has no mutex, because a fork()
+// could leave that locked.
 class SharedWorkspace {
   public:
-    // Threads may still draw when the process ends.
+    // Threads may still be drawing when the process ends.
     ~SharedWorkspace() { delete kept_.exchange(nullptr); }
     std::unique_ptr<Workspace<float>> take() {
         std::unique_ptr<Workspace<float>> kept(kept_.exchange(nullptr));
         return kept ? std::move(kept) : std::make_unique<Workspace<float>>();
     }
-    // Keeps what the next frame is likely to need, but does not sit on the memory of an exceptional
-    // one.
+    // Keeps the workspace for the next frame, unless its memory is exceptionally large.
     void give_back(std::unique_ptr<Workspace<float>> workspace) {
         constexpr uint64_t kMostRoom = uint64_t(16) << 20;
         if (workspace->most_room <= kMostRoom) workspace.reset(kept_.exchange(workspace.release()));
@@ -52,9 +52,9 @@ SceneFrameCounts draw_all(const std::vector<Draw<float>>& draws, const Camera& c
     return counts;
 }
 
-// The clusters of a cut as draws. Clusters of one instance whose rows follow on each other make one
-// draw if they are drawn alike, also with the same weight. `tint` has three SH coefficients of the
-// constant basis for each pair, in place of its gaussians' colours; null: none.
+// The clusters of a cut as draws. Clusters of one instance with adjacent rows form one
+// draw if they are drawn alike, with the same weight. `tint` has three SH coefficients
+// of degree 0 per pair, which replace the colours of its gaussians; null: none.
 class CutDraws {
   public:
     CutDraws(const HostScene& scene, const Camera& camera, const GivenCut& given,
@@ -67,7 +67,7 @@ class CutDraws {
 
     const std::vector<Draw<float>>& draws() const { return draws_; }
     int64_t num_gaussians() const { return static_cast<int64_t>(num_gaussians_); }
-    // The pair that a gaussian belongs to, counted through all draws.
+    // Returns the pair of a gaussian, whose index counts through all draws.
     size_t pair_of(uint64_t gaussian) const {
         return std::upper_bound(end_of_pair_.begin(), end_of_pair_.end(), gaussian) -
                end_of_pair_.begin();
@@ -88,7 +88,7 @@ class CutDraws {
         end_of_pair_.push_back(num_gaussians_);
         if (i != last_instance_) {
             const Pose pose = scene_.instances.pose(i);
-            if (!is_placed(pose)) return;
+            if (!scene_.instances.is_drawn(i)) return;
             view_ = model_view_from_instance(axes_of_instance(camera_, pose), pose);
         }
         end_of_pair_.back() = num_gaussians_ += count;
@@ -96,8 +96,16 @@ class CutDraws {
         const Palette palette = tint == nullptr ? model.palette : Palette{tint, nullptr, 1};
         const Appearance<float> appearance =
             fades_ ? model.appearance.faded(table, c) : model.appearance[c];
-        const Draw<float> next{model.planes, first,   count,       view_,
-                               appearance,   palette, model.codes, weight};
+        const Span<const InstanceFactors>& factors = scene_.instances.factors;
+        const Draw<float> next{.model = model.planes,
+                               .first = first,
+                               .count = count,
+                               .view = view_,
+                               .appearance = appearance,
+                               .palette = palette,
+                               .codes = model.codes,
+                               .weight = factors.empty() ? weight : weight * factors[i].opacity,
+                               .color_factors = factors.empty() ? nullptr : factors[i].color};
         if (i == last_instance_ && joins(draws_.back(), next))
             draws_.back().count += count;
         else
@@ -105,7 +113,7 @@ class CutDraws {
         last_instance_ = i;
     }
 
-    // Whether the second, of the same instance, begins where the first ends and is drawn alike.
+    // Whether b, a draw of the same instance, begins where a ends and is drawn alike.
     static bool joins(const Draw<float>& a, const Draw<float>& b) {
         return a.first + a.count == b.first && a.appearance == b.appearance &&
                a.weight == b.weight && a.palette.sh == b.palette.sh;
@@ -115,13 +123,14 @@ class CutDraws {
     const Camera& camera_;
     const bool fades_;
     std::vector<Draw<float>> draws_;
-    std::vector<uint64_t> end_of_pair_;  // end of each pair's gaussians, counted over all draws
+    // [S] end of each pair's gaussians, counted through all draws.
+    std::vector<uint64_t> end_of_pair_;
     uint64_t num_gaussians_ = 0;
     int32_t last_instance_ = -1;
     ModelView<float> view_{};
 };
 
-// Metrics of pairs over the tolerance: (S).
+// Returns the metrics of pairs divided by the tolerance: (S).
 std::vector<float> shares_of(const HostScene& scene, const Camera& camera, const SelectRule& rule,
                              const GivenCut& given, float tolerance_px2) {
     std::vector<float> share(given.instance.size);
@@ -162,16 +171,17 @@ std::vector<int64_t> levels_of(const HostScene& scene, const GivenCut& given) {
     return levels;
 }
 
-// [S][3]: what pairs are drawn with in place of their colours; empty: nothing. `tolerance_px2` is
-// the one of the cut.
+// Returns the [S][3] colours that replace those of the pairs' gaussians; empty if none
+// do. `tolerance_px2` is the tolerance of the cut.
 std::vector<float> tint_of(const HostScene& scene, const FrameRequest& request,
                            const SelectRule& rule, const GivenCut& given, float tolerance_px2) {
     const bool is_metric = request.look == FrameLook::metrics;
     if (!is_metric && request.look != FrameLook::missing) return {};
-    // Metrics are those for who looks. What is missing is so for whom the cut was chosen.
+    // Metrics are for the eye that views the picture. Missing pages are for the eye
+    // that the cut was selected for.
     const Camera& judge = is_metric ? request.eyes.camera[0] : request.choosing_eyes().camera[0];
-    // Without a budget, the tolerance that was asked for is wanted, not the one that a pool raised
-    // it to. With a budget, the one that the budget comes to is.
+    // Without a budget, the wanted tolerance is the requested one, not the one that a
+    // pool raised it to. With a budget, it is the one that the budget led to.
     const bool wants_used = is_metric || rule.budget != kNoBudget;
     const float wanted = wants_used ? tolerance_px2 : request.rule.tolerance_px2;
     std::vector<float> tint(3 * given.instance.size);
@@ -181,7 +191,7 @@ std::vector<float> tint_of(const HostScene& scene, const FrameRequest& request,
         const ClusterTable& table = scene.tables[scene.instances.bundle[given.instance[s]]];
         const bool is_finest = level_of(table, given.cluster[s]) <= rule.min_level;
         const float grey = std::min(share[s], cpu::kMostShare);
-        // A little more than the fade's factor, for metrics are rounded.
+        // Slightly more than the fade's factor, because metrics are rounded.
         const Rgb rgb =
             is_metric ? Rgb{grey, grey, grey}
                       : missing_color(is_finest ? 0.0f : share[s], 1.0001f * rule.fade.factor);
@@ -214,7 +224,7 @@ SceneFrameCounts draw_given(const HostScene& scene, const FrameRequest& request,
     const GivenCut& given = *request.cut;
     std::vector<float> tint;
     if (request.look == FrameLook::metrics) {
-        static_cast<void>(CutDraws(scene, camera, given));  // which checks the pairs
+        static_cast<void>(CutDraws(scene, camera, given));  // throws if a pair is not in the scene
         tint = tint_of(scene, request, rule, given, rule.tolerance_px2);
     }
     return draw_pairs(scene, camera, given, tint.empty() ? nullptr : tint.data(), picture, stop);
@@ -252,12 +262,11 @@ SceneFrameCounts cpu::draw_scene(const HostScene& scene, const FrameRequest& req
 }
 
 SceneFrameCounts cpu::draw_model(const GaussianPlanes<float>& model, size_t count,
-                                 const Camera& camera, const Picture<float>& picture,
-                                 const std::atomic<bool>* stop) {
+                                 const Appearance<float>& appearance, const Camera& camera,
+                                 const Picture<float>& picture, const std::atomic<bool>* stop) {
     const double start = now();
-    SceneFrameCounts counts =
-        draw_all({{&model, 0, count, view_of_world<float>(camera), {0.0f, false, false}}}, camera,
-                 picture, stop);
+    SceneFrameCounts counts = draw_all(
+        {{&model, 0, count, view_of_world<float>(camera), appearance}}, camera, picture, stop);
     counts.gaussians = static_cast<int64_t>(count);
     counts.draw_seconds = now() - start;
     return counts;

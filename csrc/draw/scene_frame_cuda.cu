@@ -1,4 +1,5 @@
-// Frames of a scene on a CUDA device: which cut writes the items, and of which models the batch is.
+// Frames of a scene on a CUDA device: they choose the cut that writes the items, and
+// the models of the batch.
 
 #include "draw/scene_frame_cuda.h"
 
@@ -115,6 +116,7 @@ EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_tra
 FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures,
                              const SelectRule& rule, cudaStream_t stream) {
     const FrameImage& last = pictures.image[pictures.count - 1];
+    const Span<const InstanceFactors> factors = scene.on_device().instances.factors;
     return {.models = rows_.data(),
             .placements = placements_.reserve(pictures.count * scene.num_instances(), stream),
             .images = images_.reserve(pictures.count, stream),
@@ -125,6 +127,8 @@ FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures
             .has_shared_items = scene.num_instances() > 1,
             .min_transmittance = pictures.min_transmittance,
             .has_faded_items = rule.fade.is_on(),
+            .factors = factors.empty() ? nullptr : factors.data,
+            .num_factors = static_cast<uint32_t>(factors.size),
             .guards_models = nullptr,
             .num_zeros = Cut::num_zeros(scene, rule),
             .has_depth = false};
@@ -179,7 +183,8 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
             cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items,
                            on, &resident);
             next = drawn_again(next);
-            // A frame that is drawn again tells nothing: another one may be telling.
+            // A frame that is drawn again reports no needs, because another frame may
+            // be reporting its own.
             if (resident.needs.report != nullptr) pages.end_frame(on);
             resident.needs = {};
         },
@@ -210,7 +215,7 @@ std::vector<std::pair<const char*, size_t>> SceneFrame::bytes() const {
 
 constexpr unsigned kModelThreads = 128;
 
-// A thread an item.
+// One thread per item.
 static __global__ void model_kernel(ModelTables tables, ModelTables* on_device,
                                     Appearance<float> appearance, ItemList items) {
     const unsigned long long i =

@@ -1,7 +1,7 @@
 #pragma once
 
-// Frames of a scene on a CUDA device: a request in, an enqueued drawing out; and the models that
-// they draw.
+// Frames of a scene on a CUDA device, which turn a request into an enqueued drawing,
+// and the models that they draw.
 
 #include "draw/device_pages.h"
 #include "draw/frame_cuda.h"
@@ -12,11 +12,12 @@
 namespace v3dg {
 namespace cuda {
 
-// The only picture of a frame; `first_tile` and the tiles are filled in.
+// Returns the only picture of a frame; the function fills in `first_tile` and the
+// tiles.
 FrameImage frame_image(const Intrinsics<float>& camera, int width, int height,
                        const float background[3], const PicturePlanes& planes);
 
-// Gaussians that stay as they are, and packed.
+// Packed gaussians that never change.
 class PackedModel {
   public:
     PackedModel(const GaussianRows<const float>& rows, cudaStream_t stream);
@@ -30,11 +31,11 @@ class PackedModel {
     PackedPlanes packed_;
 };
 
-// Gaussians as codes on the device that is current when they are made: all records, then all
-// coefficients, so that a row's place follows from its number.
+// Coded gaussians on the device that is current when they are made: all records, then
+// all SH codes, so that the address of a row follows from its index.
 class CodedModel {
   public:
-    // Returns when they are there.
+    // Returns once the codes are on the device.
     CodedModel(const CodedPages& pages, cudaStream_t stream);
     const Codes& codes() const { return codes_; }
     size_t bytes() const {
@@ -48,7 +49,7 @@ class CodedModel {
     Codes codes_;
 };
 
-// The gaussians of a bundle: one of the two.
+// The gaussians of a bundle: one of the two is set.
 struct DeviceModel {
     std::shared_ptr<const PackedModel> packed;
     std::shared_ptr<const CodedModel> coded;
@@ -57,7 +58,7 @@ struct DeviceModel {
 // Colours of the clusters of one bundle.
 class DevicePalette {
   public:
-    // `sh` is (C, 3), coefficients of the constant basis; the host's memory may be reused on
+    // `sh` is (C, 3), SH coefficients of degree 0; the host memory may be reused on
     // return.
     DevicePalette(Span<const float> sh, std::shared_ptr<const BundleTables> tables,
                   cudaStream_t stream);
@@ -68,30 +69,31 @@ class DevicePalette {
     DeviceBuffer<float> sh_;
 };
 
-// The pictures of two eyes in one frame.
+// Returns the pictures of two eyes in one frame.
 EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_transmittance);
 
-// Draws a scene that stays on the device: selects, then draws the cut.
+// Draws a scene that is on the device: selects a cut, then draws it.
 class SceneFrame {
   public:
-    // The gaussians of each bundle of the scenes that are drawn next and, unless there are none,
-    // the colours of their clusters. The host's arrays may be reused on return.
+    // Sets the gaussians of each bundle of the scenes to be drawn next and, unless
+    // empty, the colours of their clusters. The host arrays may be reused on return.
     void set_models(std::vector<DeviceModel> models,
                     std::vector<std::shared_ptr<const DevicePalette>> palettes,
                     cudaStream_t stream);
 
-    // Draws what is asked for, plainly (FrameRequest::is_plain), into `pictures`; `place` says
-    // where they are. With `pages`, what is resident of the bundles of a pool, with what comes in
-    // before. `rule` is the one of the request, as the pacing of a budget has changed it, and
-    // becomes the one that is used. What is drawn stays until the drawing is finished: the scene,
-    // the pool, and a given cut, which is on the device and has one picture. A frame that is drawn
-    // again has the pages that are there by then.
+    // Draws a plain request (FrameRequest::is_plain) into `pictures`; `place` provides
+    // their destinations. With `pages`, it draws the resident part of a pool's bundles,
+    // after bringing in pages that are ready. `rule` is the rule of the request after
+    // changes by the pacing of a budget; it becomes the rule that was used. The scene,
+    // the pool and a given cut, which is on the device and has one picture, must exist
+    // until the drawing is finished. If a frame is drawn again, it uses the pages that
+    // are resident by then.
     std::unique_ptr<Drawing> draw(const SceneTables& scene, DevicePages* pages,
                                   const FrameRequest& request, SelectRule& rule,
                                   const EyeImages& pictures, cudaStream_t stream,
                                   const Frame::Place& place);
 
-    // Bytes of what it keeps on the device, by part, without the models.
+    // Returns the bytes on the device by part, without the models.
     std::vector<std::pair<const char*, size_t>> bytes() const;
 
   private:
@@ -105,7 +107,7 @@ class SceneFrame {
     std::unique_ptr<Drawing> draw_given(const SceneTables& scene, const Camera& camera,
                                         const GivenCut& given, const EyeImages& pictures,
                                         cudaStream_t stream, const Frame::Place& place);
-    // Of the models that were set.
+    // Returns the batch for the models that were set.
     FrameBatch batch(const SceneTables& scene, const EyeImages& pictures, const SelectRule& rule,
                      cudaStream_t stream);
 
@@ -134,7 +136,8 @@ class ModelFrame {
   public:
     explicit ModelFrame(Frame::Keeps keeps = Frame::Keeps::nothing) : frame_(keeps) {}
 
-    // The rows, and what is packed of them, stay where they are until the drawing is finished.
+    // The rows, and the planes packed from them, must exist until the drawing is
+    // finished.
     std::unique_ptr<Drawing> draw(const GaussianRows<const float>& rows,
                                   const ModelView<float>& view, float filter_px2, bool antialiased,
                                   const FrameImage& image, cudaStream_t stream,

@@ -1,7 +1,8 @@
 #pragma once
 
-// Half-warps blend cells of 4 x 4 pixels, and walk them again for the gradients: each gaussian's
-// gradient from a cell is summed over the cell's pixels into a slot of its own.
+// Half-warps blend cells of 4 x 4 pixels, and visit them again for the gradients. The
+// gradient of each gaussian is summed over a cell's pixels into a slot for that
+// gaussian and cell.
 
 #include "fit_group/cell_lists.cuh"
 #include "frame/record.cuh"
@@ -12,7 +13,7 @@ namespace cuda {
 
 enum class Pass { measure, draw, train };
 
-// A lane's pixel in its half-warp's cell.
+// The pixel of a lane in the cell of its half-warp.
 struct CellPixel {
     int x, y;
     float center_x, center_y;
@@ -33,8 +34,8 @@ struct alignas(kAtOnce * sizeof(Index)) CellEntries {
     Index record[kAtOnce];
 };
 
-// Copies the records of a part of both half-warps' lists to shared memory. Small groups have theirs
-// there anyway.
+// Copies the records of a part of both half-warps' lists to shared memory. Records of
+// small groups are always in shared memory.
 template <class Fit>
 __device__ void stage_records(const Fit& fit, uint32_t begin, uint32_t end) {
     if (Fit::kSmall) return;
@@ -50,7 +51,8 @@ __device__ void stage_records(const Fit& fit, uint32_t begin, uint32_t end) {
     __syncwarp();
 }
 
-// kAtOnce records of a half-warp's list, from entry i on; `begin` is the first entry of the chunk.
+// kAtOnce records of a half-warp's list, from entry i on; `begin` is the first entry of
+// the chunk.
 struct CellRecords {
     const Record<float>* record[kAtOnce];
 };
@@ -84,8 +86,8 @@ __device__ inline Blended blend_records(const CellPixel& p, const CellRecords& r
     Blended out;
 #pragma unroll
     for (int q = 0; q < kAtOnce; ++q) {
-        // The record is read as vectors (frame/record.cuh), because nvcc rounds the falloff of a
-        // record that was copied differently.
+        // The record is read as vectors (frame/record.cuh), because nvcc rounds the
+        // falloff of a record that was copied differently.
         const Record<float>& r = *records.record[q];
         const float4 a = *reinterpret_cast<const float4*>(&r.u);
         const float4 b = *reinterpret_cast<const float4*>(&r.l22);
@@ -96,23 +98,24 @@ __device__ inline Blended blend_records(const CellPixel& p, const CellRecords& r
     return out;
 }
 
-// The memory that a pass reads and writes.
+// The outputs of a pass.
 struct BlendTargets {
-    float* slots;          // train
-    uint32_t slot_base;    // number of the first slot
-    const float* d_dssim;  // train; may be null
-    float* picture;        // draw
-    float2* errors;        // measure
+    float* slots;          // for Pass::train
+    uint32_t slot_base;    // index of the first slot
+    const float* d_dssim;  // for Pass::train; may be null
+    float* picture;        // for Pass::draw
+    float2* errors;        // for Pass::measure
 };
 
-// Half-warps add up the fragments of a chunk with one lane for each gaussian or, where the chunk
+// Half-warps sum the fragments of a chunk, with one lane per gaussian or, if the chunk
 // has fewer gaussians, with two.
 template <class Fit>
 constexpr int kLanesOfSum = kCellPixels / (Fit::kChunk < kCellPixels ? Fit::kChunk : kCellPixels);
 
-// Sums over the half-warp's cell, for record r, which is gaussian `i` of the chunk. All lanes call
-// it; those without a gaussian have a null `slot`. The sums of a row are spelled out instead of
-// using RowSums: nvcc would round them differently, and bundles would change in their last bits.
+// Sums over the half-warp's cell for record r, which is gaussian `i` of the chunk. All
+// lanes call it; those without a gaussian pass a null `slot`. The row sums are written
+// out instead of using RowSums, because nvcc would round those differently and change
+// the last bits of bundles.
 template <class Fit>
 __device__ void add_up(const Fit& fit, const CellPixel& p, uint32_t i, const Record<float>& r,
                        float* slot) {
@@ -161,7 +164,8 @@ __device__ void add_up(const Fit& fit, const CellPixel& p, uint32_t i, const Rec
         if (kLanes == 1 || (k < 5) == (part == 0)) slot[k] = all[k];
 }
 
-// Blends two neighbouring cells in view b, by a whole warp. `unit` numbers the pair.
+// Blends two neighbouring cells in view b. Called by a whole warp. `unit` is the index
+// of the pair.
 template <Pass kPass, class Fit>
 __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, int pair_x,
                             int cell_y, uint32_t unit, const BlendTargets& targets) {
@@ -225,14 +229,14 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
     }
     fit.d_pixels()[lane] = make_float4(d[0], d[1], d[2], 0);
 
-    // The same records are blended again, to the same numbers, now that the sum over all of them is
-    // known.
+    // Blends the same records again, with the same results, now that the sum over all
+    // of them is known.
     const auto slot_of = [&](uint32_t j) {
         const uint32_t slot =
             fit.slot_first(region)[j] + __popcll(fit.mask(region)[j] & ((CellMask(1) << cell) - 1));
         return targets.slots + kSums * static_cast<size_t>(slot - targets.slot_base);
     };
-    float2* const mine = fit.fragments() + lane;  // fragments of this pixel
+    float2* const mine = fit.fragments() + lane;  // fragments of this lane's pixel
     float behind =
         d[0] * color[0] + d[1] * color[1] + d[2] * color[2] + d[3] * (1 - fabsf(transmittance));
     transmittance = p.inside ? 1 : -1;
@@ -266,7 +270,7 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
         }
         __syncwarp();
     }
-    // Every pixel has stopped before the remaining records, whose sums are 0.
+    // All pixels stop before the remaining records, so the sums of those are 0.
     for (uint32_t i = begin + lane % kCellPixels; i < list.length; i += kCellPixels) {
         float* slot = slot_of(list.entry[i]);
         for (int k = 0; k < kSums; ++k) slot[k] = 0;
@@ -287,8 +291,8 @@ __device__ inline int from_middle(int k, int size) {
     return size / 2 + (k % 2 ? -(k + 1) / 2 : k / 2);
 }
 
-// Warps take pairs of cells from a queue. Those in the middle come first, because they have most to
-// blend.
+// Warps claim pairs of cells from a queue. Pairs in the middle come first, because they
+// have the longest lists.
 template <Pass kPass, class Fit>
 __device__ void blend_regions(const Fit& fit, const FitCameras& cameras, int num_views,
                               int first_region, int last_region, const BlendTargets& targets) {

@@ -1,7 +1,7 @@
 #pragma once
 
-// The gaussians that reach each cell of 4 x 4 pixels: a mask for each record, a slot for each
-// record and cell, in which its gradients from there are summed, and the list of a cell.
+// The gaussians that reach each cell of 4 x 4 pixels: a cell mask for each record, a
+// gradient slot for each record and cell, and the list of each cell.
 
 #include "base/scan.cuh"
 #include "fit_group/depth_order.cuh"
@@ -9,8 +9,9 @@
 namespace v3dg {
 namespace cuda {
 
-// Returns the cells of the region at (left, top) that the record may reach, a bit each, row by row.
-// Rounding is to pixel centres, because each cell costs a slot and a place in a list.
+// Returns a mask of the cells of the region at (left, top) that the record may reach,
+// row by row. The test rounds to pixel centres, because each cell costs a slot and a
+// list entry.
 __device__ inline CellMask cells_of(const Record<float>& r, int left, int top) {
     const PixelBox<int> box{max(r.x0 - left, 0), min(r.x1 - left, kRegion - 1), max(r.y0 - top, 0),
                             min(r.y1 - top, kRegion - 1)};
@@ -48,7 +49,8 @@ __device__ void arrange_by_depth(const Fit& fit, int num_views) {
     fit.sync();
 }
 
-// Gives each record a slot for each cell that it reaches, region by region, and counts them.
+// Assigns each record a slot for each cell that it reaches, region by region, and
+// counts the slots.
 template <class Fit>
 __device__ uint32_t assign_slots(const Fit& fit, int num_views) {
     const uint32_t used = num_views * fit.n_padded, count = fit.num_regions() * used;
@@ -84,7 +86,7 @@ __device__ uint32_t assign_slots(const Fit& fit, int num_views) {
     return total;
 }
 
-// Adds each record's slots in these regions to the sums of the regions before.
+// Adds each record's slots in these regions to the sums from earlier regions.
 template <class Fit>
 __device__ void sum_slots(const Fit& fit, int num_views, const float* slots, uint32_t slot_base,
                           int first_region, int last_region) {
@@ -109,16 +111,16 @@ __device__ void sum_slots(const Fit& fit, int num_views, const float* slots, uin
     }
 }
 
-// The ranks of the records that reach a half-warp's cell, nearest first. Both half-warps' lists
-// have the same length including padding, which is the rank of a record that draws nothing.
+// The list of a half-warp's cell: ranks of records, nearest first. The lists of both
+// half-warps have the same length, including padding with the rank of an empty record.
 template <class Fit>
 struct CellList {
     const typename Fit::Index* entry;
     uint32_t length, filled;
 };
 
-// Makes the lists of two neighbouring cells in view b, and returns that of the lane's cell; `cell`
-// is the bit of the left one.
+// Writes the lists of two neighbouring cells in view b, and returns the list of this
+// lane's cell; `cell` is the mask bit of the left one.
 template <class Fit>
 __device__ CellList<Fit> make_lists(const Fit& fit, int b, int region, int cell) {
     constexpr int kLoads = 4;

@@ -11,12 +11,12 @@
 namespace v3dg {
 namespace V3DG_ISA {
 
-// Draws the student, compares it with its target, and adds to its gradient.
+// Draws the student, compares it with its target, and accumulates its gradient.
 class Comparison {
   public:
     Comparison(const FitConfig& config) : config_(config) {}
 
-    // Adds the mean |difference| of colour and alpha of one view.
+    // Adds the mean |difference| of colour and alpha in one view.
     void residual(const Student& student, const FitView& view, const FitImage& target,
                   double error[2]) {
         draw(student, view);
@@ -73,8 +73,8 @@ class Comparison {
         return count;
     }
 
-    // Computes the L1 parts of the loss in one tile: adds to the sums and, unless `grad` is null,
-    // writes the gradient of its pixels.
+    // Computes the L1 parts of the loss in one tile: adds to the sums and, unless
+    // `grad` is null, writes the gradients of its pixels.
     void compare(int t, const FitView& view, const FitImage& target, TileGradient<float>* grad,
                  double error[2]) {
         using V = Vec<float>;

@@ -1,24 +1,24 @@
 #pragma once
 
-// Orders gaussians by their depth in each view, ties by place.
+// Sorts gaussians by depth in each view; ties are sorted by index.
 
 #include "fit_group/team.cuh"
 
 namespace v3dg {
 namespace cuda {
 
-// Key of gaussians that are not drawn; it is above all depths.
+// The key of gaussians that are not drawn; it is above all depths.
 constexpr uint32_t kHiddenKey = 0xfffffffeu;
 
-// Puts gaussian `i` of the view with these keys into its position.
+// Writes gaussian `i` of the view with these keys to its sorted position.
 template <class Fit>
 __device__ void rank_by_depth(const Fit& fit, const uint32_t* view_keys, uint32_t begin,
                               uint32_t i) {
     const uint4* all = reinterpret_cast<const uint4*>(view_keys);
     const uint32_t key = view_keys[i], warp_first = i - threadIdx.x % 32;
     uint32_t rank = 0;
-    // Equal keys are ordered by place. So keys in runs of 32 before this warp's run precede this
-    // one if they are equal, and keys in later runs do not.
+    // Equal keys are sorted by index. So equal keys precede this one if they are in an
+    // earlier run of 32 than this warp's, and follow it if they are in a later run.
     const auto count = [&](uint32_t from, uint32_t to, const auto& before) {
         for (uint32_t run = from; run < to; run += 32) {
             uint4 other[8];
@@ -47,8 +47,8 @@ __device__ void rank_by_counting(const Fit& fit, int num_views) {
                           j / fit.n_padded * fit.n_padded, j % fit.n_padded);
         return;
     }
-    // All threads read all keys, so these are copied to shared memory where they fit. Fragments are
-    // written there later.
+    // All threads read all keys, so the keys are copied to shared memory if they fit.
+    // This memory is used for fragments later.
     auto* copy = reinterpret_cast<uint32_t*>(shared_memory() + fit.layout.fragments);
     const bool fits = fit.n_padded * sizeof(uint32_t) <= Fit::kWarps * fragments_bytes(Fit::kChunk);
     for (int b = 0; b < num_views; ++b) {
@@ -91,7 +91,7 @@ __device__ void sort_bitonic(const Fit& fit, int b) {
     __syncthreads();
 }
 
-// Orders the gaussians of each view by depth, ties by place.
+// Sorts the gaussians of each view by depth; ties are sorted by index.
 template <class Fit>
 __device__ void order_by_depth(const Fit& fit, int num_views) {
     if (Fit::kSmall || fit.team_size > 1)

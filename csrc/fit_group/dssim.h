@@ -1,27 +1,28 @@
 #pragma once
 
-// D-SSIM of a picture, with its gradient, for the loss of a fit.
+// The D-SSIM of a picture and its gradient, for the loss of a fit.
 
 #include <vector>
 
 namespace v3dg {
 
-// Weights of the parts of the loss between two pictures, each a mean over pixels (and channels).
+// Weights of the parts of the loss between two pictures. Each part is a mean over
+// pixels, and over channels if it has several.
 struct LossWeights {
     float l1;     // |difference| of premultiplied colour
     float dssim;  // 1 - SSIM of premultiplied colour
     float alpha;  // |difference| of alpha
 };
 
-// Temporary maps of dssim().
+// Temporary memory of dssim().
 struct SsimScratch {
     std::vector<float> maps;
 };
 
-// Returns the mean of 1 - SSIM over one channel of width x height, row major, and adds `weight`
-// times its gradient by `picture` to `d_picture`. The Gaussian window is 11 x 11 with sigma 1.5,
-// there are zeros beyond the border, and the constants are 0.01² and 0.03² (Wang et al. 2004, as 3D
-// Gaussian Splatting uses it).
+// Returns the mean of 1 - SSIM over one channel of width x height, row major, and adds
+// `weight` times its gradient by `picture` to `d_picture`. The Gaussian window is 11 x
+// 11 with sigma 1.5, pixels beyond the border are zero, and the constants are 0.01² and
+// 0.03² (Wang et al. 2004, as 3D Gaussian Splatting uses it).
 float dssim(const float* picture, const float* target, int width, int height, float weight,
             float* d_picture, SsimScratch& scratch);
 

@@ -1,6 +1,6 @@
 #pragma once
 
-// D-SSIM of the pictures of a group; dssim.h has the definition and the CPU's version.
+// D-SSIM of the pictures of a group; dssim.h has the definition and the CPU version.
 
 #include "fit_group/team.cuh"
 #include "math/ssim.h"
@@ -8,7 +8,7 @@
 namespace v3dg {
 namespace cuda {
 
-// Writes the gradient of D-SSIM by the pictures, three planes each.
+// Writes the gradients of D-SSIM by the pictures, three planes each.
 template <class Fit>
 __device__ void dssim_backward(const Fit& fit, const FitCameras& cameras, int num_views,
                                const float* pictures, float* d_pictures, float* all_maps) {
@@ -62,7 +62,7 @@ __device__ void dssim_backward(const Fit& fit, const FitCameras& cameras, int nu
         maps[6 * num_pixels + i] = scale * ssim.d_xx;
         maps[7 * num_pixels + i] = scale * ssim.d_xy;
     });
-    // The backward pass goes through the window, which is its own transpose.
+    // The backward pass applies the window again, which is its own transpose.
     for_each_pixel([&](uint32_t, uint32_t i, float* maps) {
         float sums[3] = {0, 0, 0};
         blur(maps + 5 * num_pixels, i, i % size, 1, sums);

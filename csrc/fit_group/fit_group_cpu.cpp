@@ -1,5 +1,6 @@
-// One thread fits one group, start to end. The group's frame has its ball at the origin with radius
-// 1, so step sizes mean the same for every group and nothing is lost far from the world's origin.
+// One thread fits one group from start to end. In the group's coordinates the ball is
+// at the origin with radius 1, so that step sizes mean the same for every group, and no
+// precision is lost far from the origin of the world.
 
 #include "fit_group/fit_group.h"
 

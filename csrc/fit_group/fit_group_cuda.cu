@@ -1,10 +1,12 @@
-// Each block, or team of blocks, fits a group from start to end, then takes the next from a queue.
+// Each block, or team of blocks, fits one group from start to end, then claims the next
+// one from a queue.
 //
-// In each step threads project gaussians and order them by depth. Half-warps take cells of 4 x 4
-// pixels, list the gaussians that reach them, blend them front to back, compare, and walk them
-// again for the gradients. Each gaussian has its own slot for each cell, and slots are added up in
-// a fixed order; threads propagate the sums to the parameters, and Adam moves them. So every run
-// has the same result, whatever the order of blocks and warps.
+// In each step threads project gaussians and sort them by depth. Half-warps process
+// cells of 4 x 4 pixels: they list the gaussians that reach a cell, blend them front to
+// back, compare with the target, and visit them again for the gradients. Each gaussian
+// has a slot for each cell, and slots are summed in a fixed order; threads propagate
+// the sums to the parameters, and Adam updates those. So every run has the same result,
+// whatever the order of blocks and warps.
 
 #include "fit_group/fit_group.h"
 
@@ -21,7 +23,7 @@ namespace cuda {
 
 namespace {
 
-// Most gaussians of a small group, whose picture is one region.
+// Largest number of gaussians in a small group, whose picture is a single region.
 constexpr uint32_t kSmallCount = 256;
 constexpr int kStepsPerPoll = 16;
 
@@ -70,7 +72,8 @@ __device__ void differentiate_views(const Fit& fit, const FitCameras& cameras, i
     targets.slots = is_near ? fit.at(fit.layout.near_slots)
                             : reinterpret_cast<float*>(fit.scratch + fit.layout.far_slots);
     const uint32_t capacity = is_near ? num_slots : fit.layout.num_far_slots;
-    // This takes all regions at once, unless they have more slots than there is room for.
+    // All regions are processed at once, unless they have more slots than there is room
+    // for.
     const auto slots_before = [&](int region) {
         return region < fit.num_regions() ? fit.slot_first(region)[0] : num_slots;
     };
@@ -89,7 +92,7 @@ __device__ void differentiate_views(const Fit& fit, const FitCameras& cameras, i
     project_views_backward(fit, cameras, num_views, turn);
 }
 
-// Adds up the errors of the blocks that share the views, in each of them.
+// Sums the errors over the blocks that share the views; every block gets the sums.
 template <class Fit>
 __device__ void sum_errors(const Fit& fit, double error[2][2]) {
     if (threadIdx.x == 0)
@@ -103,7 +106,8 @@ __device__ void sum_errors(const Fit& fit, double error[2][2]) {
     }
 }
 
-// Keeps the result if it is better than the start. `error` has sums over pixels, before and after.
+// Keeps the result if it is better than the initial values. `error` has sums over
+// pixels, before and after.
 template <class Fit>
 __device__ void keep_if_better(const Fit& fit, double error[2][2]) {
     const FitConfig& config = fit.in.config;
@@ -121,21 +125,22 @@ __device__ void keep_if_better(const Fit& fit, double error[2][2]) {
         fit.in.error[2 * fit.job.error + k] = static_cast<float>(error[better][k]);
 }
 
-// Visits the views held out, those of all steps, and those held out again, in batches of at most
-// kViewsAtOnce.
+// Visits the views held out, then those of all steps, then those held out again, in
+// batches of at most kViewsAtOnce.
 template <class Fit>
 __device__ void fit_one_group(const Fit& fit) {
     const FitConfig& config = fit.in.config;
     const int views_per_step = config.views_per_step;
     const int64_t num_visits = static_cast<int64_t>(config.steps) * views_per_step;
-    // Visits of steps count from 0; visits of the views held out come before and after.
+    // Visits of steps count from 0; visits of the views held out come before and after
+    // these.
     const auto views_at = [&](int64_t visit) {
         const int64_t left = visit < 0            ? -visit
                              : visit < num_visits ? views_per_step - visit % views_per_step
                                                   : num_visits + kHeldOutViews - visit;
         return static_cast<int>(min(static_cast<int64_t>(kViewsAtOnce), left));
     };
-    // Returns how many views of a batch are this block's.
+    // Returns how many views of a batch this block processes.
     const auto own_of = [&](int num_views) {
         return fit.view_stride == 1                          ? num_views
                : static_cast<int>(fit.view_rank) < num_views ? 1
@@ -187,13 +192,14 @@ __device__ void fit_one_group(const Fit& fit) {
     if (fit.view_rank == 0) keep_if_better(fit, error);
 }
 
-// The steps are computed once, because powers are slow and all groups take the same steps.
+// The step sizes are computed once, because powers are slow and all groups use the same
+// steps.
 __global__ void steps_kernel(const FitConfig config, FitStep* steps) {
     const unsigned i = blockIdx.x * blockDim.x + threadIdx.x;
     if (i < static_cast<unsigned>(config.steps)) steps[i] = fit_step(config, static_cast<int>(i));
 }
 
-// Counters of the queue, on the device.
+// Counters of the queue, in device memory.
 struct FitQueue {
     unsigned arrived, next;
     unsigned long long groups_done, loss_sum;
@@ -204,8 +210,8 @@ __global__ void __launch_bounds__(Shape::kThreads, kBlocks)
     fit_groups_kernel(const FitGroupsInput in, const FitLayout layout, unsigned char* scratch,
                       unsigned num_blocks, FitTeam* teams, FitQueue* queue) {
     __shared__ FitShared s;
-    // Teams are formed in the order of arrival, so that blocks only wait for blocks that run or
-    // will run.
+    // Teams are formed in the order of arrival, so that blocks only wait for blocks
+    // that are running or certain to run.
     if (threadIdx.x == 0) s.arrival = atomicAdd(&queue->arrived, 1u);
     __syncthreads();
     FitBlock<Shape> fit(in, layout, s, teams, num_blocks, scratch);
@@ -239,12 +245,13 @@ int attribute(cudaDeviceAttr name) {
     return value;
 }
 
-// Starts the kernel and returns true if so many blocks, at most kBlocks, fit on a multiprocessor;
-// otherwise does nothing.
+// Starts the kernel and returns true if this many blocks, at most kBlocks, fit on a
+// multiprocessor; otherwise does nothing.
 template <class Shape, int kBlocks>
 bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stream,
          int blocks = kBlocks) {
-    const size_t reserved = sizeof(FitShared) + 1024;  // our own, and the driver's of each block
+    // The shared memory that this kernel and the driver reserve per block, bytes.
+    const size_t reserved = sizeof(FitShared) + 1024;
     const size_t limit =
         (std::min<size_t>(
             attribute(cudaDevAttrMaxSharedMemoryPerBlockOptin) - sizeof(FitShared),
@@ -252,7 +259,7 @@ bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stre
         16 * 16;
     const size_t most_blocks =
         blocks * static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
-    // The number of blocks a group; these need to run at the same time.
+    // The number of blocks per group; these must run at the same time.
     size_t num_blocks = 1;
     if (attribute(cudaDevAttrCooperativeLaunch) != 0)
         num_blocks = std::clamp<size_t>(
@@ -303,7 +310,8 @@ void fit_groups(const FitGroupsInput& in, const FitExtent& level, cudaStream_t s
     const uint32_t most = level.most;
     const int largest = level.largest;
     const auto multiprocessors = static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
-    // Three concurrent groups on a multiprocessor are faster than two where each has many to fit.
+    // Three concurrent groups per multiprocessor are faster than two if each
+    // multiprocessor has many to fit.
     const bool are_many = level.num_groups > multiprocessors,
                are_most = level.num_groups >= 6 * multiprocessors;
     const auto run_small = [&] {
@@ -312,7 +320,7 @@ void fit_groups(const FitGroupsInput& in, const FitExtent& level, cudaStream_t s
                run<FitShape<512, true, 16>, 1>(in, most, largest, stream) ||
                run<FitShape<256, true, 8>, 3>(in, most, largest, stream, 1);
     };
-    // Shapes with fewer threads are for multiprocessors with less shared memory.
+    // Shapes with fewer threads are for devices with less shared memory.
     const bool runs = most <= kSmallCount && largest <= kRegion
                           ? run_small()
                           : run<FitShape<512, false, 32>, 1>(in, most, largest, stream) ||

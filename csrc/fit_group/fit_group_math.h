@@ -1,7 +1,7 @@
 #pragma once
 
-// Formulas of a fit, for both halves: the views of a group, the parameters that Adam moves, and the
-// sizes of its steps.
+// Formulas of a fit, for the CPU and CUDA: the views of a group, the parameters that
+// Adam updates, and the step sizes.
 
 #include <numeric>
 
@@ -16,10 +16,10 @@ namespace v3dg {
 
 // The paper's code uses a 64 px image with a focal length of 88.9 px.
 constexpr double kFocalPerSize = 88.9 / 64;
-// Border around the ball for what its gaussians draw beyond it.
+// The border around the ball, because gaussians extend beyond it.
 constexpr double kMarginPx = 2.5;
-// The number of views held out: no step looks at them. Start and result are compared on them, and
-// the residual is measured there.
+// The number of views held out, which no step uses. Initial values and result are
+// compared on them, and the residual is measured on them.
 constexpr int kHeldOutViews = 8;
 
 // Multiplies matrices of 3 x 3, row major.
@@ -37,14 +37,14 @@ V3DG_HD V3DG_INLINE void random_rotation(double u0, double u1, double u2, double
     rotation_of_quat(quat, 2.0, r);  // its length is 1
 }
 
-// The size of a group's picture where config.image_size is 0, px.
+// The size of a group's picture if config.image_size is 0, px.
 struct FitSize {
     double focal, side;  // the side is a multiple of 4 px
 };
 
 V3DG_HD V3DG_INLINE FitSize size_of_group(const FitConfig& config, const FitGroup& group) {
-    // This is the focal length at which the ball's footprint (select_math.h) has the wanted number
-    // of px².
+    // The focal length at which the ball's footprint (select_math.h) has the wanted
+    // number of px².
     const double x2 = 1 / (static_cast<double>(config.distance) * config.distance);
     const double focal = sqrt_of(static_cast<double>(group.count) * config.px2_per_gaussian /
                                  solid_angle_of_ball(x2));
@@ -52,8 +52,9 @@ V3DG_HD V3DG_INLINE FitSize size_of_group(const FitConfig& config, const FitGrou
     return {focal, 4 * ::ceil((radius_px + kMarginPx) / 2)};
 }
 
-// Returns view `index` of a group. Fixed views lie on a lattice on the sphere, rotated at random;
-// the views held out, which follow them, lie on another one. Fresh views lie anywhere.
+// Returns view `index` of a group. Fixed views are on a randomly rotated lattice on the
+// sphere; the views held out, whose indices follow, are on another lattice. New views
+// are uniformly random.
 V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGroup& group,
                                           uint64_t index) {
     const auto uniform = [&](uint64_t counter) {
@@ -61,7 +62,8 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
     };
     double rotation[9];
     if (config.num_views > 0) {
-        // Directions lie on a Fibonacci lattice, each with a random roll, all rotated together.
+        // Directions form a Fibonacci lattice; each has a random roll, and all are
+        // rotated together.
         double lattice[9], turn[9];
         const auto num_fixed = static_cast<uint64_t>(config.num_views);
         const bool is_held_out = index >= num_fixed;
@@ -84,7 +86,7 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
         random_rotation(uniform(turned), uniform(turned + 1), uniform(turned + 2), turn);
         multiply(lattice, turn, rotation);
     } else {
-        // These counters are far from those that shift the picture.
+        // These counters differ from those that shift the picture.
         const uint64_t base = (uint64_t(1) << 63) + 4 * index;
         random_rotation(uniform(base), uniform(base + 1), uniform(base + 2), rotation);
     }
@@ -108,9 +110,9 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
     return view;
 }
 
-// Maps visits to views. Fixed views are visited again and again; a fresh view is visited once.
-// `stride` is prime to the number of fixed views, so that all are visited, and successive ones are
-// far apart.
+// Maps visits to views. Fixed views are visited repeatedly; a new view is visited once.
+// `stride` is coprime to the number of fixed views, so that all are visited and
+// successive ones are far apart.
 inline uint64_t visiting_stride(const FitConfig& config) {
     const auto num_views = static_cast<uint64_t>(config.num_views);
     uint64_t stride = 29;
@@ -121,13 +123,15 @@ V3DG_HD inline uint64_t visited_view(const FitConfig& config, uint64_t stride, u
     return config.num_views > 0 ? visit * stride % static_cast<uint64_t>(config.num_views) : visit;
 }
 
-// Returns the index of a view held out. Fresh ones have indices that no step uses.
+// Returns the index of a view held out. If views are new for each visit, its index is
+// one that no step uses.
 V3DG_HD inline uint64_t held_out_view(const FitConfig& config, int i) {
     return config.num_views > 0 ? static_cast<uint64_t>(config.num_views + i) : ~uint64_t(0) - i;
 }
 
-// A group is compared with pictures of its fixed views, or of the views of all steps, and then with
-// those of the views held out. These return how many there are, and the view of one.
+// A group is compared with the pictures of its fixed views, or else of the views of all
+// steps; then with the pictures of the views held out. The functions below return the
+// number of fitted pictures, the number of all pictures, and the view of one picture.
 V3DG_HD inline uint64_t num_fitted_pictures(const FitConfig& config) {
     return config.num_views > 0 ? static_cast<uint64_t>(config.num_views)
                                 : static_cast<uint64_t>(config.steps) * config.views_per_step;
@@ -158,7 +162,7 @@ V3DG_HD V3DG_INLINE ModelView<float> view_of_world(const FitConfig& config, cons
     return mv;
 }
 
-// Returns the transform from the group's frame to a view.
+// Returns the transform from the group's coordinates to a view.
 V3DG_HD V3DG_INLINE ModelView<float> view_of_group(const FitConfig& config, const FitView& view) {
     const float center[3] = {0, 0, 0};
     return view_of_world(config, center, 1, view);
@@ -176,7 +180,7 @@ V3DG_HD V3DG_INLINE Pinhole<float> camera_of(const FitView& view, float scale) {
 }
 
 constexpr float kLeastScale = 1e-5f;    // relative to the radius; far below the size of a pixel
-constexpr float kLeastOpacity = 1e-4f;  // keeps the logit finite and movable
+constexpr float kLeastOpacity = 1e-4f;  // keeps the logit finite and its gradient nonzero
 constexpr float kLog2e = 1.4426950408889634f;
 
 V3DG_HD V3DG_INLINE float log_of_scale(float scale) { return ::logf(max_of(scale, kLeastScale)); }
@@ -185,21 +189,21 @@ V3DG_HD V3DG_INLINE float logit_of_opacity(float opacity) {
     return ::logf(o / (1 - o));
 }
 
-// Clamps a mean's coordinate to the box around the ball. A mean outside might reach no picture of
-// the group, and would stay there, because nothing compares it.
+// Clamps a coordinate of a mean to the box around the ball. A mean outside might reach
+// no picture of the group; then it would have no gradient and stay outside.
 template <class V>
 V3DG_HD V3DG_INLINE V held_in_box(V x) {
     return min_of(all_lanes<V>(1.0f), max_of(all_lanes<V>(-1.0f), x));
 }
 
-// Returns a scale, which neither exceeds the ball's radius, as no gaussian of the target does, nor
-// vanishes: a value that ran away could not come back.
+// Returns a scale that does not exceed the ball's radius, as no gaussian of the target
+// does, and that does not vanish: an extreme value could not recover.
 template <class V>
 V3DG_HD V3DG_INLINE V scale_of_log(V x) {
     return exp2_in_range(min_of(all_lanes<V>(0.0f), max_of(all_lanes<V>(-20.0f), x * kLog2e)));
 }
-// Returns an opacity, which keeps `kLeastOpacity` from 0 and 1, where its gradient vanishes. Alpha
-// is limited to 0.999, so no more is needed.
+// Returns an opacity that differs from 0 and 1 by at least `kLeastOpacity`, because the
+// gradient vanishes there. This range suffices, as alpha is clamped to 0.999.
 template <class V>
 V3DG_HD V3DG_INLINE V opacity_of_logit(V x) {
     constexpr float kMost = 13.287568f;  // log2 of 1 / kLeastOpacity - 1
@@ -232,8 +236,8 @@ V3DG_HD inline float position_step(const FitConfig& config, const FitGroup& grou
     return config.position_in_world ? step.position / group.radius : step.position;
 }
 
-// Returns the loss that start and result are compared by, from the mean |difference| of colour and
-// alpha.
+// Returns the loss by which initial values and result are compared, from the mean
+// |difference| of colour and alpha.
 V3DG_HD inline double residual_loss(const LossWeights& loss, const double error[2]) {
     return loss.l1 * error[0] + loss.alpha * error[1];
 }

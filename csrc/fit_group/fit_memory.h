@@ -1,7 +1,7 @@
 #pragma once
 
-// The places of the arrays of a fit on the device: in the shared memory of blocks, or in their
-// scratch. The host decides that, and this header knows nothing of CUDA.
+// The locations of the arrays of a fit on the device: in the shared memory of blocks,
+// or in scratch memory. The host computes them, so this header does not use CUDA.
 
 #include <cstddef>
 #include <cstdint>
@@ -13,8 +13,8 @@ namespace v3dg {
 namespace cuda {
 
 constexpr int kViewsAtOnce = 2;
-// Each half-warp blends a cell. Masks have a bit for each cell of a region; a larger picture has
-// several regions.
+// Each half-warp blends a cell. A mask has a bit for each cell of a region; a larger
+// picture has several regions.
 constexpr int kCell = 4, kCellPixels = kCell * kCell;
 constexpr int kRegion = 32, kRegionCells = kRegion / kCell;
 static_assert(kRegionCells * kRegionCells == 64 && kCellPixels == 16,
@@ -24,9 +24,9 @@ constexpr int kAtOnce = 4;  // gaussians that a half-warp blends together
 constexpr int kSums = 9;    // FalloffSums and colour
 constexpr int kSumStride = 12;
 
-// The shape that a kernel is compiled for: small groups, which keep what is read repeatedly in
-// shared memory, or large ones; and the number of gaussians of a list that a warp takes from pixels
-// to sums at once.
+// The shape that a kernel is compiled for: small groups, which keep frequently read
+// arrays in shared memory, or large ones; and the number of gaussians that a warp
+// processes between two reductions over pixels.
 template <int kThreadsOfBlock, bool kIsSmall, int kChunkSize>
 struct FitShape {
     static constexpr int kThreads = kThreadsOfBlock, kWarps = kThreads / 32, kChunk = kChunkSize;
@@ -35,33 +35,35 @@ struct FitShape {
     using Index = std::conditional_t<kSmall, uint16_t, uint32_t>;
 };
 
-// The place of an array: in the block's shared memory, or in the team's part of the scratch.
+// The location of an array: in the block's shared memory, or in the team's scratch
+// memory.
 struct Place {
     size_t offset;
     bool is_shared;
 };
 
 struct FitLayout {
-    // These are in shared memory for small groups, and in the scratch for large ones.
+    // These are in shared memory for small groups, and in scratch memory for large
+    // ones.
     size_t records, sorted, keys, mask, slot_first, order, lists, errors;
     size_t list_size;          // bytes of a half-warp's list
-    size_t fragments, staged;  // shared
-    // These are wherever there is room.
+    size_t fragments, staged;  // in shared memory
+    // These are in shared memory as far as it has room.
     Place value, m, v, by_view, sum, sort_keys, sums, near_slots;
-    size_t far_slots, maps, exchange;  // scratch
+    size_t far_slots, maps, exchange;  // in scratch memory
     uint32_t num_near_slots, num_far_slots;
-    size_t shared_bytes;   // bytes of a block
-    size_t scratch_bytes;  // bytes of a team
+    size_t shared_bytes;   // bytes per block
+    size_t scratch_bytes;  // bytes per team
 };
 
-// Returns the bytes of a warp's fragments: two floats a gaussian and pixel, in rows of 33, and four
-// floats a pixel.
+// Returns the bytes of a warp's fragments: two floats per gaussian and pixel, in rows
+// of 33, and four floats per pixel.
 V3DG_HD constexpr size_t fragments_bytes(int chunk) {
     return (chunk * 33 * 2 + 32 * 4) * sizeof(float);
 }
 
-// Allocates memory. Only small groups have arrays in shared memory that large ones have in the
-// scratch.
+// Allocates memory. Some arrays are in shared memory for small groups and in scratch
+// memory for large ones.
 struct Arena {
     bool is_small;
     size_t shared_limit, shared = 0, scratch = 0;  // bytes
@@ -75,25 +77,26 @@ struct Arena {
         scratch += rounded(bytes);
         return scratch - rounded(bytes);
     }
-    // Allocates an array that a small group must have in shared memory.
+    // Allocates an array that must be in shared memory for a small group.
     size_t hot(size_t bytes) { return is_small ? in_shared(bytes) : in_scratch(bytes); }
-    // Allocates an array that a small group has in shared memory while there is room.
+    // Allocates an array that is in shared memory for a small group if there is room.
     Place anywhere(size_t bytes) {
         const bool fits = is_small && shared + rounded(bytes) <= shared_limit;
         return {fits ? in_shared(bytes) : in_scratch(bytes), fits};
     }
 };
 
-// The sizes that a layout follows from.
+// The sizes that determine a layout.
 struct FitSizes {
-    size_t most_gaussians, floats_per_gaussian;  // largest of a group
-    int largest_picture;                         // px a side
+    size_t most_gaussians, floats_per_gaussian;  // maxima over groups
+    int largest_picture;                         // px per side
     bool has_dssim;
     size_t num_blocks;    // blocks that fit a group together
-    size_t shared_limit;  // most bytes of a block
+    size_t shared_limit;  // maximum bytes per block
 };
 
-// Returns the layout. Fields that only large groups have, or only small ones, are 0 for the others.
+// Returns the layout. Fields that only large groups have, or only small ones, are 0 for
+// the others.
 template <class Shape>
 FitLayout layout_of(const FitSizes& sizes) {
     constexpr bool kSmall = Shape::kSmall;
@@ -112,7 +115,8 @@ FitLayout layout_of(const FitSizes& sizes) {
     if (!kSmall) l.sorted = arena.hot((places + 1) * sizeof(Record<float>));
     l.mask = arena.hot(regions * places * sizeof(CellMask));
     l.slot_first = arena.hot(regions * places * sizeof(uint32_t));
-    // A small group's keys are no longer needed when it is in order, before it gets slots.
+    // The keys of a small group are no longer needed once it is sorted, which is before
+    // it gets slots.
     l.keys = kSmall ? l.slot_first : arena.hot(places * sizeof(uint32_t));
     l.order = arena.hot(places * kIndex);
     l.list_size = Arena::rounded((padded + kAtOnce) * kIndex);
@@ -121,8 +125,8 @@ FitLayout layout_of(const FitSizes& sizes) {
     const size_t errors_bytes = kViewsAtOnce * (cells + largest) * 2 * kFloat;
     l.errors = kSmall && errors_bytes <= kFragments ? l.fragments : arena.hot(errors_bytes);
     if (!kSmall) l.staged = arena.in_shared(kWarps * 2 * Shape::kChunk * sizeof(Record<float>));
-    // Fragments, and the lists of small groups before them, are no longer needed when gradients are
-    // written, and not yet needed when keys are sorted.
+    // When gradients are written, fragments and the lists of small groups before them
+    // are no longer needed; when keys are sorted, they are not yet needed.
     const size_t over = kSmall ? l.lists : l.fragments;
     const auto over_fragments = [&](size_t bytes) {
         return num_blocks == 1 && bytes <= l.fragments + kFragments - over ? Place{over, true}
@@ -144,7 +148,7 @@ FitLayout layout_of(const FitSizes& sizes) {
     l.m = arena.anywhere(values * kFloat);
     l.v = arena.anywhere(values * kFloat);
     l.sum = {arena.in_scratch(values * kFloat), false};
-    // There is room for at least the slots of one region.
+    // There is room at least for the slots of one region.
     l.num_far_slots = static_cast<uint32_t>(places * kRegionCells * kRegionCells);
     l.far_slots = arena.in_scratch(l.num_far_slots * kSums * kFloat);
     if (sizes.has_dssim)

@@ -1,7 +1,7 @@
 #pragma once
 
-// The picture of a group on the CPU: its gaussians, sorted by depth, blended over the tiles of a
-// square.
+// The picture of a group on the CPU: its gaussians are sorted by depth and blended over
+// the tiles of a square.
 
 #include "fit_group/fit_group.h"
 #include "project/project.h"
@@ -16,7 +16,7 @@ constexpr int kPlanes = 4;  // red, green, blue, alpha
 static V3DG_INLINE Window square(int size) { return {0, 0, size, size}; }
 static int tiles_across(const FitView& view) { return (view.size + kTileSize - 1) / kTileSize; }
 
-// Projects a draw and sorts its visible gaussians by depth; returns how many there are.
+// Projects a draw and sorts its visible gaussians by depth; returns their number.
 static size_t project_sorted(const Draw<float>& draw, const Pinhole<float>& camera,
                              FitScratch& scratch) {
     Record<float>* records = scratch.records.reserve(draw.count);

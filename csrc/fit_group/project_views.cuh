@@ -1,7 +1,7 @@
 #pragma once
 
-// The gaussians of a group projected into the views of a batch, a thread each, and the gradients
-// of their parameters from those of their records.
+// Projects the gaussians of a group into the views of a batch, one thread each, and
+// computes the gradients of their parameters from those of their records.
 
 #include <type_traits>
 
@@ -11,7 +11,7 @@
 namespace v3dg {
 namespace cuda {
 
-// Calls `body` with the degree as a constant, which unrolls its loops.
+// Calls `body` with the degree as a constant, so that its loops are unrolled.
 template <class Body>
 __device__ void with_degree(int degree, const Body& body) {
     switch (degree) {

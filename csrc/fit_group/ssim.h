@@ -8,21 +8,22 @@
 
 namespace v3dg {
 
-// Two pictures of several channels, interleaved. T is float or double; everything is computed in
-// double.
+// Two pictures of several channels, interleaved. T is float or double; everything is
+// computed in double.
 template <class T>
 struct SsimInput {
     const T *picture, *target;  // [height * width * channels]
-    size_t height, width;       // more than kSsimRadius each
+    size_t height, width;       // each more than kSsimRadius
     size_t channels;
 };
 
-// Returns the mean of SSIM over all pixels and channels. The Gaussian window is 11 x 11 with sigma
-// 1.5, variances are those of the population, the border is mirrored without repeating the edge,
-// and the constants are 0.01² and 0.03². The result is the same on every run.
+// Returns the mean SSIM over all pixels and channels. The Gaussian window is 11 x 11
+// with sigma 1.5, variances are population variances, the border is mirrored without
+// repeating the edge, and the constants are 0.01² and 0.03². Every run gives the same
+// bits.
 //
-// Source: Wang et al., Image quality assessment: from error visibility to structural similarity,
-// 2004.
+// Source: Wang et al., Image quality assessment: from error visibility to structural
+// similarity, 2004.
 template <class T>
 double mean_ssim(const SsimInput<T>& in);
 

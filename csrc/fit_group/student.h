@@ -1,6 +1,7 @@
 #pragma once
 
-// The gaussians of a group while the CPU fits them: parameters, their gradient, and steps of Adam.
+// The gaussians of a group while the CPU fits them: parameters, gradients, and steps of
+// Adam.
 
 #include <algorithm>
 #include <cmath>
@@ -12,8 +13,8 @@
 namespace v3dg {
 namespace V3DG_ISA {
 
-// The parameters of one group are one flat array in the order means, quats, log scales, logits, sh;
-// the gradient and two moments have the same shape.
+// The parameters of one group are one flat array in the order means, quats, log scales,
+// logits, sh; the gradient and two moments have the same layout.
 class Student {
   public:
     Student(const FitConfig& config, const FitGroup& group, const GaussianRows<float>& rows)
@@ -111,8 +112,8 @@ class Student {
         activate();
     }
 
-    // Writes the values back in world units. If one of them is not finite, returns false and writes
-    // nothing.
+    // Writes the values in world units. If one of them is not finite, returns false and
+    // writes nothing.
     bool write(const GaussianRows<float>& rows) const {
         for (size_t i = 0; i < n_ * (11 + num_sh_); ++i)
             if (!std::isfinite(value_[i])) return false;
@@ -152,7 +153,7 @@ class Student {
         return end;
     }
 
-    // Computes the planes that are drawn from the parameters.
+    // Computes the planes to draw from the parameters.
     void activate() {
         const float* p = value_.data();
         float* plane = planes_.data();

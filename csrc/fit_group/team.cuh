@@ -2,9 +2,10 @@
 
 // The blocks that fit a group together, and their memory.
 //
-// Small groups keep what is read repeatedly in shared memory. One block fits a group or, where
-// there are few groups, a pair of blocks, each of which looks at every other view. Large groups are
-// in global memory, and are fitted by teams where there are fewer groups than multiprocessors.
+// Small groups keep frequently read arrays in shared memory. One block fits a group or,
+// if there are few groups, a pair of blocks, each of which processes every other view.
+// Large groups are in global memory; if there are fewer of them than multiprocessors,
+// teams of blocks fit them.
 
 #include "base/launch.cuh"
 #include "fit_group/fit_group_math.h"
@@ -15,7 +16,7 @@ namespace cuda {
 
 constexpr unsigned kLargestTeam = 16;
 
-// The views that a block looks at together.
+// The views that a block processes together.
 struct FitCameras {
     FitStep step;  // the step of these views
     ModelView<float> view[kViewsAtOnce];
@@ -25,27 +26,28 @@ struct FitCameras {
 
 constexpr int kBetweenGroups = 2;
 
-// State that the blocks of a group share besides arrays.
+// State that the blocks of a group share, without arrays.
 struct FitTeam {
-    unsigned arrived;  // arrivals at barriers so far
+    unsigned arrived;  // number of arrivals at barriers
     unsigned unit, ticket;
-    int cancel[kBetweenGroups + 1];    // alternates within steps, and has one between groups
-    uint32_t num_slots[kLargestTeam];  // slots of each block's part
+    // Alternates within steps; the last element is used between groups.
+    int cancel[kBetweenGroups + 1];
+    uint32_t num_slots[kLargestTeam];  // slots in each block's part
     double error[kViewsAtOnce][2][2];  // errors of each block's views, before and after
 };
 
-// State of a block in shared memory besides arrays.
+// State of a block in shared memory, without arrays.
 struct FitShared {
     FitCameras cameras[2];  // cameras of this step and the next
-    FitTeam own;            // team of a single block
+    FitTeam own;            // the team of a single block
     uint32_t warp_total[32];
     FitJob job;
     unsigned arrival;
     int cancel;
 };
 
-// A block that fits groups, one after another: its place among the blocks that fit a group with it,
-// the barriers between them, and the places of their arrays.
+// A block that fits groups, one after another: its rank among the blocks that fit the
+// same group, the barriers between them, and the locations of their arrays.
 template <class Shape>
 struct FitBlock : Shape {
     using Shape::kChunk, Shape::kSmall, Shape::kThreads, Shape::kWarps;
@@ -54,12 +56,12 @@ struct FitBlock : Shape {
     const FitGroupsInput& in;
     const FitLayout& layout;
     FitShared& s;
-    FitTeam& all;   // The blocks that fit the group; those of a small group share its views.
-    FitTeam& team;  // The blocks that look at the same views; a block of a small group is alone.
+    FitTeam& all;   // The blocks that fit the group; in a small group they share its views.
+    FitTeam& team;  // The blocks that process the same views; a block of a small group is alone.
     const unsigned team_rank, team_size;
-    const unsigned view_rank, view_stride;  // the block's views of a batch
+    const unsigned view_rank, view_stride;  // the block's share of a batch's views
     unsigned char* const scratch;
-    // Gradients by view of small groups whose blocks share the views.
+    // Gradients by view, for small groups whose blocks share the views.
     unsigned char* const exchange;
     unsigned char* const hot;
     // The current group.
@@ -97,7 +99,8 @@ struct FitBlock : Shape {
 
     __device__ bool leads() const { return threadIdx.x == 0 && team_rank == 0; }
     __device__ bool leads_all() const { return leads() && view_rank == 0; }
-    // Returns the number of a thread in the team; neighbouring warps are in different blocks.
+    // Returns the index of a thread in the team; neighbouring warps are in different
+    // blocks.
     __device__ uint32_t first() const {
         return (threadIdx.x / 32 * team_size + team_rank) * 32 + threadIdx.x % 32;
     }
@@ -105,7 +108,7 @@ struct FitBlock : Shape {
 
     __device__ unsigned num_blocks() const { return team_size * view_stride; }
 
-    // Waits for all blocks that look at the same views.
+    // Waits for all blocks that process the same views.
     __device__ void sync() const {
         if (team_size > 1)
             arrive_and_wait(-1);
@@ -113,9 +116,9 @@ struct FitBlock : Shape {
             __syncthreads();
     }
 
-    // Waits for all blocks that fit the group. Afterwards s.cancel is the same in all of them: the
-    // value that read_cancel() left in `note`, which must not be overwritten before all have
-    // reached another barrier.
+    // Waits for all blocks that fit the group. Afterwards s.cancel is the same in all
+    // of them: the value that read_cancel() wrote to `note`, which must not be
+    // overwritten before all blocks have reached another barrier.
     __device__ void sync_all(int note) const {
         if (num_blocks() > 1)
             arrive_and_wait(note);
@@ -148,15 +151,16 @@ struct FitBlock : Shape {
         return reinterpret_cast<float*>((place.is_shared ? shared_memory() : scratch) +
                                         place.offset);
     }
-    // Gaussians have places: those of view b begin at b * n_padded. Blended records have ranks. In
-    // a small group ranks are places, and lists follow `order`; in a large one they are positions
-    // by depth, in which the records are sorted.
+    // A place is the index of a gaussian in a view: places of view b begin at b *
+    // n_padded. A rank is the index of a blended record. In a small group ranks are
+    // places, and lists follow `order`; in a large one ranks are positions by depth, in
+    // which the records are sorted.
     __device__ Record<float>* records() const { return hot_at<Record<float>>(layout.records); }
     __device__ Record<float>* ranked() const {
         return hot_at<Record<float>>(kSmall ? layout.records : layout.sorted);
     }
     __device__ uint32_t num_places() const { return kViewsAtOnce * n_padded; }
-    // Returns the rank of a record that draws nothing.
+    // Returns the rank of an empty record.
     __device__ uint32_t nothing() const { return num_places(); }
     __device__ uint32_t* keys() const { return hot_at<uint32_t>(layout.keys); }
     __device__ Index* order() const { return hot_at<Index>(layout.order); }
@@ -170,9 +174,9 @@ struct FitBlock : Shape {
     __device__ Index* list(int half) const {
         return hot_at<Index>(layout.lists + (2 * warp() + half) * layout.list_size);
     }
-    // Returns the gradient by the exponent of a gaussian at a pixel, and its weight there,
-    // [gaussian][pixel]. Rows have a spare column, so that lanes that read one pixel each of
-    // different gaussians access different banks.
+    // Returns the gradients by the exponent of each gaussian at each pixel, and its
+    // weight there, [gaussian][pixel]. Rows have a spare column, so that lanes that
+    // read the same pixel of different gaussians access different banks.
     __device__ float2* fragments() const {
         return reinterpret_cast<float2*>(shared_memory() + layout.fragments +
                                          threadIdx.x / 32 * fragments_bytes(kChunk));
@@ -186,9 +190,9 @@ struct FitBlock : Shape {
                2 * kChunk * (threadIdx.x / 32);
     }
     __device__ int num_regions() const { return regions_across * regions_across; }
-    // Returns the gradient by the values from view b of a batch. Blocks that share views write the
-    // gradients of one batch while others may still read those of the batch before, so there are
-    // two `turn`s.
+    // Returns the gradients by the values from view b of a batch. Blocks that share
+    // views write the gradients of one batch while others may still read those of the
+    // batch before, so two values of `turn` alternate.
     __device__ float* gradient(int turn, int b) const {
         if (view_stride == 1) return at(layout.by_view) + static_cast<size_t>(b) * num_values;
         return reinterpret_cast<float*>(exchange) +

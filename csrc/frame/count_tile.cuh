@@ -1,7 +1,7 @@
 #pragma once
 
-// Counts records into tiles by whole warps. Neighbouring gaussians mostly lie in the same tile, so
-// lanes with the same tile share one atomic operation.
+// Counts records per tile with whole warps. Neighbouring gaussians are mostly in the
+// same tile, so lanes with the same tile share one atomic operation.
 
 #include "base/launch.cuh"
 #include "frame/tile_list.h"
@@ -9,21 +9,23 @@
 namespace v3dg {
 namespace cuda {
 
-// Adds one to count[tile] for every lane that has a tile; called by a whole warp.
+// Adds one to count[tile] for every lane that has a tile. Called by a whole warp.
 __device__ inline void count_tile(uint32_t* count, uint32_t tile) {
     const unsigned peers = __match_any_sync(kAllLanes, tile);
     if (tile != kNoTile && threadIdx.x % 32 + 1 == unsigned(__ffs(peers)))
         atomicAdd(count + tile, unsigned(__popc(peers)));
 }
 
-// Tiles of a warp's records beyond the first of each; they are collected until there are 32.
+// The tiles of a warp's records beyond the first tile of each record; collected until
+// there are 32.
 struct WaitingTiles {
     uint32_t tile[31 + 32 * (kFewTiles - 1)];
     unsigned count;
 };
 
-// Calls add(k, at) for each tile k of a lane beyond the first, where `at` is its place after the
-// `num_waiting`, and adds it to these; called by a whole warp.
+// Calls add(k, at) for each tile k of a lane beyond the first, where `at` is its index
+// in the queue, and adds the number of these tiles to `num_waiting`. Called by a whole
+// warp.
 template <class Add>
 __device__ void let_wait(unsigned num_tiles, unsigned& num_waiting, const Add& add) {
     const unsigned lane = threadIdx.x % 32;
@@ -35,8 +37,8 @@ __device__ void let_wait(unsigned num_tiles, unsigned& num_waiting, const Add& a
     }
 }
 
-// Adds one to the count of each tile of a lane, or adds the tile to the waiting ones; called by a
-// whole warp.
+// Adds one to the count of each tile of a lane, or adds the tile to the queue. Called
+// by a whole warp.
 template <class TileOf>
 __device__ void count_tiles(uint32_t* count, unsigned num_tiles, const TileOf& tile_of,
                             WaitingTiles& waiting) {
@@ -52,7 +54,8 @@ __device__ void count_tiles(uint32_t* count, unsigned num_tiles, const TileOf& t
     __syncwarp();
 }
 
-// Counts the tiles that still wait. It is called once, at the end, by a whole warp.
+// Counts the tiles that are left in the queue. Called once, at the end, by a whole
+// warp.
 __device__ inline void count_waiting(uint32_t* count, const WaitingTiles& waiting) {
     const unsigned lane = threadIdx.x % 32;
     count_tile(count, lane < waiting.count ? waiting.tile[lane] : kNoTile);

@@ -7,22 +7,22 @@
 namespace v3dg {
 namespace cuda {
 
-// The result of a budget: the tolerance that was used; or that the coarsest cut, of `least`
-// gaussians, exceeds the budget and nothing was selected.
+// The result of a budget: the tolerance that was used; or, if the coarsest cut exceeds
+// the budget, its number of gaussians `least`, and nothing was selected.
 struct CutChoice {
     float tolerance_px2;
     bool exceeds_budget;
     unsigned long long least;
 };
 
-// Counters on the device; all start at 0. Elements beyond a capacity are counted but not stored,
-// and nothing is then drawn.
+// Counters on the device; all start at 0. Elements beyond a capacity are counted but
+// not stored, and then nothing is drawn.
 struct FrameCounters {
     unsigned long long items, gaussians, in_frustum, records, entries;
-    unsigned long long large;   // Records over many tiles, or parts of them, in whole batches.
-    unsigned long long spread;  // entries of scratch that lists need
-    unsigned long long slots;   // slots of gradients, in a frame that keeps a tape
-    CutChoice choice;           // valid where there is a budget
+    unsigned long long large;   // records over many tiles, or parts of those, in whole batches
+    unsigned long long spread;  // scratch entries that lists need
+    unsigned long long slots;   // gradient slots, in a frame with a tape
+    CutChoice choice;           // valid if there is a budget
 };
 
 // The numbers of elements that a frame's buffers hold.
@@ -33,11 +33,13 @@ struct Capacity {
         return items == other.items && records == other.records && large == other.large &&
                entries == other.entries && spread == other.spread;
     }
-    // These two have no branches, so that a kernel loads all counters at once.
+    // These two functions have no branches, so that a kernel loads all counters at
+    // once.
     V3DG_HD bool holds_items(unsigned long long num_items, unsigned long long num_gaussians) const {
         return (num_items <= items) & (num_gaussians <= records);
     }
-    // Returns whether there is room for all elements that are counted before lists are spread.
+    // Returns whether there is room for all elements that are counted before lists are
+    // spread.
     V3DG_HD bool holds_entries(const FrameCounters& counters) const {
         return holds_items(counters.items, counters.gaussians) & (counters.large <= large) &
                (counters.entries <= entries);

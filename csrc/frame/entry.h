@@ -1,6 +1,7 @@
 #pragma once
 
-// An entry of a tile's list on the CPU, in one word. (CUDA's entries are in tile_list.h.)
+// An entry of a tile's list on the CPU, packed into one integer. CUDA's entries are in
+// tile_list.h.
 
 #include <cstdint>
 #include <cstring>
@@ -12,8 +13,9 @@ namespace v3dg {
 constexpr int kBlockSize = 4;  // px
 constexpr int kTileBlocks = kTileSize / kBlockSize;
 
-// The blocks of a tile that a box in it meets. Columns have 6 bits, the first and, higher, the
-// last; rows have 6 more. A block has a bit, row by row.
+// Tables from the columns, or the rows, of a box in a tile to the blocks of the tile.
+// An index has the first column in its lower 3 bits and the last one in the upper 3.
+// The result is a mask with a bit per block, row by row.
 struct BlocksOfBox {
     uint64_t columns[64] = {}, rows[64] = {};
     constexpr BlocksOfBox() {
@@ -36,16 +38,16 @@ V3DG_INLINE uint32_t depth_bits_of(float depth) {
     return bits;
 }
 
-// The format of an entry. From the highest bits on it has the difference of the depth's bits to the
-// least depth, the index of the record, and the box in the tile. Where depths and records are too
-// many for a word, the lowest bits of depths are dropped.
+// The format of an entry. From the highest bits on, an entry has the depth's bits minus
+// the smallest depth's bits, the index of the record, and the box in the tile. If an
+// integer is too small for all of these, the lowest bits of depths are dropped.
 struct EntryFormat {
     static constexpr int kBoxBits = 12;
     int depth_shift = kBoxBits, dropped_bits = 0;
     uint32_t least_depth = 0;
 
-    // Returns the format for records below num_records and for depths with bits from `least` to
-    // `most`.
+    // Returns the format for record indices below num_records and depths whose bits are
+    // from `least` to `most`.
     static constexpr EntryFormat of(uint64_t num_records, uint32_t least, uint32_t most) {
         EntryFormat f;
         f.least_depth = least;

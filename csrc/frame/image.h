@@ -18,19 +18,21 @@ struct Window {
     V3DG_INLINE bool contains(int x, int y) const { return x0 <= x && x < x1 && y0 <= y && y < y1; }
 };
 
-// A pixel stops where its transmittance is low, and everything behind is left out. As gsplat's
-// pixels do, it stops before a gaussian that would leave kMinTransmittance or less, which is left
-// out, too.
+// The rule by which a pixel stops when its transmittance is low, and ignores everything
+// behind. Like gsplat, it stops before a gaussian that would leave a transmittance of
+// kMinTransmittance or less; this gaussian is not blended.
 struct StopsBefore {};
-// A pixel stops after the gaussian that leaves this transmittance or less. The rest of the light is
-// distributed over what was blended, in proportion. So no channel is off by more than this fraction
-// of the difference between what was blended and what is behind it.
+// The rule by which a pixel stops after the gaussian that leaves this transmittance or
+// less. The remaining transmittance is distributed in proportion over the gaussians
+// that were blended. So the error of a channel is at most this fraction of the
+// difference between the blended colour and the colour behind.
 template <class T>
 struct StopsBehind {
     T transmittance;
 };
 
-// The value of pictures for StopsBefore, which is negative; other values mean StopsBehind.
+// The value of `min_transmittance` that selects StopsBefore. It is negative; other
+// values select StopsBehind.
 constexpr float kStopsBefore = -1.0f;
 template <class T, class Draw>
 V3DG_INLINE void with_stop(float min_transmittance, const Draw& draw) {
@@ -47,7 +49,8 @@ struct Picture {
     T background[3];
     T* color;  // premultiplied, composed over the background
     T* alpha;
-    // The expected depth: sum of weight * depth over alpha, 0 where alpha is 0; may be null.
+    // The expected depth: sum of weight * depth over alpha, 0 if alpha is 0; may be
+    // null.
     T* depth;
     T* count = nullptr;  // number of blended gaussians, instead of depth; may be null
     float min_transmittance = kStopsBefore;
@@ -63,12 +66,12 @@ struct PictureGradient {
 
 namespace cuda {
 
-// A block blends one tile, and each of its warps a part of four rows.
+// A block blends one tile, and each of its warps four rows of it.
 constexpr int kFrameTileWidth = 32, kFrameTileHeight = 16;
-// The memory of a picture, as in Picture<float>. It may be requested after the first stages of a
-// frame are enqueued.
+// The destination of a picture, as in Picture<float>. It may be requested after the
+// first stages of a frame were enqueued.
 struct PicturePlanes {
-    float *color, *alpha, *depth;  // all may be null, or depth alone
+    float *color, *alpha, *depth;  // all may be null, or only depth
 };
 
 // One picture of a batch.
@@ -76,12 +79,13 @@ struct FrameImage {
     Intrinsics<float> camera;
     int width, height;
     int tile_columns, tile_rows;
-    uint32_t first_tile;  // number in the batch; tiles are numbered row by row
+    uint32_t first_tile;  // index in the batch; tiles are numbered row by row
     float background[3];
     PicturePlanes planes;
 };
 
-// The pictures of a scene's frame, one for each eye. Tiles of the second follow those of the first.
+// The pictures of a scene's frame, one per eye. The tiles of the second follow those of
+// the first.
 struct EyeImages {
     FrameImage image[2];
     uint32_t count;

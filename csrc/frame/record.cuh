@@ -1,6 +1,7 @@
 #pragma once
 
-// A record as kernels load and store it: as vectors of 16 bytes, the last one in halves.
+// Loading and storing of records in kernels: a record is vectors of 16 bytes, the last
+// of which is half used.
 
 #include <cstddef>
 
@@ -40,7 +41,7 @@ __device__ inline Record<float> record_of_vectors(const float4& a, const float4&
             .y1 = box.y1};
 }
 
-// Loads a record; the compiler leaves out fields that the caller does not use.
+// Loads a record; the compiler omits fields that the caller does not use.
 __device__ inline Record<float> load_record(const RecordPlanes& records, uint32_t record,
                                             const RecordBox& box) {
     const float4* ellipse = ellipse_of(records, record);

@@ -1,6 +1,6 @@
 #pragma once
 
-// A record: one gaussian on the image, ready to blend.
+// A record: one gaussian projected onto the image, ready to blend.
 
 #include <cstdint>
 
@@ -8,18 +8,18 @@
 
 namespace v3dg {
 
-// A gaussian on the image; see Ellipse for L.
+// A gaussian on the image; Ellipse documents L.
 template <class T>
 struct Record {
     T u, v, l11, l12, l22, log2_opacity;
     T color[3];
     T depth;
-    // The first and last pixel whose centre the gaussian can reach, clipped to the image or the
-    // window that is drawn.
+    // The first and last pixel whose centre the gaussian can reach, clipped to the
+    // image or to the window.
     uint16_t x0, x1, y0, y1;
 };
 
-// Sets all of a record but its colour and its pixels.
+// Sets all fields except colour and pixels.
 template <class T>
 V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, Record<T>& r) {
     r.u = e.u;
@@ -31,7 +31,7 @@ V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, Record<T>& r) {
     r.depth = e.depth;
 }
 
-// Sets all of a record but its colour.
+// Sets all fields except colour.
 template <class T>
 V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, const PixelBox<int>& box, Record<T>& r) {
     set_ellipse(e, r);
@@ -41,8 +41,8 @@ V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, const PixelBox<int>& b
     r.y1 = static_cast<uint16_t>(box.y1);
 }
 
-// The sum over pixels of the absolute gradient by a record's centre, along both axes: how strongly
-// pixels pull at it, even in opposite directions.
+// The sum over pixels of the absolute gradient by a record's centre, for both axes. It
+// is large even where the gradients of different pixels cancel.
 template <class V>
 struct CenterSize {
     V u, v;
@@ -54,7 +54,7 @@ struct CenterSize {
     }
 };
 
-// Gradients by centres that are reported, (N, 2) each, in 1 / px; either may be null.
+// Gradients by centres for the caller, (N, 2) each, in 1 / px; either may be null.
 template <class T>
 struct CenterGradients {
     T* sum;

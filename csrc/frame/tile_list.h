@@ -1,7 +1,7 @@
 #pragma once
 
-// The tiles that a record may touch, and the lists that tiles are blended from, on CUDA. Tiles are
-// numbered through a batch of pictures, row by row.
+// The tiles that a record may touch, and the lists from which tiles are blended, on
+// CUDA. Tiles are numbered consecutively over a batch of pictures, row by row.
 
 #include <cstdint>
 #include <cstring>
@@ -13,34 +13,36 @@
 namespace v3dg {
 namespace cuda {
 
-// A gaussian in the list of a tile, in one word: 54 bits of depth and record, and 10 of its box in
-// the tile. A record has 26 bits and a depth 28, which is exact; in frames with room for more
-// records, a record has up to two bits more and a depth up to two fewer. Lists are blended by
-// ascending depth, ties by record. Where depths are not exact, entries of one depth are ordered by
-// the depths of their records, unless a tile has more than a thousand that share 26 bits.
+// A gaussian in the list of a tile, packed into 64 bits: 54 bits for depth and record,
+// and 10 for its box in the tile. A record has 26 bits and a depth 28, which is exact.
+// In frames with room for more records, a record has up to two more bits and a depth up
+// to two fewer. Lists are blended by ascending depth; ties are ordered by record. If
+// depths are not exact, entries of equal depth are ordered by the depths of their
+// records, unless more than a thousand entries of a tile share 26 bits.
 struct TileEntry {
     unsigned long long key;
 };
 constexpr int kLeastRecordBits = 26, kMostRecordBits = 28, kEntryBoxBits = 10;
 constexpr unsigned long long kMostFrameRecords = 1ull << kMostRecordBits;
-constexpr int kEntryBlockSize = 4;  // px; boxes count blocks
-// 32 octaves behind the near depth, and everything farther.
+constexpr int kEntryBlockSize = 4;  // px; boxes are in units of these blocks
+// 32 octaves beyond the near depth; everything farther gets this value.
 constexpr uint32_t kLastEntryDepth = (1u << 28) - 1;
 
 constexpr uint32_t kExactDepths = ~0u << 4;
 
-// Returns the bits of the upper half of an entry that are depth, in a frame with room for this many
-// records.
+// Returns the mask of the depth bits in the upper half of an entry, in a frame with
+// room for this many records.
 inline uint32_t depth_mask_of_entries(unsigned long long most_records) {
     uint32_t mask = kExactDepths;
     for (auto held = 1ull << kLeastRecordBits; held < most_records; held *= 2) mask <<= 1;
     return mask;
 }
 
-// Returns the depth of an entry, in steps of a float's last bit, or of up to four of them where
-// records need more bits. Precondition: the depth is at least the camera's near depth.
+// Returns the depth of an entry, in steps of a float's last bit, or of up to four of
+// them if records need more bits. Precondition: the depth is at least the camera's near
+// depth.
 V3DG_HD inline uint32_t entry_depth(float depth, float near_depth, uint32_t depth_mask) {
-    uint32_t depth_bits, near_bits;  // positive floats have the order of their bits
+    uint32_t depth_bits, near_bits;  // positive floats are ordered like their bits
     std::memcpy(&depth_bits, &depth, sizeof depth_bits);
     std::memcpy(&near_bits, &near_depth, sizeof near_bits);
     return min_of(depth_bits - near_bits, kLastEntryDepth) & depth_mask >> 4;
@@ -49,8 +51,8 @@ V3DG_HD inline uint32_t entry_depth(float depth, float near_depth, uint32_t dept
 constexpr uint32_t kTileBlockColumns = kFrameTileWidth / kEntryBlockSize;
 constexpr uint32_t kTileBlockRows = kFrameTileHeight / kEntryBlockSize;
 
-// The first and last block that a record's pixels lie in, relative to the corner of the picture or
-// of a tile.
+// The first and last block that contain pixels of a record, relative to the corner of
+// the picture or of a tile.
 struct EntryBox {
     uint32_t x0, x1, y0, y1;
 };
@@ -62,8 +64,8 @@ V3DG_HD inline EntryBox entry_box(const Box& pixels) {
     return {block_of(pixels.x0), block_of(pixels.x1), block_of(pixels.y0), block_of(pixels.y1)};
 }
 
-// Makes an entry in the tile of this column and row, relative to the origin of the box.
-// Precondition: the box meets the tile.
+// Returns an entry for the tile in this column and row, relative to the origin of the
+// box. Precondition: the box meets the tile.
 V3DG_HD inline TileEntry tile_entry(uint32_t depth, uint32_t record, const EntryBox& box,
                                     uint32_t column, uint32_t row) {
     const int left = static_cast<int>(kTileBlockColumns * column);
@@ -78,7 +80,7 @@ V3DG_HD inline TileEntry tile_entry(uint32_t depth, uint32_t record, const Entry
             ((3 - (y1 - y0)) << 8 | (7 - (x1 - x0)) << 5 | y0 << 3 | x0)};
 }
 
-// Return the first 26 bits of depth, and the 28 bits after them.
+// Return the first 26 bits of the depth, and the 28 bits after them.
 V3DG_HD inline uint32_t key_depth(TileEntry e) {
     return static_cast<uint32_t>(e.key >> (kEntryBoxBits + kMostRecordBits));
 }
@@ -86,30 +88,32 @@ V3DG_HD inline uint32_t key_order(TileEntry e) {
     return static_cast<uint32_t>(e.key >> kEntryBoxBits) & ((1u << kMostRecordBits) - 1);
 }
 
-// Returns a bit for each 4 x 4 pixels of the tile, row by row, that the record's box meets.
+// Returns a mask of the 4 x 4 blocks of the tile that the record's box meets, row by
+// row.
 V3DG_HD inline uint32_t blocks_of(TileEntry e) {
-    // The word holds the first block, and how many columns and rows are missing from all.
+    // The entry stores the first block, and how many columns and rows the box lacks to
+    // the full size.
     static_assert(kTileBlockColumns == 8 && kTileBlockRows == 4, "a row of blocks is a byte");
     const uint32_t box = static_cast<uint32_t>(e.key), fewer = box >> 5;
     return (0xffu >> (fewer & 7)) * (0x01010101u >> (fewer & 24)) << (box & 31);
 }
 
-// A tile, or one of its parts, in the order in which they are blended. The parts of a tile are
-// contiguous, and the first says how the tile's list was spread if that is long.
+// A tile, or one of its parts, in blending order. The parts of a tile are contiguous;
+// the first one describes how the tile's list was spread, if it is long.
 struct TilePlan {
-    uint32_t tile, image;  // kNoTile in an empty plan
-    uint32_t lowest;       // lowest depth of the buckets
+    uint32_t tile, image;  // kNoTile for an empty plan
+    uint32_t lowest;       // lowest depth in the buckets
     uint16_t last_bucket, shift;
     uint8_t part, log2_parts;
     // The list is in windows, so that parts of the tile can be blended concurrently.
     bool in_windows;
-    bool in_scratch;  // The spread list is in the scratch, and not in its own place.
-    unsigned long long first_scratch;  // place of the list in the scratch, if it needs any
+    bool in_scratch;                   // The spread list is in scratch memory, not in place.
+    unsigned long long first_scratch;  // index of the list in scratch memory, if it is there
 };
 constexpr uint32_t kNoTile = ~0u;
-constexpr int kPlanClasses = 64;  // classes of plans by load
+constexpr int kPlanClasses = 64;  // classes of plans, by load
 
-// The pixels of a Record.
+// The pixel box of a Record.
 struct RecordBox {
     uint16_t x0, x1, y0, y1;
 };
@@ -128,18 +132,19 @@ struct RecordPlanes {
     float* ellipse;       // (N, 8) u, v, l11, l12, l22, log2_opacity, two channels
     float* rest;          // (N, 2) the third channel and the depth
     RecordBox* box;       // null unless the frame keeps a tape, because few records need it later
-    uint32_t depth_mask;  // mask of the upper half of entries
+    uint32_t depth_mask;  // mask of the depth bits in the upper half of entries
 
     V3DG_HD uint32_t record_of(TileEntry e) const {
         return static_cast<uint32_t>(e.key >> kEntryBoxBits) &
                ~(depth_mask << (32 - kEntryBoxBits));
     }
-    // depth_of() has the order of depths. is_exact() says whether equal values mean equal depths.
+    // Returns a value with the order of depths. is_exact() says whether equal values
+    // mean equal depths.
     V3DG_HD uint32_t depth_of(TileEntry e) const {
         return static_cast<uint32_t>(e.key >> 32) & depth_mask;
     }
     V3DG_HD bool is_exact(TileEntry e) const {
-        // The last depth stands for many.
+        // The last value represents many depths.
         return depth_mask == kExactDepths && depth_of(e) != kExactDepths;
     }
 };
@@ -150,32 +155,36 @@ struct FrameLists {
     const uint32_t* image_of_tile;  // [num_tiles]
     uint32_t num_tiles;
     RecordPlanes records;                  // ordered by item and gaussian, with gaps between items
-    const unsigned long long* tile_first;  // [num_tiles + 1] into entries
-    TileEntry *entries, *scratch;          // each tile's entries in any order
+    const unsigned long long* tile_first;  // [num_tiles + 1] indices into `entries`
+    TileEntry *entries, *scratch;          // the entries of each tile, unordered
     FrameCounters* counters;
     Capacity capacity;  // at most kMostFrameRecords records
-    TilePlan* plans;    // [num_plans] scratch
-    // [2 * kPlanClasses], zero before: the number of plans of each class, and of those that have a
-    // place.
+    TilePlan* plans;    // [num_plans] scratch memory
+    // [2 * kPlanClasses] initially zero: the number of plans of each class, and the
+    // number of those already written.
     uint32_t* plan_counts;
-    unsigned* taken;          // Plans beyond the first of each block of spread_kernel; zero before.
-    uint32_t num_plans;       // num_tiles, or most_plans() where tiles may be in parts
+    // Plans claimed beyond the first of each block of spread_kernel; initially zero.
+    unsigned* taken;
+    uint32_t num_plans;       // num_tiles, or most_plans() if tiles may be in parts
     float min_transmittance;  // shared by all images
-    // The memory of images without a place of their own: of the first and of the second.
+    // The destinations of images without one of their own: of the first and of the
+    // second.
     PicturePlanes planes[2] = {};
-    bool has_depth = true;            // must be true if any image has depth
-    FrameCounters* report = nullptr;  // copy of the counters on the host; may be null
+    bool has_depth = true;  // must be true if any image has depth
+    // Destination of a copy of the counters on the host; may be null.
+    FrameCounters* report = nullptr;
 };
 
-// A record over more tiles than this is handled row by row of tiles.
+// A record over more tiles than this is processed by rows of tiles.
 constexpr unsigned kFewTiles = 4;
 
-// The tiles that a record's blocks lie in: the first one, and how many there are.
+// The tiles that contain a record's blocks: the first one, and the number of columns
+// and rows.
 struct TileBox {
     uint32_t left, top, columns, count;
 
-    // Return the distance of tile k of at most kFewTiles from the first. A box of more than two
-    // columns has one row.
+    // Return the distance of tile k, of at most kFewTiles, from the first. A box of
+    // more than two columns has one row.
     V3DG_HD uint32_t columns_to(uint32_t k) const {
         return columns > 2 ? k : columns == 2 ? k & 1 : 0;
     }
@@ -191,12 +200,14 @@ V3DG_HD inline TileBox tile_box(const EntryBox& b) {
     return {left, top, columns, columns * rows};
 }
 
-// A record over few tiles as the scattering kernel reads it: its depth, the number of its first
-// tile in the picture, and its blocks relative to that tile: the first, and how many follow.
+// A record over few tiles, packed for the scattering kernel: its depth, the index of
+// its first tile in the picture, and its blocks relative to that tile: the first block,
+// and the number of further ones.
 using FewTiles = unsigned long long;
-constexpr FewTiles kManyTiles = ~FewTiles(0);  // a box of five columns, which no such record has
+// The code of a box of five columns, which no such record has.
+constexpr FewTiles kManyTiles = ~FewTiles(0);
 constexpr int kFewBoxBits = 14, kFewTileBits = 22;
-// Records in later tiles count as large.
+// Records whose first tile is later count as large.
 constexpr uint32_t kMostFewTile = (1u << kFewTileBits) - 1;
 
 V3DG_HD inline FewTiles few_tiles(uint32_t depth, uint32_t tile, const EntryBox& b) {
@@ -215,12 +226,12 @@ V3DG_HD inline EntryBox box_of(FewTiles f) {
     return {x0, x0 + (box >> 4 & 31), y0, y0 + (box & 15)};
 }
 
-// A record over more than kFewTiles tiles, or some of its rows of tiles with its pixels in those.
-// They come in batches of kLargeAtOnce of one item, hence of neighbours in one picture; a batch is
-// padded at its end. A batch has no more than kMostLargeTiles tiles, or one row of tiles of each
-// record.
+// A record over more than kFewTiles tiles, or some of its rows of tiles with the pixels
+// in these. Large records are stored in batches of kLargeAtOnce from one item, and
+// therefore from neighbours in one picture; a batch is padded at its end. A batch
+// covers at most kMostLargeTiles tiles, or one row of tiles of each record.
 struct alignas(16) LargeRecord {
-    uint32_t record, image;  // kNoRecord in the padding
+    uint32_t record, image;  // kNoRecord for padding
     RecordBox box;
 };
 constexpr unsigned kLargeAtOnce = 16;
@@ -232,11 +243,13 @@ struct ItemTiles {
     uint32_t num_records, record, first_tile, columns;
 };
 
-// The counts of project() in the tiles, and scratch of tile_bin(). All is zero before project().
+// The counts of records per tile by project(), and scratch memory of tile_bin(). All is
+// zero before project().
 struct TileCounts {
-    uint32_t* count;  // [num_tiles] records over at most kFewTiles; zero after tile_bin()
-    unsigned *scan_ticket, *taken;  // parts of the scan; items whose records are scattered
-    unsigned long long* state;      // [tile_bin_parts(num_tiles)]
+    uint32_t* count;  // [num_tiles] records over at most kFewTiles tiles; zero after tile_bin()
+    // Claimed parts of the scan; claimed items whose records are scattered.
+    unsigned *scan_ticket, *taken;
+    unsigned long long* state;  // [tile_bin_parts(num_tiles)]
 };
 
 }  // namespace cuda

@@ -1,5 +1,5 @@
-// Each thread writes the shape of a gaussian, or one of its SH bases. Blocks take neighbours, so
-// they look up few clusters.
+// Each thread writes the shape of a gaussian, or one of its SH bases. Blocks process
+// neighbouring rows, so they look up few clusters.
 
 #include "base/launch.cuh"
 #include "gather/gather.h"
@@ -12,8 +12,8 @@ namespace {
 
 constexpr unsigned kBlockSize = 256;
 
-// Returns the last cluster that begins at or before `row`, from low to high. An empty cluster is
-// never returned.
+// Returns the last cluster that begins at or before `row`, among `low` to `high`. The
+// result is never an empty cluster.
 __device__ size_t cluster_at(const Span<const int64_t>& offset, size_t low, size_t high,
                              int64_t row) {
     while (low < high) {
@@ -26,7 +26,8 @@ __device__ size_t cluster_at(const Span<const int64_t>& offset, size_t low, size
     return low;
 }
 
-// There is one thread a row of the result, or one a row and basis: num_items a row.
+// There is one thread per row of the result, or one per row and basis: num_items per
+// row.
 __global__ void __launch_bounds__(kBlockSize)
     gather_kernel(GatherInput in, Rotations rotations, GaussianRows<float> out, int num_items) {
     const int64_t num = in.offset[in.instance.size] * num_items;
@@ -46,7 +47,7 @@ __global__ void __launch_bounds__(kBlockSize)
     if (basis == 0) gather_shape(in, rotations, s, row - in.offset[s], out);
 }
 
-// Copies a host array to the device for as long as the object lives.
+// Copies a host array to the device; the copy exists as long as this object.
 template <class T>
 class Copy {
   public:
@@ -72,6 +73,7 @@ void gather(const GatherInput& host, const GaussianRows<float>& out, Stream stre
         bands({tables.bands.data(), tables.bands.size()}, stream);
     const Rotations rotations{rotation.data(), bands.data()};
     const Copy<float> weight(in.weight, stream);
+    const Copy<InstanceFactors> factors(in.factors, stream);
     const Copy<int64_t> first_row(in.first_row, stream), offset(in.offset, stream);
     launch("gather", gather_kernel, blocks_for(num_items, kBlockSize), kBlockSize, 0, stream, in,
            rotations, out, num_sh_bases(out.sh_degree));

@@ -1,6 +1,6 @@
 #pragma once
 
-// Formulas of gather(), for both halves; all are in double precision.
+// Formulas of gather(), for the CPU and CUDA, all in double precision.
 
 #include <vector>
 
@@ -14,17 +14,17 @@ namespace v3dg {
 // Rotations of instances, and of their SH bands.
 struct Rotations {
     const double* rotation;  // [I * 9] rows
-    const double* bands;     // [I * kBandsSize]; empty where the result has SH degree 0
+    const double* bands;     // [I * kBandsSize]; empty if the result has SH degree 0
 };
 
-// Owns such rotations on the host.
+// Owns these rotations on the host.
 struct RotationTables {
     std::vector<double> rotation, bands;
 
     RotationTables(const GatherInput& in, int sh_degree);
 };
 
-// Writes the gaussian `within` cluster s except its SH coefficients.
+// Writes a gaussian, except its SH coefficients; `within` is its index in cluster s.
 V3DG_HD inline void gather_shape(const GatherInput& in, const Rotations& rotations, size_t s,
                                  int64_t within, const GaussianRows<float>& out) {
     const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;
@@ -49,12 +49,14 @@ V3DG_HD inline void gather_shape(const GatherInput& in, const Rotations& rotatio
         q[0] * p[3] + q[1] * p[2] - q[2] * p[1] + q[3] * p[0],
     };
     round_quat(product, out.quats + 4 * to);
-    const float opacity = rows.opacities[from];
-    out.opacities[to] = in.weight.size == 0 ? opacity : opacity * in.weight[s];
+    float opacity = rows.opacities[from];
+    if (in.weight.size != 0) opacity *= in.weight[s];
+    if (in.factors.size != 0) opacity *= in.factors[i].opacity;
+    out.opacities[to] = opacity;
 }
 
-// Writes the three coefficients of one SH basis of that gaussian, rotated into the world with its
-// band.
+// Writes the three coefficients of one SH basis of that gaussian, rotated into the
+// world and multiplied by the tint.
 V3DG_HD inline void gather_sh(const GatherInput& in, const Rotations& rotations, size_t s,
                               int64_t within, int basis, const GaussianRows<float>& out) {
     const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;
@@ -62,8 +64,13 @@ V3DG_HD inline void gather_sh(const GatherInput& in, const Rotations& rotations,
     const GaussianRows<const float>& rows = in.bundles[in.bundle[i]];
     const float* coefficients = rows.sh + rows.num_sh() * from;
     float* result = out.sh + out.num_sh() * to + 3 * basis;
+    const auto write = [&](int c, double coefficient) {
+        if (in.factors.size != 0)
+            coefficient = tinted_coefficient(basis, coefficient, in.factors[i].color[c]);
+        result[c] = static_cast<float>(coefficient);
+    };
     if (basis == 0 || 3 * basis >= rows.num_sh()) {
-        for (int c = 0; c < 3; ++c) result[c] = basis == 0 ? coefficients[c] : 0.0f;
+        for (int c = 0; c < 3; ++c) write(c, basis == 0 ? coefficients[c] : 0.0f);
         return;
     }
     const int degree = basis < 4   ? 1
@@ -78,7 +85,7 @@ V3DG_HD inline void gather_sh(const GatherInput& in, const Rotations& rotations,
         double sum = 0;
         for (int k = 0; k < size; ++k)
             sum += band[(basis - first) * size + k] * coefficients[3 * (first + k) + c];
-        result[c] = static_cast<float>(sum);
+        write(c, sum);
     }
 }
 

@@ -1,5 +1,6 @@
-// A band is closed under rotation, so its matrix follows from the bases at enough directions: the
-// colour towards d in the new frame is the colour of the old frame towards d rotated back.
+// A band is closed under rotation, so its matrix follows from the bases at enough
+// directions: the colour towards d in the new frame is the colour of the old frame
+// towards d rotated back.
 
 #include "gather/sh_rotation.h"
 
@@ -13,7 +14,8 @@ namespace v3dg {
 namespace {
 
 constexpr int kMaxBand = 7;
-// There are many more directions than the 7 that the largest band needs, for a well-posed solution.
+// Using many more directions than the 7 that the largest band needs makes the equations
+// well-conditioned.
 constexpr int kNumDirections = 32;
 
 struct Direction {
@@ -28,8 +30,8 @@ Direction direction_of(int i) {
     return {radius * std::cos(turn), radius * std::sin(turn), z};
 }
 
-// Solves least squares over the directions: for a right-hand side b with one row b[i] for each
-// direction i, row r of the solution is the sum over i of weight[r][i] * b[i].
+// Solves least squares over the directions: for a right-hand side b with one row b[i]
+// for each direction i, row r of the solution is the sum over i of weight[r][i] * b[i].
 class Band {
   public:
     explicit Band(int degree) : degree_(degree), size_(2 * degree + 1) {

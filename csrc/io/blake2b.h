@@ -1,6 +1,7 @@
 #pragma once
 
-// The hash of pages, tables and files: BLAKE2b of one message, of several at once, and of pieces.
+// The hash of pages, tables and files: BLAKE2b of one message, of several at once, and
+// of pieces.
 
 #include <array>
 #include <cstddef>
@@ -16,28 +17,29 @@ constexpr size_t kHashBlockBytes = 128;
 constexpr size_t kHashPieceBytes = 16384;
 using PageHash = std::array<uint8_t, kPageHashBytes>;
 
-// Hashes several messages with BLAKE2b, RFC 7693, with digests of 16 bytes and no key. On
-// processors with wide vectors each message has a lane of a vector, so eight messages of about the
-// same length are fastest.
+// Hashes several messages with BLAKE2b, RFC 7693, with digests of 16 bytes and no key.
+// On processors with wide vectors each message is a lane of a vector, so eight messages
+// of similar length are fastest.
 void blake2b(Span<const Span<const uint8_t>> messages, PageHash* digests);
 
-// The same hash of one message, which is added in parts.
+// Computes the same hash for one message that is added in parts.
 class Blake2b {
   public:
     Blake2b();
     void add(const unsigned char* bytes, size_t size);
-    // Returns the hash of all that was added. Nothing may be added after it.
+    // Returns the hash of all bytes that were added. No bytes may be added afterwards.
     PageHash digest();
 
   private:
     uint64_t state_[8];
-    uint64_t num_bytes_ = 0;  // in the state, without those that wait
+    uint64_t num_bytes_ = 0;  // hashed bytes, without those in the buffer
     unsigned char waiting_[kHashBlockBytes] = {};
     size_t num_waiting_ = 0;
 };
 
-// The hash of the digests of a message's pieces. A piece has kHashPieceBytes, the last one may be
-// shorter. Pieces are hashed in parallel lanes, so this is several times as fast as Blake2b.
+// The hash of the concatenated digests of a message's pieces. A piece has
+// kHashPieceBytes; the last one may be shorter. Pieces are hashed in parallel lanes, so
+// this is several times as fast as Blake2b.
 class HashOfPieces {
   public:
     explicit HashOfPieces(Span<const uint8_t> message) : message_(message) {}

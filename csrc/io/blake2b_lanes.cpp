@@ -1,5 +1,6 @@
-// The formula of BLAKE2b, for a word or for a vector of words. The words of a vector are either
-// those of several messages, one message per lane, or a row of the state of one message.
+// The formula of BLAKE2b, for a 64-bit word or for a vector of them. The words of a
+// vector are either from several messages, one message per lane, or a row of the state
+// of one message.
 
 #include "io/blake2b_lanes.h"
 
@@ -73,7 +74,7 @@ using Words = Row;
 using Words = uint64_t;
 #endif
 
-// b is available last, so it is added last.
+// b becomes available last, so it is added last.
 template <class V>
 V3DG_INLINE void mix(V& a, V& b, V& c, V& d, V x, V y) {
     a = a + x + b;
@@ -99,14 +100,14 @@ V3DG_INLINE void mix_round(V* v, const V* m) {
     mix(v[3], v[4], v[9], v[14], m[s[14]], m[s[15]]);
 }
 
-// Unrolled, so that the compiler knows the order of the words in each round.
+// Unrolled, so that the compiler knows the order of the message words in each round.
 template <class V, size_t... kRounds>
 V3DG_INLINE void mix_rounds(V* v, const V* m, std::index_sequence<kRounds...>) {
     (mix_round<kRounds>(v, m), ...);
 }
 
-// `end`: number of bytes up to the end of this block. `last`: all bits set for the last block, else
-// none.
+// `end`: number of bytes up to the end of this block. `last`: all bits set for the last
+// block, else none.
 template <class V>
 V3DG_INLINE void compress(V* h, const V* m, V end, V last) {
     V v[16];
@@ -122,7 +123,7 @@ V3DG_INLINE void compress(V* h, const V* m, V end, V last) {
 
 #if defined(__AVX2__)
 
-// Rotates a row of four words by so many lanes.
+// Rotates a row of four words by kLanes lanes.
 template <int kLanes>
 V3DG_INLINE Row turned(Row x) {
     constexpr auto source = [](int i) { return (i + kLanes) & 3; };
@@ -136,7 +137,8 @@ V3DG_INLINE uint64_t word(const unsigned char* block, int i) {
     return word;
 }
 
-// For the diagonals, the rows other than b move, because b is available last.
+// For the diagonals, the rows other than b are rotated, because b becomes available
+// last.
 template <size_t kRound>
 V3DG_INLINE void mix_rows(Row& a, Row& b, Row& c, Row& d, const unsigned char* block) {
     constexpr const uint8_t* s = kOrder[kRound % 10];
@@ -192,8 +194,8 @@ void add_last_block(uint64_t* state, uint64_t num_bytes, const unsigned char* bl
     compress_one(state, block, num_bytes, ~uint64_t{0});
 }
 
-// Returns the digest of a message of which `num_bytes` were added to the state already. `rest` is
-// what follows them.
+// Returns the digest of a message whose first `num_bytes` were already added to the
+// state; `rest` contains the remaining bytes.
 static PageHash digest_of_rest(uint64_t* state, uint64_t num_bytes, const unsigned char* rest,
                                size_t size) {
     const size_t whole = size > 0 ? (size - 1) / kHashBlockBytes : 0,
@@ -222,8 +224,8 @@ V3DG_INLINE void load_words(const unsigned char* const* blocks, Words* m) {
         __m512i rows[8];
         for (int i = 0; i < 8; ++i) rows[i] = _mm512_loadu_si512(blocks[i] + 64 * half);
         for (int odd = 0; odd < 2; ++odd) {
-            __m512i pairs[4];  // of lanes: words odd, odd + 2, odd + 4 and odd + 6
-            __m512i fours[4];  // of lanes: two of those words
+            __m512i pairs[4];  // per lane: words odd, odd + 2, odd + 4 and odd + 6
+            __m512i fours[4];  // per lane: two of those words
             for (int i = 0; i < 4; ++i)
                 pairs[i] = odd ? _mm512_unpackhi_epi64(rows[2 * i], rows[2 * i + 1])
                                : _mm512_unpacklo_epi64(rows[2 * i], rows[2 * i + 1]);
@@ -249,7 +251,7 @@ V3DG_INLINE void load_words(const unsigned char* const* blocks, Words* m) {
         for (int i = 0; i < 4; ++i)
             rows[i] = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(blocks[i] + 32 * part));
         for (int odd = 0; odd < 2; ++odd) {
-            __m256i pairs[2];  // of lanes: words odd and odd + 2
+            __m256i pairs[2];  // per lane: words odd and odd + 2
             for (int i = 0; i < 2; ++i)
                 pairs[i] = odd ? _mm256_unpackhi_epi64(rows[2 * i], rows[2 * i + 1])
                                : _mm256_unpacklo_epi64(rows[2 * i], rows[2 * i + 1]);
@@ -261,7 +263,7 @@ V3DG_INLINE void load_words(const unsigned char* const* blocks, Words* m) {
 
 #endif
 
-// Messages that are hashed together, one per lane. A lane without a message hashes zeros.
+// Messages that are hashed together, one per lane. An idle lane hashes zeros.
 class Lanes {
   public:
     bool is_busy(size_t lane) const { return digest_[lane] != nullptr; }
@@ -272,7 +274,8 @@ class Lanes {
         end_[lane] = 0;
         for (int i = 0; i < 8; ++i) state_[i][lane] = kHashStart[i];
     }
-    // Adds blocks to all messages until one ends, and stores the digests of those that have ended.
+    // Adds blocks to all messages until one ends, and stores the digests of those that
+    // ended.
     void advance() {
         size_t whole = SIZE_MAX;
         for (size_t k = 0; k < kNumLanes; ++k)
@@ -331,8 +334,8 @@ class Lanes {
         }
     }
 
-    Words state_[8] = {}, end_ = {};             // end_: bytes that were added
-    const unsigned char* rest_[kNumLanes] = {};  // what is not hashed yet
+    Words state_[8] = {}, end_ = {};             // end_: number of bytes that were added
+    const unsigned char* rest_[kNumLanes] = {};  // bytes that are not hashed yet
     size_t left_[kNumLanes] = {};
     PageHash* digest_[kNumLanes] = {};  // null: idle
 };

@@ -8,8 +8,8 @@ namespace v3dg {
 namespace {
 
 constexpr size_t kPieceBytes = size_t(1) << 20;
-constexpr size_t kPiecesAhead = 8;  // that the disk is asked for together
-// Bytes of the coarsest page, which lies before the tables and is needed next.
+constexpr size_t kPiecesAhead = 8;  // pieces that are requested from the disk together
+// The usual size of the coarsest page, which precedes the tables and is needed next.
 constexpr size_t kNeededBefore = size_t(64) << 10;
 
 }  // namespace
@@ -60,7 +60,8 @@ void HashedRead::report(size_t num_read, bool is_over) {
     has_more_.notify_one();
 }
 
-// Waits until more than so many bytes are read, or the reading is over. Returns how many are.
+// Waits until more than `num_known` bytes are read, or reading has ended. Returns how
+// many bytes are read.
 size_t HashedRead::wait_for_more(size_t num_known) {
     const MutexLock lock(busy_);
     while (!is_over_ && num_read_ <= num_known) has_more_.wait(busy_);
@@ -77,9 +78,9 @@ bool HashedRead::hash() {
         done = end;
         if (done == message_.size) break;
         end = num_before + std::min(wait_for_more(done - num_before), message_.size - num_before);
-        if (end == done) break;  // the file ended, which wait() returns
+        if (end == done) break;  // the file ended early, which wait() reports
     }
-    // The hash to compare with may be all that is still to be read.
+    // The remaining bytes may be exactly the hash to compare with.
     wait_for_more(bytes_.size - 1);
     const PageHash digest = hash_of_ == HashOf::bytes ? of_bytes.digest() : of_pieces.digest();
     return std::equal(digest.begin(), digest.end(), message_.end());

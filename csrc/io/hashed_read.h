@@ -11,25 +11,29 @@
 
 namespace v3dg {
 
-// What the hash is of: all bytes in order, or the hashes of their pieces (HashOfPieces).
+// The input of the hash: all bytes in order, or the hashes of their pieces
+// (HashOfPieces).
 enum class HashOf { bytes, pieces };
 
-// A part of a file, followed by its hash, that is read and hashed at the same time. A large part
-// has two threads of its own, so the caller may use it while it is still hashed. A small one is
-// read and hashed by the threads that wait for it.
+// A part of a file, followed by its hash, that is read and hashed at the same time. A
+// large part has two threads, so the caller may use it while it is still being hashed.
+// A small one is read and hashed by the threads that wait for it.
 class HashedRead {
   public:
     static constexpr size_t kLargeBytes = size_t(4) << 20;
 
-    // Reads from `offset` on to `message`, after its first `num_before` bytes, which are hashed,
-    // too. The message ends with the hash of all bytes before that. It outlives this.
+    // Reads from `offset` on into `message`, behind its first `num_before` bytes, which
+    // are hashed, too. The message ends with the hash of all bytes before that. The
+    // message must outlive this object.
     HashedRead(PosixFile file, size_t offset, Span<uint8_t> message, size_t num_before,
                HashOf hash_of);
     HashedRead(const HashedRead&) = delete;
 
-    // Waits until all is read. Returns false if the file ended before. Throws std::system_error.
+    // Waits until everything is read. Returns false if the file ended early. Throws
+    // std::system_error.
     bool wait() { return read_.get(); }
-    // Waits until all is hashed. Returns whether the hash at the end of the message is right.
+    // Waits until everything is hashed. Returns whether the hash at the end of the
+    // message is right.
     bool is_sound();
 
   private:
@@ -48,7 +52,8 @@ class HashedRead {
     Condition has_more_;
     size_t num_read_ V3DG_GUARDED_BY(busy_) = 0;
     bool is_over_ V3DG_GUARDED_BY(busy_) = false;
-    // Last: their destructors wait for the threads, which use all of the above.
+    // These are the last members: their destructors wait for the threads, which use all
+    // members above.
     std::shared_future<bool> read_;
     std::shared_future<bool> is_sound_;
 };

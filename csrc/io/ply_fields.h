@@ -1,6 +1,7 @@
 #pragma once
 
-// Which number in a row of a .ply file goes where in a gaussian, and how it is converted.
+// The mapping from the numbers in a row of a .ply file to a gaussian, and their
+// conversion.
 
 #include <algorithm>
 #include <cmath>
@@ -8,38 +9,29 @@
 #include <vector>
 
 #include "io/ply.h"
+#include "math/sh.h"
 
 namespace v3dg {
 
-// Bytes that all threads convert together when one thread has to cut the rows.
+// Bytes that all threads convert together if a single thread has to separate the rows.
 constexpr size_t kPlyChunkBytes = size_t(1) << 22;
 
-// The slots of a gaussian, in the order of its numbers; after kSh they are in memory's order.
-enum PlySlot : size_t { kMean = 0, kQuat = 3, kScale = 7, kOpacity = 10, kSh = 11 };
+// The slots of a gaussian, in the order of its numbers; after kSh they are in memory's
+// order.
+enum PlySlot : size_t { kMean = 0, kQuat = 3, kScale = 7, kOpacity = 10, kFilter = 11, kSh = 12 };
 
-// Where in a row the number for a slot is.
-struct PlyField {
-    size_t property;  // among the properties of the vertex element
-    size_t offset;    // bytes from the start of the row, without lists
-    PlyType type;
-};
+// Throws PlyError if a property is missing, there twice or a list.
+PlyLayout layout_of(const PlyElement& vertex);
 
-// K of the vertex element. Throws PlyError.
-size_t num_sh_of(const PlyElement& vertex);
-
-// [kSh + 3 * K] the field of each slot. Throws PlyError if a property is missing, there twice or a
-// list.
-std::vector<PlyField> fields_of(const PlyElement& vertex, size_t num_sh);
-
-// The range of numbers whose squares doubles hold to the last digit.
+// The smallest number whose square a double represents with full precision.
 constexpr double kLeastSquared = 1e-140;
 constexpr double kMostSquared = 1e140;
 
-// Of a squared length: a rounded unit quaternion is off by 3e-7.
+// For squared lengths: that of a rounded unit quaternion differs from 1 by 3e-7.
 constexpr double kUnitTolerance = 1e-6;
 
-// Multiplies a quaternion by a power of two if doubles cannot hold its squares. Quaternions that
-// are zero or not finite stay unchanged.
+// Multiplies a quaternion by a power of two if doubles cannot represent its squares.
+// Quaternions that are zero or not finite stay unchanged.
 inline void scale_extreme(double quat[4]) {
     double largest = 0;
     for (size_t j = 0; j < 4; ++j) largest = std::max(largest, std::abs(quat[j]));
@@ -49,15 +41,34 @@ inline void scale_extreme(double quat[4]) {
     for (size_t j = 0; j < 4; ++j) quat[j] = std::ldexp(quat[j], -exponent);
 }
 
-// Converts and stores gaussian i; load(slot) returns the number that the file holds for a slot.
+// Widens a gaussian by a standard deviation along each axis and lowers its opacity, so
+// that it covers as much as before. Source: Yu et al., Mip-Splatting, CVPR 2024,
+// equation 9.
+inline void widen(double filter, size_t num_axes, double scales[3], double& opacity) {
+    for (size_t j = 0; j < num_axes; ++j) {
+        const double widened = std::hypot(scales[j], filter);
+        if (widened > 0) opacity *= scales[j] / widened;
+        scales[j] = widened;
+    }
+}
+
+// Converts and stores gaussian i; load(slot) returns the number that the file holds for
+// a slot.
 template <class Load>
-void store_gaussian(const Load& load, size_t i, size_t num_sh, const PlyGaussians<float>& out) {
+void store_gaussian(const Load& load, size_t i, const PlyLayout& layout,
+                    const PlyGaussians<float>& out) {
+    const size_t num_axes = layout.is_flat ? 2 : 3;
     for (size_t j = 0; j < 3; ++j) out.means[3 * i + j] = static_cast<float>(load(kMean + j));
-    for (size_t j = 0; j < 3; ++j)
-        out.scales[3 * i + j] = static_cast<float>(std::exp(double(load(kScale + j))));
-    out.opacities[i] = static_cast<float>(1 / (1 + std::exp(-double(load(kOpacity)))));
-    float* sh = out.sh.data + 3 * num_sh * i;
-    for (size_t j = 0; j < 3 * num_sh; ++j) sh[j] = static_cast<float>(load(kSh + j));
+    double scales[3] = {};
+    for (size_t j = 0; j < num_axes; ++j) scales[j] = std::exp(double(load(kScale + j)));
+    double opacity = 1 / (1 + std::exp(-double(load(kOpacity))));
+    if (layout.has_filter) widen(load(kFilter), num_axes, scales, opacity);
+    for (size_t j = 0; j < 3; ++j) out.scales[3 * i + j] = static_cast<float>(scales[j]);
+    out.opacities[i] = static_cast<float>(opacity);
+    float* sh = out.sh.data + 3 * layout.num_sh * i;
+    for (size_t j = 0; j < 3 * layout.num_sh; ++j) sh[j] = static_cast<float>(load(kSh + j));
+    for (size_t j = 0; layout.has_base_colors && j < 3; ++j)
+        sh[j] = static_cast<float>((load(kSh + j) * layout.color_scale[j] - 0.5) / kShBase0);
 
     double quat[4];
     for (size_t j = 0; j < 4; ++j) quat[j] = load(kQuat + j);

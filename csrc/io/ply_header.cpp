@@ -1,5 +1,5 @@
-// Parses the header of a .ply file. Nothing that it claims about sizes is used here: the callers
-// compare it with the size of the file.
+// Parses the header of a .ply file. The sizes that it claims are not used here; the
+// callers compare them with the size of the file.
 
 #include "io/ply_header.h"
 
@@ -10,11 +10,13 @@ namespace v3dg {
 
 namespace {
 
-constexpr size_t kMaxHeaderBytes = size_t(1) << 20;  // real ones have a few kilobytes
-constexpr size_t kMaxElements = 64;  // real ones have one or two; each one is skipped in turn
+constexpr size_t kMaxHeaderBytes = size_t(1) << 20;  // real headers have a few kilobytes
+// Real files have one or two elements; each one is skipped in sequence.
+constexpr size_t kMaxElements = 64;
+
+constexpr const char* kSpace = " \t\r\v\f";
 
 std::vector<std::string> words_of(const std::string& line) {
-    const char* kSpace = " \t\r\v\f";
     std::vector<std::string> words;
     size_t first = line.find_first_not_of(kSpace);
     while (first != std::string::npos) {
@@ -25,6 +27,15 @@ std::vector<std::string> words_of(const std::string& line) {
     return words;
 }
 
+// What follows the first word of a line, without space around it.
+std::string rest_of(const std::string& line) {
+    const size_t word = line.find_first_not_of(kSpace);
+    const size_t space = line.find_first_of(kSpace, word);
+    const size_t first = line.find_first_not_of(kSpace, space);
+    if (space == std::string::npos || first == std::string::npos) return {};
+    return line.substr(first, line.find_last_not_of(kSpace) + 1 - first);
+}
+
 PlyType parse_type(const std::string& name) {
     static const std::pair<const char*, PlyType> kTypes[] = {
         {"char", PlyType::int8},       {"int8", PlyType::int8},       {"uchar", PlyType::uint8},
@@ -32,7 +43,8 @@ PlyType parse_type(const std::string& name) {
         {"ushort", PlyType::uint16},   {"uint16", PlyType::uint16},   {"int", PlyType::int32},
         {"int32", PlyType::int32},     {"uint", PlyType::uint32},     {"uint32", PlyType::uint32},
         {"float", PlyType::float32},   {"float32", PlyType::float32}, {"double", PlyType::float64},
-        {"float64", PlyType::float64},
+        {"float64", PlyType::float64}, {"half", PlyType::float16},    {"float16", PlyType::float16},
+        {"int64", PlyType::int64},     {"uint64", PlyType::uint64},
     };
     for (const auto& [text, type] : kTypes)
         if (name == text) return type;
@@ -76,14 +88,14 @@ PlyProperty parse_property(const std::vector<std::string>& words) {
     property.name = words.back();
     if (property.is_list) {
         property.count_type = parse_type(words[2]);
-        if (property.count_type == PlyType::float32 || property.count_type == PlyType::float64)
+        if (property.count_type >= PlyType::float32)
             throw PlyError("expected an integer type for the length of a list, got " +
                            quoted(words[2]));
     }
     return property;
 }
 
-// Takes the lines of one header in turn, and makes the header.
+// Parses the lines of one header one by one.
 struct HeaderParser {
     PlyHeader header;
     bool has_format = false;
@@ -91,7 +103,11 @@ struct HeaderParser {
     // Returns whether this was the last line.
     bool take(const std::string& line) {
         const std::vector<std::string> words = words_of(line);
-        if (words.empty() || words[0] == "comment" || words[0] == "obj_info") return false;
+        if (words.empty()) return false;
+        if (words[0] == "comment" || words[0] == "obj_info") {
+            header.comments.push_back(rest_of(line));
+            return false;
+        }
         if (words[0] == "format") {
             if (has_format) throw PlyError("expected one line 'format', got a second");
             header.encoding = parse_format(words);

@@ -12,26 +12,39 @@
 
 namespace v3dg {
 
-// The content of a file is wrong. The message has what was expected and what was found, in one line
-// of printable ASCII, without the name of the file.
+// The content of a file is wrong. The message states what was expected and what was
+// found, in one line of printable ASCII, without the name of the file.
 struct PlyError : std::runtime_error {
     using std::runtime_error::runtime_error;
 };
 
 enum class PlyEncoding { ascii, binary_little_endian, binary_big_endian };
 
-enum class PlyType { int8, uint8, int16, uint16, int32, uint32, float32, float64 };
+// The types of the format, integers first, then those that some writers use besides.
+enum class PlyType {
+    int8,
+    uint8,
+    int16,
+    uint16,
+    int32,
+    uint32,
+    float32,
+    float64,
+    float16,
+    int64,
+    uint64
+};
 
 inline size_t size_of(PlyType type) {
-    constexpr size_t kSizes[] = {1, 1, 2, 2, 4, 4, 4, 8};
+    constexpr size_t kSizes[] = {1, 1, 2, 2, 4, 4, 4, 8, 2, 8, 8};
     return kSizes[static_cast<size_t>(type)];
 }
 
 struct PlyProperty {
     std::string name;
-    PlyType type = PlyType::float32;  // of a number, or of the items of a list
+    PlyType type = PlyType::float32;  // type of a number, or of the elements of a list
     bool is_list = false;
-    PlyType count_type = PlyType::uint8;  // of the length of a list; an integer type
+    PlyType count_type = PlyType::uint8;  // type of the length of a list; an integer type
 };
 
 struct PlyElement {
@@ -40,14 +53,15 @@ struct PlyElement {
     std::vector<PlyProperty> properties;
 
     bool has_lists() const;
-    // Bytes of one row in a binary file if its lists are empty.
+    // Returns the size of a row in a binary file if its lists are empty.
     size_t min_row_bytes() const;
 };
 
 struct PlyHeader {
     PlyEncoding encoding = PlyEncoding::ascii;
     std::vector<PlyElement> elements;
-    size_t size = 0;  // bytes, including the end of the line end_header
+    std::vector<std::string> comments;  // without the keyword, and without outer spaces
+    size_t size = 0;                    // bytes, including the line end_header
 };
 
 // Throws std::system_error, or PlyError if the path is not a regular file.

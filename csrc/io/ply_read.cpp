@@ -1,5 +1,5 @@
-// Opens .ply files and chooses how their rows are read: ply_fields.h has what a row means,
-// ply_rows.h binary rows, ply_text.h lines of text.
+// Opens .ply files and chooses how their rows are read. ply_fields.h defines the
+// meaning of a row, ply_rows.h reads binary rows, ply_text.h reads lines of text.
 
 #include "io/ply.h"
 
@@ -19,10 +19,10 @@ namespace {
 // Throws PlyError unless the rest of the file has room for all rows of the element.
 void check_size(const PlyFile& ply, const PlyElement& element, size_t offset) {
     const bool is_text = ply.encoding == PlyEncoding::ascii;
-    // A number and the separator after it are at least two characters; the last number may end
+    // A number and its separator have at least two characters; the last number may end
     // with the file.
     const size_t row_bytes = is_text ? 2 * element.properties.size() : element.min_row_bytes();
-    // An offset beyond the end: the file may have grown since it was opened.
+    // The offset is beyond the end if the file has grown since it was opened.
     const size_t left = ply.file_bytes - std::min(offset, ply.file_bytes);
     if (row_bytes != 0 && element.count > (left + (is_text ? 1 : 0)) / row_bytes)
         throw PlyError("expected " + std::to_string(element.count) + " rows of element " +
@@ -52,15 +52,14 @@ PlyFile open_ply(const char* path) {
                    .encoding = header.encoding,
                    .vertex = {},
                    .vertex_offset = header.size,
-                   .num_sh = 1};
+                   .layout = {}};
     const auto is_vertex = [](const PlyElement& element) { return element.name == "vertex"; };
     const auto num_found = std::count_if(header.elements.begin(), header.elements.end(), is_vertex);
     if (num_found != 1)
         throw PlyError("expected one element 'vertex', got " + std::to_string(num_found));
     const auto vertex = std::find_if(header.elements.begin(), header.elements.end(), is_vertex);
     ply.vertex = *vertex;
-    ply.num_sh = num_sh_of(ply.vertex);
-    fields_of(ply.vertex, ply.num_sh);  // throws if a property is missing
+    ply.layout = layout_of(ply.vertex);
     for (auto element = header.elements.begin(); element != vertex; ++element)
         ply.vertex_offset = skip_element(ply, *element, ply.vertex_offset);
     check_size(ply, ply.vertex, ply.vertex_offset);

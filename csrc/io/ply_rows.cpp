@@ -1,11 +1,13 @@
-// Binary rows: RowDecoder converts rows of fixed size. Rows with lists are walked over by a
-// ByteReader and packed to such rows.
+// Binary rows: RowDecoder converts rows of fixed size. A ByteReader parses rows with
+// lists and packs them to rows of fixed size.
 
 #include "io/ply_rows.h"
 
 #include <algorithm>
+#include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <limits>
 #include <memory>
 #include <string>
 #include <vector>
@@ -20,7 +22,8 @@ namespace v3dg {
 
 namespace {
 
-// What one thread reads and converts at a time: it fits into the cache of a core.
+// The bytes that one thread reads and converts at a time; they fit into the cache of a
+// core.
 constexpr size_t kBlockBytes = size_t(1) << 18;
 
 template <class T>
@@ -30,6 +33,17 @@ T load_as(const char* bytes, bool is_swapped) {
     T value;
     std::memcpy(&value, copy, sizeof(T));
     return value;
+}
+
+// The number that IEEE 754's 16 bits stand for.
+double from_half(uint16_t bits) {
+    const int exponent = bits >> 10 & 31;
+    const int fraction = bits & 1023;
+    const double sign = bits >> 15 ? -1 : 1;
+    if (exponent == 31 && fraction != 0) return std::numeric_limits<double>::quiet_NaN();
+    if (exponent == 31) return sign * std::numeric_limits<double>::infinity();
+    if (exponent == 0) return sign * std::ldexp(fraction, -24);
+    return sign * std::ldexp(1024 + fraction, exponent - 25);
 }
 
 double load_scalar(const char* bytes, PlyType type, bool is_swapped) {
@@ -42,6 +56,9 @@ double load_scalar(const char* bytes, PlyType type, bool is_swapped) {
         case PlyType::uint32: return load_as<uint32_t>(bytes, is_swapped);
         case PlyType::float32: return load_as<float>(bytes, is_swapped);
         case PlyType::float64: return load_as<double>(bytes, is_swapped);
+        case PlyType::float16: return from_half(load_as<uint16_t>(bytes, is_swapped));
+        case PlyType::int64: return static_cast<double>(load_as<int64_t>(bytes, is_swapped));
+        case PlyType::uint64: return static_cast<double>(load_as<uint64_t>(bytes, is_swapped));
     }
     return 0;
 }
@@ -53,26 +70,22 @@ bool is_swapped(PlyEncoding encoding) {
     return (encoding == PlyEncoding::binary_big_endian) == (first == 1);
 }
 
-// Converts rows of binary numbers of fixed size, which have no lists or have lost them.
+// Converts rows of binary numbers of fixed size, from which lists were removed.
 class RowDecoder {
   public:
     RowDecoder(const PlyFile& ply, const PlyGaussians<float>& out)
-        : fields_(fields_of(ply.vertex, ply.num_sh)),
-          num_sh_(ply.num_sh),
-          is_swapped_(is_swapped(ply.encoding)),
-          out_(out) {
+        : layout_(ply.layout), is_swapped_(is_swapped(ply.encoding)), out_(out) {
         for (const PlyProperty& property : ply.vertex.properties)
             if (!property.is_list) row_bytes_ += size_of(property.type);
+        const auto is_float = [](const PlyField& field) { return field.type == PlyType::float32; };
         is_native_float_ =
-            !is_swapped_ && std::all_of(fields_.begin(), fields_.end(), [](const PlyField& field) {
-                return field.type == PlyType::float32;
-            });
+            !is_swapped_ && std::all_of(layout_.fields.begin(), layout_.fields.end(), is_float);
     }
     size_t row_bytes() const { return row_bytes_; }
 
-    // Converts `count` rows into gaussians `first` and on.
+    // Converts `count` rows into the gaussians from `first` on.
     void decode(const char* rows, size_t count, size_t first) const {
-        const PlyField* fields = fields_.data();
+        const PlyField* fields = layout_.fields.data();
         for (size_t r = 0; r < count; ++r) {
             const char* row = rows + r * row_bytes_;
             if (is_native_float_) {
@@ -81,19 +94,18 @@ class RowDecoder {
                     std::memcpy(&value, row + fields[slot].offset, sizeof(value));
                     return value;
                 };
-                store_gaussian(load, first + r, num_sh_, out_);
+                store_gaussian(load, first + r, layout_, out_);
             } else {
                 const auto load = [this, row, fields](size_t slot) {
                     return load_scalar(row + fields[slot].offset, fields[slot].type, is_swapped_);
                 };
-                store_gaussian(load, first + r, num_sh_, out_);
+                store_gaussian(load, first + r, layout_, out_);
             }
         }
     }
 
   private:
-    std::vector<PlyField> fields_;
-    size_t num_sh_;
+    const PlyLayout& layout_;
     bool is_swapped_;
     bool is_native_float_;
     size_t row_bytes_ = 0;
@@ -125,8 +137,7 @@ class ByteReader {
             buffer_begin_ = begin;
             buffer_size_ = file_.read_at(begin, buffer_.data(), buffer_.size());
             if (buffer_size_ < size)
-                throw PlyError(
-                    "expected the file not to change while it is read, got a shorter one");
+                throw PlyError("the file became shorter while it was read; read it again");
         }
         return buffer_.data() + (begin - buffer_begin_);
     }
@@ -140,7 +151,8 @@ class ByteReader {
     size_t buffer_size_ = 0;
 };
 
-// Walks over one row. Copies the numbers that are not in lists to `packed`, unless that is null.
+// Parses one row. Copies the numbers that are not in lists to `packed`, unless that is
+// null.
 void walk_row(ByteReader& reader, const PlyElement& element, uint64_t row, bool is_swapped,
               char* packed) {
     for (const PlyProperty& property : element.properties) {
@@ -172,7 +184,8 @@ PlyPlace read_fixed_rows(const PlyFile& ply, PlyPlace begin, const PlyGaussians<
     const size_t num_rows = out.opacities.size;
     const size_t num_blocks = (num_rows + block_rows - 1) / block_rows;
     const int num_threads = static_cast<int>(std::min<size_t>(most_threads(), num_blocks));
-    // Not value-initialised: a thread without a block then touches no memory.
+    // The array is not value-initialised, so that a thread without a block touches no
+    // memory.
     const std::unique_ptr<char[]> buffers(new char[num_threads * block_rows * row_bytes]);
     FirstError error;
 #pragma omp parallel for schedule(dynamic, 1) num_threads(num_threads)
@@ -183,8 +196,7 @@ PlyPlace read_fixed_rows(const PlyFile& ply, PlyPlace begin, const PlyGaussians<
             const size_t count = std::min(block_rows, num_rows - first);
             const size_t size = count * row_bytes;
             if (ply.file.read_at(begin.offset + first * row_bytes, rows, size) != size)
-                throw PlyError(
-                    "expected the file not to change while it is read, got a shorter one");
+                throw PlyError("the file became shorter while it was read; read it again");
             decoder.decode(rows, count, first);
         });
     }

@@ -1,4 +1,4 @@
-// Text: LineReader cuts lines, NumberReader reads the numbers of one.
+// Text: LineReader separates lines, NumberReader reads the numbers of a line.
 
 #include "io/ply_text.h"
 
@@ -27,10 +27,11 @@ struct Line {
 
 bool is_space(char c) { return c == ' ' || c == '\t' || c == '\r' || c == '\v' || c == '\f'; }
 
-// Reads the lines of a text that are not blank.
+// Reads the lines of a text, without blank ones.
 class LineReader {
   public:
-    // The buffer has one byte more than the rest of the file, so that a read meets the end of it.
+    // The buffer has one byte more than the rest of the file, so that reading detects
+    // the end of the file.
     LineReader(const PosixFile& file, size_t offset, size_t file_bytes)
         : file_(file),
           offset_(offset),
@@ -38,8 +39,8 @@ class LineReader {
 
     size_t offset() const { return offset_ - (end_ - begin_); }
 
-    // Returns some of the next lines, at least one and at most `max_lines`, or none at the end of
-    // the file. Valid until the next call.
+    // Returns some of the next lines, at least one and at most `max_lines`; none at the
+    // end of the file. Valid until the next call.
     const std::vector<Line>& next(uint64_t max_lines) {
         lines_.clear();
         bool at_end = false;
@@ -47,8 +48,7 @@ class LineReader {
             cut_lines(max_lines, at_end);
             if (!lines_.empty() || at_end) break;
             if (begin_ == 0 && end_ == buffer_.size() && end_ < kPlyChunkBytes)
-                throw PlyError(
-                    "expected the file not to change while it is read, got a longer one");
+                throw PlyError("the file became longer while it was read; read it again");
             if (begin_ == 0 && end_ == buffer_.size())
                 throw PlyError("expected lines of at most " + std::to_string(kPlyChunkBytes) +
                                " bytes, got a longer one");
@@ -77,14 +77,14 @@ class LineReader {
     }
 
     const PosixFile& file_;
-    size_t offset_;  // of the first byte after the buffer
+    size_t offset_;  // offset of the first byte behind the buffer
     std::vector<char> buffer_;
     size_t begin_ = 0;
     size_t end_ = 0;
     std::vector<Line> lines_;
 };
 
-// Reads the numbers of one line in turn.
+// Reads the numbers of one line one by one.
 class NumberReader {
   public:
     struct EndOfLine {};
@@ -131,7 +131,8 @@ class NumberReader {
     size_t num_read_ = 0;
 };
 
-// The shortest text of a float, read as a double, is another number: so it is rounded to float.
+// The shortest text of a float denotes another number when it is read as a double, so
+// the number is rounded to float.
 double rounded_to(PlyType type, double value) {
     return type == PlyType::float32 ? static_cast<double>(static_cast<float>(value)) : value;
 }
@@ -163,7 +164,7 @@ void parse_row(Line line, uint64_t row, const PlyElement& vertex, double* value_
 
 PlyPlace read_text(const PlyFile& ply, PlyPlace begin, const PlyGaussians<float>& out) {
     constexpr size_t kLinesPerTask = 256;
-    const std::vector<PlyField> fields = fields_of(ply.vertex, ply.num_sh);
+    const std::vector<PlyField>& fields = ply.layout.fields;
     const size_t num_properties = ply.vertex.properties.size();
     const size_t num_rows = out.opacities.size;
     std::vector<double> values(most_threads() * num_properties);
@@ -178,7 +179,7 @@ PlyPlace read_text(const PlyFile& ply, PlyPlace begin, const PlyGaussians<float>
                 double* row = values.data() + omp_get_thread_num() * num_properties;
                 parse_row(lines[r], begin.row + first + r, ply.vertex, row);
                 store_gaussian([&](size_t slot) { return row[fields[slot].property]; }, first + r,
-                               ply.num_sh, out);
+                               ply.layout, out);
             });
         }
         error.rethrow();

@@ -1,6 +1,7 @@
 #pragma once
 
-// The rows of a .ply file of text: one thread cuts lines, all threads convert their numbers.
+// The rows of a .ply text file: one thread separates lines, all threads convert their
+// numbers.
 
 #include <cstddef>
 
@@ -8,11 +9,11 @@
 
 namespace v3dg {
 
-// Reads the gaussians from `begin` on, as many as `out` holds, and returns the place of the next
-// one. Throws PlyError and std::system_error.
+// Reads the gaussians from `begin` on, as many as `out` has room for, and returns the
+// place of the next one. Throws PlyError and std::system_error.
 PlyPlace read_text(const PlyFile& ply, PlyPlace begin, const PlyGaussians<float>& out);
 
-// Returns the offset after the element that begins at `offset`. Throws likewise.
+// Returns the offset behind the element that begins at `offset`. Throws likewise.
 size_t skip_text(const PlyFile& ply, const PlyElement& element, size_t offset);
 
 }  // namespace v3dg

@@ -1,5 +1,6 @@
-// Writes .ply files. All threads convert blocks of rows. Binary blocks have known offsets, so each
-// thread writes its own; text is converted a few blocks at a time and written in order.
+// Writes .ply files. All threads convert blocks of rows. Binary blocks have known
+// offsets, so each thread writes its own blocks; text is converted a few blocks at a
+// time and written in order.
 
 #include <algorithm>
 #include <charconv>
@@ -24,16 +25,18 @@ namespace {
 constexpr size_t kBlockRows = 2048;  // half a megabyte at SH degree 3
 constexpr size_t kTextBlocks = 16;   // in memory at the same time
 
-// Finite stand-ins for infinities, beyond the logs and logits of all other float32 values (-103.3
-// and 16.6 are the outermost) and far enough that exp and the sigmoid round to exactly 0 and 1,
-// also in float32.
+// Finite replacements for infinities. They are beyond the logarithms and logits of all
+// other float32 values (-103.3 and 16.6 are the extremes), and so large that exp and
+// the sigmoid round to exactly 0 and 1, also in float32.
 constexpr float kLogOfZero = -110;
 constexpr float kLogitOfOne = 20;
 
-std::string header_text(size_t num_gaussians, size_t num_sh, PlyEncoding encoding) {
+std::string header_text(size_t num_gaussians, size_t num_sh, PlyEncoding encoding,
+                        const std::vector<std::string>& comments) {
     const char* kNames[] = {"ascii", "binary_little_endian", "binary_big_endian"};
-    std::string text = std::string("ply\nformat ") + kNames[static_cast<int>(encoding)] +
-                       " 1.0\nelement vertex " + std::to_string(num_gaussians) + "\n";
+    std::string text = std::string("ply\nformat ") + kNames[static_cast<int>(encoding)] + " 1.0\n";
+    for (const std::string& comment : comments) text += "comment " + comment + "\n";
+    text += "element vertex " + std::to_string(num_gaussians) + "\n";
     const auto add = [&](const std::string& name, size_t count) {
         for (size_t i = 0; i < count; ++i)
             text += "property float " + name + std::to_string(i) + "\n";
@@ -65,7 +68,7 @@ float opacity_logit(float opacity, size_t i) {
     return static_cast<float>(std::log(p / (1 - p)));
 }
 
-// The numbers of gaussian i in the order of the header.
+// Writes the numbers of gaussian i in the order of the header.
 void encode_gaussian(const PlyGaussians<const float>& in, size_t num_sh, size_t i, float* row) {
     const float* sh = in.sh.data + 3 * num_sh * i;
     for (size_t j = 0; j < 3; ++j) *row++ = in.means[3 * i + j];
@@ -77,7 +80,8 @@ void encode_gaussian(const PlyGaussians<const float>& in, size_t num_sh, size_t 
     for (size_t j = 0; j < 4; ++j) *row++ = in.quats[4 * i + j];
 }
 
-// Byte by byte, so that it does not depend on the byte order of the machine.
+// Bytes are stored one by one, so that the result does not depend on the machine's byte
+// order.
 void store_bytes(const float* values, size_t count, PlyEncoding encoding, unsigned char* bytes) {
     for (size_t v = 0; v < count; ++v) {
         uint32_t bits;
@@ -107,7 +111,7 @@ struct Writer {
     PlyEncoding encoding;
     size_t num_gaussians;
     size_t num_sh;
-    size_t offset;  // of the first row
+    size_t offset;  // offset of the first row
 
     size_t num_values() const { return 11 + 3 * num_sh; }
     size_t num_blocks() const { return (num_gaussians + kBlockRows - 1) / kBlockRows; }
@@ -171,10 +175,10 @@ struct Writer {
 }  // namespace
 
 void write_ply(const char* path, const PlyGaussians<const float>& gaussians, PlyEncoding encoding,
-               size_t num_sh) {
+               size_t num_sh, const std::vector<std::string>& comments) {
     const size_t num_gaussians = gaussians.opacities.size;
     PosixFile file = PosixFile::create(path);
-    const std::string header = header_text(num_gaussians, num_sh, encoding);
+    const std::string header = header_text(num_gaussians, num_sh, encoding, comments);
     file.write_at(0, header.data(), header.size());
     const Writer writer = {.file = file,
                            .gaussians = gaussians,

@@ -1,6 +1,7 @@
 #pragma once
 
-// Files of the system, by descriptor: reads and writes at offsets, with errors as exceptions.
+// Files of the system, by descriptor: reads and writes at offsets, with exceptions for
+// errors.
 
 #include <cerrno>
 #include <cstddef>
@@ -15,12 +16,13 @@
 
 namespace v3dg {
 
-// An open file. Reads and writes name their offset, so several threads can share it.
-// Failures throw std::system_error with errno's code.
+// An open file. Reads and writes pass their offset, so several threads can share the
+// file. Failures throw std::system_error with the code of errno.
 class PosixFile {
   public:
     static PosixFile open(const char* path) {
-        // O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
+        // With O_NONBLOCK, opening a pipe does not wait for a writer; regular files
+        // ignore it.
         return PosixFile(::open(path, O_RDONLY | O_CLOEXEC | O_NONBLOCK));
     }
     static PosixFile create(const char* path) {
@@ -44,13 +46,14 @@ class PosixFile {
         return status;
     }
 
-    // Returns how many bytes were read: fewer than `size` only at the end of the file.
+    // Returns how many bytes were read; fewer than `size` only at the end of the file.
     size_t read_at(size_t offset, char* bytes, size_t size) const {
         iovec piece{bytes, size};
         return read_at(offset, Span<iovec>{&piece, 1});
     }
 
-    // The same into at most 1024 pieces of memory in turn. Changes the pieces.
+    // Reads into at most 1024 pieces of memory, one after another, which it modifies.
+    // Returns as read_at() above.
     size_t read_at(size_t offset, Span<iovec> pieces) const {
         size_t done = 0;
         while (!pieces.empty()) {
@@ -70,7 +73,8 @@ class PosixFile {
         return done;
     }
 
-    // Asks the system to begin to read a part of the file; a hint, on systems that have one.
+    // Asks the system to begin reading a part of the file. This is a hint, on systems
+    // that support it.
     void expect(size_t offset, size_t size) const {
 #ifdef POSIX_FADV_WILLNEED
         static_cast<void>(::posix_fadvise(descriptor_, static_cast<off_t>(offset),

@@ -1,6 +1,6 @@
-// Views of random cuts of a bundle. A view follows from its number: a size, a camera, and a window
-// in which cuts are compared. Each of its cuts has a share of the gaussians that goes with its
-// size.
+// Views of random cuts of a bundle. A view follows from its number: a size, a camera,
+// and a window in which cuts are compared. Each of its cuts has a share of the
+// gaussians that goes with its size.
 
 #include "levels/cut_views.h"
 
@@ -50,7 +50,8 @@ class Random {
     uint64_t seed_, stream_, counter_;
 };
 
-// Returns a camera that looks at the centre from anywhere around it; its picture is one px wide.
+// Returns a camera that looks at the centre from anywhere around it; its picture is one
+// px wide.
 Camera camera_around(const CutPictures& pictures, Random& random) {
     double outwards[3], up[3], right[3];
     random.direction(outwards);
@@ -83,8 +84,8 @@ Camera resized(Camera camera, double scale) {
     return camera;
 }
 
-// Returns the camera with its picture shifted to a random place among the pixels of a screen, and
-// widened where it is narrow.
+// Returns the camera with its picture shifted to a random place among the pixels of a
+// screen, and widened where it is narrow.
 Camera on_screen(Camera camera, Random& random) {
     const double width = std::max(camera.width, kNarrowestPx),
                  height = std::max(camera.height, kNarrowestPx);
@@ -95,8 +96,8 @@ Camera on_screen(Camera camera, Random& random) {
     return camera;
 }
 
-// Returns a window of the picture around a random gaussian. A gaussian that is twice as large in
-// the asset is chosen twice as often.
+// Returns a window of the picture around a random gaussian. A gaussian that is twice as
+// large in the asset is chosen twice as often.
 Camera window_of(const Camera& camera, double widest_px, const CutPictures& pictures,
                  Random& random) {
     double at[2] = {camera.width / 2, camera.height / 2};
@@ -171,8 +172,8 @@ double share_of_part(const CutPictures& pictures, double part) {
     return pictures.most * std::pow(pictures.least / pictures.most, part * part) / all;
 }
 
-// Returns the share of another cut of a view. It has the distribution of all shares, as far as the
-// picture's size relative to the native size of the cut stays in its range.
+// Returns the share of another cut of a view. It has the distribution of all shares, as
+// far as the picture's size relative to the native size of the cut stays in its range.
 double share_of_cut(const CutPictures& pictures, const AssetView& view, uint64_t number,
                     size_t cut) {
     if (cut == 0) return view.share;
@@ -185,9 +186,10 @@ double share_of_cut(const CutPictures& pictures, const AssetView& view, uint64_t
     return view.share;
 }
 
-// The way in which a picture is compared: the largest side of the window, and the samples of a side
-// of a pixel of the asset. The larger its gaussians appear, the smoother the picture is; small
-// pictures cost little. `size` is that of the picture, relative to the asset's native size.
+// The way in which a picture is compared: the largest side of the window, and the
+// samples of a side of a pixel of the asset. The larger its gaussians appear, the
+// smoother the picture is; small pictures cost little. `size` is that of the picture,
+// relative to the asset's native size.
 struct Comparison {
     double widest_px;
     int samples;
@@ -316,8 +318,9 @@ std::vector<SelectRule> cuts_of_view(const CutPictures& pictures, const AssetVie
     for (size_t cut = 0; cut < count; ++cut) {
         SelectRule rule = whole;
         BudgetCut found = cuts[cut];
-        // A camera inside of groups refines these at any tolerance, and only the coarsest clusters
-        // meet a budget below what remains of them. Then coarser levels alone are used.
+        // A camera inside of groups refines these at any tolerance, and only the
+        // coarsest clusters meet a budget below what remains of them. Then coarser
+        // levels alone are used.
         while (std::isinf(found.tolerance_px2) &&
                2 * found.num_gaussians < static_cast<int64_t>(budgets[cut]) &&
                rule.min_level < coarsest) {

@@ -1,5 +1,6 @@
-// Cuts of windows: a block has a window, and goes through all clusters of the table. It is compiled
-// without contraction, so that a window has the clusters that the CPU selects.
+// Cuts of windows: a block has a window, and goes through all clusters of the table. It
+// is compiled without contraction, so that a window has the clusters that the CPU
+// selects.
 
 #include "levels/cut_windows_cuda.h"
 

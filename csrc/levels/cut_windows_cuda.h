@@ -43,29 +43,32 @@ struct WindowTables {
     PictureGradient<float> slope[kMostWindows];
 };
 
-// Returns the memory of a window in one block that has room for `most_pixels` of each window.
+// Returns the memory of a window in one block that has room for `most_pixels` of each
+// window.
 V3DG_HD inline PicturePlanes planes_of_window(float* memory, size_t most_pixels, size_t window) {
     float* color = memory + 4 * most_pixels * window;
     return {color, color + 3 * most_pixels, nullptr};
 }
 
-// Windows on the device, and the items of their clusters. A cluster of C has as many items as it
-// has begun kItemSize gaussians.
+// Windows on the device, and the items of their clusters. A cluster of C has as many
+// items as it has begun kItemSize gaussians.
 class DeviceWindows {
   public:
-    // Uploads the tables and cuts all windows; the host's memory may be reused on return.
+    // Uploads the tables and cuts all windows; the host's memory may be reused on
+    // return.
     void cut(const DeviceTable& table, const WindowTables& windows, Shown shown,
              cudaStream_t stream);
 
     uint32_t count() const { return count_; }
     uint32_t num_tiles() const { return num_tiles_; }
     const WindowTables* tables() const { return tables_.data(); }
-    // [count * C] the first item of a cluster among those of its window; -1: it is not shown.
+    // [count * C] the first item of a cluster among those of its window; -1: it is not
+    // shown.
     const int32_t* item_of_cluster() const { return item_of_cluster_.data(); }
     const uint32_t* num_items() const { return num_items_.data(); }  // [count]
 
-    // Enqueues the items of a frame of all windows, window by window. Item i has the records from
-    // kItemSize * i on.
+    // Enqueues the items of a frame of all windows, window by window. Item i has the
+    // records from kItemSize * i on.
     void write_items(const DeviceTable& table, const Appearance<float>& appearance,
                      const ItemList& items, cudaStream_t stream) const;
 

@@ -1,5 +1,6 @@
-// Compares pictures of the leaves and of level 1 at several sizes, and chooses for each group the
-// growth of its ball from the sum of the log loss ratios over sizes.
+// Compares pictures of the leaves and of level 1 at several sizes. For each group it
+// chooses the growth of its ball from the sum over sizes of the logarithms of loss
+// ratios.
 
 #include "levels/first_selected.h"
 
@@ -15,25 +16,25 @@ namespace v3dg {
 
 namespace {
 
-// Limits of the growth of balls: at the default tolerance a group is selected at 1.5 to 0.19 px² a
-// gaussian.
+// Limits of the growth of balls: with them and the default tolerance, a group is
+// selected at 1.5 to 0.19 px² per gaussian.
 constexpr double kLeast = 1.4, kMost = 4, kDefaultPx2 = 3;
-constexpr double kPx2[FirstSelected::kSizes] = {0.2, 0.5, 1.2,
-                                                3};  // median px² a gaussian of groups
-constexpr double kWidestPx = 2048, kBorderPx = 4;  // width of a picture, and border around the ball
-constexpr double kDistance = 8,
-                 // Distance from the centre, in radii; share of the gaussians in the ball.
-    kShare = 0.999;
-// A pixel counts by this power of its error, as it is perceived. By this measure a level is as good
-// as the leaves, by FLIP, where its loss is this many times theirs.
+constexpr double kPx2[FirstSelected::kSizes] = {0.2, 0.5, 1.2, 3};  // median px² per gaussian
+constexpr double kWidestPx = 2048;                                  // limit of a picture's width
+constexpr double kBorderPx = 4;                                     // border around the ball
+constexpr double kDistance = 8;   // distance from the centre, in radii
+constexpr double kShare = 0.999;  // fraction of the gaussians in the ball
+// The loss of a pixel is its error to this power, which approximates perception. By
+// this measure, and by FLIP, a level is as good as the leaves if its loss is at most
+// kAsGood times theirs.
 constexpr float kPower = 0.7f;
 constexpr double kAsGood = 1.15;
-// Groups that few pixels show are treated as average: this many times the mean loss of a group is
-// added, in the proportion of all groups. Their appearance also matters little, so this much more
-// is added for leaves.
+// Groups that are visible in few pixels are treated as average: kLikeAll times the mean
+// loss over groups is added to both losses. Moreover their appearance matters little,
+// so kOutOfSight times the mean is added to the leaves' loss.
 constexpr double kLikeAll = 0.2, kOutOfSight = 0.05;
-constexpr double kNothing = 1e-9;  // losses and footprints in the ball below it count as 0
-constexpr int kSteps = 64;         // number of sizes that are tried
+constexpr double kNothing = 1e-9;  // losses and footprints in the ball count as at least this
+constexpr int kSteps = 64;         // number of sizes to try
 
 double mean_of(const std::vector<double>& values) {
     return std::accumulate(values.begin(), values.end(), 0.0) / static_cast<double>(values.size());
@@ -58,8 +59,8 @@ FirstSelected::FirstSelected(Span<const float> means, Span<const Ball> balls,
     }
 }
 
-// Cameras look at the ball from afar, evenly all around; their pixels are shifted by a fraction of
-// a pixel each time.
+// Cameras look at the ball from a distance, evenly distributed around it; each picture
+// is shifted by a different fraction of a pixel.
 Camera FirstSelected::camera(size_t picture) const {
     const size_t side = picture % kSides;
     const double z = 1 - (2 * static_cast<double>(side) + 1) / kSides;
@@ -98,29 +99,28 @@ std::vector<float> FirstSelected::growth() const {
     }
     std::vector<float> growth;
     for (size_t g = 0; g < footprint_.size(); ++g) {
-        double px2[kSizes],
-            // Logarithms: of px², and of how much worse the level is than the leaves.
-            worse[kSizes];
+        double log_px2_of[kSizes];
+        double log_ratio[kSizes];  // of the level's loss to the largest acceptable one
         for (size_t size = 0; size < kSizes; ++size) {
-            px2[size] = std::log(footprint_[g] * focal_[size] * focal_[size]);
+            log_px2_of[size] = std::log(footprint_[g] * focal_[size] * focal_[size]);
             const double of_level = of_level_[size][g] + kLikeAll * mean_of_level[size] + kNothing;
             const double of_leaves =
                 of_leaves_[size][g] + (kLikeAll + kOutOfSight) * mean_of_leaves[size] + kNothing;
-            worse[size] = std::log(of_level / of_leaves / kAsGood);
+            log_ratio[size] = std::log(of_level / of_leaves / kAsGood);
         }
-        // This goes from the smallest size on, as long as the sum over sizes says that the level is
-        // better.
+        // Starts at the smallest size, and finds the size with the best sum over all
+        // smaller sizes.
         double sum = 0, least = INFINITY, first = kMost;
         for (int step = 0; step < kSteps; ++step) {
             const double times = kMost * std::pow(kLeast / kMost, step / (kSteps - 1.0));
             const double log_px2 = std::log(kDefaultPx2 / (times * times));
-            const auto above =
-                static_cast<size_t>(std::upper_bound(px2, px2 + kSizes, log_px2) - px2);
+            const auto above = static_cast<size_t>(
+                std::upper_bound(log_px2_of, log_px2_of + kSizes, log_px2) - log_px2_of);
             const size_t next = std::clamp<size_t>(above, 1, kSizes - 1), last = next - 1;
-            const double width = px2[next] - px2[last];
+            const double width = log_px2_of[next] - log_px2_of[last];
             const double part =
-                width > 0 ? std::clamp((log_px2 - px2[last]) / width, 0.0, 1.0) : 0.0;
-            sum += worse[last] + part * (worse[next] - worse[last]);
+                width > 0 ? std::clamp((log_px2 - log_px2_of[last]) / width, 0.0, 1.0) : 0.0;
+            sum += log_ratio[last] + part * (log_ratio[next] - log_ratio[last]);
             if (sum < least) {
                 least = sum;
                 first = times;
@@ -139,8 +139,8 @@ void losses_of_pixels(const PictureColors& colors, size_t width, size_t height,
         for (size_t i = 0; i < 3 * kSamples * width; ++i)
             truth[3 * (y / kSamples * width + i / (3 * kSamples)) + i % 3] +=
                 std::min(colors.truth[3 * kSamples * width * y + i], 1.0f) / (kSamples * kSamples);
-    // An error in a single pixel is hardly visible, so its neighbours share it. The border is
-    // empty.
+    // An error in a single pixel is hardly visible, so it is distributed over its
+    // neighbours. The border of a picture is empty.
     const auto shared = [](const std::vector<float>& from, size_t i, size_t step) {
         const float before = i < step ? 0.0f : from[i - step];
         return 0.25f * (before + 2 * from[i] + (i + step < from.size() ? from[i + step] : 0.0f));

@@ -1,4 +1,5 @@
-// Distributes the groups of a level over threads. fit_group/fit_group_cpu.cpp fits one group.
+// Distributes the groups of a level over threads. fit_group/fit_group_cpu.cpp fits one
+// group.
 
 #include "base/threads.h"
 #include "levels/fit_level.h"
@@ -22,8 +23,8 @@ void fit_level(const FitConfig& config, Span<const FitGroup> groups, const FitTa
     // Pictures that a group keeps.
     const size_t num_pictures = config.num_views > 0 ? config.num_views + kHeldOutViews : 0;
     std::vector<FitImage> images;
-    // Pictures are drawn first, one a (group, view), so that the last levels, with a group or two,
-    // keep all threads busy.
+    // Pictures are drawn first, one a (group, view), so that the last levels, with a
+    // group or two, keep all threads busy.
     for (size_t first = 0; first < groups.size && !progress.cancel;) {
         size_t last = groups.size;
         if (num_pictures > 0) {

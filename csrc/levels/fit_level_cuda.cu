@@ -1,5 +1,5 @@
-// Fits the groups of a level on CUDA, as many at once as their pictures fit into memory, while the
-// host reports progress and passes on a request to cancel.
+// Fits the groups of a level on CUDA, as many at once as their pictures fit into
+// memory, while the host reports progress and passes on a request to cancel.
 
 #include "levels/fit_level_cuda.h"
 
@@ -17,8 +17,8 @@ namespace cuda {
 
 namespace {
 
-// The largest size of target pictures that wait at once, in bytes; a quarter of the free memory, if
-// that is less.
+// The largest size of target pictures that wait at once, in bytes; a quarter of the
+// free memory, if that is less.
 constexpr size_t kTargetBytes = size_t(1) << 30;
 constexpr std::chrono::microseconds kBetweenLooks{50};
 
@@ -42,7 +42,8 @@ class Signals {
     FitSignals* host_ = nullptr;
 };
 
-// Returns the groups in the order in which they are taken: those that take longest come first.
+// Returns the groups in the order in which they are taken: those that take longest come
+// first.
 std::vector<FitJob> jobs_of(const FitConfig& config, Span<const FitGroup> groups) {
     std::vector<FitJob> jobs(groups.size);
     for (size_t g = 0; g < groups.size; ++g)

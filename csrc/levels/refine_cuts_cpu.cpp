@@ -178,8 +178,8 @@ class GradientSum {
         parallel_for(index.size(), kGaussiansAtOnce,
                      [&](size_t g) { add_gradient(gradient, g, sum_, index[g]); });
     }
-    // Calls move(i, sum, num_windows) for each gaussian i that windows showed, and begins the next
-    // sum.
+    // Calls move(i, sum, num_windows) for each gaussian i that windows showed, and
+    // begins the next sum.
     template <class Move>
     void move_shown(const Move& move) {
         parallel_for(shown_.size(), kGaussiansAtOnce, [&](size_t k) {
@@ -206,7 +206,8 @@ class CutFrame {
     explicit CutFrame(const FitConfig& config)
         : appearance_{config.filter_px2, config.antialiased, false} {}
 
-    // Returns the rows of `count` gaussians, which the caller writes before they are drawn.
+    // Returns the rows of `count` gaussians, which the caller writes before they are
+    // drawn.
     const GaussianRows<float>& start(size_t count, int sh_degree) {
         values_.resize(num_values(sh_degree) * count);
         rows_ = rows_in(values_.data(), count, sh_degree);

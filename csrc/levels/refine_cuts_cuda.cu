@@ -1,6 +1,6 @@
-// One step follows another on the caller's stream. All windows of a step are one frame, and go back
-// together. Other threads with streams of their own plan windows, cut them, and draw the pictures
-// of the asset that they are compared with, some steps ahead.
+// One step follows another on the caller's stream. All windows of a step are one frame,
+// and go back together. Other threads with streams of their own plan windows, cut them,
+// and draw the pictures of the asset that they are compared with, some steps ahead.
 
 #include "levels/refine_cuts_cuda.h"
 
@@ -29,9 +29,9 @@ constexpr unsigned kStepsAhead = 3;
 static_assert(kViewSlots >= (kStepsAhead + 1) * kMostWindows, "no step that is drawn reads it");
 constexpr unsigned kMostPlanners = 4;
 
-// Returns the number of threads that plan steps. All windows of a slot have one thread, whose
-// stream the memory of the target belongs to, and no step that is drawn reads a target that is
-// being overwritten.
+// Returns the number of threads that plan steps. All windows of a slot have one thread,
+// whose stream the memory of the target belongs to, and no step that is drawn reads a
+// target that is being overwritten.
 constexpr unsigned num_planners(unsigned windows_per_step) {
     unsigned num = kMostPlanners;
     while (num > 1 && (kViewSlots % (num * windows_per_step) != 0 ||
@@ -96,8 +96,9 @@ class StepFrame {
         num_slots_ = counters.slots;
         num_items_ = static_cast<unsigned>(counters.items);
     }
-    // Returns the gradients of the gaussians of items, kItemSize an item, whose slopes by pixels
-    // the windows have. Those of items that begin before row `first_wanted` are undefined.
+    // Returns the gradients of the gaussians of items, kItemSize an item, whose slopes
+    // by pixels the windows have. Those of items that begin before row `first_wanted`
+    // are undefined.
     GaussianRows<float> backward(const DeviceWindows& windows, uint64_t first_wanted) {
         const size_t count = size_t(kItemSize) * num_items_;
         const GaussianRows<float> gradient =
@@ -193,8 +194,8 @@ class TargetPainter {
           stream_(stream),
           model_(Span<const GaussianRows<const float>>{&target.rows, 1}, stream) {}
 
-    // Draws the asset in a window; `windows` is scratch. The pixels are in `picture`, whose memory
-    // belongs to the stream.
+    // Draws the asset in a window; `windows` is scratch. The pixels are in `picture`,
+    // whose memory belongs to the stream.
     ReadPlanes draw(const ClusterTable& table, const AssetView& view, WindowTables& windows,
                     DeviceBuffer<float>& picture) {
         const Camera camera = enlarged(view.window, view.samples);
@@ -234,11 +235,12 @@ class TargetPainter {
     Frame frame_;
 };
 
-// Plans the windows of steps ahead of them: a step waits for the host once, and choosing
-// tolerances takes the host as long as a step takes the device.
+// Plans the windows of steps ahead of them: a step waits for the host once, and
+// choosing tolerances takes the host as long as a step takes the device.
 class StepsAhead {
   public:
-    // Without a target, each window has a view of its own and nothing to compare it with.
+    // Without a target, each window has a view of its own and nothing to compare it
+    // with.
     StepsAhead(const CutPictures& pictures, const DeviceTable& table, const Canvases& canvases,
                uint64_t num_windows, unsigned windows_per_step, unsigned cuts_per_view,
                const DeviceFitTarget* target, cudaStream_t stream)
@@ -432,7 +434,8 @@ void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows,
     const DeviceBuffer<float> grey(3 * rows.size, stream);
     if (rows.size > 0)
         check(cudaMemsetAsync(grey.data(), 0, grey.bytes(), stream), "cudaMemsetAsync");
-    // The gradient by a colour says how much is seen of a gaussian, whatever its own colour is.
+    // The gradient by a colour says how much is seen of a gaussian, whatever its own
+    // colour is.
     GaussianRows<const float> rows_in_grey = rows;
     rows_in_grey.sh = grey.data();
     rows_in_grey.sh_degree = 0;

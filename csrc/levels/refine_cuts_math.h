@@ -25,8 +25,8 @@ inline size_t num_pixels(const Camera& camera) {
     return static_cast<size_t>(camera.width) * static_cast<size_t>(camera.height);
 }
 
-// Returns value k of a pixel of the target, averaged over `samples` x `samples` pixels; `width` is
-// that of the small picture.
+// Returns value k of a pixel of the target, averaged over `samples` x `samples` pixels;
+// `width` is that of the small picture.
 V3DG_HD inline float box_average(const float* plane, size_t width, size_t num_values, size_t k,
                                  size_t x, size_t y, int samples) {
     const auto side = static_cast<size_t>(samples);
@@ -51,8 +51,8 @@ struct ReadPlanes {
     }
 };
 
-// Puts the slopes of the loss in place of the differences of a pixel, as if the picture had the
-// weight 1. Returns the pixel's loss.
+// Puts the slopes of the loss in place of the differences of a pixel, as if the picture
+// had the weight 1. Returns the pixel's loss.
 V3DG_HD inline float put_slopes(const LossWeights& loss, PixelValues& pixel) {
     float sum = 0;
     for (int k = 0; k < 4; ++k) {
@@ -63,9 +63,10 @@ V3DG_HD inline float put_slopes(const LossWeights& loss, PixelValues& pixel) {
     return sum;
 }
 
-// Returns the weight of a picture, which is by its relative loss, not by its absolute one.
-// Otherwise small pictures, in which levels have larger errors, would improve at the cost of large
-// ones. A picture whose loss is below kLeastLoss is right, and its absolute loss counts.
+// Returns the weight of a picture, which is by its relative loss, not by its absolute
+// one. Otherwise small pictures, in which levels have larger errors, would improve at
+// the cost of large ones. A picture whose loss is below kLeastLoss is right, and its
+// absolute loss counts.
 constexpr double kLeastLoss = 1e-4;
 V3DG_HD inline float weight_of_picture(double loss_sum, double num_pixels) {
     return static_cast<float>(1 / (loss_sum + kLeastLoss * num_pixels));
@@ -77,8 +78,8 @@ V3DG_HD inline void put_sum_slopes(float color[3], float& alpha) {
     alpha = 0;
 }
 
-// Returns the step of a gaussian that `num_windows` of the step's windows show: the noise of a sum
-// of n gradients, relative to the sum, falls with the root of n.
+// Returns the step of a gaussian that `num_windows` of the step's windows show: the
+// noise of a sum of n gradients, relative to the sum, falls with the root of n.
 V3DG_HD inline FitStep step_of_windows(FitStep step, int num_windows) {
     const float factor = ::sqrtf(static_cast<float>(num_windows));
     for (float* size :
@@ -103,8 +104,9 @@ V3DG_HD inline void add_gradient(const GaussianRows<const float>& source, size_t
     for (size_t k = 0; k < num_sh; ++k) sum.sh[num_sh * to + k] += source.sh[num_sh * from + k];
 }
 
-// Moves gaussian i by a step; its gradient is row g of `gradient`. The position moves in fractions
-// of `radius`, scales by their logarithm and opacity by its logit, both within the range of a fit.
+// Moves gaussian i by a step; its gradient is row g of `gradient`. The position moves
+// in fractions of `radius`, scales by their logarithm and opacity by its logit, both
+// within the range of a fit.
 V3DG_HD inline void move_gaussian(const GaussianRows<float>& rows, size_t i,
                                   const GaussianRows<const float>& gradient, size_t g, float radius,
                                   const FitStep& step, float beta2, const Moments& moments) {
@@ -147,16 +149,16 @@ V3DG_HD inline void copy_gaussian(const GaussianRows<const float>& source, size_
     for (size_t k = 0; k < num_sh; ++k) rows.sh[num_sh * to + k] = source.sh[num_sh * from + k];
 }
 
-// Copies a gaussian in grey, of SH degree 0. The gradient by that colour says how much is seen of
-// it, whatever its own colour is.
+// Copies a gaussian in grey, of SH degree 0. The gradient by that colour says how much
+// is seen of it, whatever its own colour is.
 V3DG_HD inline void copy_in_grey(const GaussianRows<const float>& source, size_t from,
                                  const GaussianRows<float>& rows, size_t to) {
     copy_shape(source, from, rows, to);
     for (size_t k = 0; k < 3; ++k) rows.sh[3 * to + k] = 0;
 }
 
-// Returns the fraction of a picture that a gaussian fills, from the gradient of the picture's sum
-// by the colour of a gaussian that copy_in_grey made.
+// Returns the fraction of a picture that a gaussian fills, from the gradient of the
+// picture's sum by the colour of a gaussian that copy_in_grey made.
 V3DG_HD inline double blend_weight(float gradient, size_t num_pixels) {
     return static_cast<double>(gradient) / (kShBase0 * static_cast<double>(num_pixels));
 }
@@ -166,8 +168,8 @@ V3DG_HD inline size_t num_values(int sh_degree) {
     return 11 + 3 * static_cast<size_t>(num_sh_bases(sh_degree));
 }
 
-// Returns `count` rows in one block of memory, num_values() for each gaussian. Values that must be
-// aligned to 16 bytes come first.
+// Returns `count` rows in one block of memory, num_values() for each gaussian. Values
+// that must be aligned to 16 bytes come first.
 V3DG_HD inline GaussianRows<float> rows_in(float* memory, size_t count, int sh_degree) {
     const size_t num_sh = 3 * static_cast<size_t>(num_sh_bases(sh_degree));
     float* rest = memory + (4 + num_sh) * count;

@@ -1,8 +1,9 @@
 #pragma once
 
-// The kernels of refine_cuts and weigh_cuts: they handle the pixels of windows and the gaussians of
-// clusters before and after drawing and its backward pass. A row of blocks has a window where
-// pixels are handled; where gaussians are, a block has up to kItemSize of those of a cluster.
+// The kernels of refine_cuts and weigh_cuts: they handle the pixels of windows and the
+// gaussians of clusters before and after drawing and its backward pass. A row of blocks
+// has a window where pixels are handled; where gaussians are, a block has up to
+// kItemSize of those of a cluster.
 
 #include "base/launch.cuh"
 #include "levels/cut_windows_cuda.h"
@@ -39,8 +40,8 @@ struct WindowPixel {
     __device__ bool is_in_window() const { return pixel < width * height; }
 };
 
-// Writes the slopes of pixels as if windows had the weight 1, a thread each, and the loss of each
-// block. `planes` has room for `most_pixels` of each window.
+// Writes the slopes of pixels as if windows had the weight 1, a thread each, and the
+// loss of each block. `planes` has room for `most_pixels` of each window.
 __global__ void __launch_bounds__(kThreads)
     compare_kernel(const WindowTables* windows, LossWeights loss, size_t most_pixels, float* planes,
                    double* loss_of_block) {
@@ -113,8 +114,8 @@ struct ShownCluster {
     size_t num_clusters;
     unsigned num_windows;
 
-    // Calls visit(window, row) for each window that shows gaussian `i` of cluster `c`, in the order
-    // of the windows; row `row` of the gradients is its.
+    // Calls visit(window, row) for each window that shows gaussian `i` of cluster `c`,
+    // in the order of the windows; row `row` of the gradients is its.
     template <class Visit>
     __device__ void for_each_window(size_t c, size_t i, const Visit& visit) const {
         size_t first = 0;
@@ -126,8 +127,8 @@ struct ShownCluster {
     }
 };
 
-// Moves the gaussians of clusters from `first_cluster` on, by the sum of their gradients, which
-// takes the place of the first one.
+// Moves the gaussians of clusters from `first_cluster` on, by the sum of their
+// gradients, which takes the place of the first one.
 __global__ void __launch_bounds__(kItemSize)
     move_kernel(ShownCluster shown, Span<const int64_t> offset, size_t first_cluster,
                 GaussianRows<float> rows, GaussianRows<float> gradient, const float* radius,

@@ -8,12 +8,12 @@
 
 namespace v3dg {
 
-// A ball by its centre and radius.
+// A ball with centre and radius.
 struct Ball {
     float x, y, z, radius;
 };
 
-// A box by its lower and upper corner.
+// A box with lower and upper corners.
 struct Box {
     float lo[3], hi[3];
 };
@@ -23,7 +23,7 @@ V3DG_HD inline Box no_box() {
     return {{INFINITY, INFINITY, INFINITY}, {-INFINITY, -INFINITY, -INFINITY}};
 }
 
-// Makes `box` contain `other`, too.
+// Extends `box` so that it contains `other`.
 V3DG_HD inline void grow(Box& box, const Box& other) {
     for (int a = 0; a < 3; ++a) {
         box.lo[a] = other.lo[a] < box.lo[a] ? other.lo[a] : box.lo[a];

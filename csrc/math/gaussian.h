@@ -1,6 +1,6 @@
 #pragma once
 
-// A gaussian, the layouts in which many of them are held, and how far one reaches. Its alpha at a
+// A gaussian, the memory layouts for many of them, and the reach of one. Its alpha at a
 // pixel is in rasterize/rasterize_math.h.
 
 #include <cstddef>
@@ -11,11 +11,12 @@
 
 namespace v3dg {
 
-constexpr double kMinAlpha = 1.0 / 255;     // contributions below it are skipped
-constexpr double kMaxAlpha = 0.999;         // alpha is cut here
-constexpr double kMinTransmittance = 1e-4;  // a pixel that stops as gsplat's do stops before this
+constexpr double kMinAlpha = 1.0 / 255;     // contributions below this are skipped
+constexpr double kMaxAlpha = 0.999;         // alpha is clamped to this
+constexpr double kMinTransmittance = 1e-4;  // a pixel with gsplat's stopping rule stops before this
 constexpr double kLog2MinAlpha = -7.994353436858858;
-constexpr double kReachSigmas = 3.33;  // opacity 1 has fallen below 1/255 there
+// Here the alpha of a gaussian with opacity 1 has fallen to 1/255.
+constexpr double kReachSigmas = 3.33;
 constexpr double kLn2 = 0.6931471805599453;
 // sqrt(log2(e) / 2): exp(-d²/2) = 2^-(scale d)².
 constexpr double kFalloffScale = 0.8493218002880191;
@@ -28,9 +29,9 @@ struct Gaussian3d {
     V opacity;
 };
 
-// Gaussians as rows, which is how users hold them, on the host or on a device: (N, 3), (N, 4), (N,
-// 3), (N,) and (N, bases, 3). T is const where they are only read. On a device, quaternions and SH
-// coefficients start at a multiple of 16 bytes.
+// Gaussians as rows, the layout of the Python interface, on the host or on a device:
+// (N, 3), (N, 4), (N, 3), (N,) and (N, bases, 3). T is const for read-only rows. On a
+// device, quaternions and SH coefficients begin at a multiple of 16 bytes.
 template <class T>
 struct GaussianRows {
     T *means, *quats, *scales, *opacities, *sh;
@@ -49,7 +50,7 @@ struct GaussianRows {
     }
 };
 
-// Copies all of row `from` but its SH coefficients to row `to`.
+// Copies row `from`, except its SH coefficients, to row `to`.
 template <class T>
 V3DG_HD inline void copy_shape(const GaussianRows<const T>& source, size_t from,
                                const GaussianRows<T>& rows, size_t to) {
@@ -61,8 +62,9 @@ V3DG_HD inline void copy_shape(const GaussianRows<const T>& source, size_t from,
     rows.opacities[to] = source.opacities[from];
 }
 
-// Gaussians as the CPU's rasterizer reads them: a plane an attribute. Planes have `kPlanePadding`
-// elements of padding, so that a vector load may run past the last gaussian.
+// Gaussians in the layout of the CPU's rasterizer: one plane per attribute. Planes end
+// with `kPlanePadding` elements of padding, so that a vector load may read beyond the
+// last gaussian.
 constexpr size_t kPlanePadding = 16;
 template <class T>
 struct GaussianPlanes {
@@ -74,9 +76,9 @@ struct GaussianPlanes {
     int sh_degree;
 };
 
-// Colours of a bundle's clusters in which their gaussians are drawn, instead of the gaussians' own.
+// Colours of a bundle's clusters, which replace the colours of their gaussians.
 struct Palette {
-    const float* sh = nullptr;  // (C, 3) coefficients of the constant basis; null: no palette
+    const float* sh = nullptr;           // (C, 3) SH coefficients of degree 0; null: no palette
     const int64_t* first_row = nullptr;  // first gaussian of each cluster, ascending
     uint32_t num_clusters = 0;
 
@@ -94,8 +96,9 @@ struct Palette {
     }
 };
 
-// Gaussians as a CUDA frame reads them from resident memory: four planes of (N, 4) that hold a
-// PackedGaussian each, and the SH coefficients as rows that begin `sh_stride` floats apart.
+// Gaussians in the layout of CUDA frames: four planes of (N, 4) that together hold a
+// PackedGaussian per row, and the SH coefficients as rows that begin `sh_stride` floats
+// apart.
 struct PackedPlanes {
     const float* plane[4];
     const float* sh;
@@ -103,9 +106,9 @@ struct PackedPlanes {
     Palette palette;
 };
 
-// Returns an upper bound of a gaussian's reach in standard deviations, which is not below the one
-// that extent_of() uses. It is negative where the gaussian is too faint to be drawn, and not a
-// number where the opacity is invalid.
+// Returns an upper bound of a gaussian's reach in standard deviations, not below that
+// of extent_of(). It is negative if the gaussian is too faint to be drawn, and NaN if
+// the opacity is invalid.
 V3DG_HD inline float reach_in_sigmas(float opacity) {
     if (opacity < float(kMinAlpha)) return -1.0f;
     const float sigmas =
@@ -113,8 +116,8 @@ V3DG_HD inline float reach_in_sigmas(float opacity) {
     return opacity <= 1 ? sigmas : NAN;
 }
 
-// Returns an upper bound of a gaussian's reach from its mean, in its model's units. It is also not
-// a number where the gaussian may have no area.
+// Returns an upper bound of a gaussian's reach from its mean, in the units of its
+// model. It may be NaN also for a gaussian without area.
 V3DG_HD inline float reach_of(const Gaussian3d<float>& g) {
     const float sigmas = reach_in_sigmas(g.opacity);
     if (sigmas < 0) return -1.0f;
@@ -123,9 +126,9 @@ V3DG_HD inline float reach_of(const Gaussian3d<float>& g) {
     return least > 0 ? most * sigmas : NAN;
 }
 
-// A gaussian in the form that is quickest to project, for models that are projected more than once.
-// Its covariance is F Fᵀ with F = [f[0] f[3] 0; f[1] f[4] f[6]; f[2] f[5] f[7]], whose columns
-// start with the longest.
+// A gaussian in the form that is fastest to project, for models that are projected
+// repeatedly. Its covariance is F Fᵀ with F = [f[0] f[3] 0; f[1] f[4] f[6]; f[2] f[5]
+// f[7]]; the longest column is first.
 struct PackedGaussian {
     float mean[3];
     float reach;
@@ -133,7 +136,7 @@ struct PackedGaussian {
     float log2_opacity;
 };
 
-// These operations round exactly as written, whatever the compiler's options are.
+// These operations round exactly as written, for any compiler options.
 V3DG_HD inline double product_of(double a, double b) {
 #ifdef __CUDA_ARCH__
     return __dmul_rn(a, b);
@@ -161,8 +164,9 @@ V3DG_HD inline double inverse_of(double b) {
     return 1 / b;
 #endif
 }
-// Returns a / b. Precondition: the numbers are far from the ends of the range of doubles, as are
-// all that float32 leads to. It is a device's own division without the test for other numbers.
+// Returns a / b. Precondition: the numbers are far from the limits of doubles, as are
+// all that result from float32. It equals a device's division without the handling of
+// other numbers.
 V3DG_HD inline double quotient_of(double a, double b, double inverse) {
 #ifdef __CUDA_ARCH__
     const double q = __dmul_rn(a, inverse);
@@ -172,7 +176,7 @@ V3DG_HD inline double quotient_of(double a, double b, double inverse) {
     return a / b;
 #endif
 }
-// Rounds to float32. Readers of the result treat what is below 2^-126 as 0.
+// Rounds to float32. Code that reads the result treats values below 2^-126 as 0.
 V3DG_HD inline float rounded(double x) {
 #ifdef __CUDA_ARCH__
     float y;
@@ -183,14 +187,14 @@ V3DG_HD inline float rounded(double x) {
 #endif
 }
 
-// Packs a gaussian. Every rounding is explicit, so that all kernels that pack a gaussian get the
-// same bits.
+// Packs a gaussian. Every rounding is explicit, so that all kernels that pack a
+// gaussian get the same bits.
 V3DG_HD inline PackedGaussian pack_gaussian(const Gaussian3d<float>& g) {
     PackedGaussian out{};
     for (int k = 0; k < 3; ++k) out.mean[k] = g.mean[k];
     out.log2_opacity = log2_of(g.opacity);
     out.reach = reach_of(g);
-    // These are the columns of its rotation, as in rotation_of_quat().
+    // These are the columns of the rotation, as in rotation_of_quat().
     const double w = g.quat[0], x = g.quat[1], y = g.quat[2], z = g.quat[3];
     const double xx = product_of(x, x), yy = product_of(y, y), zz = product_of(z, z),
                  wx = product_of(w, x), wz = product_of(w, z), xz = product_of(x, z);
@@ -220,8 +224,9 @@ V3DG_HD inline PackedGaussian pack_gaussian(const Gaussian3d<float>& g) {
     }
     for (int k = 0; k < 3; ++k)
         for (int i = 0; i < 3; ++i) column[k][i] = product_of(column[k][i], scale[k]);
-    // Rotate columns 1 and 2 by a Givens rotation so that column 2 begins with 0; F Fᵀ does not
-    // change. They are the shortest columns, so their rounding is least.
+    // Rotate columns 1 and 2 by a Givens rotation so that column 2 begins with 0; F Fᵀ
+    // does not change. These are the shortest columns, so their rounding errors are
+    // smallest.
     const double a0 = column[1][0], b0 = column[2][0],
                  length = sqrt_of(::fma(a0, a0, product_of(b0, b0)));
     const double inverse = inverse_of(length);

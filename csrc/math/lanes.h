@@ -1,8 +1,8 @@
 #pragma once
 
-// The few elementary operations that formulas need, for a scalar (scalar.h) and, in sources
-// compiled per instruction set, for a SIMD vector of them (simd.h). A formula written with these
-// and `mask ? a : b` runs as either.
+// The elementary operations that formulas use, for a scalar (scalar.h) and, in sources
+// compiled per instruction set, for a SIMD vector (simd.h). A formula written with
+// these operations and `mask ? a : b` works for both.
 
 #include <type_traits>
 
@@ -11,7 +11,7 @@
 
 namespace v3dg {
 
-// Converts bits that hold an integer below 2^24.
+// Converts bits that hold an integer below 2^24 to a number.
 template <class V>
 V3DG_HD V3DG_INLINE V float_of_number(Bits<V> bits) {
     if constexpr (std::is_arithmetic<V>::value)
@@ -51,8 +51,8 @@ V3DG_HD V3DG_INLINE V min_of(V a, V b) {
     return a < b ? a : b;
 }
 
-// Returns the same number in every lane. Zero is subtracted, not added: that keeps every number, so
-// the compiler leaves it out.
+// Returns the same number in every lane. Zero is subtracted, not added, because the
+// subtraction preserves every number; so the compiler removes it.
 template <class V>
 V3DG_HD V3DG_INLINE V all_lanes(Lane<V> x) {
     if constexpr (std::is_arithmetic<V>::value) return x;

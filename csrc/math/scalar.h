@@ -11,7 +11,8 @@
 
 namespace v3dg {
 
-// These are constants because nvcc does not let device code call constexpr functions of the host.
+// These are constants because nvcc does not allow calls of the host's constexpr
+// functions in device code.
 template <class T>
 constexpr T kLargest = std::numeric_limits<T>::max();
 template <class T>
@@ -38,11 +39,11 @@ V3DG_HD inline int floor_to_int(float x) {
     return static_cast<int>(::floorf(x));
 #endif
 }
-// Returns 1 / x with a relative error below 1e-6, for positive x; that of the least normal number
-// where x is smaller. It is exact enough for margins.
+// Returns 1 / x with a relative error below 1e-6, for positive x; below the smallest
+// normal number, the result for that number. The accuracy suffices for margins.
 V3DG_HD inline float rough_reciprocal(float x) {
 #ifdef __CUDA_ARCH__
-    float inverse;  // skips the handling of numbers beyond that
+    float inverse;  // omits the handling of numbers outside the range
     asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(fmaxf(x, 1.17549435e-38f)));
     return inverse;
 #else
@@ -69,10 +70,10 @@ V3DG_HD inline float saturated_fma(float a, float b, float c) {
     return x > 0 ? (x < 1 ? x : 1.0f) : 0.0f;
 #endif
 }
-// Returns `bits` shifted to the left by the integer nearest to 8 x, for x in [0, 1]; ties go either
-// way.
+// Returns `bits` shifted left by the integer nearest to 8 x, for x in [0, 1]; ties are
+// rounded either way.
 V3DG_HD inline uint32_t shifted_by_eighths(uint32_t bits, float x) {
-    const float number = 8 * x + 8388608.0f;  // 2^23: adding it rounds to an integer
+    const float number = 8 * x + 8388608.0f;  // adding 2^23 rounds to an integer
     uint32_t last_bits;
     std::memcpy(&last_bits, &number, sizeof last_bits);
 #ifdef __CUDA_ARCH__
@@ -108,7 +109,7 @@ struct LaneOf {
 template <class V>
 using Lane = typename LaneOf<V>::type;
 
-// 32 bits, or a vector of 32 bits a lane of V.
+// A 32-bit integer, or a vector with one per lane of V.
 template <class V>
 struct BitsOf {
     using type = uint32_t;

@@ -1,22 +1,23 @@
 #pragma once
 
-// Real spherical harmonics of degree 0 to 3, in the order and with the signs that .ply assets are
-// stored in. A gaussian's colour is max(0, 1/2 + sum of coefficient * basis(view direction)).
+// Real spherical harmonics of degree 0 to 3, with the order and signs of .ply assets.
+// The colour of a gaussian is max(0, 1/2 + sum of coefficient * basis(view direction)).
 
 #include "math/vec.h"
 
 namespace v3dg {
 
 constexpr int kMaxShDegree = 3, kMaxShBases = 16;
-constexpr double kShBase0 = 0.28209479177387814;  // equal in every direction
-// The degree of plain colours: three numbers, possibly negative, in place of coefficients.
+constexpr double kShBase0 = 0.28209479177387814;  // the same in every direction
+// The degree of plain colours: three numbers, possibly negative, in place of
+// coefficients.
 constexpr int kPlainColor = -1;
 
 V3DG_HD constexpr int num_sh_bases(int degree) {
     return degree == kPlainColor ? 1 : (degree + 1) * (degree + 1);
 }
 
-// Computes the bases in the unit direction (x, y, z).
+// Computes the bases for the unit direction (x, y, z).
 template <class V>
 V3DG_HD V3DG_INLINE void sh_bases(int degree, V x, V y, V z, V basis[kMaxShBases]) {
     using T = Lane<V>;
@@ -79,10 +80,11 @@ V3DG_HD V3DG_INLINE void sh_bases_vjp(int degree, V x, V y, V z, const V g[kMaxS
     g_dir[2] = gz;
 }
 
-// Computes the colour in a direction of any length, from the eye to the gaussian in model space. A
-// channel that is not finite becomes 0, so that it does not spread to pixels on which the gaussian
-// has no weight. `sh(k)` returns the k-th coefficient of one gaussian (or of one a lane), base by
-// base, three channels each; each is requested once, in this order.
+// Computes the colour for a direction of any length, from the eye to the gaussian in
+// model space. A channel that is not finite becomes 0, so that it does not spread to
+// pixels where the gaussian has no weight. `sh(k)` returns the k-th coefficient of one
+// gaussian or of one per lane, basis by basis, three channels each; each coefficient is
+// requested once, in this order.
 template <class V, class Coefficient>
 V3DG_HD V3DG_INLINE void color_of_coefficients(int degree, const V direction[3],
                                                const Coefficient& sh, V color[3]) {
@@ -119,7 +121,8 @@ V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V direction[3], const V* 
     color_of_coefficients(degree, direction, [&](int k) { return sh[k]; }, color);
 }
 
-// Adds to `d_direction` and sets `d_sh` from the gradient of the colour. `d_sh` may be `sh` itself.
+// Adds to `d_direction` and sets `d_sh` from the gradient of the colour. `d_sh` may
+// alias `sh`.
 template <class V>
 V3DG_HD V3DG_INLINE void color_of_sh_vjp(int degree, const V direction[3], const V* sh,
                                          const V color[3], const V d_color[3], V d_direction[3],

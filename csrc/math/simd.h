@@ -1,8 +1,9 @@
 #pragma once
 
-// The operations of scalar.h for SIMD vectors, as wide as the instruction set that a source is
-// compiled for. They exist only in sources that are compiled once for each instruction set, and are
-// always inlined, so that the linker cannot give them to other sources. Formulas include lanes.h.
+// The operations of scalar.h for SIMD vectors, as wide as the instruction set of the
+// compilation. They exist only in sources that are compiled once per instruction set,
+// and are always inlined, so that the linker cannot share them with other sources.
+// Formulas include lanes.h.
 
 #include <cmath>
 #include <cstdint>
@@ -36,7 +37,8 @@ template <class T>
 constexpr int kLanes = kVectorBytes / static_cast<int>(sizeof(T));
 
 typedef int32_t IntVec32 __attribute__((vector_size(kVectorBytes)));
-typedef uint32_t BitsVec32 __attribute__((vector_size(kVectorBytes)));  // arithmetic on it may wrap
+// Integer arithmetic on it may wrap.
+typedef uint32_t BitsVec32 __attribute__((vector_size(kVectorBytes)));
 
 template <>
 struct LaneOf<Vec<float>> {
@@ -71,8 +73,8 @@ V3DG_INLINE Vec<double> sqrt_of(Vec<double> x) {
     return x;
 }
 
-// Returns bits of which bit i is set where lane i of a comparison holds. Compilers differ in the
-// type of 64-bit lanes.
+// Returns a bit mask in which bit i is set if the comparison holds in lane i. Compilers
+// differ in the type of 64-bit lanes.
 template <class Mask>
 V3DG_INLINE unsigned bits_of(Mask mask) {
     if constexpr (sizeof(mask[0]) == 4) {
@@ -89,19 +91,20 @@ V3DG_INLINE unsigned bits_of(Mask mask) {
     return bits;
 }
 
-// Returns bits of which bit i is set where the sign of lane i is.
+// Returns a bit mask of the lanes' sign bits.
 template <class V>
 V3DG_INLINE unsigned sign_bits_of(V x) {
     using Mask = decltype(x < x);
 #if defined(__SSE2__)
-    if constexpr (sizeof(x[0]) == 4) return bits_of((Mask)x);  // it looks only at the signs
+    // The instruction reads only the signs.
+    if constexpr (sizeof(x[0]) == 4) return bits_of((Mask)x);
 #endif
     return bits_of((Mask)x >> (8 * sizeof(x[0]) - 1));
 }
 
-// Returns 2^x for x in [-126, 127], with a relative error below 2^-22; the result is undefined for
-// other x. The integer part of x goes into the exponent. A polynomial with the least maximum
-// relative error on [-1/2, 1/2] gives the rest.
+// Returns 2^x for x in [-126, 127], with a relative error below 2^-22; undefined for
+// other x. The integer part of x becomes the exponent. A polynomial with minimal
+// maximum relative error on [-1/2, 1/2] gives the rest.
 V3DG_INLINE Vec<float> exp2_in_range(Vec<float> x) {
     // 1.5 * 2^23: adding it rounds to an integer.
     const Vec<float> magic = Vec<float>{} + 12582912.0f;
@@ -121,8 +124,8 @@ V3DG_INLINE Vec<double> exp2_in_range(Vec<double> x) {
 
 // Returns log2 of positive normal x, with an error below 2e-7 * max(1, |log2 x|).
 V3DG_INLINE Vec<float> log2_of(Vec<float> x) {
-    // x = m * 2^k with m in [sqrt(1/2), sqrt(2)); the polynomial is fitted to atanh((m - 1) / (m +
-    // 1)).
+    // x = m * 2^k with m in [sqrt(1/2), sqrt(2)); the polynomial is fitted to atanh((m
+    // - 1) / (m + 1)).
     const IntVec32 bits = (IntVec32)((BitsVec32)x - 0x3f3504f3u);
     const IntVec32 k = bits >> 23;
     const Vec<float> m = (Vec<float>)((bits & 0x007fffff) + 0x3f3504f3);
@@ -146,7 +149,7 @@ V3DG_INLINE auto to_int(V x) {
 template <class V>
 V3DG_INLINE auto floor_to_int(V x) {
     const auto i = to_int(x);
-    return i + (x < __builtin_convertvector(i, V));  // a comparison that holds is -1
+    return i + (x < __builtin_convertvector(i, V));  // a true comparison is -1
 }
 template <class V>
 V3DG_INLINE auto ceil_to_int(V x) {
@@ -181,7 +184,7 @@ V3DG_INLINE void store(T* p, Vec<T> v) {
 }
 
 #if defined(__SSE2__)
-// One instruction each, in place of the templates in lanes.h.
+// One instruction each, replacing the templates in lanes.h.
 V3DG_INLINE Vec<float> max_of(Vec<float> a, Vec<float> b) {
 #if defined(__AVX512F__)
     return (Vec<float>)_mm512_max_ps((__m512)a, (__m512)b);

@@ -1,8 +1,8 @@
 #pragma once
 
-// Poses of instances, and a camera in the frame of an instance: composed in double precision, then
-// rounded. Decisions depend on the results, so sources that call these functions are compiled
-// without contraction.
+// Poses of instances, and a camera in the coordinates of an instance: composed in
+// double precision, then rounded. Decisions depend on the results, so sources that call
+// these functions are compiled without contraction.
 
 #include <cfloat>
 
@@ -18,8 +18,8 @@ struct Pose {
     double scale;
 };
 
-// Returns whether a pose is valid. Instances whose pose is not finite, has no size or has a zero
-// quaternion are not drawn.
+// Returns whether a pose is valid. An instance is not drawn if its pose is not finite,
+// its scale is not positive, or its quaternion is zero.
 V3DG_HD inline bool is_placed(const Pose& pose) {
     double sum = pose.scale;
     for (int k = 0; k < 3; ++k) sum += fabs(pose.position[k]);
@@ -32,10 +32,10 @@ V3DG_HD inline bool is_placed(const Pose& pose) {
     return pose.scale > 0.0 && sum <= DBL_MAX && !is_zero && is_finite;
 }
 
-// The camera in the frame of an instance.
+// The camera in the coordinates of an instance.
 struct InstanceAxes {
     double axes[9],
-        origin[3];  // camera coordinates of an asset's point p, over the scale: axes p + origin
+        origin[3];  // camera coordinates of a point p, divided by the scale: axes p + origin
     double eye[3];
 };
 
@@ -56,7 +56,7 @@ V3DG_HD inline InstanceAxes axes_of_instance(const CameraPose& camera, const Pos
             out.axes[3 * row + k] = axis;
         }
         out.origin[row] = origin * inverse_scale;
-        // The cut is exact for any eye as long as squares of distances stay finite.
+        // The cut is exact for any eye as long as squared distances are finite.
         out.eye[row] = min_of(max_of(eye * inverse_scale, -1e18), 1e18);
     }
     return out;

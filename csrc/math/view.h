@@ -1,7 +1,8 @@
 #pragma once
 
-// Where a camera stands: its pose in the world, and the transform from a model to view space. Both
-// are the same for every camera model; camera/camera.h has what depends on the model.
+// The pose of a camera in the world, and the transform from a model to view space. Both
+// are the same for every camera model; camera/camera.h has the parts that depend on the
+// model.
 
 #include <cstdint>
 #include <cstring>
@@ -17,18 +18,19 @@ struct CameraPose {
     double eye[3];          // the camera's position in the world
 };
 
-// Model space to view space: view = linear * (model - eye) + translation, linear = uniform scale *
-// rotation. Subtracting the eye first keeps the digits of points near it, however far from zero
-// both are.
+// Transform from model space to view space: view = linear * (model - eye) +
+// translation, with linear = uniform scale * rotation. Subtracting the eye first
+// preserves the precision of points near it, however far from the origin both are.
 template <class T>
 struct ModelView {
     T linear[9];            // row major
-    T translation[3];       // what rounding `eye` to 24 bits leaves, in view space
-    T eye[3], eye_rest[3];  // the camera's position in model space is their sum
+    T translation[3];       // remainder after rounding `eye` to 24 bits, in view space
+    T eye[3], eye_rest[3];  // their sum is the camera's position in model space
 };
 
-// The leading 24 bits of a number, which a float holds. It masks bits instead of casting, because
-// GCC 12 takes (double)(float)x to be x where it vectorizes.
+// Returns the leading 24 bits of a number, which a float can represent. The function
+// masks bits instead of casting, because GCC 12 replaces (double)(float)x by x in
+// vectorised code.
 V3DG_HD inline double leading_bits(double x) {
     uint64_t bits;
     std::memcpy(&bits, &x, sizeof bits);
@@ -37,7 +39,7 @@ V3DG_HD inline double leading_bits(double x) {
     return x;
 }
 
-// Places the eye, in double precision; `translation` is that of view = linear * model +
+// Sets the eye, in double precision. `translation` is from view = linear * model +
 // translation.
 template <class T>
 V3DG_HD inline void set_eye(const double linear[9], const double translation[3],
@@ -67,10 +69,10 @@ V3DG_HD V3DG_INLINE void from_eye(const ModelView<T>& mv, const V point[3], V di
     for (int k = 0; k < 3; ++k) direction[k] = point[k] - mv.eye[k] - mv.eye_rest[k];
 }
 
-// The position of a camera: the point that its world-to-camera matrix maps to 0. The rotation in it
-// may be off by what float32 loses.
+// Computes the position of a camera: the point that its world-to-camera matrix maps to
+// 0. The rotation in the matrix may have float32 rounding errors.
 V3DG_HD inline void eye_of(const double viewmat[16], double eye[3]) {
-    // The rotation's inverse by columns, which are cross products of its rows.
+    // The columns of the inverse rotation are cross products of its rows.
     double determinant = 0.0;
     for (int a = 0; a < 3; ++a) {
         const int b = (a + 1) % 3, c = (a + 2) % 3;
@@ -86,7 +88,7 @@ V3DG_HD inline void eye_of(const double viewmat[16], double eye[3]) {
     for (int a = 0; a < 3; ++a) eye[a] /= determinant;
 }
 
-// The view of gaussians that are given in world space.
+// Returns the view of gaussians in world space.
 template <class T>
 V3DG_HD inline ModelView<T> view_of_world(const CameraPose& pose) {
     ModelView<T> view;

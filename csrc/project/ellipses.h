@@ -1,6 +1,7 @@
 #pragma once
 
-// The ellipses of all gaussians on an image, whether or not they are drawn, for training.
+// The ellipses of all gaussians on an image, including those that are not drawn, for
+// training.
 
 #include <cstdint>
 
@@ -9,16 +10,19 @@
 
 namespace v3dg {
 
-// Arrays of N gaussians. A gaussian that is not in sight has zeros: one that is nearer than the
-// near plane or farther than the far depth, has an alpha of 1/255 nowhere, lies outside of the
-// image, or reaches at most `min_radius_px` from its centre.
+// Arrays of N gaussians. All values are zero for a gaussian that is not visible: it is
+// nearer than the near plane or farther than the far depth, its alpha is below 1/255
+// everywhere, it is outside of the image, or it reaches at most `min_radius_px` from
+// its centre.
 template <class T>
 struct Ellipses {
-    T* centers;      // (N, 2) px
-    T* depths;       // (N,)
-    T* conics;       // (N, 3) inverses of the covariances as xx, xy, yy, 1 / px²
-    T* opacities;    // (N,) as they are blended, compensation included
-    int32_t* radii;  // (N, 2) px from the centre within which alpha is 1/255 or more, rounded up
+    T* centers;    // (N, 2) px
+    T* depths;     // (N,)
+    T* conics;     // (N, 3) inverse covariances as xx, xy, yy, 1 / px²
+    T* opacities;  // (N,) as used for blending, including compensation
+    // (N, 2) distance from the centre, px, up to which alpha is 1/255 or more, rounded
+    // up.
+    int32_t* radii;
 };
 
 template <class T>
@@ -60,7 +64,7 @@ struct EllipsesInput {
     }
 
   private:
-    // The result is undefined for NaN.
+    // Rounds up. The result is undefined for NaN.
     static V3DG_HD int32_t rounded_up(T x) {
         const auto whole = static_cast<int32_t>(min_of(max_of(x, T(0)), T(1 << 30)));
         return whole + (T(whole) < x ? 1 : 0);

@@ -1,6 +1,6 @@
 #pragma once
 
-// Large records, which lie over many tiles: they are listed in batches for tile_bin.
+// Large records, which cover many tiles. They are listed in batches for tile_bin.
 
 #include "frame/tile_list.h"
 #include "project/warp_space.cuh"
@@ -8,8 +8,8 @@
 namespace v3dg {
 namespace cuda {
 
-// One of `count` parts of a large record: a share of its rows of tiles. Its record is kNoRecord
-// where the share is empty.
+// Returns one of `count` parts of a large record: a part of its rows of tiles. The
+// record of an empty part is kNoRecord.
 __device__ inline LargeRecord part_of(LargeRecord large, int part, int count) {
     const int top = large.box.y0 / kFrameTileHeight,
               rows = static_cast<int>(tile_rows_of(large.box));
@@ -20,9 +20,9 @@ __device__ inline LargeRecord part_of(LargeRecord large, int part, int count) {
     return large;
 }
 
-// Writes the item's large records that wait, in whole batches. What is left over goes on waiting,
-// or at the end of the item fills a batch with padding. A batch that lies over very many tiles is
-// written as several, each with a part of every record.
+// Writes the item's large records from the queue, in whole batches. An incomplete batch
+// stays in the queue, or is padded at the end of the item. A batch that covers very
+// many tiles is written as several batches, each with a part of every record.
 template <class Model>
 __device__ void write_large(WarpSpace<Model>& space, FrameCounters& counters,
                             const ProjectOutput& out, bool is_end) {

@@ -1,5 +1,5 @@
-// Packs gaussians into the planes that frames draw from: the rows of an asset, and the pages of a
-// pool, whether they hold rows or codes.
+// Packs gaussians into the planes that frames read: the rows of an asset, and the pages
+// of a pool, which are rows or codes.
 
 #include "base/launch.cuh"
 #include "math/gaussian.h"
@@ -11,7 +11,7 @@ namespace cuda {
 
 namespace {
 
-// Packs a gaussian into a row of four planes of `num_rows`.
+// Packs a gaussian into row `i` of four planes with `num_rows` rows.
 __device__ void pack_row(const Gaussian3d<float>& gaussian, const float* sh, float4* planes,
                          size_t num_rows, size_t row) {
     const PackedGaussian p = pack_gaussian(gaussian);
@@ -32,7 +32,7 @@ __device__ Gaussian3d<float> gaussian_of(const GaussianRows<const float>& rows, 
     return gaussian;
 }
 
-// One thread a gaussian.
+// One thread per gaussian.
 __global__ void pack_kernel(GaussianRows<const float> rows, float4* planes) {
     const size_t g = blockIdx.x * size_t(blockDim.x) + threadIdx.x;
     if (g < rows.size)
@@ -42,7 +42,8 @@ __global__ void pack_kernel(GaussianRows<const float> rows, float4* planes) {
 // Decodes a row of a page of codes; `sh` has room for all coefficients.
 __device__ Gaussian3d<float> decoded(const PageCodes<const uint32_t>& codes, size_t row,
                                      float* sh) {
-    size_t cluster = codes.num_clusters() - 1;  // becomes the last that begins at or before the row
+    // Becomes the last cluster that begins at or before the row.
+    size_t cluster = codes.num_clusters() - 1;
     while (static_cast<size_t>(codes.offset[cluster]) > row) --cluster;
     const uint32_t* words = codes.ranges(cluster);
     const auto& code = *reinterpret_cast<const ClusterCode*>(words);
@@ -54,7 +55,7 @@ __device__ Gaussian3d<float> decoded(const PageCodes<const uint32_t>& codes, siz
     return gaussian;
 }
 
-// One block a page. The coefficients of degree 0 are in the planes.
+// One block per page. The coefficients of degree 0 are in the planes.
 __global__ void pack_pages_kernel(const PageRows* pages, float4* planes, size_t num_rows, float* sh,
                                   int sh_stride) {
     const PageRows page = pages[blockIdx.x];

@@ -1,5 +1,6 @@
-// Backward pass of projection. A block has an item, a thread one of its records. SH coefficients
-// are brought into shared memory, one row a gaussian, where their gradients replace them.
+// Backward pass of projection. Each block processes an item, each thread one of its
+// records. SH coefficients are loaded into shared memory, one row per gaussian, where
+// the kernel overwrites them with their gradients.
 
 #include <type_traits>
 
@@ -13,8 +14,8 @@ namespace cuda {
 namespace {
 
 constexpr int kThreads = kItemSize;
-constexpr uint32_t kFewSlots = 16;  // a thread adds up to this many by itself, a warp adds more
-constexpr int kWordsAtOnce = 6;     // how many a thread loads before it stores the first
+constexpr uint32_t kFewSlots = 16;  // up to this many are summed by a thread, more by a warp
+constexpr int kWordsAtOnce = 6;     // floats that a thread loads before it stores the first one
 
 template <class Value>
 __device__ void add_slot(const Value* of_slot, uint32_t i, Value& sum) {
@@ -25,8 +26,8 @@ __device__ void add_slot(const Value* of_slot, uint32_t i, Value& sum) {
     sum += slot;
 }
 
-// Sums `num` slots, in their order or, when there are many, in another fixed order. All lanes of
-// the warp take part. Returns whether any slot was touched.
+// Sums `num` slots in their order or, if there are many, in another fixed order. All
+// lanes of the warp take part. Returns whether any slot was written.
 template <class Value>
 __device__ bool sum_of_slots(const GradientSlots& slots, const Value* of_slot, uint32_t first,
                              uint32_t num, Value& sum) {
@@ -101,7 +102,7 @@ __device__ void store_row(float* rows, uint64_t i, const float* row) {
     for (int k = 0; k < kWidth; ++k) rows[kWidth * i + k] = row[k];
 }
 
-// How a row of SH coefficients is moved. The stride is odd, against bank conflicts.
+// How a row of SH coefficients is copied. The stride is odd to avoid bank conflicts.
 template <int kDegree>
 struct ShRow {
     static constexpr int kValues = 3 * num_sh_bases(kDegree);
@@ -110,7 +111,8 @@ struct ShRow {
     static constexpr int kStride = kWords | 1;
 };
 
-// The gaussians of a block: of the only model, kItemSize after another, or of an item of a batch.
+// The gaussians of a block: of the only model, kItemSize after another, or of an item
+// of a batch.
 struct BlockRows {
     uint64_t first;  // row of the first gaussian
     int count;
@@ -124,8 +126,8 @@ __device__ BlockRows rows_of_block(const ProjectBackwardInput& in, const ItemBat
     const uint64_t first = static_cast<uint64_t>(blockIdx.x) * kItemSize;
     return {first, static_cast<int>(min(static_cast<uint64_t>(kItemSize), in.rows.size - first))};
 }
-// They are asked with a compile-time constant, so that those of a single picture stay in constant
-// memory.
+// They are asked with a compile-time constant, so that those of a single picture stay
+// in constant memory.
 template <bool kIsBatch>
 __device__ const ModelView<float>& view_of_block(const ProjectBackwardInput& in,
                                                  const ItemBatch& batch) {
@@ -147,7 +149,7 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
     using Row = ShRow<kDegree>;
     using Word = typename Row::Word;
     Word* sh_rows = reinterpret_cast<Word*>(shared_memory());
-    __shared__ bool is_used[kThreads];  // whether anything flows into the gaussian
+    __shared__ bool is_used[kThreads];  // whether any gradient reaches the gaussian
     const BlockRows block = rows_of_block<kIsBatch>(in, batch);
     const uint64_t first = block.first,
                    first_record = static_cast<uint64_t>(blockIdx.x) * kItemSize;
@@ -161,7 +163,7 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
     const uint64_t i = is_record ? in.source[record] : 0;  // the gaussian of the record
     Gaussian3d<float> g{};
     float color[3] = {0, 0, 0};
-    if (is_record) {  // early, so that it arrives while the slots are added up
+    if (is_record) {  // early, so that it arrives while the slots are summed
         load_row(in.rows.means, i, g.mean);
         load_row(in.rows.quats, i, g.quat);
         load_row(in.rows.scales, i, g.scale);

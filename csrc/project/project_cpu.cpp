@@ -1,10 +1,12 @@
-// Projection on the CPU, forward and backward, a vector of gaussians at a time. In the forward pass
-// the lanes are neighbours in the planes. Compiled once for each instruction set.
+// Projection on the CPU, forward and backward, a vector of gaussians at a time. In the
+// forward pass the lanes are neighbours in the planes. Compiled once for each
+// instruction set.
 
 #include "project/project.h"
 
 #include <algorithm>
 
+#include "math/instance_factors.h"
 #include "quantize/quantize_math.h"
 
 namespace v3dg {
@@ -30,7 +32,7 @@ struct PlaneSource {
     }
 };
 
-// Gaussians as codes, of one cluster. Lanes past its end repeat its last gaussian.
+// Gaussians of one cluster as codes. Lanes beyond its end repeat its last gaussian.
 struct CodeSource {
     using V = Vec<float>;
 
@@ -59,7 +61,7 @@ struct CodeSource {
     }
 
   private:
-    // Loads `width` words of each row; rows begin `stride` words apart.
+    // Loads `width` integers of each row; rows begin `stride` integers apart.
     static V3DG_INLINE void load_words(const uint32_t* rows, int width, uint64_t stride,
                                        uint64_t count, Bits<V>* words) {
         for (int lane = 0; lane < kLanes<float>; ++lane) {
@@ -69,13 +71,15 @@ struct CodeSource {
     }
 };
 
-// The number of tiles that the pixels from `first` to `last` lie in, along one axis.
+// Returns the number of tiles that contain the pixels from `first` to `last` on one
+// axis.
 template <class I>
 static V3DG_INLINE I tiles_of(I first, I last) {
     return last / kTileSize - first / kTileSize + 1;
 }
 
-// Loads the colours of the clusters of the gaussians from `at` on, for the lanes in `kept`.
+// Loads the colours of the clusters of the gaussians from `at` on, for the lanes in
+// `kept`.
 template <class V>
 static V3DG_INLINE void load_palette(const Palette& palette, uint64_t at, unsigned kept, V sh[3]) {
     for (int k = 0; k < 3; ++k) sh[k] = V{};
@@ -86,7 +90,8 @@ static V3DG_INLINE void load_palette(const Palette& palette, uint64_t at, unsign
     }
 }
 
-// Writes the records of those of the `count` gaussians from `at` on whose bits are set in `lanes`.
+// Writes the records of the `count` gaussians from `at` on whose bits are set in
+// `lanes`.
 template <class Source, class T, class V, class I>
 static V3DG_INLINE void write_records(const Source& from, const Draw<T>& draw, uint64_t at,
                                       uint64_t count, unsigned lanes, const Gaussian3d<V>& g,
@@ -100,6 +105,7 @@ static V3DG_INLINE void write_records(const Source& from, const Draw<T>& draw, u
     } else {
         const int sh_degree = from.load_sh(at, count, sh);
         color_of_sh(sh_degree, direction, sh, color);
+        if (draw.color_factors != nullptr) tint(draw.color_factors, color);
     }
     for (Record<T>* r = records; lanes != 0; lanes &= lanes - 1, ++r) {
         const int i = __builtin_ctz(lanes);
@@ -113,7 +119,7 @@ static V3DG_INLINE void write_records(const Source& from, const Draw<T>& draw, u
     }
 }
 
-// project() for rows of one source, from `first` on.
+// project() for rows of one source, beginning at row `first`.
 template <class Source, class T>
 static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t first, uint64_t count,
                            const Intrinsics<T>& camera, const Window& window, Record<T>* records,
@@ -150,7 +156,8 @@ static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t fir
         reach.drawn += __builtin_popcount(drawn_bits);
         top = min_of(top, drawn ? box.y0 : top);
         bottom = max_of(bottom, drawn ? box.y1 : bottom);
-        // The boxes of gaussians that are not drawn may be so large that the product overflows.
+        // The product may overflow for gaussians that are not drawn, because their
+        // boxes can be very large.
         const I columns = drawn ? tiles_of(box.x0, box.x1) : I{},
                 rows = drawn ? tiles_of(box.y0, box.y1) : I{};
         entries += columns * rows;
@@ -211,8 +218,8 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Intrins
                         records, source, source_base, reach);
 }
 
-// The gaussians are scattered, so lanes are filled one by one, which costs little beside the
-// arithmetic.
+// The gaussians are scattered, so lanes are filled one by one. This costs little
+// compared to the arithmetic.
 template <class T>
 void project_backward(const Draw<T>& draw, const uint32_t* source,
                       const RecordGradient<T>* d_records, size_t count, const Intrinsics<T>& camera,
@@ -228,7 +235,7 @@ void project_backward(const Draw<T>& draw, const uint32_t* source,
         Ellipse<V> d{};
         V d_color[3] = {};
         for (size_t i = 0; i < kWidth; ++i) {
-            // Spare lanes repeat the first gaussian with no gradient.
+            // Unused lanes repeat the first gaussian with zero gradients.
             const size_t at = done + (i < lanes ? i : 0);
             const uint64_t s = draw.first + source[at];
             for (int k = 0; k < 3; ++k) g.mean[k][i] = m.mean[k][s];

@@ -1,14 +1,16 @@
-// Projects the items of a frame: the kernels, and how a warp goes through an item.
+// Projects the items of a frame: the kernels, and how a warp processes an item.
 //
-// A warp has one item at a time. It tests the spheres of 32 gaussians at a time (sphere_test.cuh);
-// those that may reach a pixel centre enter a queue, and are projected as soon as there are 32 of
-// them (write_records.cuh). So no lane idles for a gaussian that is not drawn, and records come out
-// in order without synchronising with another warp. Where nearly all of 32 may reach a pixel
-// centre, the next ones are projected without the test, which would cost more than it saves.
+// A warp processes one item at a time. It tests the bounding spheres of 32 gaussians at
+// a time (sphere_test.cuh). Gaussians that may reach a pixel centre enter a queue, and
+// are projected as soon as the queue has 32 of them (write_records.cuh). So no lane
+// idles for a gaussian that is not drawn, and records are in order without
+// synchronisation between warps. If nearly all of 32 gaussians pass, the next ones are
+// projected without the test, which would cost more than it saves.
 //
-// In a shared item a warp takes one gaussian at a time, in front of up to 32 placements. Many far
-// instances of a cluster of few gaussians are then a few items with full warps, which read those
-// gaussians once. Shared items have a kernel of their own, because they need more registers.
+// In a shared item a warp processes one gaussian at a time, in front of up to 32
+// placements. Many distant instances of a small cluster thus become a few items with
+// full warps, which read each gaussian once. Shared items have a separate kernel,
+// because they need more registers.
 
 #include "project/project_cuda.h"
 
@@ -25,21 +27,23 @@ namespace cuda {
 
 namespace {
 
-constexpr unsigned kBlocks = 4;  // on a multiprocessor
-// An item is tested by rows where at least kManySmall of its first 32 gaussians reach less than
-// kSmall px.
+constexpr unsigned kBlocks = 4;  // per multiprocessor
+// An item is tested by rows if at least kManySmall of its first 32 gaussians have a
+// reach below kSmall px.
 constexpr float kSmall = 3;
 constexpr unsigned kManySmall = 4;
-// Where at least kNearlyAll of 32 gaussians pass the sphere test, the next ones are not tested, as
-// long as at least kMany of 32 become records.
+// If at least kNearlyAll of 32 gaussians pass the sphere test, the next ones are not
+// tested, as long as at least kMany of 32 become records.
 constexpr unsigned kNearlyAll = 22, kMany = 12;
 
-// Projects the item whose tables the warp holds. Returns its number of records.
+// Projects the item whose tables the warp has loaded. `factors` are those of its
+// placement, or of all placements that share the item; null unless the source has
+// factors. Returns its number of records.
 template <class Source, bool kIsShared>
 __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const Placement* sharers,
-                                 FrameCounters& counters, const ProjectOutput& out,
-                                 unsigned& num_in_frustum) {
-    constexpr unsigned kRound = kIsShared ? 1 : 32;  // gaussians
+                                 const InstanceFactors* factors, FrameCounters& counters,
+                                 const ProjectOutput& out, unsigned& num_in_frustum) {
+    constexpr unsigned kRound = kIsShared ? 1 : 32;  // gaussians per iteration
     const auto& tables = space.tables;
     const unsigned lane = threadIdx.x % 32, count = tables.item.count;
     if (lane == 0) space.num_large = 0;
@@ -47,6 +51,9 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
     ModelView<float> of_sharer;
     if (kIsShared && sees) of_sharer = sharers[lane].view;
     const ModelView<float>& view = kIsShared ? of_sharer : tables.placement.view;
+    bool is_faint = false;
+    if constexpr (Source::kTints)
+        if (sees) is_faint = factors[kIsShared ? lane : 0].opacity < 1;
     const auto reach_scale_of = [&] {
         const float* linear = view.linear;
         return tables.image.camera.sphere_scale(
@@ -54,7 +61,7 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
     };
     const float reach_scale = sees ? reach_scale_of() : 0;
     unsigned head = 0, waiting = 0;
-    uint32_t record = tables.item.record;  // the next one
+    uint32_t record = tables.item.record;  // index of the next record
     ItemTraits traits{.are_small = false, .have_shade = Source::has_shade(tables.model)};
     bool are_tested = true;
     const typename Source::Place start = Source::start(tables);
@@ -75,7 +82,8 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
             const float mean[3] = {sphere.x, sphere.y, sphere.z};
             to_view(view, mean, mine.p);
             if (are_tested) {
-                const SphereTest told = test_sphere<Source>(tables, mine.p, sphere.w, reach_scale);
+                const SphereTest told =
+                    test_sphere<Source>(tables, mine.p, sphere.w, reach_scale, is_faint);
                 may_reach = told.may_reach;
                 is_small = may_reach && told.half < kSmall;
                 num_in_frustum += told.misses_centers;
@@ -94,7 +102,8 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
             __syncwarp();
             const bool are_nearly_all = !kIsShared && __popc(come) >= kNearlyAll;
             if (waiting < 32 && first + kRound < count && !are_nearly_all) continue;
-            // After the last gaussian up to two rounds may be left.
+            // After the last gaussian, the queue may contain up to two iterations'
+            // worth.
             const unsigned taken = min(waiting, 32u);
             may_reach = lane < taken;
             if (may_reach) mine = space.queue[(head + lane) % kQueue];
@@ -102,11 +111,12 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
             waiting -= taken;
             are_tested = !are_nearly_all || waiting > 0;
         }
-        const unsigned num_records = write_records<Source, kIsShared>(
-            space, sharers, start, traits, may_reach, mine, record, counters, out, num_in_frustum);
+        const unsigned num_records =
+            write_records<Source, kIsShared>(space, sharers, factors, start, traits, may_reach,
+                                             mine, record, counters, out, num_in_frustum);
         record += num_records;
         are_tested = are_tested || num_records < kMany;
-        __syncwarp();  // before the queue and the records are written again
+        __syncwarp();  // the queue and the records are written next
     }
     write_large(space, counters, out, true);
     return record - tables.item.record;
@@ -132,6 +142,14 @@ __device__ void report_counts(FrameCounters& counters, unsigned num_in_frustum,
 }
 
 template <class Source>
+__device__ const InstanceFactors* factors_for(const ProjectInput& in, const DrawItem& item) {
+    if constexpr (Source::kTints)
+        return in.factors_of(item);
+    else
+        return nullptr;
+}
+
+template <class Source>
 __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     project_kernel(ProjectInput in, const typename Source::Model* models, ProjectOutput out,
                    unsigned* taken) {
@@ -144,9 +162,10 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     Loaded loaded;
     Source::prepare();
     space.tiles.count = 0;
-    __syncwarp();  // A warp without an item reads it next.
-    // Items differ much in how many of their gaussians are seen, so warps take them from a counter.
-    // A warp asks for its next item as it begins with one, to hide the latency.
+    __syncwarp();  // A warp without an item skips to its next read.
+    // The number of visible gaussians per item varies widely, so warps claim items from
+    // a counter. A warp claims its next item when it starts with one, to hide the
+    // latency.
     for (unsigned i = blockIdx.x * kWarps + threadIdx.x / 32; i < num_items;) {
         const uint32_t item_word = load_word(in.items.items[i]);
         const unsigned next = take_next(taken, gridDim.x * kWarps);
@@ -155,8 +174,9 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
         __syncwarp();
         store_tables(space.tables, item_word, placement_word, in, models, loaded);
         if (space.tables.item.sharers == 0 && Source::has(space.tables.model)) {
-            const unsigned written = project_item<Source, false>(space, nullptr, *in.items.counters,
-                                                                 out, num_in_frustum);
+            const unsigned written = project_item<Source, false>(
+                space, nullptr, factors_for<Source>(in, space.tables.item), *in.items.counters, out,
+                num_in_frustum);
             num_records += written;
             report_item(space.tables, i, written, out);
         }
@@ -166,7 +186,8 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     report_counts(*in.items.counters, num_in_frustum, num_records);
 }
 
-// Most frames have few shared items, so a warp searches 32 items at a time for them.
+// Most frames have few shared items, so a warp searches 32 items at a time for shared
+// ones.
 template <class Source>
 __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     project_shared_kernel(ProjectInput in, const typename Source::Model* models,
@@ -196,7 +217,8 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
                          in, models, loaded);
             if (!Source::has(space.tables.model)) continue;
             const unsigned written =
-                project_item<Source, true>(space, sharers, *in.items.counters, out, num_in_frustum);
+                project_item<Source, true>(space, sharers, factors_for<Source>(in, item),
+                                           *in.items.counters, out, num_in_frustum);
             num_records += written;
             report_item(space.tables, i, written, out);
         }
@@ -220,12 +242,21 @@ static void project_from(const typename Source::Model* models, const ProjectInpu
 }
 
 template <class Source>
-static void project_scene(const typename Source::Model* models, const ProjectInput& in,
-                          const ProjectOutput& out, int taken, cudaStream_t stream) {
+static void project_instances(const typename Source::Model* models, const ProjectInput& in,
+                              const ProjectOutput& out, int taken, cudaStream_t stream) {
     if (in.has_faded_items)
         project_from<Faded<Source>, Source>(models, in, out, taken, stream);
     else
         project_from<Source, Source>(models, in, out, taken, stream);
+}
+
+template <class Source>
+static void project_scene(const typename Source::Model* models, const ProjectInput& in,
+                          const ProjectOutput& out, int taken, cudaStream_t stream) {
+    if (in.factors != nullptr)
+        project_instances<Tinted<Source>>(models, in, out, taken, stream);
+    else
+        project_instances<Source>(models, in, out, taken, stream);
 }
 
 void project(const ProjectInput& in, const ProjectOutput& out, cudaStream_t stream) {

@@ -1,12 +1,12 @@
 #pragma once
 
-// Projects one gaussian for one camera: its ellipse on the image, the pixels that it may reach, and
-// the gradients of the ellipse.
+// Projects one gaussian for one camera: its ellipse on the image, the pixels that it
+// may reach, and the gradients of the ellipse.
 //
-// This is EWA projection (Zwicker et al. 2001) as 3D Gaussian Splatting uses it (Kerbl et al.
-// 2023), for any camera model (camera/camera.h). The 2D covariance is A Aᵀ + filter I with A = J W
-// R S (2x3), where J is the model's Jacobian, so its determinant is |a1 x a2|² plus terms that are
-// positive: nothing cancels, however thin the gaussian is.
+// This is EWA projection (Zwicker et al. 2001) as 3D Gaussian Splatting uses it (Kerbl
+// et al. 2023), for any camera model (camera/camera.h). The 2D covariance is A Aᵀ +
+// filter I with A = J W R S (2x3), where J is the model's Jacobian. Its determinant is
+// |a1 x a2|² plus positive terms, so nothing cancels, however thin the gaussian is.
 
 #include "camera/camera.h"
 #include "frame/draw_list.h"
@@ -17,7 +17,7 @@
 
 namespace v3dg {
 
-// Intermediate results of the projection, which the gradients need again.
+// Intermediate results of the projection, which the gradients use again.
 template <class V, ProjectingModel C = Intrinsics<Lane<V>>>
 struct Projection {
     V p[3];          // view space
@@ -27,14 +27,14 @@ struct Projection {
     V c11, c12, c22, det0, det;
 };
 
-// A limited filter adds at most this many times the gaussian's own variance, which is the square
-// root of its determinant. A round gaussian then keeps at least a fifth of its opacity. Without the
-// limit, many tiny gaussians that cover an area together would all fall below the least alpha that
-// is drawn, and nothing would be left of them.
+// The limit of a limited filter: this multiple of the gaussian's own variance, which is
+// the square root of its determinant. With it, a round gaussian keeps at least a fifth
+// of its opacity. Without it, many tiny gaussians that together cover an area would all
+// fall below the smallest alpha that is drawn, and vanish.
 constexpr float kMostFilterOfVariance = 4;
 
-// The ellipse whose covariance is A Aᵀ + filter I, with the rows a1 and a2 of A, p and the Jacobian
-// in `s`; all but its opacity.
+// Sets the ellipse with covariance A Aᵀ + filter I, except its opacity. `s` contains
+// the rows a1 and a2 of A, p and the Jacobian.
 template <class V, ProjectingModel C>
 V3DG_HD V3DG_INLINE Ellipse<V> ellipse_of_axes(const C& cam, Lane<V> most_filter_px2,
                                                bool is_limited, Projection<V, C>& s) {
@@ -59,9 +59,10 @@ V3DG_HD V3DG_INLINE Ellipse<V> ellipse_of_axes(const C& cam, Lane<V> most_filter
     return e;
 }
 
-// The ellipse of a gaussian. Precondition: s.p is set, at a positive depth. `filter_px2` is added
-// to both variances; with `antialiased` the opacity is multiplied by sqrt(det before / det after),
-// which keeps the integral of the gaussian over the image.
+// Returns the ellipse of a gaussian. Precondition: s.p is set, at a positive depth.
+// `filter_px2` is added to both variances. With `antialiased` the opacity is multiplied
+// by sqrt(det before / det after), which preserves the integral of the gaussian over
+// the image.
 template <class V, class T, ProjectingModel C>
 V3DG_HD V3DG_INLINE Ellipse<V> project_gaussian(const Gaussian3d<V>& g, const ModelView<T>& mv,
                                                 const C& cam, T filter_px2, bool antialiased,
@@ -89,9 +90,9 @@ V3DG_HD V3DG_INLINE void fade(Lane<V> weight, Ellipse<V>& e) {
     e.log2_opacity += log2_of(weight);
 }
 
-// Sets how far from the centre, px, alpha is 1/255 or more: up to |L d|² = log2 of the alpha at the
-// centre over 1/255. Returns whether it is anywhere, at a finite depth; where it is not, the extent
-// is undefined.
+// Sets the distance from the centre, px, up to which alpha is 1/255 or more: |L d|² is
+// at most log2 of (alpha at the centre / (1/255)). Returns whether the depth is finite
+// and alpha reaches 1/255 at all; if not, the extent is undefined.
 template <class V, ProjectingModel C>
 V3DG_HD V3DG_INLINE auto extent_of(V opacity, const Ellipse<V>& e, const Projection<V, C>& s,
                                    V& half_x, V& half_y) {
@@ -104,7 +105,8 @@ V3DG_HD V3DG_INLINE auto extent_of(V opacity, const Ellipse<V>& e, const Project
            (s.det > V{}) & (s.det < huge) & (half_x < huge) & (half_y < huge) & (e.depth < huge);
 }
 
-// The packed version of project_gaussian(). Precondition: s.p is set. It leaves s.linear_rs alone.
+// The version of project_gaussian() for packed gaussians. Precondition: s.p is set. It
+// does not change s.linear_rs.
 template <ProjectingModel C>
 V3DG_HD V3DG_INLINE Ellipse<float> project_packed(const PackedGaussian& g,
                                                   const ModelView<float>& mv, const C& cam,
@@ -112,7 +114,7 @@ V3DG_HD V3DG_INLINE Ellipse<float> project_packed(const PackedGaussian& g,
                                                   const Appearance<float>& look,
                                                   Projection<float, C>& s) {
     s.at = cam.linearized(limits, s.p);
-    float row1[3], row2[3];  // of the Jacobian times the view
+    float row1[3], row2[3];  // rows of the Jacobian times the view rotation
     for (int k = 0; k < 3; ++k)
         cam.times_jacobian(s.at, mv.linear[k], mv.linear[3 + k], mv.linear[6 + k], row1[k],
                            row2[k]);
@@ -128,34 +130,37 @@ V3DG_HD V3DG_INLINE Ellipse<float> project_packed(const PackedGaussian& g,
     return e;
 }
 
-// Whether no pixel centre lies within `half` of `center` on one axis, with the margin of
-// pixel_span().
+// Returns whether no pixel centre is within `half` of `center` on one axis, with the
+// margin of pixel_span().
 template <class T>
 V3DG_HD V3DG_INLINE bool misses_centers(T center, T half) {
     const T from_center = center - T(0.5);
     return abs_of(from_center - round_of(from_center)) > half * T(1 + 1e-5) + T(2e-3);
 }
 
-// Whether the interval of half width `half` around `center` meets (0, size).
+// Returns whether the interval of half width `half` around `center` intersects (0,
+// size).
 template <class V>
 V3DG_HD V3DG_INLINE auto meets_image(V center, V half, Lane<V> size) {
     return (center + half > V{}) & (center - half < all_lanes<V>(size));
 }
 
-// The pixels from ceil(low) to floor(high) have their centres within `half` of `center`, plus a
-// margin, so that the blend step alone decides. Whatever the arguments are, NaN included, `low` is
-// from 0 to size and `high` from -1 to size - 1: neither overflows an integer.
+// Sets `low` and `high` such that the pixels from ceil(low) to floor(high) are those
+// with centres within `half` of `center`, plus a margin, so that the blend step alone
+// decides. For any arguments, NaN included, `low` is in [0, size] and `high` in [-1,
+// size - 1], so neither overflows an integer.
 template <class V>
 V3DG_HD V3DG_INLINE void pixel_span(V center, V half, Lane<V> size, V& low, V& high) {
     using T = Lane<V>;
     const V margin = half * T(1e-5) + T(2e-3);
-    // Where the first argument is NaN, min_of() and max_of() return the second.
+    // If the first argument is NaN, min_of() and max_of() return the second.
     low = min_of(max_of(center - half - margin - T(0.5), V{}), all_lanes<V>(size));
     high = max_of(min_of(center + half + margin - T(0.5), all_lanes<V>(size - 1)),
                   all_lanes<V>(T(-1)));
 }
 
-// The pixels of the camera's image whose centres lie in the box of an ellipse of this extent.
+// Returns the pixels of the camera's image whose centres are in the box of an ellipse
+// of this extent.
 template <class V, ProjectingModel C>
 V3DG_HD V3DG_INLINE auto pixel_box(const Ellipse<V>& e, V half_x, V half_y, const C& camera) {
     V low_x, high_x, low_y, high_y;
@@ -166,14 +171,15 @@ V3DG_HD V3DG_INLINE auto pixel_box(const Ellipse<V>& e, V half_x, V half_y, cons
                        floor_to_int(high_y)};
 }
 
-// Gradients of the gaussian's mean, quaternion, scales and opacity from those of its ellipse.
+// Computes the gradients of the gaussian's mean, quaternion, scales and opacity from
+// those of its ellipse.
 template <class V, class T, ProjectingModel C>
 V3DG_HD V3DG_INLINE Gaussian3d<V> project_gaussian_vjp(const Gaussian3d<V>& g,
                                                        const ModelView<T>& mv, const C& cam,
                                                        T filter_px2, bool antialiased,
                                                        const Projection<V, C>& s,
                                                        const Ellipse<V>& e, const Ellipse<V>& d) {
-    // From the ellipse to the covariance, where c11 enters through det alone.
+    // Propagate from the ellipse to the covariance; c11 enters only through det.
     const V d_l11 = d.l11 - d.l12 * (s.c12 / s.c22);
     const V half = 1 / (2 * s.c22);
     const V d_c22 = (d_l11 * e.l11 - d.l22 * e.l22) * half - d.l12 * e.l12 / s.c22;

@@ -1,12 +1,13 @@
 #pragma once
 
-// The sources that the project kernels read gaussians from: rows, planes of packed gaussians, or
-// codes.
+// The sources from which the project kernels read gaussians: rows, planes of packed
+// gaussians, or codes.
 //
-// A source computes a gaussian in steps, because most gaussians reach no pixel centre. fetch()
-// loads early what its sphere follows from; sphere() returns its mean and its reach; project() its
-// ellipse and its colour, for a Projection whose p is set; shade() replaces the colour, for models
-// for which has_shade() is true.
+// A source computes a gaussian in steps, because most gaussians reach no pixel centre.
+// fetch() loads what the bounding sphere depends on; sphere() returns mean and reach;
+// project() returns ellipse and colour, for a Projection whose p is set; shade()
+// replaces the colour, for models for which has_shade() is true. The factors of
+// instances are applied afterwards.
 
 #include "base/launch.cuh"
 #include "project/project_cuda.h"
@@ -29,7 +30,7 @@ __device__ inline float4 load4(const float* rows, uint32_t row) {
     return __ldg(reinterpret_cast<const float4*>(rows) + row);
 }
 
-// `sh(k)` is the k-th coefficient, as color_of_coefficients() has it.
+// `sh(k)` is the k-th coefficient, as in color_of_coefficients().
 template <int kDegree, class Coefficient>
 __device__ void color_of(const Coefficient& sh, const float mean[3], const ModelView<float>& view,
                          float color[3]) {
@@ -38,7 +39,8 @@ __device__ void color_of(const Coefficient& sh, const float mean[3], const Model
     color_of_coefficients(kDegree, direction, sh, color);
 }
 
-// Loads the coefficients as they are used, because there are not enough registers for all at once.
+// Loads each coefficient at its use, because there are not enough registers for all of
+// them.
 template <int kDegree>
 __device__ void color_of_row(const float* row, const float mean[3], const ModelView<float>& view,
                              float color[3]) {
@@ -57,8 +59,9 @@ template <class RowModel>
 struct OfRows {
     using Model = RowModel;
     using Fetched = float4;
-    struct Place {};  // the row alone is the place
+    struct Place {};  // a row needs no further state
     static constexpr bool kFades = false;
+    static constexpr bool kTints = false;
 
     static __device__ Place start(const ItemTables<Model>&) { return {}; }
     static __device__ void prepare() {}
@@ -67,7 +70,7 @@ struct OfRows {
     }
 };
 
-// Gaussians as users hold them.
+// Unpacked gaussians, in the caller's memory.
 struct RowSource : OfRows<GaussianRows<const float>> {
     static __device__ bool has(const Model&) { return true; }
     static __device__ bool has_shade(const Model& m) { return m.sh_degree > 0; }
@@ -92,7 +95,7 @@ struct RowSource : OfRows<GaussianRows<const float>> {
         gaussian.quat[1] = quat.y;
         gaussian.quat[2] = quat.z;
         gaussian.quat[3] = quat.w;
-        const float* sh = m.sh + 3 * size_t(g);  // valid where there is one coefficient
+        const float* sh = m.sh + 3 * size_t(g);  // used only if there is a single coefficient
         if (m.sh_degree == 0)
             color_of_row<0>(sh, gaussian.mean, view, color);
         else if (m.sh_degree == kPlainColor)
@@ -116,9 +119,10 @@ struct RowSource : OfRows<GaussianRows<const float>> {
     }
 };
 
-// Gaussians as PackedGaussian, which are the quickest to project.
+// PackedGaussian, which is fastest to project.
 struct PackedSource : OfRows<PackedPlanes> {
     static __device__ bool has(const Model& m) { return m.plane[0] != nullptr; }
+    static __device__ bool has_palette(const Model& m) { return m.palette.sh != nullptr; }
     static __device__ bool has_shade(const Model& m) {
         return m.palette.sh != nullptr || m.sh_degree > 0;
     }
@@ -146,20 +150,23 @@ struct PackedSource : OfRows<PackedPlanes> {
     }
 };
 
-// Gaussians as codes. The result has the same bits as that of the rows that they decode to, packed.
+// Coded gaussians. The results have the same bits as those of decoding to rows and
+// packing the rows.
 struct CodeSource {
     using Model = CodedGaussians;
     using Fetched = uint4;
     static constexpr bool kFades = false;
+    static constexpr bool kTints = false;
     struct Place {
-        uint32_t cluster, end;  // the cluster of a row, and the end of the cluster's rows
+        uint32_t cluster, end;  // cluster of a row, and end of the cluster's rows
     };
-    // Numbers that depend on the code of the opacity alone.
+    // Values that depend only on the code of the opacity.
     struct OpacityEntry {
         float reach_in_sigmas, log2_opacity;
     };
 
     static __device__ bool has(const Model& m) { return m.codes.records != nullptr; }
+    static __device__ bool has_palette(const Model& m) { return m.palette.sh != nullptr; }
     static __device__ bool has_shade(const Model& m) {
         return m.palette.sh != nullptr || m.codes.sh_degree > 0;
     }
@@ -167,7 +174,7 @@ struct CodeSource {
         __shared__ OpacityEntry entries[kMostOpacity + 1];
         return entries;
     }
-    // Fills the table of opacities. For the whole block.
+    // Fills the table of opacities. Called by the whole block.
     static __device__ void prepare() {
         for (unsigned code = threadIdx.x; code <= kMostOpacity; code += blockDim.x) {
             const float opacity = static_cast<float>(code) * kOpacityStep;
@@ -175,7 +182,7 @@ struct CodeSource {
         }
         __syncthreads();
     }
-    // The place of the item's first gaussian. For the whole warp.
+    // Returns the place of the item's first gaussian. Called by the whole warp.
     static __device__ Place start(const ItemTables<Model>& in) {
         const Span<const int64_t>& offset = in.model.codes.offset;
         const uint32_t next = in.item.cluster + 1 + threadIdx.x % 32;
@@ -184,7 +191,7 @@ struct CodeSource {
         const uint32_t cluster = in.item.cluster + __popc(__ballot_sync(kAllLanes, is_before));
         return {cluster, static_cast<uint32_t>(__ldg(offset.data + cluster + 1))};
     }
-    // Moves the place to a row of the same cluster or of a later one.
+    // Advances the place to a row of the same cluster or of a later one.
     static __device__ void advance(const Model& m, Place& place, uint32_t g) {
         while (g >= place.end)
             place.end = static_cast<uint32_t>(__ldg(m.codes.offset.data + ++place.cluster + 1));
@@ -264,6 +271,12 @@ struct CodeSource {
         decode_sh<float>(words, step, kDegree, sh + 3);
         color_of<kDegree>([&](int k) { return sh[k]; }, gaussian.mean, view, color);
     }
+};
+
+// A source for frames in which some instances have factors of colours or opacities.
+template <class Source>
+struct Tinted : Source {
+    static constexpr bool kTints = true;
 };
 
 // A source for frames in which some items have weights below 1.

@@ -1,7 +1,7 @@
 #pragma once
 
-// Tests that tell that a gaussian reaches no pixel centre before it is projected, or no pixel
-// centre of a row. They skip work, and decide nothing that the blend step would decide otherwise.
+// Tests that show, before projection, that a gaussian reaches no pixel centre, or none
+// in a row. They only save work: their result never contradicts the blend step.
 
 #include "project/project_math.h"
 #include "project/sources.cuh"
@@ -9,18 +9,19 @@
 namespace v3dg {
 namespace cuda {
 
-// What the sphere around a gaussian shows.
+// The result of testing the bounding sphere of a gaussian.
 struct SphereTest {
-    bool may_reach;       // it may reach a pixel centre; also where a number is NaN
-    bool misses_centers;  // it is in the frustum and reaches no pixel centre
-    float half;           // px that it reaches from its centre, at most
+    bool may_reach;       // it may reach a pixel centre; also true for NaN
+    bool misses_centers;  // it is in the frustum but reaches no pixel centre
+    float half;           // upper bound on its reach from the centre, px
 };
 
-// Tests a gaussian at p in view space. Free of branches, because some lane of the warp would take
-// each of them.
+// Tests a gaussian at p in view space; `is_faint` says whether its instance has an
+// opacity below 1. It has no branches, because in a warp some lane would take each of
+// them.
 template <class Source>
 __device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, const float p[3],
-                                  float reach, float reach_scale) {
+                                  float reach, float reach_scale, bool is_faint) {
     const Intrinsics<float>& cam = in.image.camera;
     const auto [u, v, half] =
         cam.image_of_sphere(p, reach, reach_scale, in.item.appearance.filter_px2);
@@ -28,9 +29,9 @@ __device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, 
     const float from_x = fabsf(u - middle_x), from_y = fabsf(v - middle_y);
     const bool is_outside = !(cam.depth_of(p) >= cam.near_depth) | (reach < 0) |
                             (from_x - half >= middle_x) | (from_y - half >= middle_y);
-    // With its centre in the image it is in the frustum for certain, unless antialiasing or a fade
-    // makes it too faint.
-    const bool is_faded = Source::kFades && in.item.weight < 1;
+    // If its centre is in the image, it certainly is in the frustum, unless
+    // antialiasing, a fade or its instance makes it too faint.
+    const bool is_faded = (Source::kFades && in.item.weight < 1) || is_faint;
     const bool is_inside =
         (from_x < middle_x) & (from_y < middle_y) & !in.item.appearance.antialiased & !is_faded;
     const bool misses = is_inside & (misses_centers(u, half) | misses_centers(v, half));
@@ -38,8 +39,8 @@ __device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, 
         .may_reach = !(is_outside | misses), .misses_centers = misses && !is_outside, .half = half};
 }
 
-// Drops the first and the last row of a box where the ellipse misses all of their pixel centres,
-// with a margin, so that the blend step alone decides.
+// Removes the first and the last row of a box if the ellipse misses all pixel centres
+// of that row, with a margin, so that the blend step alone decides.
 __device__ inline void drop_missed_rows(const Ellipse<float>& e, const Projection<float>& s,
                                         float image_width, PixelBox<int>& box) {
     const float slope = quotient_of(s.c12, s.c22), u = e.u - 0.5f;
@@ -47,8 +48,8 @@ __device__ inline void drop_missed_rows(const Ellipse<float>& e, const Projectio
     const float reach = e.log2_opacity - static_cast<float>(kLog2MinAlpha) + 1e-4f;
     const auto misses = [&](int row) {
         const float dy = static_cast<float>(row) + 0.5f - e.v;
-        // Alpha is largest here in this row. No pixel centre, whether in the image or not, is
-        // nearer than the one that this rounds to.
+        // Alpha has its maximum in this row here. Rounding yields the nearest pixel
+        // centre, whether or not that is inside the image.
         const float middle = slope * dy + u;
         const float t1 = e.l11 * fmaxf(fabsf(middle - round_of(middle)) - margin, 0.0f),
                     t2 = e.l22 * dy;

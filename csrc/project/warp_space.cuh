@@ -1,6 +1,6 @@
 #pragma once
 
-// The shared memory of a warp that projects an item: the tables of the item, and what waits in
+// The shared memory of a warp that projects an item: the tables of the item, and the
 // queues.
 
 #include "base/launch.cuh"
@@ -12,13 +12,14 @@ namespace v3dg {
 namespace cuda {
 
 constexpr unsigned kWarps = 8;
-constexpr unsigned kQueue = 64;        // fewer than 32 gaussians wait when 32 are added
-constexpr unsigned kMostWaiting = 64;  // fewer than 32 large records wait when 32 are added
+constexpr unsigned kQueue = 64;        // at most 31 gaussians are queued when 32 are added
+constexpr unsigned kMostWaiting = 64;  // at most 31 large records are queued when 32 are added
 
-// A gaussian that waits to be projected.
+// A gaussian in the queue.
 struct Queued {
-    float p[3];      // view space
-    uint32_t place;  // in the item; in a shared one 32 times that, plus the number of the sharer
+    float p[3];  // view space
+    // Index in the item; in a shared item 32 times that, plus the index of the sharer.
+    uint32_t place;
 };
 
 // The shared memory of a warp.
@@ -26,16 +27,18 @@ template <class Model>
 struct WarpSpace {
     ItemTables<Model> tables;
     alignas(16) Queued queue[kQueue];
-    // The ellipses of records, which lanes write one each, and which are then copied in a row.
+    // The ellipses of records: each lane writes one, and then they are copied
+    // contiguously.
     float4 ellipses[kEllipseVectors * 32];
-    // The item's large records that wait: their boxes and their places among the item's records.
+    // The queue of the item's large records: their boxes and their indices among the
+    // item's records.
     RecordBox boxes[kMostWaiting];
     uint8_t large[kMostWaiting];
     unsigned num_large;
     WaitingTiles tiles;
 };
 
-// A warp copies a table, one word a lane.
+// Copies a table with a warp, one 32-bit word per lane.
 template <class T>
 __device__ uint32_t load_word(const T& from) {
     static_assert(sizeof(T) <= 32 * sizeof(uint32_t), "a warp copies a table");
@@ -50,12 +53,12 @@ __device__ void store_word(T& to, uint32_t word) {
     if (lane < sizeof(T) / sizeof(uint32_t)) reinterpret_cast<uint32_t*>(&to)[lane] = word;
 }
 
-// Which tables a warp holds.
+// Which tables the warp has loaded.
 struct Loaded {
     uint32_t image = ~0u, model = ~0u;
 };
 
-// Stores the tables of an item, of which the lanes hold one word each.
+// Stores the tables of an item; each lane holds one 32-bit word of them.
 template <class Model>
 __device__ void store_tables(ItemTables<Model>& tables, uint32_t item_word, uint32_t placement_word,
                              const ProjectInput& in, const Model* models, Loaded& loaded) {

@@ -1,7 +1,7 @@
 #pragma once
 
-// Projects the gaussians that the lanes of a warp hold, and writes a record for each that reaches a
-// pixel centre.
+// Projects the gaussians in the lanes of a warp, and writes a record for each that
+// reaches a pixel centre.
 
 #include "project/large_records.cuh"
 #include "project/project_math.h"
@@ -13,25 +13,28 @@ namespace cuda {
 
 // Properties of an item's gaussians.
 struct ItemTraits {
-    bool are_small;   // judged by the first of them
-    bool have_shade;  // whether the colour needs more than project() sets
+    bool are_small;   // decided by the first 32 gaussians
+    bool have_shade;  // whether project() does not set the final colour
 };
 
-// Makes the record of gaussian g at p in view space, except for its pixels, which are `box`.
-// Returns whether it reaches a pixel centre; where gaussians are not small, those few that miss all
-// centres in their box count as reaching one. It returns early neither for gaussians that reach
-// none nor for lanes without one, because other lanes of the warp go on.
+// Computes the record of gaussian g at p in view space, except for its pixels, which
+// are returned in `box`. Returns whether it reaches a pixel centre. If gaussians are
+// not small, the few that miss all centres in their box count as reaching one. There is
+// no early return for gaussians that reach none, nor for lanes without a gaussian,
+// because other lanes of the warp go on.
 template <class Source>
 __device__ bool project_one(const ItemTables<typename Source::Model>& in,
                             const ModelView<float>& view, typename Source::Place place, uint32_t g,
                             const float p[3], bool is_one, const ItemTraits& traits,
-                            Record<float>& r, PixelBox<int>& box, unsigned& num_in_frustum) {
+                            const InstanceFactors* factors, Record<float>& r, PixelBox<int>& box,
+                            unsigned& num_in_frustum) {
     Projection<float> s;
     for (int i = 0; i < 3; ++i) s.p[i] = p[i];
-    const Ellipse<float> e = Source::project(in, view, place, g, s, r.color);
+    Ellipse<float> e = Source::project(in, view, place, g, s, r.color);
+    if constexpr (Source::kTints) fade(factors->opacity, e);
     float half_x, half_y;
     const Intrinsics<float>& cam = in.image.camera;
-    // The sphere test has shown that it is not too faint.
+    // The sphere test has shown that the gaussian is not too faint.
     bool is_in_frustum = is_one & extent_of(1.0f, e, s, half_x, half_y);
     is_in_frustum &= meets_image(e.u, half_x, cam.width) & meets_image(e.v, half_y, cam.height);
     num_in_frustum += is_in_frustum;
@@ -40,27 +43,33 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in,
     set_ellipse(e, r);
     const bool reaches_pixel = is_in_frustum & box.holds_pixels();
     if (reaches_pixel && traits.have_shade) Source::shade(in.model, view, place, g, r.color);
+    if constexpr (Source::kTints)
+        if (!Source::has_palette(in.model)) tint(factors->color, r.color);
     return reaches_pixel;
 }
 
-// Writes the records of the lanes' gaussians, in their order, and counts them into tiles. Returns
-// the number of records. `sharers` are the placements of a shared item.
+// Writes the records of the lanes' gaussians, in lane order, and counts them in tiles.
+// Returns the number of records. `sharers` are the placements of a shared item, and
+// `factors` those of these placements; for other items, those of its placement. They
+// are null unless the source has factors.
 template <class Source, bool kIsShared>
 __device__ unsigned write_records(WarpSpace<typename Source::Model>& space,
-                                  const Placement* sharers, const typename Source::Place& start,
-                                  const ItemTraits& traits, bool has_one, const Queued& mine,
-                                  uint32_t first, FrameCounters& counters, const ProjectOutput& out,
+                                  const Placement* sharers, const InstanceFactors* factors,
+                                  const typename Source::Place& start, const ItemTraits& traits,
+                                  bool has_one, const Queued& mine, uint32_t first,
+                                  FrameCounters& counters, const ProjectOutput& out,
                                   unsigned& num_in_frustum) {
     const auto& in = space.tables;
     const unsigned lane = threadIdx.x % 32;
-    // A lane without a gaussian computes one that exists, and drops it.
+    // A lane without a gaussian computes an existing one, and discards it.
     const uint32_t place = has_one ? mine.place : kIsShared ? __ffs(in.item.sharers) - 1 : 0;
     const uint32_t g = in.item.first + (kIsShared ? place / 32 : place);
     const ModelView<float>& view = kIsShared ? sharers[place % 32].view : in.placement.view;
     Record<float> r;
     PixelBox<int> box;
-    const bool reaches_pixel =
-        project_one<Source>(in, view, start, g, mine.p, has_one, traits, r, box, num_in_frustum);
+    const bool reaches_pixel = project_one<Source>(
+        in, view, start, g, mine.p, has_one, traits,
+        Source::kTints && kIsShared ? factors + place % 32 : factors, r, box, num_in_frustum);
     const unsigned kept = __ballot_sync(kAllLanes, reaches_pixel);
     if (kept == 0) return 0;
     const unsigned rank = __popc(kept & ((1u << lane) - 1));
@@ -82,7 +91,7 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space,
         const uint32_t depth =
             entry_depth(r.depth, in.image.camera.near_depth, out.records.depth_mask);
         out.few[first + rank] = is_large ? kManyTiles : few_tiles(depth, tile, blocks);
-        if (out.source != nullptr) {  // the frame keeps a tape
+        if (out.source != nullptr) {  // non-null if the frame keeps a tape
             out.source[first + rank] = g;
             out.records.box[first + rank] = pixels();
         }

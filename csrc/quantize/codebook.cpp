@@ -1,4 +1,5 @@
-// Codebooks by Lloyd's algorithm, from a guess by density; palettes by cutting sets in two.
+// Codebooks by Lloyd's algorithm, initialised from the density of values; palettes by
+// repeatedly cutting sets in two.
 
 #include "quantize/codebook.h"
 
@@ -14,12 +15,12 @@ namespace {
 
 constexpr size_t kBins = 4096;
 constexpr int kRounds = 16;
-// The share of a table's entries that is spread evenly over the range, so that rare values have a
-// neighbour.
+// The fraction of a table's entries that is spread evenly over the range, so that rare
+// values have a close entry.
 constexpr double kEven = 0.25;
 
-// Places entries as densely as the cube root of the values' density, which is best for many entries
-// (Panter and Dite).
+// Distributes entries with a density proportional to the cube root of the values'
+// density, which is optimal for many entries (Panter and Dite).
 void guess_codebook(const std::vector<double>& ordered, Span<double> table) {
     const double low = ordered.front(), width = (ordered.back() - low) / kBins;
     std::vector<double> density(kBins, 0.0);
@@ -27,7 +28,7 @@ void guess_codebook(const std::vector<double>& ordered, Span<double> table) {
         density[std::min(static_cast<size_t>((value - low) / width), kBins - 1)] += 1.0;
     for (double& count : density) count = std::cbrt(count);
     const double total = std::accumulate(density.begin(), density.end(), 0.0);
-    double before = 0.0;  // share of the entries below a bin
+    double before = 0.0;  // fraction of the entries below a bin
     size_t entry = 0;
     for (size_t bin = 0; bin < kBins; ++bin) {
         const double share = (1 - kEven) * density[bin] / total + kEven / kBins;
@@ -40,11 +41,11 @@ void guess_codebook(const std::vector<double>& ordered, Span<double> table) {
     }
 }
 
-// A part of an order of rows; one vector stands for all of them.
+// A part of an order of rows; one vector represents all of them.
 struct Part {
     size_t first, last;
     double error;  // sum of squared distances to the mean
-    size_t axis;   // axis with the largest share of it
+    size_t axis;   // axis with the largest part of that error
     uint32_t number;
     std::vector<double> mean;
 
@@ -121,7 +122,7 @@ VectorPalette make_palette(Span<const float> vectors, size_t width, size_t size)
         auto middle = std::stable_partition(first, last, [&](uint32_t row) {
             return vectors[row * width + part.axis] <= part.mean[part.axis];
         });
-        if (middle == first || middle == last)  // the differences are lost in rounding
+        if (middle == first || middle == last)  // the differences vanish in rounding
             middle = first + (part.last - part.first) / 2;
         const auto cut = static_cast<size_t>(middle - order.begin());
         parts.push(part_of(vectors, width, order, part.first, cut, ++number));

@@ -1,7 +1,8 @@
 #pragma once
 
-// Gaussians as codes of few bits: pages of bundles, pages on the host, and slots of a pool. This is
-// the codec "quantized" of v3dg/bundle/codec.py; docs/extending.md says where another one goes.
+// Gaussians as codes of few bits: pages of bundles, pages on the host, and slots of a
+// pool. This is the codec "quantized" of v3dg/bundle/codec.py; docs/extending.md
+// describes how to add another one.
 
 #include <cstring>
 
@@ -12,12 +13,13 @@
 
 namespace v3dg {
 
-// A page of K clusters: the codes of its gaussians, a row of words each; those of their higher
-// coefficients; and the ranges of its clusters. T is const where the page is only read.
+// A page of K clusters: a record of codes per gaussian; the codes of the higher
+// coefficients; and the ranges of the clusters. T is const for a page that is only
+// read.
 template <class T>
 struct PageCodes {
     Span<const int64_t> offset;  // [K + 1] first row of each cluster, ascending
-    T* words;                    // page_bytes()
+    T* words;                    // size: page_bytes()
     int sh_degree;
 
     V3DG_HD size_t num_clusters() const { return offset.size - 1; }
@@ -48,12 +50,12 @@ V3DG_HD inline void decode_row(const uint32_t* record, const uint32_t* sh_words,
     out.opacities[row] = g.opacity;
 }
 
-// Pages of a bundle on the host, as its file has them. It borrows words and offsets and owns the
-// ranges.
+// Pages of a bundle on the host, in the layout of its file. It borrows codes and
+// offsets and owns the ranges.
 class CodedPages {
   public:
-    // words: all P pages; first_cluster: [P + 1]; offset: [C + 1]. Throws std::invalid_argument,
-    // naming the cluster, where ranges are not are_valid().
+    // words: all P pages; first_cluster: [P + 1]; offset: [C + 1]. Throws
+    // std::invalid_argument, naming the cluster, where ranges are not are_valid().
     CodedPages(const uint32_t* words, Span<const int64_t> first_cluster, Span<const int64_t> offset,
                int sh_degree);
     const Codes& codes() const { return codes_; }
@@ -66,11 +68,11 @@ class CodedPages {
     Codes codes_;
 };
 
-// Memory for the codes of pages that come and go, which is drawn from as if it were one bundle. It
-// is divided into slots of a page each, which hold equally many rows and equally many clusters. The
-// rows of all slots are contiguous, and so are their clusters, with gaussians or without. A page's
-// ranges move with it, and its gaussians and its clusters are neighbours as in its own bundle, so
-// nothing else has to know where the page is.
+// Memory for the codes of pages that come and go; frames read it like a single bundle.
+// It is divided into slots for one page each, with the same numbers of rows and
+// clusters. The rows of all slots are contiguous, and so are their clusters, used or
+// not. A page's ranges move with the page, and within a page gaussians and clusters are
+// stored as in the bundle, so no other code needs to know where the page is.
 struct CodeSlots {
     uint32_t *records, *sh;
     unsigned char* ranges;
@@ -101,8 +103,8 @@ constexpr size_t slot_cluster_bytes(int sh_degree) {
 // A page, and the slot that it is written to.
 struct SlotPage {
     PageCodes<const uint32_t> page;
-    size_t row, cluster;  // the first of the slot
-    size_t num_clusters;  // clusters of the slot; those that the page lacks are empty
+    size_t row, cluster;  // first of the slot
+    size_t num_clusters;  // clusters in the slot; those beyond the page's are empty
 };
 
 // Writes the ranges and the offset of the k-th cluster of a slot.
@@ -126,35 +128,36 @@ V3DG_HD inline void write_cluster(const SlotPage& from, size_t k, const CodeSlot
 struct DecodeInput {
     Codes codes;
     Span<const int32_t> cluster;  // [S]
-    Span<const int64_t> offset;   // [S + 1] rows of the result, ascending from 0
+    Span<const int64_t> offset;   // [S + 1] first row in the result, ascending from 0
 };
 
 namespace cpu {
-// Encodes gaussians to the nearest step of the ranges of their clusters. Gaussians that were
-// decoded from a page give the same page again. A scale of 0 becomes 2^-14 of the largest of its
-// gaussian; scales are clamped from 2^-64 to 2^64, means within 2^126, colours within 32,768,
-// higher coefficients within 1,024 and opacities from 0 to 1. Throws std::invalid_argument where a
-// value is not finite.
+// Encodes gaussians to the nearest step of the ranges of their clusters. Gaussians that
+// were decoded from a page give the same page again. A scale of 0 becomes 2^-14 of the
+// gaussian's largest scale. Scales are clamped to [2^-64, 2^64], means to 2^126,
+// colours to 32,768, higher coefficients to 1,024 and opacities to [0, 1]. Throws
+// std::invalid_argument if a value is not finite.
 void encode_page(const GaussianRows<const float>& in, const PageCodes<uint32_t>& page);
 
-// Decodes the gaussians of a page. Throws std::invalid_argument, naming the cluster, where ranges
-// are not are_valid().
+// Decodes the gaussians of a page. Throws std::invalid_argument, which names the
+// cluster, if ranges are not are_valid().
 void decode_page(const PageCodes<const uint32_t>& page, const GaussianRows<float>& out);
 
 // Decodes the gaussians of clusters.
 void decode(const DecodeInput& in, const GaussianRows<float>& out);
 
-// Writes a page, whose ranges are_valid(), to its slot.
+// Writes a page, whose ranges must be are_valid(), to its slot.
 void write_slot(const SlotPage& from, const CodeSlots& to);
 }  // namespace cpu
 
-// Both halves give the same bits. The codes and `out` are on the device, all else on the host. Work
-// is queued on the stream. Throws std::runtime_error when CUDA reports an error.
+// The CPU and CUDA give the same bits. The codes and `out` are on the device, all other
+// arrays on the host. Work is queued on the stream. Throws std::runtime_error if CUDA
+// reports an error.
 namespace cuda {
 void decode(const DecodeInput& in, const GaussianRows<float>& out, Stream stream);
 
-// As cpu::write_slot() for several pages. `pages` is in memory that the device can read; the memory
-// that the pages and the slots point to is on the device.
+// As cpu::write_slot() for several pages. The array `pages` is in memory that the
+// device can read; its pages and the slots are in device memory.
 void write_slots(const SlotPage* pages, size_t num_pages, const CodeSlots& to, Stream stream);
 }  // namespace cuda
 

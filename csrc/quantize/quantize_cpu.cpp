@@ -1,4 +1,5 @@
-// Decodes pages and clusters on all threads, and writes pages to slots. encode_cpu.cpp makes pages.
+// Decodes pages and clusters on all threads, and writes pages to slots. encode_cpu.cpp
+// encodes pages.
 
 #include <algorithm>
 #include <stdexcept>
@@ -22,14 +23,14 @@ CodedRanges ranges_at(const uint32_t* words, int sh_degree) {
     return out;
 }
 
-// Returns ranges that are_valid(). Throws std::invalid_argument, which names the cluster, where
-// they are not.
+// Returns ranges that are_valid(). Otherwise throws std::invalid_argument, which names
+// the cluster.
 ClusterRanges valid_ranges(const uint32_t* words, int sh_degree, size_t cluster,
                            const char* whose) {
     const CodedRanges coded = ranges_at(words, sh_degree);
     if (!are_valid(coded.code, coded.sh_steps, sh_degree))
         throw std::invalid_argument("cluster " + std::to_string(cluster) + whose +
-                                    ": expected ranges of finite numbers, got others");
+                                    ": expected finite ranges, got infinite or NaN ones");
     return decoded(coded, sh_degree);
 }
 
@@ -56,7 +57,7 @@ CodedPages::CodedPages(const uint32_t* words, Span<const int64_t> first_cluster,
              .sh_degree = sh_degree,
              .range_size = range_bytes(sh_degree),
              .sh_stride = static_cast<uint32_t>(sh_degree)} {
-    std::vector<uint64_t> place(first_cluster.size, 0);  // words before each page
+    std::vector<uint64_t> place(first_cluster.size, 0);  // offset of each page, in integers
     const auto page_at = [&](size_t p) {
         const auto first = static_cast<size_t>(first_cluster[p]),
                    last = static_cast<size_t>(first_cluster[p + 1]);

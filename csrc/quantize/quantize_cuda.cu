@@ -13,8 +13,8 @@ constexpr unsigned kBlockSize = 128;
 __global__ void decode_kernel(DecodeInput in, GaussianRows<float> out) {
     const size_t row = blockIdx.x * size_t(kBlockSize) + threadIdx.x;
     if (row >= out.size) return;
-    // This finds the last cluster that begins at or before the gaussian, which is never an empty
-    // one.
+    // This finds the last cluster that begins at or before the gaussian; it is never
+    // empty.
     size_t first = 0, last = in.cluster.size - 1;
     while (first < last) {
         const size_t middle = first + (last - first + 1) / 2;

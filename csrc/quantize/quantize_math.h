@@ -1,12 +1,12 @@
 #pragma once
 
-// The codes of a gaussian: 128 bits for all that SH degree 0 needs, and more words for the higher
-// degrees, relative to the ranges of its cluster. docs/format.md describes the layout for authors
-// of readers.
+// The codes of a gaussian: 128 bits for all that SH degree 0 needs, and more bits for
+// the higher degrees, relative to the ranges of its cluster. docs/format.md describes
+// the layout for authors of readers.
 //
-// Every device and every instruction set decodes to the same bits, whether products are contracted
-// into sums or not: a step has so few bits that its product with a code is exact in float32, so
-// only the sum is rounded.
+// Every device and every instruction set decodes to the same bits, whether or not
+// products and sums are contracted: a step has so few bits that its product with a code
+// is exact in float32, so only the sum is rounded.
 
 #include "base/span.h"
 #include "math/gaussian.h"
@@ -14,41 +14,42 @@
 namespace v3dg {
 
 constexpr int kRecordWords = 4;
-constexpr int kPageAlignment = 16;  // bytes, so that one load reads a record
+constexpr int kPageAlignment = 16;  // bytes, so that one load instruction reads a record
 
 constexpr uint32_t kMostMean = 4095, kMostScale = 1023, kMostColor = 511, kMostOpacity = 255;
-// A rotation is multiplied by one of the 24 of a cube until the largest component is w; the others
-// are then at most sin(22.5 degrees), which is 255 steps. A quaternion of codes has the length
-// sqrt(kQuatLength2).
+// A rotation is multiplied by one of the 24 rotations of a cube such that w becomes the
+// largest component; the others are then at most sin(22.5 degrees), which is 255 steps.
+// A coded quaternion has the length sqrt(kQuatLength2).
 constexpr int32_t kZeroQuat = 255, kQuatLength2 = 444016;
 constexpr float kQuatStep = 0.0015007235f;  // 1 / sqrt(kQuatLength2)
 constexpr float kOpacityStep = 1.0f / 255;
-// Scales are coded by the bits of the float, which rise about as the logarithm does, from 2^-64 to
-// 2^64.
+// Scales are coded by the bits of the float, which grow approximately like the
+// logarithm, from 2^-64 to 2^64.
 constexpr uint32_t kLeastScaleBits = 63u << 23, kMostScaleBits = (191u << 23) - 1;
 constexpr int kScaleFirstShift = 14, kScaleStepShift = 4;
-// This unit makes the steps of small ranges normal numbers in 16 bits.
+// In this unit, the steps of small ranges are normal numbers in 16 bits.
 constexpr float kStepUnit = 0.00390625f;  // 2^-8
 
-// Ranges of a cluster, as a page has them. Halves are float16.
+// The ranges of a cluster, as stored in a page. Halves are float16.
 struct ClusterCode {
-    float mean_first[3], mean_step[3];  // the step has 12 significant bits
+    float mean_first[3], mean_step[3];  // steps have 12 significant bits
     uint16_t color_first[3];            // halves
-    uint16_t color_step[3];             // halves, in kStepUnit
+    uint16_t color_step[3];             // halves, in units of kStepUnit
     uint16_t scale_first, scale_step;
 };
 static_assert(sizeof(ClusterCode) == 40, "a format of files");
 
-// Returns the bytes of a cluster's ranges: a ClusterCode, and three halves for each band above the
-// constant one.
+// Returns the bytes of a cluster's ranges: a ClusterCode, and three halves per band
+// above degree 0.
 V3DG_HD constexpr int cluster_code_bytes(int sh_degree) {
     return static_cast<int>(sizeof(ClusterCode)) + (6 * sh_degree + 3) / 4 * 4;
 }
 
-// Returns the words of a gaussian's coefficients above the constant one.
+// Returns the number of 32-bit integers for a gaussian's coefficients above degree 0.
 V3DG_HD constexpr int num_sh_words(int sh_degree) { return 2 * sh_degree; }
 
-// Returns the bits of a coefficient's brightness (channel 0), orange (1) or green (2).
+// Returns the number of bits of a coefficient's brightness (channel 0), orange (1) or
+// green (2).
 V3DG_HD constexpr int sh_bits(int sh_degree, int basis, int channel) {
     return sh_degree == 1   ? 7
            : sh_degree == 2 ? (channel == 0 ? 7 : 6 - channel)
@@ -57,8 +58,8 @@ V3DG_HD constexpr int sh_bits(int sh_degree, int basis, int channel) {
 }
 V3DG_HD constexpr int band_of(int basis) { return basis < 4 ? 1 : basis < 9 ? 2 : 3; }
 
-// Returns the bytes of a page: codes of gaussians, those of their coefficients, and ranges of
-// clusters, padded to 16.
+// Returns the bytes of a page: codes of gaussians, codes of their coefficients, and
+// ranges of clusters, padded to 16.
 V3DG_HD constexpr size_t page_bytes(size_t num_gaussians, size_t num_clusters, int sh_degree) {
     return (4 * (kRecordWords + num_sh_words(sh_degree)) * num_gaussians +
             cluster_code_bytes(sh_degree) * num_clusters + kPageAlignment - 1) /
@@ -73,8 +74,8 @@ V3DG_HD inline float float_of_half(uint32_t half) {
     return half & 0x8000 ? -size : size;
 }
 
-// The ranges of a cluster, ready to decode with, and the places of its codes. In tables each takes
-// range_bytes().
+// The ranges of a cluster, prepared for decoding, and the locations of its codes. In
+// tables each has range_bytes() bytes.
 struct alignas(16) ClusterRanges {
     float mean_first[3];
     uint32_t scale_first;
@@ -87,16 +88,17 @@ struct alignas(16) ClusterRanges {
 V3DG_HD constexpr uint32_t range_bytes(int sh_degree) { return 64 + (3 * sh_degree + 3) / 4 * 16; }
 static_assert(range_bytes(3) == sizeof(ClusterRanges), "all of it");
 
-// The gaussians of a bundle as codes, on the host or on a device. Row r, of cluster c, has four
-// words from 4 (record_base + r) of `records` on, and two words a degree from 2 (sh_base +
-// sh_stride r) of `sh` on; the expressions in brackets are modulo 2^32.
+// The gaussians of a bundle as codes, on the host or on a device. Row r of cluster c
+// has four integers of `records` from index 4 (record_base + r) on, and two integers
+// per degree of `sh` from index 2 (sh_base + sh_stride r) on; the sums in parentheses
+// are modulo 2^32.
 struct Codes {
     const uint32_t *records, *sh;
     const unsigned char* ranges;  // [C]
-    Span<const int64_t> offset;   // [C + 1] gaussians before each cluster
+    Span<const int64_t> offset;   // [C + 1] number of gaussians before each cluster
     int sh_degree;
-    uint32_t range_size;  // range_bytes(), or more
-    uint32_t sh_stride;   // sh_degree, or more
+    uint32_t range_size;  // range_bytes() or larger
+    uint32_t sh_stride;   // sh_degree or larger
 
     V3DG_HD size_t num_clusters() const { return offset.size - 1; }
     V3DG_HD V3DG_INLINE const ClusterRanges& ranges_of(uint32_t cluster) const {
@@ -110,7 +112,8 @@ struct Codes {
     }
 };
 
-// Returns the ranges of a code. `sh_steps` are the halves after the code, three a band.
+// Returns the ranges of a ClusterCode. `sh_steps` are the halves after it, three per
+// band.
 V3DG_HD inline ClusterRanges ranges_of(const ClusterCode& code, const uint16_t* sh_steps,
                                        int sh_degree) {
     ClusterRanges out{};
@@ -129,20 +132,20 @@ V3DG_HD inline ClusterRanges ranges_of(const ClusterCode& code, const uint16_t* 
 template <class V>
 V3DG_HD V3DG_INLINE V exact_sqrt(V x) {
 #ifdef __CUDA_ARCH__
-    return __fsqrt_rn(x);  // whatever the compiler's options are
+    return __fsqrt_rn(x);  // for any compiler options
 #else
     return sqrt_of(x);
 #endif
 }
 
-// Returns `num_bits` bits of each lane's word as a number.
+// Returns `num_bits` bits of each lane's integer as a number.
 template <class V>
 V3DG_HD V3DG_INLINE V number_at(Bits<V> word, int first, int num_bits) {
     return float_of_number<V>(word >> first & ((1u << num_bits) - 1));
 }
 
-// Decodes one gaussian, or one a lane, with the coefficients of its constant basis. The result is
-// finite where the ranges are_valid().
+// Decodes one gaussian, or one per lane, with its coefficients of degree 0. The result
+// is finite if the ranges are_valid().
 template <class V>
 V3DG_HD V3DG_INLINE void decode(const Bits<V> record[kRecordWords], const ClusterRanges& ranges,
                                 Gaussian3d<V>& g, V color[3]) {
@@ -168,7 +171,7 @@ V3DG_HD V3DG_INLINE void decode(const Bits<V> record[kRecordWords], const Cluste
     g.quat[3] = z * kQuatStep;
 }
 
-// Returns `num_bits` bits of words, from bit `first` on.
+// Returns `num_bits` bits of an array of integers, from bit `first` on.
 template <class B>
 V3DG_HD V3DG_INLINE B bits_at(const B* words, int first, int num_bits) {
     const int word = first / 32, shift = first % 32;
@@ -177,9 +180,9 @@ V3DG_HD V3DG_INLINE B bits_at(const B* words, int first, int num_bits) {
     return bits & ((1u << num_bits) - 1);
 }
 
-// Decodes the coefficients above the constant basis, three channels each, of one gaussian or of one
-// a lane. A code is a signed number that stands for its square, so that small values have small
-// steps.
+// Decodes the coefficients above degree 0, three channels each, of one gaussian or of
+// one per lane. A code is a signed number that represents its signed square, so that
+// small values have small steps.
 template <class V>
 V3DG_HD V3DG_INLINE void decode_sh(const Bits<V>* words, const float* step, int sh_degree, V* sh) {
     int first = 0;
@@ -203,7 +206,7 @@ V3DG_HD V3DG_INLINE void decode_sh(const Bits<V>* words, const float* step, int 
     }
 }
 
-// Returns whether all gaussians that can be decoded with these ranges are finite.
+// Returns whether every gaussian that these ranges can produce is finite.
 V3DG_HD inline bool are_valid(const ClusterCode& code, const uint16_t* sh_steps, int sh_degree) {
     bool valid = true;
     const auto is_finite_half = [](uint32_t half) { return (half >> 10 & 31) != 31; };

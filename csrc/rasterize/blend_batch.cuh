@@ -2,12 +2,13 @@
 
 // Blends a batch of records, nearest first, over the pixels of a tile.
 //
-//
-// Many gaussians cover a few pixels. So a warp takes 32 records that may reach its sub-tile; each
-// lane finds the pixels that one of them reaches, and the bits are transposed: a pixel then walks
-// its own records only. Where gaussians cover many pixels, a lane has two neighbouring pixels,
-// which share most of their records and the loads and computations for a row; a sub-tile has 16 x 4
-// pixels then, otherwise 8 x 4. A pixel gets the same bits either way.
+// Many gaussians cover only a few pixels. Therefore a warp processes 32 records that
+// may reach its sub-tile at once: each lane computes a bit mask of the pixels that one
+// record reaches, and the masks are transposed, so that each pixel then visits only its
+// own records. Where gaussians cover many pixels, a lane blends two neighbouring
+// pixels, which share most of their records and the loads and computations for a row. A
+// sub-tile then has 16 x 4 pixels, otherwise 8 x 4. Both ways give a pixel the same
+// bits.
 
 #include <type_traits>
 
@@ -29,7 +30,7 @@ struct BlendedPixels {
     float depth[kPixels];
 };
 
-// Returns the place of a lane's first pixel in TilePixels.
+// Returns the index in TilePixels of a lane's first pixel.
 template <int kPixels>
 __device__ unsigned place_of(unsigned sub, unsigned lane) {
     if (kPixels == 1) return 32 * sub + (lane ^ (16 * (sub % 2)));
@@ -46,8 +47,9 @@ __device__ inline void store(const float (&from)[2], float* to) {
     *reinterpret_cast<float2*>(to) = {from[0], from[1]};
 }
 
-// Load vectors of the record that begins at a place in shared memory. No clobber keeps these loads
-// behind plain stores: records are written by copy_async() only, which is waited for.
+// Load the vectors of the record at an address in shared memory. No clobber orders
+// these loads after plain stores: only copy_async() writes records, and the code waits
+// for it.
 template <int kVector>
 __device__ float4 vector_at(uint32_t place) {
     float4 v{};
@@ -68,15 +70,16 @@ __device__ inline float2 rest_at(uint32_t place) {
     return v;
 }
 
-// Writes an element of BlendShared::list to a place in shared memory.
+// Stores an element of BlendShared::list at an address in shared memory.
 __device__ inline void list_record(uint32_t place, uint32_t record) {
 #ifdef __CUDA_ARCH__
     asm volatile("st.shared.u16 [%0], %1;" ::"r"(place), "h"(static_cast<uint16_t>(record)));
 #endif
 }
 
-// Loads an element of BlendShared::list; its writing ends with a clobber. This load fills 32 bits;
-// after a plain load nvcc would extend the number again.
+// Loads an element of BlendShared::list. The code that writes the list ends with a
+// memory clobber. This load zero-extends to 32 bits; after a plain load nvcc would
+// extend the number again.
 __device__ inline uint32_t listed_at(uint32_t place) {
     uint32_t listed = 0;
 #ifdef __CUDA_ARCH__
@@ -94,20 +97,21 @@ __device__ inline uint32_t low_bits(uint32_t bits, uint32_t count) {
     return low;
 }
 
-// Returns a bit for each of the tile's blocks that belongs to a sub-tile.
+// Returns a mask with a bit for each of the tile's blocks inside a sub-tile.
 template <int kPixels>
 __device__ uint32_t blocks_of_sub(unsigned sub) {
     return ((1u << SubTile<kPixels>::kBlocks) - 1) << SubTile<kPixels>::kBlocks * sub;
 }
 
-// Returns a bit for each sub-tile that has one of the blocks, at the place of its first block.
+// Returns a mask of the sub-tiles that contain one of the blocks. The bit of a sub-tile
+// is that of its first block.
 template <int kPixels>
 __device__ uint32_t subs_of(uint32_t blocks) {
     blocks |= blocks >> 1;
     return kPixels == 1 ? blocks & 0x55555555u : (blocks | blocks >> 2) & 0x11111111u;
 }
 
-// Publishes which blocks of a sub-tile have died.
+// Clears the bits of the sub-tile's blocks whose pixels have all stopped.
 template <int kPixels>
 __device__ void publish_alive(bool is_alive, unsigned sub, BlendShared& s) {
     constexpr int kAcross = kEntryBlockSize / kPixels;  // lanes across a block of pixels
@@ -125,7 +129,8 @@ __device__ void publish_alive(bool is_alive, unsigned sub, BlendShared& s) {
 // Transposes bits: bit j of lane i becomes bit i of lane j.
 __device__ inline uint32_t transpose_bits(uint32_t bits) {
     const unsigned lane = threadIdx.x % 32;
-    // Halves and bytes are exchanged whole: first lanes 16 apart, then lanes 8 apart.
+    // Halves and bytes are exchanged as units: first between lanes 16 apart, then 8
+    // apart.
     bits =
         __byte_perm(bits, __shfl_xor_sync(kAllLanes, bits, 16), (lane & 16) != 0 ? 0x3276 : 0x5410);
     bits =
@@ -143,8 +148,8 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
     return bits;
 }
 
-// Returns the rule by which pixels stop, in a register. If it were read from an argument of the
-// kernel, nvcc would load it for each gaussian.
+// Returns the stopping rule in a register. nvcc would load it for each gaussian if it
+// were read from a kernel argument.
 template <class Stop>
 __device__ Stop stop_of(const BlendShared& s) {
     if constexpr (std::is_same_v<Stop, StopsBefore>)
@@ -153,15 +158,15 @@ __device__ Stop stop_of(const BlendShared& s) {
         return {s.stops_behind};
 }
 
-// Blends the batch over a sub-tile; called by a whole warp.
+// Blends the batch over a sub-tile. Called by a whole warp.
 template <int kPixels, bool kWithDepth, class Stop>
 __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
     const Stop stop = stop_of<Stop>(s);
     unsigned lane = threadIdx.x % 32;
-    // The lane is hidden from the compiler, which would otherwise keep values that follow from it
-    // in registers from batch to batch and spill others.
+    // The asm hides the lane index from the compiler, which would otherwise keep values
+    // derived from it in registers between batches and spill others.
     asm volatile("" : "+r"(lane));
-    // The list is in reverse, from its end to its begin.
+    // The list is in reverse order, from its end to its beginning.
     constexpr uint32_t kEach = sizeof(s.list[0][0]);
     const auto list =
         static_cast<uint32_t>(__cvta_generic_to_shared(s.list[threadIdx.x / 32] + kBlendBatch));
@@ -177,7 +182,7 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
         listed += __popc(reaching);
     }
     __syncwarp();
-    asm volatile("" ::: "memory");  // listed_at() relies on it
+    asm volatile("" ::: "memory");  // listed_at() relies on this clobber
 
     using Sub = SubTile<kPixels>;
     const float corner_x = static_cast<float>(left + sub % Sub::kColumns * Sub::kWidth) + 0.5f;
@@ -191,7 +196,8 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
     load(pixels.transmittance + place, p.transmittance);
     for (int c = 0; c < 3; ++c) load(pixels.color[c] + place, p.color[c]);
     if (kWithDepth) load(s.depth + place, p.depth);
-    // Of two pixels, one that has stopped is put infinitely far from all gaussians.
+    // If one of two pixels has stopped, it is moved infinitely far away from all
+    // gaussians.
     constexpr float kNowhere = INFINITY;
     bool alive = false;
     for (int k = 0; k < kPixels; ++k) {
@@ -200,8 +206,8 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
         else
             p.x[k] = kNowhere;
     }
-    // The last lane takes the first record of a group, which becomes the highest bit of a lane's
-    // pixels.
+    // The last lane has the first record of a group, which becomes the highest bit in
+    // the masks of pixels.
     uint32_t last_of_group = list - 31 * kEach;
     for (; listed > 0; listed -= 32, last_of_group -= 32 * kEach) {
         uint32_t bits = 0;
@@ -212,13 +218,14 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
         }
         bits = transpose_bits(bits);
         if (!alive) bits = 0;
-        // The place of the next record is looked up ahead; after the last record it is meaningless.
+        // The index of the next record is computed ahead; after the last record it is
+        // unused.
         int highest = 31 - __clz(static_cast<int>(bits));
         uint32_t next = listed_at(last_of_group + kEach * highest);
         while (bits != 0) {
-            // A record is used as its vectors (frame/record.cuh). If it were copied to a Record
-            // first, nvcc would round the falloff differently than for the other number of pixels,
-            // and than in the backward pass.
+            // The record is read as vectors (frame/record.cuh). If it were copied to a
+            // Record first, nvcc would round the falloff differently than in the
+            // version for the other number of pixels, and than in the backward pass.
             const float4 a = vector_at<0>(next), b = vector_at<1>(next);
             const float2 c = rest_at(next);
             bits = low_bits(bits, highest);
@@ -239,9 +246,9 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
             }
             if (!alive) bits = 0;
         }
-        // With StopsBefore, one of two pixels that has stopped seems to go on, because it keeps
-        // more light than a pixel stops at. So lanes whose two pixels have stopped may walk up to
-        // here.
+        // With StopsBefore, a pixel that has stopped keeps more light than the stopping
+        // threshold, so it seems to go on. Therefore lanes whose two pixels have
+        // stopped may reach this test.
         if (kPixels > 1) alive = p.x[0] != kNowhere || p.x[kPixels - 1] != kNowhere;
         __syncwarp();
     }
@@ -254,14 +261,15 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
     publish_alive<kPixels>(alive, sub, s);
 }
 
-// Blends the batch over the sub-tiles that have one of the blocks `reached`; called by the whole
-// block.
+// Blends the batch over the sub-tiles that contain one of the blocks `reached`. Called
+// by the whole block.
 template <int kPixels, bool kWithDepth, class Stop>
 __device__ void blend_batch(uint32_t reached, int left, int top, BlendShared& s) {
     const uint32_t subs = subs_of<kPixels>(reached), lane = threadIdx.x % 32;
-    // The lane whose number is the bit of a sub-tile counts the sub-tiles before it.
+    // Each lane represents the sub-tile of its bit, and counts the sub-tiles before
+    // that.
     const uint32_t before = subs >> lane & 1 ? __popc(subs & ((1u << lane) - 1)) : ~0u;
-    // Each warp has its first sub-tile; later ones are taken when a warp is done.
+    // Each warp starts with its own sub-tile, and claims further ones when it is done.
     uint32_t taken = threadIdx.x / 32;
     for (;;) {
         const uint32_t bit = __ballot_sync(kAllLanes, before == taken);

@@ -1,7 +1,7 @@
 #pragma once
 
-// Takes pieces from a tile's list, nearest first and without entries over pixels that have all
-// stopped, and sorts them.
+// Takes pieces from a tile's list, nearest first, and sorts them. Entries that cover
+// only stopped pixels are skipped.
 
 #include "frame/record.cuh"
 #include "rasterize/tile_lists.cuh"
@@ -11,55 +11,57 @@ namespace cuda {
 
 constexpr int kBlendThreads = 128;
 constexpr int kBlendWarps = kBlendThreads / 32;
-constexpr int kWindow = kEntriesAtOnce * kBlendThreads;  // entries read at once
-constexpr int kPiece = 3 * kWindow / 2;                  // most entries sorted at once
-constexpr int kLog2SpreadAgain = 10;                     // buckets of a list that is spread again
-constexpr int kLog2Sort = 9;                             // buckets of a piece
-constexpr uint32_t kMostAlike = 12;  // most entries of a bucket that is not crowded
-// Most of a sample, an entry a thread, in crowded buckets.
+constexpr int kWindow = kEntriesAtOnce * kBlendThreads;  // entries read together
+constexpr int kPiece = 3 * kWindow / 2;                  // most entries sorted together
+constexpr int kLog2SpreadAgain = 10;  // buckets of a list that is spread a second time
+constexpr int kLog2Sort = 9;          // buckets of a piece
+constexpr uint32_t kMostAlike = 12;   // a bucket with more entries is crowded
+// The largest number of sampled entries, one per thread, that may be in crowded
+// buckets.
 constexpr uint32_t kMostCrowded = kBlendThreads / 4;
-constexpr int kFewEntries = 64;   // sorted without buckets
-constexpr int kBlendBatch = 192;  // records blended at once
-// The range of the first level is a guess. Each level after it takes at least 4 bits, first of the
-// depth (26 bits), then of the order (28 bits).
+constexpr int kFewEntries = 64;   // at most this many entries are sorted without buckets
+constexpr int kBlendBatch = 192;  // records blended together
+// The range of the first level is a guess. Each further level resolves at least 4 bits,
+// first of the depth (26 bits), then of the order (28 bits).
 constexpr int kMostSpreadLevels = 1 + 26 / 4 + 28 / 4 + 2;
 constexpr uint32_t kNoBucket = ~0u;
 
-// The pixels that a warp blends at a time, kPixels of a row a lane.
+// The pixels that a warp blends together: kPixels of a row per lane.
 template <int kPixels>
 struct SubTile {
     static constexpr int kWidth = 8 * kPixels, kHeight = 4, kColumns = kFrameTileWidth / kWidth;
     static constexpr int kCount = kColumns * kFrameTileHeight / kHeight;
-    static constexpr int kBlocks = kWidth / kEntryBlockSize;  // blocks of the tile, side by side
+    static constexpr int kBlocks = kWidth / kEntryBlockSize;  // blocks of the tile in a row
 };
 constexpr int kFrameTilePixels = kFrameTileWidth * kFrameTileHeight;
 
 static_assert(2 * kFewEntries <= kBlendThreads, "two threads rank an entry");
 
-// A part of the list, up to `end`, that is in bucket order, in the entries or in the scratch.
+// A part of the list, up to `end`, in bucket order. It is in the entries or in the
+// scratch.
 struct SpreadLevel {
     uint32_t end;
     bool in_scratch;
     Buckets buckets;
 };
 
-// The counts of warps that look through a window of a list together. There are three windows: one
-// is filled while the one before is still read and the next one is cleared.
+// The counters of warps that filter a window of a list together. There are three: one
+// is filled while the previous one is still read and the next one is cleared.
 struct ListWindow {
     uint32_t taken;
-    uint32_t end;  // first entry outside of the window
+    uint32_t end;  // first entry behind the window
 };
 
-// The state of a tile's pixels, by areas of 8 x 4. In areas with odd columns the upper and lower
-// halves are exchanged, so that the pixels of half a warp lie in different banks, with one and with
-// two of them a lane.
+// The state of a tile's pixels, in areas of 8 x 4. In areas of odd columns the upper
+// and lower halves are exchanged, so that the pixels of half a warp are in different
+// banks, with one pixel per lane and with two.
 struct TilePixels {
     alignas(float2) float transmittance[kFrameTilePixels];
     alignas(float2) float color[3][kFrameTilePixels];
 };
 
 struct BlendShared {
-    EntryKey key[kPiece];  // keys of the piece, in any order
+    EntryKey key[kPiece];  // keys of the piece, unordered
     union {
         SpreadShared<kLog2SpreadAgain> spreading;
         struct {
@@ -69,31 +71,34 @@ struct BlendShared {
         };
         float4 record[kRecordVectors][kBlendBatch];  // records without their boxes
     };
-    uint16_t sorted[kPiece];       // places in `key`
+    uint16_t sorted[kPiece];       // indices into `key`
     uint32_t blocks[kBlendBatch];  // live blocks that each record of the batch may reach
-    // The records of the batch that may reach the sub-tile of a warp, as addresses in shared
-    // memory. They stand from the last place on backwards; the first place is read ahead only.
+    // The records of the batch that may reach a warp's sub-tile, as addresses in shared
+    // memory. They fill the array from its end backwards; the first element stays
+    // unused, and is only loaded ahead of time.
     uint16_t list[kBlendWarps][kBlendBatch + 1];
     TilePixels pixels;
     uint32_t alive_blocks;  // bits as in blocks_of(TileEntry)
-    uint32_t reached[2];    // blocks that the batch reaches; batches alternate
-    // Blocks counted once for each record that reaches them; batches alternate.
+    uint32_t reached[2];    // blocks that the batch reaches; one element per parity of the batch
+    // The sum over records of the number of blocks they reach; one element per parity
+    // of the batch.
     uint32_t num_covered[2];
-    uint32_t subs_taken;  // sub-tiles taken
+    uint32_t subs_taken;  // sub-tiles claimed so far
     ListWindow window[3];
-    uint32_t lowest, highest;  // range of depths of the piece
-    uint32_t crowded;          // sampled entries in crowded buckets
+    uint32_t lowest, highest;  // range of depths in the piece
+    uint32_t crowded;          // number of sampled entries in crowded buckets
     float stops_behind;        // StopsBehind::transmittance
     SpreadLevel level[kMostSpreadLevels];
-    // Sums of weight * depth, in the order of TilePixels. Frames without depth do not allocate this
-    // member.
+    // Sums of weight * depth, in the order of TilePixels. Frames without depth do not
+    // allocate this member.
     alignas(float2) float depth[kFrameTilePixels];
 };
 static_assert(sizeof(BlendShared) < 1 << 15,
               "`list` has 16 bits; a block's memory begins within the lower half");
 static_assert(kBlendBatch % 32 == 0, "a warp takes 32 records");
 
-// Returns the end of the bucket of entry `first`; the entries up to `last` are in bucket order.
+// Returns the end of the bucket that contains entry `first`; the entries up to `last`
+// are in bucket order.
 __device__ inline uint32_t end_of_bucket(const TileEntry* entries, uint32_t first, uint32_t last,
                                          const Buckets& buckets) {
     const uint32_t bucket = buckets.of(entries[first].key);
@@ -106,8 +111,9 @@ __device__ inline uint32_t end_of_bucket(const TileEntry* entries, uint32_t firs
     return last;
 }
 
-// Adds the entries of [first, end) that lie over live pixels to the piece, but none from the bucket
-// `beyond` on. Returns where it stopped and how many entries the piece now holds.
+// Adds the entries of [first, end) that cover live pixels to the piece, up to the
+// bucket `beyond`, exclusively. Returns the index at which it stopped and the number of
+// entries in the piece.
 __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, uint32_t end,
                                     const Buckets& buckets, uint32_t beyond, uint32_t held,
                                     uint32_t window_number, BlendShared& s) {
@@ -164,8 +170,8 @@ __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, ui
     return {min(end, window.end), held + window.taken};
 }
 
-// Returns whether the first entry is blended before the second. Where their depths are alike and
-// not exact, the records' own depths decide.
+// Returns whether the first entry is blended before the second. If their rounded depths
+// are equal and not exact, the depths of the records decide.
 __device__ inline bool precedes(EntryKey first, EntryKey second, const RecordPlanes& records) {
     const TileEntry one{first}, other{second};
     if (records.depth_of(one) != records.depth_of(other) || records.is_exact(other))
@@ -176,7 +182,7 @@ __device__ inline bool precedes(EntryKey first, EntryKey second, const RecordPla
     return depth_a != depth_b ? depth_a < depth_b : a < b;
 }
 
-// Returns how many of the entries at places [first, last) of by_bucket come before the one at place
+// Returns how many of the entries [first, last) of by_bucket precede the one at index
 // p.
 __device__ inline uint32_t count_before(uint32_t p, uint32_t first, uint32_t last,
                                         const RecordPlanes& records, const BlendShared& s) {
@@ -188,7 +194,7 @@ __device__ inline uint32_t count_before(uint32_t p, uint32_t first, uint32_t las
         return before;
     }
     const uint32_t depth = records.depth_of(entry);
-    uint32_t num_alike = 0, last_alike = 0;  // other entries only
+    uint32_t num_alike = 0, last_alike = 0;  // entries other than p
     for (uint32_t j = first; j < last; ++j) {
         const uint32_t other = records.depth_of(entry_at(j));
         before += other < depth;
@@ -197,8 +203,8 @@ __device__ inline uint32_t count_before(uint32_t p, uint32_t first, uint32_t las
             last_alike = j;
         }
     }
-    // Lanes that have to look records up do it together; most have one other entry of the same
-    // depth.
+    // Lanes that have to look up records do so together. Most have one other entry of
+    // equal depth.
     for (uint32_t j = last_alike; num_alike > 0; --j) {
         if (records.depth_of(entry_at(j)) != depth || j == p) continue;
         before += precedes(entry_at(j).key, entry.key, records);
@@ -207,8 +213,8 @@ __device__ inline uint32_t count_before(uint32_t p, uint32_t first, uint32_t las
     return before;
 }
 
-// These sort the piece by buckets. The counters are 0 first, then the begin of each bucket, and at
-// the end the begin of the next.
+// These functions sort the piece by buckets. The counters start as 0, then hold the
+// begin of each bucket, and in the end the begin of the next one.
 template <class SomeBuckets>
 __device__ void count_buckets(const SomeBuckets& buckets, uint32_t* bucket, uint32_t count,
                               BlendShared& s) {
@@ -247,14 +253,14 @@ __device__ inline void sort_piece(const RecordPlanes& records, uint32_t count, B
         for (int i = threadIdx.x; i < 1 << kLog2Sort; i += kBlendThreads) s.bucket[i] = 0;
     }
     __syncthreads();
-    if (threadIdx.x == 0) {  // the next piece starts from this
+    if (threadIdx.x == 0) {  // the next piece starts with this value
         s.lowest = ~0u;
         s.highest = 0;
     }
     if (few) return;
     count_buckets(buckets, s.bucket, count, s);
-    // A sample of the entries tells whether most have many others in their bucket, each of which
-    // costs them a comparison.
+    // A sample shows whether most entries share their bucket with many others, each of
+    // which costs a comparison.
     const bool is_crowded =
         threadIdx.x < count && s.bucket[buckets.of(s.key[threadIdx.x])] > kMostAlike;
     if (is_crowded) atomicAdd(&s.crowded, 1u);
@@ -269,7 +275,7 @@ __device__ inline void sort_piece(const RecordPlanes& records, uint32_t count, B
         scan_buckets<1 << kLog2Sort, kBlendThreads>(s.finer, s.warp_sum);
         sort_buckets(finer, s.finer, records, count, s);
     }
-    if (threadIdx.x == 0) s.crowded = 0;  // the next piece starts from this
+    if (threadIdx.x == 0) s.crowded = 0;  // the next piece starts with this value
 }
 
 }  // namespace cuda

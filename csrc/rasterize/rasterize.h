@@ -1,7 +1,7 @@
 #pragma once
 
-// Blends the lists of tiles into pictures, front to back, and takes the gradients of pictures back
-// to those of their records.
+// Blends the lists of tiles into pictures, front to back, and computes the gradients of
+// records from those of pictures.
 
 #include <cstddef>
 #include <cstdint>
@@ -16,16 +16,16 @@
 
 namespace v3dg {
 
-// Blends one tile's sorted entries, front to back, and writes its pixels that are in the picture's
-// window.
+// Blends one tile's sorted entries, front to back, and writes the pixels of the tile
+// that are inside the picture's window.
 V3DG_DECLARE_PER_ISA(template <class T>
                      void rasterize_tile(const Record<T>* records, EntryFormat format,
                                          const uint64_t* entry, size_t count, int left, int top,
                                          const Picture<T>& picture))
 
-// Writes the gradients of a tile's sorted entries, in their order, into `d_entry`. Where `size` is
-// not null, it gets the sizes of the gradients by the centres. Both are zero on entry.
-// `d_background` (3) is added to.
+// Writes the gradients of a tile's sorted entries, in their order, to `d_entry`.
+// `size`, unless null, receives the sizes of the gradients by the centres. Both must be
+// zero on entry. Adds to `d_background` (3).
 V3DG_DECLARE_PER_ISA(template <class T> void rasterize_tile_backward(
     const Record<T>* records, EntryFormat format, const uint64_t* entry, size_t count, int left,
     int top, const Picture<T>& picture, const PictureGradient<T>& d_picture,
@@ -33,35 +33,39 @@ V3DG_DECLARE_PER_ISA(template <class T> void rasterize_tile_backward(
 
 namespace cuda {
 
-// The tape that the forward pass leaves for the backward pass; every pointer is on the device.
+// The data that the forward pass leaves for the backward pass; all pointers are to
+// device memory.
 struct RasterTape {
-    // The records of each tile in the order they were blended, without those that could change no
-    // pixel. It is as long as the entries, and tile t's records begin at tile_first[t].
+    // The records of each tile in blending order, without those that could not change
+    // any pixel. The array is as long as the entries; the records of tile t begin at
+    // tile_first[t].
     uint32_t* order;
-    // [num_tiles] How many entries of `order` were written.
+    // [num_tiles] Number of elements that were written to `order` for each tile.
     uint32_t* blended;
 };
 
-// Returns the largest number of plans that blending in parts takes. A frame with a tape has one
-// plan a tile.
+// Returns the largest number of plans for blending in parts. A frame with a tape has
+// one plan per tile.
 uint32_t most_plans(uint32_t num_tiles);
 
-// Blends each tile's list into the pictures that lists.images name; every pixel is written.
-// Overwrites lists.entries and lists.scratch. Does nothing where the counters are over a capacity.
-// The result does not depend on the order of the entries within a tile's list. `tape` may be null.
+// Blends each tile's list into the pictures of lists.images; writes every pixel.
+// Overwrites lists.entries and lists.scratch. Does nothing if the counters exceed a
+// capacity. The result does not depend on the order of entries in a tile's list. `tape`
+// may be null.
 void rasterize(const FrameLists& lists, const RasterTape* tape, Stream stream);
 
-// Pictures as they were drawn, the lists they were blended from, and their gradients, all on the
+// Drawn pictures, the lists they were blended from, and their gradients, all on the
 // device.
 struct RasterizeBackwardInput {
     FrameImage image;  // of the only picture; unused where there is a batch
     RecordPlanes records;
-    const unsigned long long* tile_first;  // [num_tiles + 1] into order
-    const uint32_t* order;                 // each tile's records front to back
-    const uint32_t* blended;  // [num_tiles] of them, those in front of where all pixels had stopped
-    const TilePlan* plans;    // [num_tiles] in the order in which blocks take the tiles
+    const unsigned long long* tile_first;  // [num_tiles + 1] indices into `order`
+    const uint32_t* order;                 // records of each tile, front to back
+    const uint32_t* blended;  // [num_tiles] number of them, up to where all pixels had stopped
+    const TilePlan* plans;    // [num_tiles] in the order in which blocks process the tiles
     PictureGradient<float> d_picture;  // of the only picture
 };
+
 // The pictures of a batch, without depth.
 struct PictureBatch {
     const FrameImage* images;
@@ -69,12 +73,12 @@ struct PictureBatch {
     uint32_t num_tiles;  // of all pictures together
 };
 
-// Writes the slots and the gradient of the background (3) of one picture. `d_background_of_tile` is
-// scratch, (num_tiles, 3).
+// Writes the slots and the gradient of the background (3) of one picture.
+// `d_background_of_tile` is scratch memory, (num_tiles, 3).
 void rasterize_backward(const RasterizeBackwardInput& in, const GradientSlots& slots,
                         float* d_background_of_tile, float* d_background, Stream stream);
-// Writes the slots of all pictures of a batch, without sizes. The image and the gradient of `in`
-// are unused.
+// Writes the slots of all pictures of a batch, without sizes. The image and the
+// gradient of `in` are unused.
 void rasterize_backward(const RasterizeBackwardInput& in, const PictureBatch& batch,
                         const GradientSlots& slots, Stream stream);
 

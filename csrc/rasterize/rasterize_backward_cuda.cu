@@ -1,9 +1,9 @@
-// Each block takes a tile, each warp 8 x 4 of its pixels, each lane one pixel; they walk the tile's
-// list front to back as the forward pass did.
+// Each block processes a tile, each warp 8 x 4 of its pixels, each lane one pixel. They
+// visit the tile's list front to back, as the forward pass did.
 //
-// The sums over a warp's pixels are made for kHeld gaussians at once: each lane stores the
-// contribution of its pixel to each of them, then each lane sums a row of 8 pixels of one gaussian.
-// That costs a fifth of adding up across lanes gaussian by gaussian.
+// The sums over a warp's pixels are computed for kHeld gaussians at once: each lane
+// stores the contribution of its pixel to each of them, then each lane sums a row of 8
+// pixels for one gaussian. This costs a fifth of a reduction across lanes per gaussian.
 
 #include <cmath>
 
@@ -23,10 +23,10 @@ constexpr int kWarpWidth = 8, kWarpHeight = 4;  // px
 constexpr int kWarpColumns = kFrameTileWidth / kWarpWidth;
 constexpr int kBatch = 192;  // entries
 constexpr int kPairs = 768;  // (entry, warp) pairs of a batch
-constexpr int kHeld = 8;     // gaussians whose sums a warp makes at once
+constexpr int kHeld = 8;     // gaussians whose sums a warp computes together
 constexpr int kGradientValues = sizeof(RecordGradient<float>) / sizeof(float);
 constexpr int kSizeValues = sizeof(CenterSize<float>) / sizeof(float);
-// The number of sums of a gaussian.
+// The number of sums per gaussian.
 template <bool kWithSize>
 constexpr int kValuesOf = kGradientValues + (kWithSize ? kSizeValues : 0);
 static_assert(kHeld * kWarpHeight == 32 && kWarpHeight == 4, "a lane sums one row of one gaussian");
@@ -34,20 +34,20 @@ constexpr int kTogether = 2;  // gaussians blended without a branch between them
 static_assert(kPairs >= kWarps, "one entry fits");
 static_assert(kBatch <= 255 && kBatch % 32 == 0 && kHeld % kTogether == 0, "");
 
-// The contribution of a pixel to a gaussian.
+// The contribution of one pixel to the gradient of a gaussian.
 struct Share {
     float d_exponent, weight;
 };
-constexpr int kShareStride = 33;  // pixels of a gaussian; odd, against bank conflicts
-constexpr int kRowsStride = 40;   // row sums of a value; padded against bank conflicts, too
+constexpr int kShareStride = 33;  // elements per gaussian; odd, to avoid bank conflicts
+constexpr int kRowsStride = 40;   // row sums of a value, padded to avoid bank conflicts
 static_assert(kRowsStride * kValuesOf<true> * sizeof(float) <= kHeld * kShareStride * sizeof(Share),
               "");
 
-// The data of a batch's entries that is kept until their pairs are added up.
+// The data of a batch's entries, which must stay until their pairs are summed.
 struct Batch {
     uint32_t slot[kBatch];
     uint32_t first_pair[kBatch];
-    uint32_t took_part[kBatch];  // bit k: the k-th of the warps that might blend the entry did so
+    uint32_t took_part[kBatch];  // bit k: the k-th warp that may blend the entry did blend it
 };
 
 template <bool kWithSize>
@@ -58,19 +58,21 @@ struct Shared {
     uint32_t pairs_of_warp[kBatch / 32];
     uint32_t alive;  // bit w: warp w has a pixel that has not stopped
     float4 d_color[kWarps][kWarpHeight]
-                  // Gradients by colour and depth; the spare column avoids bank conflicts.
+                  // Gradients by colour and depth; the spare column avoids bank
+                  // conflicts.
                   [kWarpWidth + 1];
     Share share[kWarps][kHeld * kShareStride];
-    Batch batch[2];  // one is blended while the other one is added up
+    Batch batch[2];  // one batch is blended while the other one is summed
     float pair[kPairs][kValuesOf<kWithSize>];
     float d_background[kWarps][3];
 };
 
 static_assert(sizeof(Shared<true>) <= 99 * 1024, "the most that a block can have on every device");
 
-// Returns the parts of the tile, one bit a warp, that the record may reach. It compares without
-// rounding to pixel centres. A tile marks the slots of all records that it lists for a warp, so
-// this comparison decides which gaussians get zeros.
+// Returns the parts of the tile that the record may reach, one bit per warp. It
+// compares without rounding to pixel centres. A tile marks the slots of every record
+// that it lists for a warp, so this comparison decides which gaussians get zero
+// gradients.
 __device__ uint32_t warps_of(const Record<float>& g, int left, int top) {
     const int x0 = max(g.x0 - left, 0) / kWarpWidth,
               x1 = min(g.x1 - left, kFrameTileWidth - 1) / kWarpWidth;
@@ -96,11 +98,13 @@ struct PixelGradient {
     float x, y;
     float d_color[3], d_depth, d_weight;
     float total,
-        running;  // sum over gaussians of weight * (gradient by that weight): of all, and so far
+        // Sums over gaussians of weight * (gradient by that weight): all of them, and
+        // those so far.
+        running;
     float transmittance;
 };
 
-// Reads the pixel at (column, row) of the picture; adds to `d_background`.
+// Reads the pixel at (column, row) of the picture, and adds to `d_background`.
 __device__ PixelGradient read_pixel(const FrameImage& image,
                                     const PictureGradient<float>& d_picture, int column, int row,
                                     float d_background[3]) {
@@ -134,9 +138,9 @@ __device__ PixelGradient read_pixel(const FrameImage& image,
     return p;
 }
 
-// Sums over the warp's pixels for the gaussians that it holds. `entry` is the place in the batch of
-// this lane's gaussian, (left, top) the centre of the warp's first pixel. Lane = row of pixels *
-// kHeld + gaussian.
+// Sums over the warp's pixels for the gaussians that it holds. `entry` is the index in
+// the batch of this lane's gaussian, (left, top) the centre of the warp's first pixel.
+// The lane index is row of pixels * kHeld + gaussian.
 template <bool kWithDepth, bool kWithSize>
 __device__ void add_up(Shared<kWithSize>& s, Batch& batch, int warp, int held, int entry,
                        float left, float top) {
@@ -164,7 +168,7 @@ __device__ void add_up(Shared<kWithSize>& s, Batch& batch, int warp, int held, i
     }
     const Ellipse<float> d = falloff_vjp(l11, l12, l22, sums.of_falloff(f));
 
-    // The sums over the rows take the place of the shares: lane l adds up the values l / kHeld, l /
+    // The row sums overwrite the contributions: lane l sums the values l / kHeld, l /
     // kHeld + 4, ...
     constexpr int kValues = kValuesOf<kWithSize>;
     const float value[kValuesOf<true>] = {
@@ -223,7 +227,7 @@ __device__ void blend_batch_vjp(Shared<kWithSize>& s, Batch& batch, int warp, in
     for (int first = 0; first < count && alive; first += kHeld) {
         const int held = min(kHeld, count - first);
         for (int h = 0; h < held; h += kTogether) {
-            Share share[kTogether];  // stored last, so that all the loads can come first
+            Share share[kTogether];  // stored last, so that all loads can be issued first
 #pragma unroll
             for (int k = 0; k < kTogether; ++k)
                 share[k] = blend_vjp<kWithDepth>(s.record[list[first + h + k]], p);
@@ -236,7 +240,7 @@ __device__ void blend_batch_vjp(Shared<kWithSize>& s, Batch& batch, int warp, in
     if (!alive && lane == 0) atomicAnd(&s.alive, ~(1u << warp));
 }
 
-// Adds up the pairs of a batch's entries into their slots; `thread` of `num_threads`.
+// Sums the pairs of a batch's entries into their slots, as `thread` of `num_threads`.
 template <bool kWithSize>
 __device__ void add_up_pairs(const Shared<kWithSize>& s, const Batch& batch, int num, int thread,
                              int num_threads, const GradientSlots& slots) {
@@ -258,8 +262,8 @@ __device__ void add_up_pairs(const Shared<kWithSize>& s, const Batch& batch, int
     }
 }
 
-// The only picture, and one of a batch. They are asked with a compile-time constant, so that a
-// single picture stays in constant memory.
+// The only picture, and one of a batch. They are asked with a compile-time constant, so
+// that a single picture stays in constant memory.
 template <bool kIsBatch>
 __device__ const FrameImage& image_of(const RasterizeBackwardInput& in, const PictureBatch& batch,
                                       uint32_t image) {
@@ -281,7 +285,7 @@ __global__ void __launch_bounds__(kThreads, 2)
     Shared<kWithSize>& s = *reinterpret_cast<Shared<kWithSize>*>(shared_memory());
     const int lane = threadIdx.x % 32;
     const int warp = __shfl_sync(kAllLanes, static_cast<int>(threadIdx.x) / 32,
-                                 0);  // tells the compiler that all lanes agree
+                                 0);  // shows the compiler that all lanes agree
     const uint32_t tile = in.plans[blockIdx.x].tile, number = in.plans[blockIdx.x].image;
     const FrameImage& image = image_of<kIsBatch>(in, batch, number);
     const uint32_t in_image = tile - image.first_tile;
@@ -317,7 +321,7 @@ __global__ void __launch_bounds__(kThreads, 2)
     const int i = threadIdx.x;
     int first = 0, num = 0;
     for (int turn = 0;; turn ^= 1) {
-        // Some warps load a batch while the others add up the one before.
+        // Some warps load a batch while the others sum the previous one.
         const bool goes_on = first < count && s.alive != 0;
         Batch& entries = s.batch[turn];
         uint32_t end_pair = 0;
@@ -344,7 +348,7 @@ __global__ void __launch_bounds__(kThreads, 2)
             for (int w = 0; w < warp; ++w) end_pair += s.pairs_of_warp[w];
             entries.first_pair[i] = end_pair - __popc(s.warps[i]);
         }
-        // These are the entries of the batch whose pairs fit.
+        // The entries of the batch are those whose pairs fit.
         num = __syncthreads_count(i < min(kBatch, count - first) && end_pair <= kPairs);
         blend_batch_vjp<kWithDepth, kWithSize>(s, entries, warp, num, p, warp_left + 0.5f,
                                                warp_top + 0.5f);
@@ -363,7 +367,7 @@ void start(const RasterizeBackwardInput& in, const GradientSlots& slots,
 
 constexpr int kSumThreads = 256;
 
-// Each block sums a channel.
+// One block per channel.
 __global__ void sum_over_tiles_kernel(const float* of_tile, uint32_t num_tiles, float* total) {
     __shared__ float of_warp[kSumThreads / 32];
     float sum = 0;

@@ -16,7 +16,7 @@ static void blend_entries(const Record<T>* records, EntryFormat format, const ui
     });
 }
 
-// Calls visit(place in the tile, place in the picture) for the pixels of a tile that are in the
+// Calls visit(index in the tile, index in the picture) for the tile's pixels inside the
 // window.
 template <class Visit>
 static V3DG_INLINE void for_each_pixel(int left, int top, const Window& window,
@@ -89,7 +89,7 @@ static void backward(const Record<T>* records, EntryFormat format, const uint64_
         grad.d_weight[p] = d_weight;
         grad.total[p] = total + d_weight * (1 - t);
     });
-    constexpr size_t kPrefetch = 48;  // far enough ahead that a record arrives in time
+    constexpr size_t kPrefetch = 48;  // records ahead, enough for a prefetch to arrive in time
     const BlockPixels<T> pixels;
     uint64_t alive = clear_tile(tile, left, top, picture.window, Extra::kNothing);
     for (size_t i = 0; i < count && alive != 0; ++i) {

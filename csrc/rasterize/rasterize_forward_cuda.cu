@@ -1,12 +1,13 @@
-// Each block blends a tile, front to back; its warps take the tile's sub-tiles one after another.
+// Each block blends a tile, front to back; its warps process the tile's sub-tiles one
+// after another.
 //
-//
-// Lists are sorted piece by piece, nearest first. Entries over pixels that have all stopped by then
-// are dropped unsorted, and their records are never fetched. A list that does not fit into a piece
-// is first spread over buckets of depth: in its own place if shared memory holds it, else into
-// scratch, as many entries at a time as shared memory holds. A bucket too long for a window is
-// spread again. A list with far more than its share of a frame's entries is blended in parts of the
-// tile, concurrently.
+// A list is sorted in pieces, nearest first. Entries that cover only pixels that have
+// stopped by then are dropped before sorting, and their records are never loaded. A
+// list that does not fit into a piece is first spread over buckets of depth: in place
+// if it fits into shared memory, else into scratch memory, one chunk of the size of
+// shared memory at a time. A bucket that is longer than a window is spread again. A
+// list that is much longer than a block's share of the frame's entries is blended in
+// parts of the tile, concurrently.
 
 #include "rasterize/rasterize.h"
 
@@ -20,16 +21,16 @@ namespace v3dg {
 namespace cuda {
 namespace {
 
-constexpr int kBlocks = 8;  // blocks on a multiprocessor with 228 KiB, in frames without depth
-// The average number of blocks that a record reaches from which two pixels a lane are faster.
+constexpr int kBlocks = 8;  // blocks per multiprocessor with 228 KiB, in frames without depth
+// The average number of blocks per record from which two pixels per lane are faster.
 // Measured: 4, 7 and 10 differ by 1 %.
 constexpr int kBlocksForPairs = 5;
 
 static_assert(kBlocks * (offsetof(BlendShared, depth) + 1024) <= 228 << 10,
               "the driver keeps 1024 of each");
 
-// Returns a bit for each block of a part of a tile: the whole, its left or right half, or a
-// quarter.
+// Returns a mask of the blocks in a part of a tile: the whole tile, its left or right
+// half, or a quarter.
 __device__ uint32_t blocks_of_part(int part, int log2_parts) {
     if (log2_parts == 0) return ~0u;
     return (log2_parts == 1 ? 0x0f0f0f0fu : 0x0f0fu) << (4 * (part & 1) + 16 * (part >> 1));
@@ -67,7 +68,8 @@ __device__ void blend_piece(const RecordPlanes& records, uint32_t count, int lef
         if (threadIdx.x == 0) s.reached[turn ^ 1] = s.num_covered[turn ^ 1] = 0;
         const int num_records = min(count - first, static_cast<uint32_t>(kBlendBatch));
         const uint32_t reached = s.reached[turn];
-        // Fewer sub-tiles than warps would leave some warps idle.
+        // Larger sub-tiles would leave some warps idle if there are fewer of them than
+        // warps.
         if (s.num_covered[turn] >= kBlocksForPairs * num_records &&
             __popc(subs_of<2>(reached)) >= kBlendWarps)
             blend_batch<2, kWithDepth, Stop>(reached, left, top, s);
@@ -78,8 +80,9 @@ __device__ void blend_piece(const RecordPlanes& records, uint32_t count, int lef
     if (threadIdx.x < 2) s.reached[threadIdx.x] = s.num_covered[threadIdx.x] = 0;
 }
 
-// Blends the list of a tile. Returns how many of its entries were not dropped. For a list in
-// windows, which is in the scratch, `window_ends` has their ends; it is null for others.
+// Blends the list of a tile. Returns how many of its entries were not dropped. If the
+// list is in windows, which are in scratch memory, `window_ends` contains their ends;
+// otherwise it is null.
 template <bool kWithDepth, class Stop>
 __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, TileEntry* scratch,
                                uint32_t count, const TilePlan& plan, const Buckets& spread_buckets,
@@ -118,7 +121,7 @@ __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, 
                 continue;
             }
             if (room < kWindow) break;
-            // This takes as many whole buckets as a window holds.
+            // The window gets as many whole buckets as fit.
             const uint32_t beyond = level.buckets.of(from[done + kWindow].key);
             const uint2 taken = take_window(from, done, done + kWindow, level.buckets, beyond, held,
                                             num_windows++, s);
@@ -148,7 +151,7 @@ __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, 
     return blended;
 }
 
-// Returns the memory of the image, which is an element of lists.images.
+// Returns the destination of the image, which is an element of lists.images.
 __device__ const PicturePlanes& planes_of(const FrameLists& lists, const FrameImage& image) {
     return image.planes.color != nullptr ? image.planes : lists.planes[&image - lists.images];
 }
@@ -162,7 +165,8 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
     const int left = in_image % image.tile_columns * kFrameTileWidth;
     const int top = in_image / image.tile_columns * kFrameTileHeight;
     const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
-    // A thread initialises and writes one pair of pixels of each sub-tile that it takes.
+    // A thread initialises and writes one pair of pixels of each sub-tile that it
+    // processes.
     using Sub = SubTile<2>;
     const auto for_each_pair = [&](const auto& visit) {
         for (int sub = warp; sub < Sub::kCount; sub += kBlendWarps)
@@ -232,7 +236,7 @@ __global__ void __launch_bounds__(kBlendThreads, kBlocks)
     if (lists.plans[blockIdx.x].tile == kNoTile) return;
     const int part = lists.plans[blockIdx.x].part;
     const TilePlan& plan = lists.plans[blockIdx.x - part];
-    if (part > 0 && !plan.in_windows) return;  // the first part blends it all
+    if (part > 0 && !plan.in_windows) return;  // the first part blends the whole tile
     const uint32_t own_blocks = blocks_of_part(part, plan.in_windows ? plan.log2_parts : 0);
     const Buckets buckets{
         .lowest = plan.lowest, .last = plan.last_bucket, .shift = plan.shift, .by_order = false};

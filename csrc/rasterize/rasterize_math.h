@@ -1,9 +1,10 @@
 #pragma once
 
-// One gaussian over one pixel (or a vector of pixels): its falloff, the blend step, and the
-// gradients of both.
+// One gaussian over one pixel or a vector of pixels: its falloff, the blend step, and
+// the gradients of both.
 //
-// A pixel's transmittance is negative once it has stopped; its magnitude is then the final value.
+// The transmittance of a pixel becomes negative when the pixel stops; its magnitude is
+// then the final transmittance.
 
 #include "frame/image.h"
 #include "math/ellipse.h"
@@ -14,9 +15,9 @@ namespace v3dg {
 // The falloff of a gaussian at a pixel.
 template <class V>
 struct Falloff {
-    V dx, dy;    // px, relative to the centre
-    V t1, t2;    // L d
-    V exponent;  // log2 of alpha before it is limited
+    V dx, dy;    // px, relative to the gaussian's centre
+    V t1, t2;    // the vector L d
+    V exponent;  // log2 of alpha before clamping
 };
 
 template <class V>
@@ -26,12 +27,12 @@ V3DG_HD V3DG_INLINE Falloff<V> falloff_at(V x, V y, V u, V v, V l11, V l12, V l2
     f.dy = y - v;
     f.t1 = l11 * f.dx + l12 * f.dy;
     f.t2 = l22 * f.dy;
-    // Pixels of a row share all but the last term.
+    // Pixels of a row share all terms but the last.
     f.exponent = log2_opacity - f.t2 * f.t2 - f.t1 * f.t1;
     return f;
 }
 
-// Returns whether the gaussian contributes to the pixel at all.
+// Returns whether the gaussian contributes to the pixel.
 template <class V>
 V3DG_HD V3DG_INLINE auto contributes(const Falloff<V>& f) {
     return f.exponent >= all_lanes<V>(Lane<V>(kLog2MinAlpha));
@@ -59,7 +60,8 @@ V3DG_HD V3DG_INLINE V transmittance_behind(V alpha, V t) {
 #endif
 }
 
-// Blend over a pixel with transmittance `t`, update it, and return the gaussian's weight.
+// Blend a gaussian over a pixel with transmittance `t`, update `t`, and return the
+// gaussian's weight.
 template <class V>
 V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t, StopsBehind<Lane<V>> stop) {
     const V next = transmittance_behind(alpha, t);
@@ -78,8 +80,8 @@ V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t, StopsBefore = {}) {
     return weight;
 }
 
-// What remains to be applied to a pixel when its blending is over: the transmittance to the
-// background, and the factor by which its colour is multiplied.
+// The final factors of a pixel after blending: the transmittance of the background, and
+// the factor of the colour.
 template <class T>
 struct Finished {
     T transmittance, gain;
@@ -91,8 +93,9 @@ V3DG_HD V3DG_INLINE Finished<T> finished(T t, float min_transmittance) {
     return {has_stopped ? -t : t, T(1)};
 }
 
-// As blend_weight(), for several gaussians, front to back; `before` is the transmittance before
-// each. Most pixels do not stop among them, which the product of all tells.
+// As blend_weight(), for several gaussians, front to back; `before` is the
+// transmittance before each. The product of all shows that most pixels do not stop
+// among them.
 template <int kCount, class T>
 V3DG_HD V3DG_INLINE void blend_weights(const T (&alpha)[kCount], T& t, T (&before)[kCount],
                                        T (&weight)[kCount]) {
@@ -112,12 +115,13 @@ V3DG_HD V3DG_INLINE void blend_weights(const T (&alpha)[kCount], T& t, T (&befor
     }
 }
 
-// Returns the gradient by the exponent of a gaussian that was blended with `alpha` and `weight`
-// where the transmittance was `before`. `by_weight` is the gradient by its weight; `behind` is the
-// sum over all gaussians behind it of their weights times the gradients by them.
+// Returns the gradient by the exponent of a gaussian that was blended with `alpha` and
+// `weight` where the transmittance was `before`. `by_weight` is the gradient by its
+// weight; `behind` is the sum, over all gaussians behind it, of weight times gradient
+// by that weight.
 template <class V>
 V3DG_HD V3DG_INLINE V exponent_vjp(V alpha, V before, V weight, V by_weight, V behind) {
-    // alpha adds to the gaussian's weight and attenuates everything behind it.
+    // Alpha increases the gaussian's weight and attenuates everything behind it.
     const V d_alpha = before * by_weight - quotient_of(behind, 1 - alpha);
     const auto moves = (weight > V{}) & (alpha < all_lanes<V>(Lane<V>(kMaxAlpha)));
     return moves ? Lane<V>(kLn2) * alpha * d_alpha : V{};
@@ -130,8 +134,8 @@ struct FalloffSums {
     T t1_dx, t1_dy, t2_dy;  // gradient by t1 times dx, ...
 };
 
-// Sums over the pixels of one row, which share dy and t2: of the gradient by the exponent, and of
-// its products with t1 and t1 dx.
+// Sums over the pixels of one row, which share dy and t2: the gradient by the exponent,
+// and its products with t1 and t1 dx.
 template <class T>
 struct RowSums {
     T exponent, t1, t1_dx;
@@ -143,8 +147,8 @@ struct RowSums {
         t1_dx += d_t1 * f.dx;
     }
 
-    // Returns the row's sums for falloff_vjp(); `f` is the falloff at any pixel of the row. The
-    // exponent contains -(t1² + t2²), hence the factors -2.
+    // Returns the row's contribution to falloff_vjp(); `f` is the falloff at any pixel
+    // of the row. The exponent contains -(t1² + t2²), hence the factors -2.
     V3DG_HD V3DG_INLINE FalloffSums<T> of_falloff(const Falloff<T>& f) const {
         FalloffSums<T> sums;
         sums.exponent = exponent;
@@ -157,8 +161,8 @@ struct RowSums {
     }
 };
 
-// Returns the contribution of a pixel to the size of the gradient by the centre: the absolute
-// values of both components of falloff_vjp().
+// Returns the contribution of a pixel to the size of the gradient by the centre: the
+// absolute values of both components of falloff_vjp().
 template <class V>
 V3DG_HD V3DG_INLINE CenterSize<V> size_of_center_vjp(V l11, V l12, V l22, const Falloff<V>& f,
                                                      V d_exponent) {
@@ -166,8 +170,8 @@ V3DG_HD V3DG_INLINE CenterSize<V> size_of_center_vjp(V l11, V l12, V l22, const 
     return {max_of(d_u, -d_u), max_of(d_v, -d_v)};
 }
 
-// Returns the gradient of the ellipse, where t1 = l11 dx + l12 dy and t2 = l22 dy, with dx = x - u
-// and dy = y - v.
+// Returns the gradient of the ellipse, where t1 = l11 dx + l12 dy and t2 = l22 dy, with
+// dx = x - u and dy = y - v.
 template <class T>
 V3DG_HD V3DG_INLINE Ellipse<T> falloff_vjp(T l11, T l12, T l22, const FalloffSums<T>& d) {
     Ellipse<T> out;
@@ -181,9 +185,10 @@ V3DG_HD V3DG_INLINE Ellipse<T> falloff_vjp(T l11, T l12, T l22, const FalloffSum
     return out;
 }
 
-// As blend_weight(), for a single pixel that has not stopped: they call add(weight) if there is a
-// weight, and return whether the pixel goes on; `t` stays positive. As predicates these conditions
-// are nearly free on a GPU, where selecting between numbers is an instruction each.
+// As blend_weight(), for a single pixel that has not stopped. They call add(weight) if
+// the weight is positive, and return whether the pixel goes on; `t` stays positive.
+// Written as predicates, these conditions are nearly free on a GPU, where a select
+// between numbers costs an instruction.
 template <class Add>
 V3DG_HD V3DG_INLINE bool blend_live(const Falloff<float>& f, float& t, StopsBehind<float> stop,
                                     const Add& add) {
@@ -207,31 +212,32 @@ V3DG_HD V3DG_INLINE bool blend_live(const Falloff<float>& f, float& t, StopsBefo
     return !is_last;
 }
 
-// Returns a bit for each cell of a window of 8 x 4, each of kPixels side by side, in which a
-// gaussian may reach a pixel, row by row. (u, v) is its centre relative to that of the first pixel.
-// Both axes have a margin, so that the blend step alone decides.
+// Returns a mask of the cells that a gaussian may reach in a window of 8 x 4 cells, row
+// by row. A cell has kPixels adjacent pixels. (u, v) is the gaussian's centre relative
+// to that of the first pixel. Both axes have a margin, so that the blend step alone
+// decides.
 template <int kPixels>
 V3DG_HD inline uint32_t reached_cells(float u, float v, float l11, float l12, float l22,
                                       float log2_opacity) {
-    // In x, 1 is the width of the window, so that saturation clips to it.
+    // In x, 1 is the width of the window, so that saturation clips to the window.
     constexpr float kScale = 0.125f / kPixels, kMargin = 1e-2f, kReachMargin = 1e-5f;
     const float reach = log2_opacity - static_cast<float>(kLog2MinAlpha) + kReachMargin;
     const float inverse = kScale * rough_reciprocal(l11), slope = -l12 * inverse,
                 wider = inverse * (1 + 2e-3f);
-    // The first cell is the first one whose last pixel is not before the ellipse; the end is after
-    // the last one whose first pixel is not behind it. Half a cell is added, because both are
-    // rounded to integers.
+    // The first cell is the first one whose last pixel is not left of the ellipse; the
+    // end follows the last cell whose first pixel is not right of it. Half a cell is
+    // added because both are rounded to integers.
     const float first_u = kScale * u + kScale * (1 - 0.5f * kPixels - kMargin),
                 end_u = kScale * u + kScale * (0.5f * kPixels + kMargin);
     uint32_t cells = 0;
     for (int row = 0; row < 4; ++row) {
         const float y = static_cast<float>(row) - v, t = l22 * y;
-        // In rows that the ellipse misses it is NaN, which saturates to 0.
+        // In rows that the ellipse misses this is NaN, which saturates to 0.
         const float half = rough_sqrt(reach - t * t) * wider;
         const float first = saturated_fma(slope, y, first_u - half);
         const float end = fmaxf(saturated_fma(slope, y, end_u + half), first);
-        // In the last row an end of 1 shifts the bit out, which leaves the 0 that the subtraction
-        // needs.
+        // In the last row an end of 1 shifts the bit out of the word, which leaves the
+        // 0 that the subtraction needs.
         const uint32_t row_begin = 1u << (8 * row);
         cells += shifted_by_eighths(row_begin, end) - shifted_by_eighths(row_begin, first);
     }

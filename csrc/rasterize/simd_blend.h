@@ -1,7 +1,8 @@
 #pragma once
 
-// Blends one tile, front to back: a batch of records is sorted into the blocks that they may
-// change, then each block blends its own, with its pixels in registers.
+// Blends one tile, front to back. A batch of records is sorted into the blocks that
+// they may change; then each block blends its own records, with its pixels in
+// registers.
 
 #include <cstddef>
 #include <cstring>
@@ -11,15 +12,15 @@
 namespace v3dg {
 namespace V3DG_ISA {
 
-// A batch is so large that a block finds several records of its own, and so small that all stay in
-// the first-level cache.
+// The batch size is large enough that a block has several records in a batch, and small
+// enough that the batch stays in the first-level cache.
 constexpr int kBatchSize = 256;
-// The records of a batch reach few blocks in all, so that where records are large, few are taken
-// that turn out to be hidden.
+// The limit on the blocks that a batch reaches in total. With large records, it keeps
+// batches short, so that few records are loaded that turn out to be hidden.
 constexpr int kBatchBlocks = 1024;
 
-// The part of a record that blending reads, which is its first part; its centre is in px from the
-// tile's corner.
+// The first part of a record, which blending reads; its centre is in px from the tile's
+// corner.
 template <class T>
 struct BatchRecord {
     T u, v, l11, l12, l22, log2_opacity;
@@ -36,8 +37,8 @@ struct BatchRecord {
     }
 };
 
-// Prefetches a record into the second-level cache, which supports more outstanding lines than the
-// first. A record may lie on two lines.
+// Prefetches a record into the second-level cache, which supports more outstanding
+// lines than the first-level cache. A record may straddle two lines.
 template <class T>
 V3DG_INLINE void prefetch_record(const Record<T>* record) {
     constexpr int kRead = 0, kSecondLevel = 2;
@@ -45,11 +46,11 @@ V3DG_INLINE void prefetch_record(const Record<T>* record) {
     __builtin_prefetch(reinterpret_cast<const char*>(record + 1) - 1, kRead, kSecondLevel);
 }
 
-// Records of a tile, front to back, and their places by block.
+// Records of a tile, front to back, and their indices by block.
 template <class T>
 struct Batch {
     int size;
-    const Record<T>* source[1 + kBatchSize];  // valid from 1 on
+    const Record<T>* source[1 + kBatchSize];  // valid from index 1
     uint64_t blocks[kBatchSize];              // blocks that each record may change
     BatchRecord<T> record[kBatchSize];
     uint16_t count[kTileBlocks * kTileBlocks];
@@ -63,9 +64,9 @@ struct Listed {
     uint64_t blocks;
 };
 
-// Takes records from the i-th on until the batch is full. It takes those whose boxes meet live
-// blocks, and only those are fetched from memory. It is branch-free, because the outcome is
-// unpredictable.
+// Adds records from index i on until the batch is full. Only records whose boxes meet
+// live blocks are added, and only those are loaded from memory. The loop is
+// branch-free, because the outcome is unpredictable.
 template <class T, class ListedAt>
 V3DG_INLINE size_t take_live(size_t i, size_t count, uint64_t alive, const ListedAt& listed_at,
                              Batch<T>& batch) {
@@ -84,8 +85,8 @@ V3DG_INLINE size_t take_live(size_t i, size_t count, uint64_t alive, const Liste
     return i;
 }
 
-// Restricts each record's blocks to those that its ellipse reaches, and sorts the records into the
-// blocks.
+// Restricts the blocks of each record to those that its ellipse reaches, and sorts the
+// records into the blocks.
 template <class T>
 V3DG_INLINE void sort_into_blocks(int left, int top, Batch<T>& batch) {
     uint8_t many[kBatchSize];
@@ -108,7 +109,7 @@ V3DG_INLINE void sort_into_blocks(int left, int top, Batch<T>& batch) {
     }
 }
 
-// Blends a batch's records over one block. Returns whether a pixel of it goes on.
+// Blends a batch's records over one block. Returns whether any of its pixels goes on.
 template <class T, Extra kExtra, class Stop>
 V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels<T>& pixels,
                              Stop stop, TilePlanes<T>& tile) {
@@ -131,7 +132,8 @@ V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels
             const Falloff<V> f = falloff_at(
                 x, y, all_lanes<V>(g.u) - block_u, all_lanes<V>(g.v) - block_v, all_lanes<V>(g.l11),
                 all_lanes<V>(g.l12), all_lanes<V>(g.l22), all_lanes<V>(g.log2_opacity));
-            // Where a vector spans a block, few vectors are missed, so the test does not pay.
+            // Where a vector covers a whole block, few vectors are missed, so the test
+            // does not pay.
             if (kLanes<T> < kBlockPixels && bits_of(contributes(f)) == 0) continue;
             const V weight = blend_weight(alpha_of(f), t, stop);
             red += weight * all_lanes<V>(g.color[0]);
@@ -151,8 +153,8 @@ V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels
     return goes_on;
 }
 
-// Blends `count` records front to back over a tile, which is cleared first. listed_at(i) returns
-// record i.
+// Blends `count` records front to back over a tile, which is cleared first.
+// listed_at(i) returns record i.
 template <class T, Extra kExtra, class Stop, class ListedAt>
 V3DG_INLINE void blend_tile(size_t count, int left, int top, const Window& window, Stop stop,
                             TilePlanes<T>& tile, const ListedAt& listed_at) {

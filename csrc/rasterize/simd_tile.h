@@ -1,11 +1,12 @@
 #pragma once
 
-// The inner loops of the rasterizer, on one tile of 32 x 32 pixels that stays in the first-level
-// cache.
+// The inner loops of the rasterizer, on one tile of 32 x 32 pixels that stays in the
+// first-level cache.
 //
-// A tile has 8 x 8 blocks of 4 x 4 pixels. Two 64-bit masks have a bit a block: the blocks that a
-// gaussian may touch, and those that still have a pixel that has not stopped. A gaussian whose mask
-// has no live block costs a few integer operations.
+// A tile has 8 x 8 blocks of 4 x 4 pixels. Two 64-bit masks have a bit per block: the
+// blocks that a gaussian may touch, and the live blocks, which have a pixel that has
+// not stopped. A gaussian whose mask contains no live block costs a few integer
+// operations.
 
 #include <cstdint>
 
@@ -20,7 +21,7 @@ namespace V3DG_ISA {
 constexpr int kBlockPixels = kBlockSize * kBlockSize;
 constexpr int kTilePixels = kTileSize * kTileSize;
 
-// The sums of a tile besides colour and transmittance.
+// The optional sum per pixel besides colour and transmittance.
 enum class Extra { kNothing, kDepth, kCount };
 
 // The planes of a tile, block after block, 16 pixels each.
@@ -28,16 +29,16 @@ template <class T>
 struct TilePlanes {
     alignas(64) T transmittance[kTilePixels];
     alignas(64) T color[3][kTilePixels];
-    alignas(64) T extra[kTilePixels];  // sum of weight * depth, or the number of gaussians
+    alignas(64) T extra[kTilePixels];  // sum of weight * depth, or number of gaussians
 };
 
-// The gradients of each pixel that the backward pass reads, and the sums that it keeps.
+// The gradients per pixel that the backward pass reads, and its running sums.
 template <class T>
 struct TileGradient {
     alignas(64) T d_color[3][kTilePixels];
     alignas(64) T d_depth[kTilePixels];  // gradient by the sum of weight * depth
     alignas(
-        // The gradient by every weight alike, through alpha and the background that it hides.
+        // The gradient that all weights share, through alpha and the hidden background.
         64) T d_weight[kTilePixels];
     alignas(64) T total[kTilePixels];  // sum over gaussians of weight * (gradient by that weight)
 };
@@ -52,12 +53,13 @@ V3DG_INLINE uint64_t blocks_of(const Record<T>& g, int left, int top) {
     return EntryFormat::blocks_of(static_cast<uint64_t>(x0 | x1 << 3 | y0 << 6 | y1 << 9));
 }
 
-// Fewer touched blocks than this are not worth an exact test.
+// If fewer blocks are touched, the exact test does not pay.
 constexpr int kFewBlocks = 5;
 
-// Returns those of `blocks` that the ellipse itself reaches, not just its box: for each row of
-// blocks, the ellipse's extent in x over the row's pixel centres, with the margin of row_extent().
-// It rounds by truncation, which is one instruction for a vector on every instruction set.
+// Returns those of `blocks` that the ellipse itself reaches, not only its box. For each
+// row of blocks, it computes the ellipse's extent in x over the row's pixel centres,
+// with the margin of row_extent(). It rounds by truncation, which is one instruction
+// per vector on every instruction set.
 template <class T>
 V3DG_INLINE uint64_t blocks_of_ellipse(const Record<T>& g, int left, int top, uint64_t blocks) {
     if (__builtin_popcountll(blocks) < kFewBlocks) return blocks;
@@ -82,15 +84,15 @@ V3DG_INLINE uint64_t blocks_of_ellipse(const Record<T>& g, int left, int top, ui
     return blocks & mask;
 }
 
-// Returns the live blocks of the tile that the record may change. Precondition: its box meets the
-// tile.
+// Returns the live blocks of the tile that the record may change. Precondition: its box
+// meets the tile.
 template <class T>
 V3DG_INLINE uint64_t live_blocks(const Record<T>& g, int left, int top, uint64_t alive) {
     return blocks_of_ellipse(g, left, top, blocks_of(g, left, top) & alive);
 }
 
-// Clears the planes to an empty picture and returns the blocks with a pixel in the window. Pixels
-// outside count as stopped.
+// Clears the planes to an empty picture and returns the blocks that have a pixel inside
+// the window. Pixels outside count as stopped.
 template <class T>
 inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, const Window& window,
                            Extra extra) {
@@ -116,8 +118,8 @@ inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, const Window&
 // The pixel centres of a block.
 template <class T>
 struct BlockPixels {
-    alignas(64) T x[kBlockPixels], y[kBlockPixels];  // centres relative to the block's corner
-    // Corner of a block in the tile, the same in every lane.
+    alignas(64) T x[kBlockPixels], y[kBlockPixels];  // relative to the block's corner
+    // The corner of each block in the tile, the same in every lane.
     alignas(64) T corner[kTileBlocks][kLanes<T>];
     BlockPixels() {
         for (int k = 0; k < kTileBlocks; ++k)
@@ -129,10 +131,10 @@ struct BlockPixels {
     }
 };
 
-// Computes the gradients of one record. It takes the same steps on the same numbers as
-// blend_block(), front to back, so that the same pixels take part: `tile` starts empty again, and
-// its color[0] holds the running sum. Returns false where no pixel of the tile took part. `size` is
-// written where kWithSize.
+// Computes the gradients of one record. It performs the same steps on the same numbers
+// as blend_block(), front to back, so that the same pixels take part: `tile` starts
+// empty again, and its color[0] holds the running sum. Returns false if no pixel of the
+// tile takes part. Writes `size` only if kWithSize is set.
 template <class T, bool kWithDepth, bool kWithSize = false>
 V3DG_INLINE bool blend_record_vjp(const Record<T>& g, uint64_t blocks, int left, int top,
                                   const BlockPixels<T>& pixels, const TileGradient<T>& grad,

@@ -1,7 +1,7 @@
-// Plans the order in which tiles are blended, and in how many parts each, and spreads long lists
-// over buckets of depth. A list is spread in its own place if shared memory holds it, else into
-// scratch, as many entries at a time as shared memory holds; the list of a tile in parts is spread
-// into windows.
+// Plans the order in which tiles are blended, and the number of parts of each, and
+// spreads long lists over buckets of depth. A list is spread in place if it fits into
+// shared memory, else into scratch memory, one chunk of the size of shared memory at a
+// time. The list of a tile in parts is spread into windows.
 
 #include "rasterize/spread_lists_cuda.h"
 
@@ -16,7 +16,7 @@ namespace cuda {
 namespace {
 
 constexpr int kLog2Spread = 11;    // most buckets of a list
-constexpr int kPlanThreads = 256;  // one thread a tile
+constexpr int kPlanThreads = 256;  // one thread per tile
 constexpr int kSpreadThreads = 1024;
 constexpr int kMostParts = 4;  // parts of a tile
 
@@ -27,11 +27,13 @@ __device__ uint32_t count_of(const FrameLists& lists, uint32_t tile) {
     return static_cast<uint32_t>(lists.tile_first[tile + 1] - lists.tile_first[tile]);
 }
 
-// The rules by which two kernels with a thread a tile plan the tiles. They are ordered by falling
-// load, so that no block starts a long list at the end. Loads of one class, half an octave wide,
-// are in any order. Where few tiles have most of the entries, as with an asset in the middle of a
-// picture, they are blended in parts, each by a block that drops entries outside of its part.
-// `num_places` blocks run at a time, and no block should have much more than its share.
+// The rules by which two kernels, with a thread per tile, plan the tiles. Plans are
+// ordered by falling load, so that no block starts a long list at the end. Plans of one
+// class, whose loads differ by less than half an octave, are in any order. If few tiles
+// have most of the entries, as for an asset in the middle of a picture, they are
+// blended in parts, each by a block that drops entries outside of its part.
+// `num_places` blocks run concurrently, and no block should get much more than its
+// share of the load.
 struct PlanRules {
     uint32_t share;
     bool has_parts;
@@ -49,15 +51,16 @@ struct PlanRules {
         const int octave = 31 - __clz(static_cast<int>(load));
         return kPlanClasses - 1 - 2 * octave - static_cast<int>(load >> (octave - 1) & 1);
     }
-    // After a plan of a lower load there is no plan of a list longer than kPiece: a part has half a
-    // share or more, and the loads of a class differ by less than half of the least.
+    // Behind a plan of a lower load there is no plan of a list longer than kPiece: a
+    // part has at least half a share, and the loads of a class differ by less than half
+    // of the smallest.
     __device__ uint32_t least_of_long() const {
         constexpr uint32_t kLongest = kPiece, kLeastOfPart = kPiece / kMostParts;
         return has_parts ? max(min(share / 3, kLongest), kLeastOfPart) : kLongest;
     }
 };
 
-// Counts the plans of each class.
+// Counts the plans per class.
 __global__ void __launch_bounds__(kPlanThreads)
     count_plans_kernel(FrameLists lists, uint32_t num_places) {
     await_kernel_before();
@@ -76,8 +79,7 @@ __global__ void __launch_bounds__(kPlanThreads)
         atomicAdd(&lists.plan_counts[threadIdx.x], in_block[threadIdx.x]);
 }
 
-// Writes the plans. The plans of a class stand together, those of this block after those of other
-// blocks.
+// Writes the plans. The plans of a class are contiguous, ordered by block.
 __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, uint32_t num_places) {
     await_kernel_before();
     __shared__ uint32_t place[kPlanClasses], in_block[kPlanClasses], num_planned;
@@ -89,7 +91,7 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, ui
     const int log2_parts = rules.log2_parts_of(count), own_class = rules.class_of(count);
     if (threadIdx.x < kPlanClasses) in_block[threadIdx.x] = 0;
     __syncthreads();
-    uint32_t before = 0;  // plans of the block's earlier tiles
+    uint32_t before = 0;  // plans of earlier tiles in the block
     if (tile < lists.num_tiles) before = atomicAdd(&in_block[own_class], 1u << log2_parts);
     __syncthreads();
     if (threadIdx.x < 32) {
@@ -123,7 +125,7 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, ui
         lists.plans[i].tile = kNoTile;
 }
 
-// Allocates room for entries in the scratch; called by the whole block.
+// Allocates entries in the scratch memory. Called by the whole block.
 __device__ unsigned long long take_scratch(FrameCounters& counters, uint32_t count) {
     __shared__ unsigned long long first;
     if (threadIdx.x == 0)
@@ -134,14 +136,16 @@ __device__ unsigned long long take_scratch(FrameCounters& counters, uint32_t cou
     return taken;
 }
 
-// The entries of a window of a list in windows; a window has up to a bucket more.
+// The smallest number of entries in a window of a list in windows; a window may exceed
+// it by up to a bucket.
 constexpr uint32_t kWindowEntries = 3 * kWindow / 4;
 
 __device__ uint32_t num_window_ends(uint32_t count) {
     return (count + kWindowEntries - 1) / kWindowEntries;
 }
 
-// Returns the room of a list in windows, with the ends of its windows after it.
+// Returns the number of entries that a list in windows occupies, including the ends of
+// its windows, which follow the list.
 __device__ uint32_t room_in_windows(uint32_t count) {
     static_assert(sizeof(TileEntry) == 2 * sizeof(uint32_t), "two ends in the place of an entry");
     return count + num_window_ends(count) / 2 + 1;
@@ -153,8 +157,8 @@ struct SpreadSpace {
     TileEntry chunk[1];  // the size depends on the device
 };
 
-// Returns whether a bucket has more entries than `most`. A counter stands at the begin of the next
-// bucket.
+// Returns whether a bucket has more than `most` entries. The counter of a bucket holds
+// the begin of the next one.
 __device__ bool has_longer(const uint32_t (&bucket)[1 << kLog2Spread], uint32_t most) {
     bool is_long = false;
     for (uint32_t b = threadIdx.x; b < 1 << kLog2Spread; b += kSpreadThreads)
@@ -162,8 +166,8 @@ __device__ bool has_longer(const uint32_t (&bucket)[1 << kLog2Spread], uint32_t 
     return __syncthreads_or(is_long);
 }
 
-// Writes the ends of windows, which are the ends of the buckets that reach every kWindowEntries
-// entries.
+// Writes the ends of windows. A window ends with the bucket that reaches the next
+// multiple of kWindowEntries entries.
 __device__ void write_window_ends(const uint32_t (&bucket)[1 << kLog2Spread], uint32_t count,
                                   uint32_t* window_ends) {
     for (uint32_t w = threadIdx.x; w < num_window_ends(count); w += kSpreadThreads) {
@@ -176,10 +180,10 @@ __device__ void write_window_ends(const uint32_t (&bucket)[1 << kLog2Spread], ui
     }
 }
 
-// Spreads a list into windows of whole buckets, to a place that has room_in_windows() of it; called
-// by the whole block. Returns whether there are such windows. There are none where a list consists
-// of one step of depth: the order within a step depends on the begins of pieces, which parts of a
-// tile do not share.
+// Spreads a list into windows of whole buckets, to memory for room_in_windows()
+// entries. Called by the whole block. Returns whether windows are possible. They are
+// not if all entries have the same rounded depth: the order within one depth depends on
+// where pieces begin, which differs between the parts of a tile.
 __device__ bool spread_into_windows(const TileEntry* from, uint32_t count, TileEntry* to,
                                     SpreadSpace& space) {
     SpreadShared<kLog2Spread>& s = space.even;
@@ -197,10 +201,10 @@ __device__ bool spread_into_windows(const TileEntry* from, uint32_t count, TileE
     return has_windows;
 }
 
-// The number of entries of each chunk of a list in each bucket, two in a word.
+// The number of entries in each bucket for each chunk of a list, two counts per word.
 struct ChunkCounts {
     uint32_t* words;
-    uint32_t stride;  // words of a chunk
+    uint32_t stride;  // words per chunk
 
     __device__ void add(uint32_t chunk, uint32_t bucket) const {
         atomicAdd(&words[chunk * stride + bucket / 2], 1u << 16 * (bucket % 2));
@@ -210,17 +214,17 @@ struct ChunkCounts {
     }
 };
 
-// As spread(), for a list that does not fit into shared memory. Chunks of it pass through shared
-// memory, so that entries of a bucket are written contiguously. There is room for `most` entries: a
-// chunk, and after it the counts of all chunks, if these are few enough; otherwise each chunk is
-// counted when it is read.
+// As spread(), for a list that does not fit into shared memory. The list passes through
+// shared memory in chunks, so that entries of a bucket are written contiguously. Shared
+// memory has room for `most` entries: a chunk, followed by the counts of all chunks if
+// these are few enough; otherwise each chunk is counted when it is read.
 __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t count,
                                  uint32_t most, const Buckets& buckets, SpreadSpace& space) {
     SpreadShared<kLog2Spread>& s = space.even;
     uint32_t (&of_chunk)[1 << kLog2Spread] = space.finer;
     TileEntry* chunk = space.chunk;
     const uint32_t num_buckets = buckets.last + 1,
-                   counts_room = num_buckets / 4;  // counts of a chunk, in entries
+                   counts_room = num_buckets / 4;  // room for the counts of a chunk, in entries
     uint32_t num_chunks = 1;
     const auto size_of_chunk = [&] { return (count + num_chunks - 1) / num_chunks; };
     const auto has_room = [&] { return size_of_chunk() + num_chunks * counts_room <= most; };
@@ -248,7 +252,8 @@ __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t 
         place_buckets<kSpreadThreads>(from, 0, count, buckets, s.bucket, s.warp_sum);
     }
 
-    // Returns the begin of a bucket in the chunk, once its counter stands at the begin of the next.
+    // Returns the begin of a bucket in the chunk. The counter of a bucket holds the
+    // begin of the next one.
     const auto begin_of = [&](uint32_t b) { return b > 0 ? of_chunk[b - 1] : 0; };
     for (uint32_t k = 0; k < num_chunks; ++k) {
         const uint32_t first = k * size, last = min(first + size, count);
@@ -276,9 +281,10 @@ __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t 
     }
 }
 
-// Spreads the list of a plan's tile if it is long: in its own place if `most_held` entries in
-// shared memory suffice, else into the scratch. The list of a tile in parts is spread into windows,
-// in the scratch, by the block that has the first part. Called by the whole block.
+// Spreads the list of a plan's tile if it is long: in place if it has at most
+// `most_held` entries, which fit into shared memory, else into scratch memory. The list
+// of a tile in parts is spread into windows, in scratch memory, by the block of the
+// first part. Called by the whole block.
 __device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t count,
                             uint32_t most_held, SpreadSpace& space) {
     static_assert(offsetof(SpreadSpace, finer) % sizeof(TileEntry) == 0,
@@ -328,7 +334,8 @@ __device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t co
     }
 }
 
-// Spreads the long lists. A block requests its next plan when it begins with one.
+// Spreads the long lists. A block claims its next plan when it starts with the current
+// one.
 __global__ void __launch_bounds__(kSpreadThreads, 2)
     spread_kernel(FrameLists lists, uint32_t most_held, uint32_t num_places) {
     __shared__ uint32_t next_of_block;
@@ -346,22 +353,23 @@ __global__ void __launch_bounds__(kSpreadThreads, 2)
         if (threadIdx.x == 0) next_of_block = next;
         __syncthreads();
         i = next_of_block;
-        __syncthreads();  // before the next round writes it
+        __syncthreads();  // the next iteration writes it
     }
 }
 
-// Returns the number of entries that a block of spread_kernel holds; two blocks share a
-// multiprocessor.
+// Returns the number of entries that fit into shared memory for a block of
+// spread_kernel; two blocks share a multiprocessor.
 uint32_t most_held() {
-    const size_t of_two = shared_memory_of_multiprocessor() / 2 - 2048;  // the driver keeps 1024
+    // The driver reserves 1024 bytes per block.
+    const size_t of_two = shared_memory_of_multiprocessor() / 2 - 2048;
     return static_cast<uint32_t>((of_two - sizeof(SpreadShared<kLog2Spread>)) / sizeof(TileEntry));
 }
 
 }  // namespace
 
 uint32_t most_plans(uint32_t num_tiles, uint32_t num_places) {
-    // A tile of one share has one more plan, a tile of two shares three more, and there are
-    // num_places shares.
+    // A tile of one share has one additional plan, a tile of two shares has three, and
+    // there are num_places shares.
     return num_tiles + (kMostParts - 1) * num_places / 2 + 1;
 }
 

@@ -8,27 +8,28 @@
 namespace v3dg {
 namespace cuda {
 
-using EntryKey = unsigned long long;  // the word of a TileEntry
+using EntryKey = unsigned long long;  // a TileEntry as an integer
 
-constexpr int kEntriesAtOnce = 4;  // loads of a thread in flight
+constexpr int kEntriesAtOnce = 4;  // loads in flight per thread
 
-// Buckets of entries, of equal width in the bits of their depths, which are logarithmic over
-// octaves and linear within one. Where all depths are equal, the width is equal in the bits that
-// order those.
+// Buckets of entries. They have equal width in the bits of the depths, which are
+// logarithmic over octaves and linear within one. If all depths are equal, the width is
+// equal in the bits of the order.
 struct Buckets {
-    uint32_t lowest, last;  // `last` is the number of the last bucket
+    uint32_t lowest, last;  // `last` is the index of the last bucket
     int shift;
     bool by_order;
 
     __device__ uint32_t part_of(EntryKey key) const {
         return by_order ? key_order({key}) : key_depth({key});
     }
-    // Returns the bucket of a key. Keys outside the range of the buckets belong to the first or the
-    // last.
+    // Returns the bucket of a key. Keys outside of the range belong to the first or the
+    // last bucket.
     __device__ uint32_t of(EntryKey key) const {
         return min((max(part_of(key), lowest) - lowest) >> shift, last);
     }
-    // Returns the part of a key at which a bucket begins; nothing lies before the first.
+    // Returns the part of a key at which a bucket begins; no key is before the first
+    // bucket.
     __device__ uint32_t begin_of(uint32_t bucket) const {
         return bucket == 0 ? 0 : lowest + (bucket << shift);
     }
@@ -43,14 +44,14 @@ __device__ inline Buckets buckets_over(uint32_t lowest, uint32_t highest, int lo
             .by_order = by_order};
 }
 
-// Buckets for entries most of which lie in few buckets of equal width. An entry's bucket follows
-// from the place that it would have if the entries of its even bucket lay evenly in that. The even
-// buckets were made for all entries.
+// Buckets for entries that are concentrated in few of the even buckets (Buckets of all
+// entries). The bucket of an entry follows from the rank that it would have if the
+// entries of its even bucket were spread uniformly over that.
 struct FinerBuckets {
     Buckets even;
     const uint32_t* first;  // first entry of each even bucket
     uint32_t count;         // number of entries
-    int shift;              // shift of places
+    int shift;              // right shift from ranks to buckets
 
     __device__ uint32_t of(EntryKey key) const {
         const uint32_t bucket = even.of(key);
@@ -75,7 +76,7 @@ struct SpreadShared {
     uint32_t warp_sum[32];
 };
 
-// Turns counts into the place of each bucket's first entry.
+// Turns counts into the index of each bucket's first entry.
 template <int kCount, int kBlock>
 __device__ void scan_buckets(uint32_t* bucket, uint32_t* warp_sum) {
     constexpr int kEach = kCount / kBlock;
@@ -100,7 +101,7 @@ __device__ void scan_buckets(uint32_t* bucket, uint32_t* warp_sum) {
     __syncthreads();
 }
 
-// Calls visit(entry) for a thread's share of entries [first, last).
+// Calls visit(entry) for the entries of [first, last) that one thread processes.
 template <int kBlock, class Visit>
 __device__ void for_each_entry(const TileEntry* entries, uint32_t first, uint32_t last,
                                const Visit& visit) {
@@ -117,8 +118,8 @@ __device__ void for_each_entry(const TileEntry* entries, uint32_t first, uint32_
     }
 }
 
-// Returns buckets for entries [first, last): for the range of all of them, or of a sample when
-// `roughly`; as many as possible when `finely`.
+// Returns buckets for entries [first, last): for the range of all of them, or of a
+// sample if `roughly`; as many buckets as possible if `finely`.
 template <int kBlock, int kLog2Buckets>
 __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32_t last,
                                 bool roughly, bool finely, SpreadShared<kLog2Buckets>& s) {
@@ -132,7 +133,7 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
         }
     };
     if (roughly) {
-        // A list that is spread has at least as many entries as there are threads.
+        // A list that is spread has at least as many entries as the block has threads.
         widen(entries[first + static_cast<uint32_t>(static_cast<unsigned long long>(last - first) *
                                                     threadIdx.x / kBlock)]);
     } else {
@@ -148,8 +149,8 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
         }
     }
     __syncthreads();
-    // There are some 64 entries a bucket. With fewer buckets, entries that are written together are
-    // more likely to stay together in the cache.
+    // This gives about 64 entries per bucket. With few buckets, entries that are
+    // written together more likely stay together in the cache.
     const int log2_buckets =
         finely ? kLog2Buckets
                : min(max(31 - __clz(static_cast<int>(last - first)) - 6, 4), kLog2Buckets);
@@ -158,8 +159,8 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
     return buckets_over(range[0], range[1], log2_buckets, by_order);
 }
 
-// Counts entries [first, last) into buckets, and turns the counts into the place of each bucket's
-// first entry.
+// Counts entries [first, last) into buckets, and turns the counts into the index of
+// each bucket's first entry.
 template <int kBlock, int kCount, class SomeBuckets>
 __device__ void place_buckets(const TileEntry* entries, uint32_t first, uint32_t last,
                               const SomeBuckets& buckets, uint32_t (&bucket)[kCount],
@@ -172,8 +173,8 @@ __device__ void place_buckets(const TileEntry* entries, uint32_t first, uint32_t
     scan_buckets<kCount, kBlock>(bucket, warp_sum);
 }
 
-// Spreads entries [first, last) into bucket order, from one place to another. At the end a bucket's
-// counter stands at the begin of the next bucket.
+// Copies entries [first, last) into bucket order. At the end, the counter of a bucket
+// holds the begin of the next bucket.
 template <int kBlock, int kCount, class SomeBuckets>
 __device__ void spread(const TileEntry* from, TileEntry* to, uint32_t first, uint32_t last,
                        const SomeBuckets& buckets, uint32_t (&bucket)[kCount], uint32_t* warp_sum) {

@@ -14,7 +14,8 @@ namespace {
 // Copies arrays of the host into one allocation on the device.
 class Upload {
   public:
-    // `span` points to memory of the host; finish() makes it point to memory of the device.
+    // `span` points to memory of the host; finish() makes it point to memory of the
+    // device.
     template <class T>
     void add(Span<const T>& span) {
         const size_t first = (num_bytes_ + kAlignment - 1) / kAlignment * kAlignment;
@@ -34,7 +35,7 @@ class Upload {
     }
 
   private:
-    static constexpr size_t kAlignment = 256;  // as in the allocator of the device
+    static constexpr size_t kAlignment = 256;  // equal to the alignment of the device's allocator
 
     size_t num_bytes_ = 0;
     std::vector<std::function<void(unsigned char*, cudaStream_t)>> moves_;

@@ -1,7 +1,7 @@
 #pragma once
 
-// The tables of a bundle on a device. They live as long as a scene that uses them is resident there
-// (v3dg/residency.py).
+// The tables of a bundle on a device. They stay there while a scene that uses them is
+// resident (v3dg/residency.py).
 
 #include "base/device.h"
 #include "residency/cluster_bounds.h"
@@ -9,27 +9,29 @@
 namespace v3dg {
 namespace cuda {
 
-// What kernels read of a bundle; all pointers point to memory of the device.
+// The tables of a bundle that kernels read; all pointers point to device memory.
 struct BundleOnDevice {
     ClusterTable table;
     ClusterAppearance appearance;
     Span<const ClusterBounds> bounds;
-    // A byte for each ClusterBounds. Bit k: its cluster k is drawn together with the cluster before
-    // it, since its rows follow and it has the same appearance.
+    // A byte per ClusterBounds. Bit k says that its cluster k is drawn together with
+    // the cluster before it, because the rows of both are adjacent and their appearance
+    // is equal.
     const uint8_t* joins;
     ClusterRuns runs;
 };
 
-// Returns BundleOnDevice::joins: a byte for each kClustersOfBounds clusters.
+// Returns BundleOnDevice::joins: a byte per kClustersOfBounds clusters.
 std::vector<uint8_t> joins_of_clusters(const ClusterTable& table,
                                        const ClusterAppearance& appearance);
 
-// The tables of one bundle on the device that is current when they are made. They never change, so
-// all scenes, threads and streams of that device share them. They have to outlive the work that
-// reads them.
+// The tables of one bundle on the device that is current when they are made. They never
+// change, so all scenes, threads and streams of that device share them. The owner keeps
+// them alive until all work that reads them is done.
 class BundleTables {
   public:
-    // Returns when the tables are on the device; the memory of the host may be reused then.
+    // Returns after the tables have arrived on the device; the host memory may then be
+    // reused.
     BundleTables(const ClusterTable& table, const ClusterAppearance& appearance,
                  cudaStream_t stream);
     BundleTables(const BundleTables&) = delete;
@@ -42,7 +44,7 @@ class BundleTables {
 
   private:
     const int device_ = current_device();
-    DeviceBuffer<unsigned char> storage_;  // of all arrays
+    DeviceBuffer<unsigned char> storage_;  // memory of all arrays
     BundleOnDevice on_device_;
 };
 

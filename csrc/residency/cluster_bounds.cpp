@@ -1,4 +1,4 @@
-// Collects the bounds of eight neighbouring clusters each, and of runs of them.
+// Computes the bounds of each eight neighbouring clusters, and of the runs of clusters.
 
 #include "residency/cluster_bounds.h"
 
@@ -14,7 +14,8 @@ namespace {
 // The square of this radius is far above the range where float32 loses digits.
 constexpr float kLeastRunRadius = 1e-15f;
 
-// Returns a ball that contains the centres of the balls; at the origin if there are none.
+// Returns a ball that contains the centres of the balls; a ball at the origin if there
+// are none.
 Ball ball_of_centers(Span<const Ball> balls) {
     double middle[3] = {0, 0, 0}, radius2 = 0;
     for (const Ball& b : balls) {
@@ -83,7 +84,7 @@ std::vector<ClusterBounds> bounds_of_clusters(const ClusterTable& table) {
 ClusterRuns runs_of_clusters(const ClusterTable& table) {
     const size_t count = table.num_clusters();
     ClusterRuns runs{};
-    std::vector<size_t> ends;  // of the runs, in bounds, the last run first
+    std::vector<size_t> ends;  // the ends of the runs, counted in bounds, the last run first
     size_t left = (count + kClustersOfBounds - 1) / kClustersOfBounds;
     for (size_t size = 1; left > 0; size *= ends.size() > 1 ? 2 : 1) {
         ends.push_back(left);

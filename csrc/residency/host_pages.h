@@ -1,7 +1,7 @@
 #pragma once
 
-// The slots of a page pool on the host. They hold rows, in planes that the bundles of the pool
-// share, or codes.
+// The slots of a page pool on the host. Slots hold either rows, in planes that the
+// bundles of the pool share, or codes.
 
 #include <memory>
 #include <vector>
@@ -16,9 +16,10 @@ class HostPages {
   public:
     explicit HostPages(const PagePool& pool);
 
-    // Brings pages to their slots.
+    // Copies pages to their slots.
     void apply(const PagePool& pool, const std::vector<PageChange>& changes);
-    // The gaussians of a bundle. One of the two is null, depending on PagePool::keeps_codes().
+    // Return the gaussians of a bundle. One of the two results is null, depending on
+    // PagePool::keeps_codes().
     const GaussianPlanes<float>* planes(size_t bundle) const {
         return planes_.empty() ? nullptr : &planes_[bundle];
     }
@@ -30,17 +31,17 @@ class HostPages {
     void write_rows(const PageSource& source, const PageChange& change);
 
     Buffer<float> storage_;
-    size_t stride_ = 0;                          // of a plane
-    std::vector<GaussianPlanes<float>> planes_;  // of each bundle; they differ in the SH degree
+    size_t stride_ = 0;                          // length of a plane
+    std::vector<GaussianPlanes<float>> planes_;  // one per bundle; they differ in the SH degree
 
     Buffer<uint32_t> records_, sh_;
     Buffer<unsigned char> ranges_;
     std::vector<int64_t> offset_;
     CodeSlots slots_{};
-    std::vector<Codes> codes_;  // of each bundle; they differ in the SH degree
+    std::vector<Codes> codes_;  // one per bundle; they differ in the SH degree
 };
 
-// Blocks on the host.
+// Memory for blocks on the host.
 class HostBlocks : public BlockMemory {
   public:
     unsigned char* allocate(size_t bytes) override { return blocks_.emplace_back(bytes).data(); }

@@ -1,7 +1,7 @@
 #pragma once
 
-// Blocks of memory for pages on their way to their slots. There are a few sizes of blocks, so that
-// little of them stays empty.
+// Blocks of host memory that hold pages after reading and before they are copied to
+// their slots. Blocks come in a few sizes, so that little of their memory is unused.
 
 #include <algorithm>
 #include <cstddef>
@@ -9,17 +9,17 @@
 
 namespace v3dg {
 
-// Allocates memory for blocks; its kind depends on the device.
+// Allocates memory for blocks; the kind of memory depends on the device.
 struct BlockMemory {
     virtual ~BlockMemory() = default;
-    // The memory lives as long as this.
+    // The memory is freed with this object.
     virtual unsigned char* allocate(size_t bytes) = 0;
 };
 
 class PageBlocks {
   public:
-    // Allocates about `num_bytes` in at most `most_blocks` blocks for pages whose sizes are
-    // distributed like `samples`, and four blocks for the largest page.
+    // Allocates about `num_bytes` in at most `most_blocks` blocks for pages whose sizes
+    // are distributed like `samples`, plus four blocks for the largest page.
     void allocate(const std::vector<size_t>& samples, size_t most_page_bytes, size_t num_bytes,
                   size_t most_blocks, BlockMemory& memory) {
         constexpr size_t kNumSizes = 8, kLeast = 64;
@@ -56,7 +56,7 @@ class PageBlocks {
     size_t num_blocks() const { return num_blocks_; }
     size_t num_bytes() const { return num_bytes_; }
 
-    // Returns a block of at least so many bytes, or null if none is free.
+    // Returns a block of at least this many bytes, or null if none is free.
     unsigned char* take(size_t bytes) {
         for (Size& size : sizes_) {
             if (size.size < bytes || size.free.empty()) continue;
@@ -74,7 +74,7 @@ class PageBlocks {
 
   private:
     struct Size {
-        size_t size;  // bytes of a block
+        size_t size;  // bytes per block
         unsigned char* first;
         size_t count;
         std::vector<unsigned char*> free;

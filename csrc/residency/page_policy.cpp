@@ -1,6 +1,7 @@
-// How a view's needs become decisions. note() marks what is resident as used and collects what is
-// absent, choose() orders that for reading, and bring() assigns slots to what was read, evicting
-// the pages that were unused for longest.
+// Turns the needs of a view into decisions. note() marks resident pages as used and
+// collects absent ones, choose() orders the absent pages for reading, and bring()
+// assigns slots to pages that were read and evicts the pages that were unused for
+// longest.
 
 #include "residency/page_policy.h"
 
@@ -17,34 +18,36 @@ namespace v3dg {
 
 namespace {
 
-// The priority of a page is at least this multiple of those of the pages below it.
+// The priority of a page is at least this multiple of the priorities of the pages below
+// it.
 constexpr float kAbove = 2.0f;
-// Priorities around the eye have no bound; they are clamped to this, so that a page
-// above one of them is still more urgent.
+// Priorities near the eye have no upper bound. They are clamped to this value, so that
+// a page above such a page can still be more urgent.
 constexpr float kMostPriority = 1073741824.0f;
-constexpr size_t kMostLeaving = 4096;            // slots that are found at once to be evicted
+constexpr size_t kMostLeaving = 4096;            // slots to be evicted that one search collects
 constexpr size_t kMostChosen = size_t(1) << 14;  // pages to be read before the next choice
 constexpr int32_t kRootSlot = -2;
 constexpr int32_t kNoSlot = -1;
-constexpr size_t kAhead = 16;  // needs whose memory is prefetched
+constexpr size_t kAhead = 16;  // needs whose memory is prefetched ahead
 
-// A key is a priority from 1/2 on, rounded down to a sixteenth of a power of two: the exponent of a
-// float and the upper four of its 23 bits of mantissa.
+// A key is a priority of at least 1/2, rounded down to a sixteenth of a power of two:
+// the exponent of a float and the upper four of its 23 mantissa bits.
 constexpr uint32_t kNumKeys = 1024;
 constexpr uint32_t kKeyShift = 19;
 constexpr uint32_t kFirstKey = 0x3f000000u >> kKeyShift;
-// The key of priority 1. Pages with a lower key are not missing from the view: they are asked for
-// ahead.
+// The key of priority 1. A page with a lower key is not missing from the view: it is
+// requested ahead of use.
 constexpr uint32_t kKeyOfMissed = (0x3f800000u >> kKeyShift) - kFirstKey;
 
-// A disk is faster the more it reads at once, and neighbours in a file are neighbours in space and
-// of one level: mostly of about the same urgency. So about so many bytes of neighbours form a
-// stretch, which is as urgent as the most urgent wanted page in it.
+// A disk reads faster in large requests. Neighbours in a file are neighbours in space
+// and of one level, so they are mostly of similar urgency. Therefore neighbouring pages
+// of about this many bytes form a stretch, which is as urgent as its most urgent wanted
+// page.
 constexpr size_t kStretchBytes = size_t(512) << 10;
 constexpr uint32_t kNoStretch = UINT32_MAX;
 
 uint32_t key_of(float priority) {
-    uint32_t bits;  // those of positive floats have the order of the floats
+    uint32_t bits;  // the bits of positive floats are ordered like the floats
     std::memcpy(&bits, &priority, sizeof bits);
     return std::clamp(bits >> kKeyShift, kFirstKey, kFirstKey + kNumKeys - 1) - kFirstKey;
 }
@@ -121,11 +124,10 @@ void PagePolicy::plan_memory(const PoolMemory& memory) {
     const size_t slot = memory.bytes_of(plan_.slot_rows, plan_.slot_clusters);
     const size_t least = roots + (num_pages > 0 ? bundles_.size() * slot : 0);
     if (memory.num_bytes < least || memory.most_rows < plan_.num_rows())
-        throw std::invalid_argument(
-            "memory: expected room for at least " + std::to_string(least) +
-            " bytes of gaussians, the coarsest of all bundles and a page more of "
-            "each, got room for " +
-            std::to_string(memory.num_bytes));
+        throw std::invalid_argument("memory: expected room for at least " + std::to_string(least) +
+                                    " bytes of gaussians, which are the coarsest pages of all "
+                                    "bundles and one more page of each, got room for " +
+                                    std::to_string(memory.num_bytes));
     plan_.num_slots =
         std::min({(memory.num_bytes - roots) / slot,
                   (memory.most_rows - plan_.first_slot_row) / plan_.slot_rows, num_pages});
@@ -169,7 +171,8 @@ void PagePolicy::use(int32_t slot, bool is_needed) {
     }
 }
 
-// Returns the topmost page that failed, among a page and those above it; -1 if none did.
+// Returns the topmost page that failed among this page and those above it; -1 if none
+// failed.
 int32_t PagePolicy::block_above(int32_t id) const {
     int32_t blocked = -1;
     for (; id >= 0; id = pages_[id].parent)
@@ -177,8 +180,8 @@ int32_t PagePolicy::block_above(int32_t id) const {
     return blocked;
 }
 
-// Adds an absent page and the absent pages above it to the wanted ones. Returns how many of them
-// the cut misses that were not counted as missing before.
+// Adds an absent page and the absent pages above it to the wanted pages. Returns how
+// many of these pages the cut misses that were not counted as missing before.
 size_t PagePolicy::ask(const PageRequest& request, bool has_failures) {
     auto id = static_cast<int32_t>(id_of(request.bundle, request.page));
     const int32_t blocked = has_failures ? block_above(id) : -1;
@@ -225,9 +228,9 @@ void PagePolicy::note(Span<const PageRequest> needs, size_t num_left_out, bool h
     num_needed_ = needed_.now;
 }
 
-// Replaces the keys of the wanted pages by those of their stretches, and sorts the pages in the
-// order of their files. No stretch contains both a page and one below it, and the stretch of a page
-// is more urgent than those of the pages below it.
+// Replaces the key of each wanted page by the key of its stretch, and sorts the pages
+// in file order. No stretch contains both a page and a page below it, and the stretch
+// of a page is more urgent than the stretches of the pages below it.
 void PagePolicy::find_stretches() {
     std::sort(wanted_.begin(), wanted_.end(), [](const Wanted& a, const Wanted& b) {
         return a.bundle != b.bundle ? a.bundle < b.bundle : a.page < b.page;
@@ -235,8 +238,8 @@ void PagePolicy::find_stretches() {
     key_of_stretch_.clear();
     uint32_t bundle = UINT32_MAX;
     size_t pages_of_stretch = 1;
-    size_t number = 0;        // of the stretch, in its bundle
-    int32_t least_above = 0;  // the first of the pages above those of the stretch
+    size_t number = 0;        // number of the stretch in its bundle
+    int32_t least_above = 0;  // first page above the pages of the stretch
     for (const Wanted& w : wanted_) {
         const auto id = static_cast<int32_t>(id_of(w.bundle, w.page));
         if (w.bundle != bundle)
@@ -254,8 +257,8 @@ void PagePolicy::find_stretches() {
         least_above = std::min(least_above, page.parent);
         key_of_stretch_.back() = std::max(key_of_stretch_.back(), w.key);
     }
-    // A page lies after those below it, so a stretch has its final key when its first page is
-    // reached.
+    // A page lies behind those below it in the file, so the key of a stretch is final
+    // when the loop reaches its first page.
     for (Wanted& w : wanted_) {
         const Page& page = pages_[id_of(w.bundle, w.page)];
         const Page& above = pages_[page.parent];
@@ -264,7 +267,7 @@ void PagePolicy::find_stretches() {
             uint32_t& key_above = key_of_stretch_[above.stretch];
             key_above = std::min(std::max(key_above, key + 1), kNumKeys - 1);
         }
-        // Pages that are asked for ahead wait until none is missed.
+        // Pages that are requested ahead wait until no missed page is left.
         w.key = w.key < kKeyOfMissed ? std::min(key, kKeyOfMissed - 1) : key;
     }
 }
@@ -282,7 +285,8 @@ void PagePolicy::choose(size_t under_way, std::vector<PageRequest>& todo) {
     const size_t unneeded = num_old(needed_), unused = num_old(used_);
     const size_t room = num_missed > unused ? std::min(num_missed, unneeded) : unused;
     const size_t most = std::min(room > under_way ? room - under_way : 0, kMostChosen);
-    // The least urgent come first, and of those as many are left out as there is no room for.
+    // The list begins with the least urgent pages; as many of these are left out as
+    // there is no room for.
     size_t num_left_out = wanted_.size() > most ? wanted_.size() - most : 0;
     todo.resize(wanted_.size() - num_left_out);
     uint32_t end = 0;
@@ -317,7 +321,7 @@ void PagePolicy::evict(uint32_t s, PagesComing& out) {
     free_slots_.push_back(s);
 }
 
-// Collects slots that may be freed, when no slot is free.
+// Collects slots that may be evicted; called when no slot is free.
 void PagePolicy::find_leaving() {
     for (uint32_t s = 0; s < slots_.size(); ++s)
         if (may_go(s)) leaving_.push_back({uses_[s].last_used, s});
@@ -329,8 +333,8 @@ void PagePolicy::find_leaving() {
     has_none_leaving_ = leaving_.empty();
 }
 
-// Drops slots that were used again from the front of the heap. Returns whether one is left that may
-// be freed.
+// Removes slots that were used again from the front of the heap. Returns whether a slot
+// remains that may be evicted.
 bool PagePolicy::has_leaving() {
     while (!leaving_.empty()) {
         const Leaving& first = leaving_.front();
@@ -341,8 +345,9 @@ bool PagePolicy::has_leaving() {
     return false;
 }
 
-// Evicts a page unless a slot is free. `is_missed`: the slot is for a page that the cut misses,
-// else for one that is asked for ahead. Returns whether there is a free slot.
+// Evicts a page unless a slot is free. `is_missed` says whether the slot is for a page
+// that the cut misses or for a page requested ahead. Returns whether there is a free
+// slot.
 bool PagePolicy::make_room(bool is_missed, PagesComing& out) {
     if (!free_slots_.empty()) return true;
     if (!has_leaving() && !has_none_leaving_) find_leaving();

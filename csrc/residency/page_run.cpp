@@ -19,8 +19,8 @@ static std::string name_of(const PageRun& run, size_t page) {
            ")";
 }
 
-// Reads `count` pages into contiguous memory, and calls use(page, bytes) for each until one cannot
-// be read.
+// Reads `count` pages into contiguous memory, and calls use(page, bytes) for each, up
+// to the first page that cannot be read.
 template <class Use>
 static void read_few(const PosixFile& file, const PageRun& run, size_t first, size_t count,
                      unsigned char* bytes, const Use& use) {

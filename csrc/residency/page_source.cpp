@@ -1,5 +1,5 @@
-// Reads pages in three steps: neighbours in one call of the system, page by page where that fails
-// so that each error names its page, then all hashes together.
+// Reads pages in three steps: neighbours in one system call; page by page if that
+// fails, so that each error names its page; then all hashes together.
 
 #include "residency/page_source.h"
 
@@ -62,18 +62,19 @@ static void read_one(const PosixFile& file, Span<const int64_t> places, PageRead
     const auto size = static_cast<size_t>(places[page + 1] - places[page]);
     try {
         if (file.read_at(places[page], reinterpret_cast<char*>(reading.bytes), size) < size)
-            reading.error.emplace(name_of(page) + " is not there; the file was truncated", true);
+            reading.error.emplace(name_of(page) + " is missing; the file was truncated", true);
     } catch (const std::system_error& error) {
         reading.error.emplace(name_of(page) + ": " + error.code().message(), false,
                               error.code().value());
     }
 }
 
-// A gap between two pages of at most so many bytes, a page or two, is read and discarded: that is
-// faster than a second call.
+// A gap of at most this many bytes between two pages, the size of one or two pages, is
+// read and discarded: that is faster than a second call.
 constexpr size_t kMostSkippedBytes = size_t(32) << 10;
 
-// Returns the end of the pages that are read in one call with `first`.
+// Returns the end of the pages that are read in one call together with the page
+// `first`.
 static size_t end_of_run(Span<const int64_t> places, Span<const PageReading> pages, size_t first) {
     size_t end = first + 1;
     while (end < pages.size &&
@@ -101,7 +102,7 @@ static void read_run(const PosixFile& file, Span<const int64_t> places, Span<Pag
     try {
         if (file.read_at(first, {pieces, count}) == static_cast<size_t>(place - first)) return;
     } catch (const std::system_error&) {
-        // Reading page by page shows which one it was, and whether the error persists.
+        // Reading page by page shows which page failed, and whether the error persists.
     }
     for (PageReading& reading : run) read_one(file, places, reading, name_of);
 }
@@ -148,7 +149,8 @@ void FilePages::expect(Span<const PageReading> pages) const {
     }
 }
 
-// Fetches the pages. Returns whether they can be read now; else all of them have an error.
+// Fetches the pages. Returns whether they can be read now; if not, each of them has an
+// error.
 bool FilePages::fetch(Span<PageReading> pages) const {
     int64_t places[2 * kMostPagesTogether];
     size_t count = 0;

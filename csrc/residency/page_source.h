@@ -1,7 +1,7 @@
 #pragma once
 
-// The source of the bytes of a bundle's pages: a file, which may have to be fetched first, or
-// memory; and the codecs that pages have (PageCodec). Any thread may read from it.
+// The source of the pages of a bundle: a file, which may have to be fetched first, or
+// memory. Also the codecs of pages (PageCodec). Any thread may read from a source.
 // docs/extending.md says how to add a codec.
 
 #include <cstdint>
@@ -23,31 +23,33 @@ class PageError : public std::runtime_error {
   public:
     PageError(const std::string& text, bool is_damage, int code = 0)
         : std::runtime_error(text), is_damage(is_damage), code(code) {}
-    const bool is_damage;  // the content of the file is wrong; else the system failed to read it
-    const int code;        // errno of the system, or 0
+    // true: the content of the file is wrong; false: the system failed to read it
+    const bool is_damage;
+    const int code;  // errno of the system call, or 0
 };
 
 constexpr const char* kDamaged = "the file is damaged, copy or build it again";
 
-// A page to be read, and the error if that failed.
+// A page to be read, and the error if reading failed.
 struct PageReading {
     size_t page;
     unsigned char* bytes;  // has room for the whole page
     std::optional<PageError> error;
 };
-// Most pages that are read together; a constant, so that reading allocates nothing.
+// The largest number of pages that are read together. It is a constant, so that reading
+// never allocates.
 constexpr size_t kMostPagesTogether = 64;
 
-// Reads at most kMostPagesTogether pages of a file, in ascending order, and verifies their hashes,
-// several at once. Neighbours are read in one call, including small gaps between them. `places` is
-// [P + 1], the first byte of each page and the end; `hashes` is [P][16]. Errors begin with
-// name_of(page).
+// Reads at most kMostPagesTogether pages of a file, in ascending order, and verifies
+// their hashes, several at once. Neighbouring pages are read in one call, including
+// small gaps between them. `places` is [P + 1], the offset of each page and the end;
+// `hashes` is [P][16]. Errors begin with name_of(page).
 void read_verified(const PosixFile& file, Span<const int64_t> places, const uint8_t* hashes,
                    Span<PageReading> pages, const std::function<std::string(size_t)>& name_of);
 
 enum class PageCodec { float32, quantized };
 
-// The pages of a bundle, as bytes.
+// Reads the pages of a bundle as bytes.
 class PageSource {
   public:
     PageSource(const ClusterTable& table, int sh_degree, PageCodec codec);
@@ -60,26 +62,29 @@ class PageSource {
         return first_cluster_[page + 1] - first_cluster_[page];
     }
     size_t first_cluster(size_t page) const { return first_cluster_[page]; }
-    // [K + 1] the first row of each cluster of a page, among the rows of the bundle, and the end.
+    // Returns the [K + 1] first rows in the bundle of the clusters of a page, and the
+    // end.
     Span<const int64_t> clusters(size_t page) const;
     int64_t first_row(size_t page) const { return offset_[first_cluster_[page]]; }
     size_t num_rows(size_t page) const {
         return offset_[first_cluster_[page + 1]] - first_row(page);
     }
 
-    // The bytes of a page, including padding.
+    // Returns the size of a page, including padding.
     virtual size_t num_bytes(size_t page) const = 0;
-    // Reads at most kMostPagesTogether pages, in ascending order, and verifies them. Fastest for
-    // neighbours.
+    // Reads at most kMostPagesTogether pages, in ascending order, and verifies them.
+    // Neighbouring pages are fastest.
     virtual void read_pages(Span<PageReading> pages) const = 0;
     // Reads and verifies one page. Throws PageError.
     void read(size_t page, unsigned char* bytes) const;
-    // Whether reading is so slow that a page should not be read before it is missed.
+    // Whether the source is so slow that pages should be read only once they are
+    // missed.
     virtual bool is_far() const { return false; }
-    // Tells the source that these pages will be read soon.
+    // Announces that these pages will be read soon.
     virtual void expect(Span<const PageReading> pages) const { static_cast<void>(pages); }
 
-    // The rows of a page, given its bytes: borrowed from them, or from `decoded`.
+    // Returns the rows of a page, given its bytes. The rows borrow from `bytes` or from
+    // `decoded`.
     GaussianRows<const float> rows(size_t page, const unsigned char* bytes,
                                    std::vector<float>& decoded) const;
 
@@ -90,16 +95,18 @@ class PageSource {
     std::vector<int64_t> offset_;        // [C + 1]
 };
 
-// Fetches parts of a file before they are read: for each pair of numbers, the bytes from the first
-// to the second. Returns the problem, or an empty text. Called on any thread.
+// Fetches parts of a file before they are read. The argument has pairs of numbers: the
+// first byte of a part and its end. Returns an error message, or an empty string.
+// Called on any thread.
 using Fetch = std::function<std::string(Span<const int64_t>)>;
 
-// Pages of a file, which stays open as long as this lives. The file may be renamed or removed in
-// the meantime; if it is truncated or written to, the hashes show it.
+// The pages of a file, which stays open while this object exists. The file may be
+// renamed or removed in the meantime; if it is truncated or overwritten, the hashes
+// detect that.
 class FilePages : public PageSource {
   public:
-    // `place` is [P + 1], `hash` is [P][16], as docs/format.md describes them. `fetch` is empty if
-    // the whole file is there.
+    // `place` is [P + 1], `hash` is [P][16], as docs/format.md describes them. `fetch`
+    // is empty if the whole file is local.
     FilePages(const ClusterTable& table, int sh_degree, PageCodec codec, std::string name,
               int descriptor, Span<const int64_t> place, Span<const uint8_t> hash, Fetch fetch);
     size_t num_bytes(size_t page) const override { return place_[page + 1] - place_[page]; }
@@ -118,7 +125,7 @@ class FilePages : public PageSource {
     const Fetch fetch_;
 };
 
-// Pages of gaussians in memory, which have to outlive this.
+// The pages of gaussians in memory. The gaussians must outlive this object.
 class MemoryPages : public PageSource {
   public:
     MemoryPages(const ClusterTable& table, const GaussianRows<const float>& rows)
@@ -132,7 +139,7 @@ class MemoryPages : public PageSource {
     const GaussianRows<const float> rows_;
 };
 
-// The rows of a page of float32 gaussians, borrowed from its bytes.
+// Returns the rows of a page of float32 gaussians; they borrow from its bytes.
 GaussianRows<const float> rows_of_page(const unsigned char* bytes, size_t num_gaussians,
                                        int sh_degree);
 

@@ -1,5 +1,5 @@
-// A round of deciding: takes needs and loaded pages under the mutex, decides without it, and hands
-// the results over under it again.
+// A round of deciding: it takes needs and loaded pages under the mutex, decides without
+// the mutex, and hands over the results under the mutex again.
 
 #include "residency/pool_decider.h"
 
@@ -9,7 +9,7 @@
 
 namespace v3dg {
 
-// How the tolerance follows the share of the pool that a view needs.
+// How fast the tolerance follows the fraction of the pool that a view needs.
 constexpr float kToleranceStep = 1.02f;
 constexpr double kRoomyShare = 0.7;
 
@@ -20,8 +20,8 @@ void PoolDecider::reserve(size_t num_blocks, size_t num_changes) {
     coming_.changes.reserve(num_changes);
 }
 
-// Decides, without the mutex, about the state at the beginning of the round; the next round sees
-// what other threads do meanwhile.
+// Decides, without the mutex, about the state at the beginning of the round. The next
+// round sees the changes that other threads make meanwhile.
 void PoolDecider::decide(PoolShared& shared) {
     ++shared.rounds_begun;
     shared.wants_round = false;
@@ -67,8 +67,8 @@ void PoolDecider::decide(PoolShared& shared) {
     shared.has_changed.notify_all();
 }
 
-// Adapts from the tolerance that the frame used, so several frames in flight together cause only
-// one step.
+// Adapts from the tolerance that the frame used, so several frames in flight together
+// cause only one step.
 void PoolDecider::adapt_tolerance(PoolShared& shared, const FrameNeeds& needs) {
     const size_t slots = policy_.num_slots();
     const size_t needed = shared.needed;

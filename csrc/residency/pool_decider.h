@@ -1,11 +1,12 @@
 #pragma once
 
-// The deciding side of a page pool: which pages are read, come and go.
+// The deciding part of a page pool: which pages are read, become resident, and are
+// evicted.
 //
-// Its fields belong to whoever decides, one thread at a time: the pool's deciding thread, or, in a
-// pool without threads, the thread that draws, which then calls decide_next_round(). Frames call
-// decide_next_round() and forget_failures(). Nothing here waits for a file. Only
-// decide_next_round() waits for another thread.
+// One thread at a time uses the fields: the deciding thread of the pool or, in a pool
+// without threads, the drawing thread, which then calls decide_next_round(). Frames
+// call decide_next_round() and forget_failures(). No function here waits for a file.
+// Only decide_next_round() waits for another thread.
 
 #include <cstddef>
 #include <vector>
@@ -19,16 +20,17 @@ class PoolDecider {
   public:
     explicit PoolDecider(PagePolicy& policy) : policy_(policy) {}
 
-    // Allocates what decide() needs for so many blocks, so that it never runs out of memory.
+    // Allocates the memory that decide() needs for this many blocks, so that it never
+    // runs out of memory.
     void reserve(size_t num_blocks, size_t num_changes);
 
-    // The deciding thread; returns once the pool is over.
+    // The deciding thread; returns once the pool has ended.
     void decide_always(PoolShared& shared) V3DG_EXCLUDES(shared.busy);
-    // Returns once the pool has decided about all that it has now; waits for the deciding thread,
-    // or decides in this one where there is none.
+    // Returns once the pool has decided about everything that is known now. Waits for
+    // the deciding thread, or decides in the calling thread if there is none.
     void decide_next_round(PoolShared& shared) V3DG_REQUIRES(shared.busy);
-    // Allows pages that could not be read to be tried again. Must not be called while a round is
-    // under way.
+    // Allows another attempt at pages that could not be read. Must not be called during
+    // a round.
     void forget_failures(PoolShared& shared) V3DG_REQUIRES(shared.busy);
 
   private:

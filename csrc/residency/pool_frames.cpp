@@ -1,4 +1,5 @@
-// The exchange of a frame with the other threads, and the tables of what is resident.
+// The exchange between a frame and the other threads of a pool, and the tables of
+// resident pages.
 
 #include "residency/pool_frames.h"
 
@@ -43,7 +44,8 @@ void PoolFrames::reserve(size_t num_blocks, size_t num_changes, size_t num_frame
     changes_.reserve(num_changes);
     taken_.reserve(num_blocks);
     returned_.reserve(num_blocks);
-    all_needs_.resize(num_frames + 2);  // one more waits, and one more is decided about
+    // one more that waits, and one more that is being decided about
+    all_needs_.resize(num_frames + 2);
     for (FrameNeeds& needs : all_needs_) {
         needs.list =
             reinterpret_cast<PageRequest*>(memory.allocate(most_needs * sizeof(PageRequest)));
@@ -55,7 +57,7 @@ const std::vector<PageChange>& PoolFrames::begin_frame(PoolShared& shared, bool 
                                                        Arrive arrive) {
     least_of_frame_ = shared.least_tolerance;
     const bool is_first = !std::exchange(has_begun_, true);
-    if (!is_first) take_changes(shared, is_bounded);  // the first frame has the coarsest pages
+    if (!is_first) take_changes(shared, is_bounded);  // the first frame brings the coarsest pages
     const bool is_after_look = std::exchange(has_looked_, !is_bounded);
     arrivals_.advance(changes_, is_bounded && !is_after_look ? arrive : Arrive::at_once);
     return changes_;
@@ -84,14 +86,14 @@ void PoolFrames::swap_changes(PoolShared& shared, bool is_bounded) {
     changes_.swap(shared.ready);
     shared.ready_bytes = 0;
     shared.has_noted = false;
-    // A look waits until the pool has decided about its own view. An earlier one that was decided
-    // about in between would bring pages to `ready`, and then no other view may be noted before the
-    // next frame.
+    // A frame that is not bounded waits until the pool has decided about its own view.
+    // If the pool decided about an earlier view in between, that would fill `ready`,
+    // and then no other view could be noted before the next frame.
     if (!is_bounded) forget_noted(shared);
     if (shared.has_to_decide()) shared.to_decide.notify_one();
 }
 
-// Updates the tables for the changes of the frame, and keeps their blocks.
+// Updates the tables for the changes of the frame, and stores their blocks.
 void PoolFrames::apply_changes(PoolShared& shared) {
     for (const PageChange& change : changes_) {
         const PageSource& source = policy_.source(change.bundle);
@@ -108,7 +110,8 @@ void PoolFrames::apply_changes(PoolShared& shared) {
     }
 }
 
-// Hands needs and free blocks to the other threads, and takes back needs that were decided about.
+// Hands needs and free blocks to the other threads, and receives needs that were
+// decided about.
 void PoolFrames::exchange(PoolShared& shared) {
     if (to_note_ != nullptr) {
         if (shared.noted != nullptr) idle_needs_.push_back(shared.noted);
@@ -125,7 +128,7 @@ void PoolFrames::exchange(PoolShared& shared) {
     if (shared.has_to_decide()) shared.to_decide.notify_one();
 }
 
-// Withdraws a view that was noted and that no round has begun with.
+// Withdraws a noted view that no round has begun with.
 void PoolFrames::forget_noted(PoolShared& shared) {
     if (shared.noted != nullptr) idle_needs_.push_back(std::exchange(shared.noted, nullptr));
 }
@@ -165,7 +168,8 @@ NotedView PoolFrames::note_needs(PoolShared& shared, FrameNeeds* needs, bool wai
     return noted;
 }
 
-// Returns how many pages the cut missed in the tables of the frame that began last.
+// Returns how many pages the cut missed, according to the tables of the frame that
+// began last.
 size_t PoolFrames::count_absent(const FrameNeeds& needs) const {
     size_t count = needs.num_left_out;
     for (size_t k = 0; k < needs.count; ++k) {

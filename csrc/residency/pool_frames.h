@@ -1,10 +1,12 @@
 #pragma once
 
-// The drawing side of a page pool: what a frame takes from the pool and what it gives back.
+// The drawing side of a page pool: the pages that a frame receives and the needs that
+// it returns.
 //
-// Used by one thread at a time, the one that draws; PagePool's callers see to that. Its fields need
-// no mutex. A function that has `waits` true, and a frame that is not bounded, wait for the mutex
-// and for the next round of the decider; all else waits for nothing.
+// One thread at a time uses it, the drawing thread; the callers of PagePool ensure
+// that. Hence its fields need no mutex. A function with `waits` set, and a frame that
+// is not bounded, wait for the mutex and for the next round of the decider; nothing
+// else waits.
 
 #include <cstddef>
 #include <cstdint>
@@ -21,11 +23,11 @@ class PoolFrames {
   public:
     PoolFrames(const PagePolicy& policy, PoolDecider& decider, size_t num_bundles);
 
-    // Reads the coarsest pages, which come with the first frame. Returns their bytes, including
-    // padding. Throws PageError.
+    // Reads the coarsest pages, which the first frame brings. Returns their size,
+    // including padding. Throws PageError.
     size_t read_roots(BlockMemory& memory);
-    // Allocates what frames need, so that exchanges never allocate: room for the changes and the
-    // blocks of a frame, and for the needs of several.
+    // Allocates the memory of frames, so that exchanges never allocate: room for the
+    // changes and the blocks of a frame, and for the needs of several frames.
     void reserve(size_t num_blocks, size_t num_changes, size_t num_frames, size_t most_needs,
                  BlockMemory& memory);
 
@@ -58,18 +60,18 @@ class PoolFrames {
     PoolDecider& decider_;
 
     bool has_begun_ = false;
-    bool has_looked_ = false;  // the frame before was not bounded
+    bool has_looked_ = false;  // whether the frame before was not bounded
     float least_of_frame_ = 0;
-    std::vector<PageChange> changes_;          // of the frame
+    std::vector<PageChange> changes_;          // changes of the current frame
     std::vector<unsigned char*> taken_;        // the blocks of those changes
-    std::vector<unsigned char*> returned_;     // blocks that can be used again
-    std::vector<std::vector<int64_t>> shift_;  // [P] of each bundle
+    std::vector<unsigned char*> returned_;     // blocks that readers can reuse
+    std::vector<std::vector<int64_t>> shift_;  // [P] per bundle
     PageArrivals arrivals_;
 
     std::vector<FrameNeeds> all_needs_;
     std::vector<FrameNeeds*> idle_needs_;
-    FrameNeeds* to_note_ = nullptr;  // to be handed to the decider with the next exchange
-    uint64_t num_views_ = 0;         // that were noted
+    FrameNeeds* to_note_ = nullptr;  // needs for the decider, handed over in the next exchange
+    uint64_t num_views_ = 0;         // number of views that were noted
 };
 
 }  // namespace v3dg

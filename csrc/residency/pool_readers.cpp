@@ -1,4 +1,5 @@
-// Batches of the most urgent pages: taken under the mutex, read without it, reported under it.
+// Reads batches of the most urgent pages: a batch is taken under the mutex, read
+// without it, and reported under it.
 
 #include "residency/pool_readers.h"
 
@@ -11,8 +12,8 @@ namespace v3dg {
 namespace {
 
 constexpr int kTries = 3;
-constexpr size_t kMostAtOnce = 64;  // pages that a thread asks the disk for together
-// Of those, the bytes that it then reads and hashes together.
+constexpr size_t kMostAtOnce = 64;  // pages that a thread requests from the disk together
+// The number of bytes of those pages that a thread then reads and hashes together.
 constexpr size_t kMostBytesTogether = size_t(512) << 10;
 
 }  // namespace
@@ -42,8 +43,8 @@ bool PoolReaders::read_some(PoolShared& shared, size_t most) const {
     return true;
 }
 
-// Reads all pages in the order of their files: the disk is asked for all at once, then a few are
-// read together.
+// Reads all pages in file order: announces all of them to the disk, then reads a few at
+// a time.
 void PoolReaders::read_batch(PoolShared& shared, Span<Reading> batch) const {
     std::sort(batch.begin(), batch.end(), [](const Reading& a, const Reading& b) {
         return a.page.bundle != b.page.bundle ? a.page.bundle < b.page.bundle
@@ -54,7 +55,8 @@ void PoolReaders::read_batch(PoolShared& shared, Span<Reading> batch) const {
         pages[k].page = batch[k].page.page;
         pages[k].bytes = batch[k].block;
     }
-    // Calls visit(bundle, pages) for neighbours of a bundle that have at most so many bytes.
+    // Calls visit(bundle, pages) for runs of neighbouring pages of a bundle with at
+    // most this many bytes each.
     const auto for_each_run = [&](size_t most_bytes, const auto& visit) {
         for (size_t first = 0, end = 0; first < batch.size; first = end) {
             const uint32_t bundle = batch[first].page.bundle;
@@ -74,7 +76,8 @@ void PoolReaders::read_batch(PoolShared& shared, Span<Reading> batch) const {
     });
 }
 
-// Reads pages of a bundle. Those that succeed are reported at once, the others are tried again.
+// Reads pages of a bundle. Pages that succeed are reported at once; the others are
+// tried again.
 void PoolReaders::read_together(PoolShared& shared, uint32_t bundle,
                                 Span<PageReading> pages) const {
     policy_.source(bundle).read_pages(pages);
@@ -95,7 +98,7 @@ void PoolReaders::read_together(PoolShared& shared, uint32_t bundle,
     }
 }
 
-// Reports that a page is loaded, or has failed.
+// Reports that a page is loaded or has failed.
 void PoolReaders::finish(PoolShared& shared, uint32_t bundle, const PageReading& reading) const {
     --shared.num_loading;
     policy_.state(bundle, reading.page) = reading.error ? PageState::failed : PageState::loaded;
@@ -116,7 +119,7 @@ void PoolReaders::finish(PoolShared& shared, uint32_t bundle, const PageReading&
 void PoolReaders::read_always(PoolShared& shared) const {
     const MutexLock lock(shared.busy);
     while (!shared.is_over) {
-        // A part of what is left, so that the other threads have as much to do.
+        // Taking only a part of the list leaves equal work for the other threads.
         const size_t share = shared.todo.size() / (2 * size_t(shared.limits.num_threads));
         if (read_some(shared, std::clamp<size_t>(share, 1, kMostAtOnce))) continue;
         shared.has_changed.notify_all();

@@ -1,10 +1,12 @@
 #pragma once
 
-// The reading side of a page pool: takes the most urgent pages and reads them into blocks.
+// The reading side of a page pool: takes the most urgent pages and reads them into
+// blocks.
 //
-// Several threads read at the same time: the pool's reading threads and callers of read_some().
-// They wait for files, never while they hold the mutex. What they share is in PoolShared; of the
-// policy they use the sources, which never change, and the states of pages, which are atomic.
+// Several threads read at the same time: the reading threads of the pool and the
+// callers of read_some(). They wait for files, but never while they hold the mutex.
+// Their shared state is in PoolShared. From the policy they use only the sources, which
+// never change, and the states of pages, which are atomic.
 
 #include <cstddef>
 
@@ -19,14 +21,14 @@ class PoolReaders {
   public:
     explicit PoolReaders(const PagePolicy& policy) : policy_(policy) {}
 
-    // A reading thread; returns once the pool is over.
+    // A reading thread; returns once the pool has ended.
     void read_always(PoolShared& shared) const V3DG_EXCLUDES(shared.busy);
-    // Reads at most so many of the most urgent pages, without the mutex. Returns whether there was
-    // a page to read, and a block for it.
+    // Reads at most this many of the most urgent pages; releases the mutex meanwhile.
+    // Returns whether there was a page to read, and a block for it.
     bool read_some(PoolShared& shared, size_t most) const V3DG_REQUIRES(shared.busy);
 
   private:
-    // A page that this thread reads, and where to.
+    // A page to read, and its destination.
     struct Reading {
         PageRequest page;
         unsigned char* block;

@@ -4,7 +4,7 @@
 
 namespace v3dg {
 
-constexpr int kSpins = 64;  // further tries before a frame does without the mutex
+constexpr int kSpins = 64;  // further attempts before a frame goes on without the mutex
 
 PoolShared::PoolShared(const PoolLimits& pool_limits, size_t num_slots)
     : limits(pool_limits),

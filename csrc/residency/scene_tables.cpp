@@ -15,7 +15,7 @@ void SceneTables::set_bundles(std::vector<std::shared_ptr<const BundleTables>> b
         if (bundle->device() != device_)
             throw std::invalid_argument(
                 "bundles: expected tables on device " + std::to_string(device_) +
-                ", as the scene is, got some on device " + std::to_string(bundle->device()));
+                ", where the scene is, got tables on device " + std::to_string(bundle->device()));
         on_device.push_back(bundle->on_device());
     }
     const DeviceGuard guard(device_);
@@ -26,7 +26,7 @@ void SceneTables::set_bundles(std::vector<std::shared_ptr<const BundleTables>> b
 }
 
 void SceneTables::set_instances(Span<const int32_t> bundle, Span<const float> importance,
-                                cudaStream_t stream) {
+                                Span<const InstanceFactors> factors, cudaStream_t stream) {
     const DeviceGuard guard(device_);
     const StreamLock lock(busy_, stream);
     num_instances_ = bundle.size;
@@ -34,6 +34,8 @@ void SceneTables::set_instances(Span<const int32_t> bundle, Span<const float> im
     for (const int32_t b : bundle) ++num_instances_of_[b];
     bundle_.copy_from(bundle, stream);
     importance_.copy_from(importance, stream);
+    factors_.copy_from(factors, stream);
+    num_factors_ = factors.size;
 }
 
 void SceneTables::set_poses(const PoseSpan& position, const PoseSpan& quaternion,
@@ -49,7 +51,8 @@ void SceneTables::set_poses(const PoseSpan& position, const PoseSpan& quaternion
 }
 
 size_t SceneTables::bytes() const {
-    size_t bytes = bundles_on_device_.bytes() + bundle_.bytes() + importance_.bytes();
+    size_t bytes =
+        bundles_on_device_.bytes() + bundle_.bytes() + importance_.bytes() + factors_.bytes();
     for (const DeviceBuffer<double>& poses : uploaded_) bytes += poses.bytes();
     return bytes;
 }
@@ -61,7 +64,8 @@ SceneOnDevice SceneTables::on_device() const {
                           .position = {position_, 3 * count},
                           .quaternion = {quaternion_, 4 * count},
                           .scale = {scale_, count},
-                          .importance = {importance_.data(), count}}};
+                          .importance = {importance_.data(), count},
+                          .factors = {factors_.data(), num_factors_}}};
 }
 
 }  // namespace cuda

@@ -12,43 +12,45 @@
 namespace v3dg {
 namespace cuda {
 
-// A part of the poses of all instances: positions, quaternions or scales.
+// One component of the poses of all instances: positions, quaternions or scales.
 struct PoseSpan {
     Span<const double> values;
     bool is_on_device;
 };
 
-// What kernels read of a scene; all pointers point to memory of the device.
+// The tables of a scene that kernels read; all pointers point to device memory.
 struct SceneOnDevice {
     const BundleOnDevice* bundles;
     InstanceTable instances;
 };
 
-// The bundles and the instances of a scene on the device that is current when it is made.
+// The bundles and the instances of a scene on the device that is current when it is
+// made.
 //
-// All work is enqueued on the stream that is passed, which belongs to that device. Several threads
-// and streams take turns: a thread that enqueues reads of the scene on a stream holds lock(stream)
-// while it does so.
+// All work is enqueued on the stream that is passed, which must belong to that device.
+// Several threads and streams take turns: a thread that enqueues reads of the scene on
+// a stream holds lock(stream) meanwhile.
 class SceneTables {
   public:
     SceneTables() = default;
 
-    // Sets the bundles, which instances name by their places in this list. Uploads only pointers to
-    // their tables. Existing instances keep their numbers of bundles: to add bundles, pass a longer
-    // list that begins with the last one. Throws std::invalid_argument if tables are on another
-    // device.
+    // Sets the bundles. Instances refer to them by their index in this list. Uploads
+    // only pointers to the tables. Existing instances keep their indices: to add
+    // bundles, pass a longer list that begins with the previous one. Throws
+    // std::invalid_argument if tables are on another device.
     void set_bundles(std::vector<std::shared_ptr<const BundleTables>> bundles, cudaStream_t stream);
-    // Replaces all instances; set_poses() has to follow. The memory of the host may be reused on
-    // return.
+    // Replaces all instances; the caller must call set_poses() afterwards. The host
+    // memory may be reused on return. `factors` is empty if all are 1.
     void set_instances(Span<const int32_t> bundle, Span<const float> importance,
-                       cudaStream_t stream);
-    // Each part is either in memory of the host, which may be reused on return, or in memory of the
-    // device, which has to stay as it is.
+                       Span<const InstanceFactors> factors, cudaStream_t stream);
+    // Sets the poses. Each component is either in host memory, which may be reused on
+    // return, or in device memory, which must stay unchanged.
     void set_poses(const PoseSpan& position, const PoseSpan& quaternion, const PoseSpan& scale,
                    cudaStream_t stream);
 
     int device() const { return device_; }
-    // Bytes on the device, without the tables of the bundles, which other scenes may share.
+    // Returns the bytes on the device, without the tables of the bundles, which other
+    // scenes may share.
     size_t bytes() const;
     size_t num_bundles() const { return bundles_.size(); }
     size_t num_instances() const { return num_instances_; }
@@ -56,18 +58,20 @@ class SceneTables {
     size_t num_instances_of(size_t b) const { return num_instances_of_[b]; }
 
     SceneOnDevice on_device() const;
-    // Holds the scene for work that is enqueued on a stream.
+    // Locks the scene for work that is enqueued on a stream.
     StreamLock lock(cudaStream_t stream) const { return StreamLock(busy_, stream); }
 
   private:
     const int device_ = current_device();
     mutable StreamMutex busy_;
     std::vector<std::shared_ptr<const BundleTables>> bundles_;
-    std::vector<size_t> num_instances_of_;  // of each bundle
+    std::vector<size_t> num_instances_of_;  // per bundle
     size_t num_instances_ = 0;
     DeviceBuffer<BundleOnDevice> bundles_on_device_;
     DeviceBuffer<int32_t> bundle_;
     DeviceBuffer<float> importance_;
+    DeviceBuffer<InstanceFactors> factors_;
+    size_t num_factors_ = 0;
     DeviceBuffer<double> uploaded_[3];
     const double *position_ = nullptr, *quaternion_ = nullptr, *scale_ = nullptr;
 };

@@ -1,7 +1,8 @@
 #pragma once
 
-// Bounds on neighbouring clusters, which show that none of them is drawn without asking each. They
-// never change a decision: the margins are larger than what rounding does to either side.
+// Bounds on neighbouring clusters. Where a bound shows that none of the clusters is
+// drawn, none is tested alone. Bounds never change a decision: their margins are larger
+// than the rounding errors on both sides.
 
 #include <cmath>
 #include <cstdint>
@@ -14,10 +15,12 @@
 
 namespace v3dg {
 
-// A relative margin between a metric and a bound on it, larger than their rounding.
+// A relative margin between a metric and a bound on it. It exceeds the rounding errors
+// of both.
 constexpr float kBoundMargin = 1e-3f;
 
-// Whether all groups above the clusters fit for certain, so that none of the clusters is drawn.
+// Whether all groups above the clusters certainly fit, so that none of the clusters is
+// drawn.
 V3DG_HD inline bool parents_fit(const ClusterBounds& bounds, const InstanceView& view,
                                 const SelectRule& rule) {
     if (bounds.has_root || rule.footprint == Footprint::paper) return false;
@@ -27,7 +30,7 @@ V3DG_HD inline bool parents_fit(const ClusterBounds& bounds, const InstanceView&
                                   (1.0f - kBoundMargin) * rule.tolerance_px2;
 }
 
-// Whether each cluster has a group of its own that is refined for certain, so that none of the
+// Whether the own group of each cluster is certainly refined, so that none of the
 // clusters is drawn.
 V3DG_HD inline bool owns_are_refined(const ClusterBounds& bounds, const InstanceView& view,
                                      const SelectRule& rule) {
@@ -40,11 +43,12 @@ V3DG_HD inline bool owns_are_refined(const ClusterBounds& bounds, const Instance
            (1.0f + kBoundMargin) * rule.tolerance_px2;
 }
 
-// The tolerances that a bound is to hold for: that of the rule, or that and all larger ones.
+// The tolerances for which a bound has to hold: the tolerance of the rule alone, or
+// also all larger ones.
 enum class Tolerances { this_one, from_this_on };
 
-// False only if none of the clusters is drawn at these tolerances. Bounds do not know which pages
-// are absent, and the groups of absent pages fit whatever their bounds are.
+// False only if none of the clusters is drawn at these tolerances. Bounds ignore which
+// pages are absent: a group whose page is absent fits, whatever its bound is.
 V3DG_HD inline bool may_draw(const ClusterTable& table, const ClusterBounds& bounds,
                              const InstanceView& view, const SelectRule& rule,
                              Tolerances tolerances) {
@@ -58,14 +62,14 @@ struct ClusterRange {
     uint32_t first, end;
 };
 
-// A ball whose radius is at most half of its distance covers at least pi x2 steradians, where x2 is
-// the square of radius over distance, and at most this many times that.
+// A ball whose radius is at most half of its distance covers between pi x2 and
+// kMostOfPi x2 steradians, where x2 is the square of radius over distance.
 constexpr float kMostOfPi = 1.08f;
-// These are far from where float32 loses digits and from where squares overflow.
+// Beyond these limits float32 may lose digits, or squares may overflow.
 constexpr float kLeastRunTolerance = 1e-20f, kLeastRunX2 = 1e-30f, kMostRunDistance = 1e18f;
 
-// The clusters that have to be asked: whole runs, outside of which bounds show that no cluster is
-// drawn at these tolerances.
+// The clusters that have to be tested one by one. It consists of whole runs; bounds
+// show that no cluster outside of it is drawn at these tolerances.
 V3DG_HD inline ClusterRange clusters_to_ask(const ClusterTable& table, const ClusterRuns& runs,
                                             const InstanceView& view, const SelectRule& rule,
                                             Tolerances tolerances) {

@@ -1,10 +1,10 @@
-// Chooses the tolerance of a budget. change_kernel adds up by how many gaussians the cuts of
-// neighbouring bins differ (budget_math.h); choose_kernel chooses the smallest tolerance from which
-// on no cut exceeds the budget.
+// Chooses the tolerance that meets a budget. change_kernel counts by how many gaussians
+// the cuts of neighbouring bins differ (budget_math.h). choose_kernel chooses the
+// smallest tolerance from which on no cut exceeds the budget.
 //
-// Both run for two rounds. The first considers no tolerance below half of the last choice, which
-// spares it the tables of distant instances. The second does nothing unless a smaller tolerance
-// might have been chosen.
+// Both run in two rounds. The first round considers no tolerance below half of the last
+// choice, so it need not read the tables of distant instances. The second round does
+// nothing unless the first shows that a smaller tolerance may be the answer.
 
 #include "base/scan.cuh"
 #include "select/cut_parts.cuh"
@@ -15,11 +15,12 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kChooseThreads = 1024;
-// The number of bins of a warp of choose_kernel.
+// The number of bins that one warp of choose_kernel sums.
 constexpr uint32_t kWarpBins = (kNumBudgetBins + kChooseThreads - 1) / kChooseThreads * 32;
 constexpr float kMostGuess = 1 << 20;
 
-// Adds up by how many gaussians the cut of each bin differs from that of the bin before.
+// Counts by how many gaussians the cut of each bin differs from the cut of the bin
+// before.
 __global__ void change_kernel(PlacedScene scene, SelectRule rule, BudgetRound round,
                               const unsigned* num_parts, Count* change) {
     if (round.is_over()) return;
@@ -56,8 +57,10 @@ __global__ void change_kernel(PlacedScene scene, SelectRule rule, BudgetRound ro
     if (threadIdx.x == 0 && at_first > 0) atomicAdd(&change[0], at_first);
 }
 
-// Chooses the tolerance of the bin after the last one whose cut exceeds the budget, or in steps one
-// that is not below it. Where there is none, leaves no parts to cut. Runs in one block.
+// Chooses the tolerance of the bin after the last one whose cut exceeds the budget;
+// when the budget moves in steps, a tolerance that is not below it. If no bin fits, it
+// sets the number of parts to 0, so that cut_kernel has nothing to do. Runs in one
+// block.
 __global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change, CutChoice* choice,
                               BudgetState* state, unsigned* num_parts) {
     if (round.is_over()) return;

@@ -11,14 +11,14 @@
 
 namespace v3dg {
 
-// What consecutive pictures of one camera know of the ones before: the tolerance of a budget, and
-// for how long nothing has moved. A copy is independent.
+// The state that consecutive pictures of one camera share: the tolerance of the budget,
+// and for how long nothing has moved. A copy is independent.
 class BudgetSteps {
   public:
     uint32_t last_bin = kNoBin;  // the state of tolerance_of_budget(), on the host
 
-    // The rule of the next picture, which shows `scene`. A scene that changes becomes another
-    // object. Without a fade the pictures before have no influence.
+    // Returns the rule of the next picture, which shows `scene`. A scene that changes
+    // becomes another object. Without a fade, earlier pictures have no influence.
     SelectRule next(SelectRule rule, const Eyes& eyes, const std::shared_ptr<const void>& scene) {
         if (!rule.fade.is_on()) return rule;
         const bool is_same_scene = !scene_.owner_before(scene) && !scene.owner_before(scene_);
@@ -37,13 +37,14 @@ class BudgetSteps {
     bool has_begun_ = false;
     SelectRule rule_{};
     Eyes eyes_;
-    std::weak_ptr<const void> scene_;  // keeps no scene alive, and its address cannot be reused
+    // does not keep the scene alive, but keeps its address from being reused
+    std::weak_ptr<const void> scene_;
     int32_t frames_at_rest_ = 0;
 };
 
-// Returns body(rule, last_bin) for the next picture after those that `steps` knows. `steps` counts
-// the picture unless body throws. Where it is null, nothing came before and the rule is not
-// changed.
+// Returns body(rule, last_bin) for the next picture of the sequence `steps`, and counts
+// the picture unless body throws. If `steps` is null, there is no earlier picture and
+// the rule is unchanged.
 template <class Body>
 auto in_steps(BudgetSteps* steps, const SelectRule& rule, const Eyes& eyes,
               const std::shared_ptr<const void>& scene, const Body& body) {

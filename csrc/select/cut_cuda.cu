@@ -1,17 +1,18 @@
 // The cut of a scene on the device, in two kernels.
 //
-// place_kernel has a thread for each instance (place_instances.cuh). It places the camera in the
-// instance's frame and chooses the source of its cut: none, its tops, or its table. It deals the
-// work out as parts: 256 of those clusters of a table that bounds leave to be asked; or, for up to
-// 32 neighbouring instances, their tops, or the last clusters of their tables where bounds leave no
-// more than one lane asks.
+// place_kernel has a thread for each instance (place_instances.cuh). The thread
+// transforms the camera into the frame of the instance and chooses the source of its
+// cut: nothing, the top clusters, or the whole table. The kernel divides the work into
+// parts for cut_kernel. A part is up to 256 clusters of one table that bounds could not
+// exclude; or the top clusters of up to 32 neighbouring instances; or the last clusters
+// of their tables, where bounds exclude all but what one lane can test.
 //
-// cut_kernel has a block for up to eight parts, one a warp. It asks which clusters are drawn
-// (cut_parts.cuh), records which pages they need (page_needs.cuh), and writes them to their places
-// in the list by a prefix sum (write_clusters.cuh).
+// cut_kernel has a block for up to eight parts, one per warp. The block tests which
+// clusters are drawn (cut_parts.cuh), records which pages they need (page_needs.cuh),
+// and writes them at positions given by a prefix sum (write_clusters.cuh).
 //
-// For a budget, the kernels of budget_cuda.cu run in between, in two rounds with place_kernel
-// before each.
+// With a budget, the kernels of budget_cuda.cu run between these two, in two rounds,
+// each after a place_kernel.
 
 #include "select/select_cuda.h"
 
@@ -29,8 +30,8 @@
 namespace v3dg {
 namespace cuda {
 
-// Where the choice of a budget is written, and the pictures and placements of a frame. Pointers are
-// null where they are not wanted.
+// Where to write the choice of a budget, and the pictures and placements of a frame.
+// Pointers to outputs that are not requested are null.
 struct Cut::Target {
     EyeImages pictures;
     FrameImage* images;
@@ -40,18 +41,18 @@ struct Cut::Target {
 
 namespace {
 
-constexpr unsigned kCutBlocks = 4;  // on a multiprocessor
+constexpr unsigned kCutBlocks = 4;  // blocks per multiprocessor
 constexpr unsigned kReportBlocks = 64;
-constexpr unsigned kPlaceBlocks = 12;  // on a multiprocessor
+constexpr unsigned kPlaceBlocks = 12;  // blocks per multiprocessor
 
-// One thread a bundle.
+// One thread per bundle.
 __global__ void sides_kernel(const BundleOnDevice* bundles, size_t num_bundles, Eyes eyes,
                              CameraSides* sides) {
     const size_t b = size_t(blockIdx.x) * blockDim.x + threadIdx.x;
     if (b < num_bundles) sides[b] = sides_of_eyes(eyes, bundles[b].table.pad_px);
 }
 
-// One thread an instance. `kAreTwo` says whether there are two eyes.
+// One thread per instance. `kAreTwo` says whether there are two eyes.
 template <bool kAreTwo>
 __global__ void __launch_bounds__(kPlaceThreads, kAreTwo ? kPlaceBlocks / 2 : kPlaceBlocks)
     place_kernel(PlacedScene scene, Eyes eyes, BundleSides sides, SelectRule rule,
@@ -71,7 +72,7 @@ __global__ void report_kernel(NeedList needs, SelectRule rule, const CutChoice* 
     report_needs(needs, rule, choice);
 }
 
-// `kTells` says whether the pages that are needed are recorded.
+// `kTells` says whether the kernel records which pages are needed.
 template <class Output, bool kTells>
 __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
     cut_kernel(PlacedScene scene, SelectRule rule, const CutChoice* choice,
@@ -84,7 +85,8 @@ __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
     if (num_tickets == 0 && blockIdx.x == 0 && threadIdx.x == 0) output.finish(0, 0);
     if (rule.budget != kNoBudget) rule.tolerance_px2 = choice->tolerance_px2;
     if (!Output::kFades) rule.fade = {};
-    // Where there are enough blocks, each of the first takes one ticket and the others none.
+    // If there are enough blocks, each of the first blocks processes one ticket and the
+    // others none.
     const bool is_enough = num_tickets <= gridDim.x;
     if (is_enough && blockIdx.x >= num_tickets) return;
     for (unsigned ticket = take_ticket(scratch.cut_ticket); ticket < num_tickets;
@@ -105,7 +107,7 @@ __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
     }
 }
 
-// One thread an instance.
+// One thread per instance.
 __global__ void place_all_kernel(PlacedScene scene, Camera camera, FrameImage image,
                                  FrameImage* images, Placement* placements) {
     const size_t i = size_t(blockIdx.x) * blockDim.x + threadIdx.x;
@@ -116,14 +118,14 @@ __global__ void place_all_kernel(PlacedScene scene, Camera camera, FrameImage im
         placement_of(axes_of_instance(camera, pose), pose, scene.instances.bundle[i], 0);
 }
 
-// One thread a pair. Pairs of instances without a pose are left out.
+// One thread per pair. Pairs whose instance is not drawn are left out.
 template <class Output>
 __global__ void __launch_bounds__(kCutThreads)
     given_kernel(PlacedScene scene, GivenCut given, CutScratch scratch, Output output) {
     const unsigned ticket = take_ticket(scratch.cut_ticket);
     const size_t p = size_t(ticket) * kCutThreads + threadIdx.x;
     LaneClusters mine{};
-    if (p < given.instance.size && is_placed(scene.instances.pose(given.instance[p]))) {
+    if (p < given.instance.size && scene.instances.is_drawn(given.instance[p])) {
         const int32_t i = given.instance[p];
         mine = {.bundle = &scene.bundles[scene.instances.bundle[i]],
                 .instance = static_cast<uint32_t>(i),
@@ -140,7 +142,8 @@ __global__ void __launch_bounds__(kCutThreads)
                    output);
 }
 
-// How many parts all tables have together, if every cluster is asked.
+// Returns the number of parts of all tables together if no cluster is excluded by
+// bounds.
 size_t most_parts(const SceneTables& scene) {
     size_t parts = 0;
     for (size_t b = 0; b < scene.num_bundles(); ++b)
@@ -188,7 +191,7 @@ void Cut::cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule
                              .parts = parts_.reserve(parts, stream)};
     const auto blocks = static_cast<unsigned>(std::clamp<size_t>(parts, 1, 2 * num_places));
     const bool has_budget = rule.budget != kNoBudget;
-    Count* change = zeros + 2 * zeros_of_round(count);  // with a budget
+    Count* change = zeros + 2 * zeros_of_round(count);  // used with a budget only
     BudgetState* state = has_budget ? budget_state(stream) : nullptr;
     BundleSides sides{};
     const size_t num_bundles = scene.num_bundles();
@@ -287,7 +290,7 @@ void Cut::select_pairs(const SceneTables& scene, const Eyes& eyes, const SelectR
     const bool has_budget = rule.budget != kNoBudget;
     const bool keeps_bin = has_budget && last_bin != nullptr;
     uint32_t* bin_on_device = keeps_bin ? &budget_state(stream)->last_bin : nullptr;
-    // Most cuts fit in the first round.
+    // Most cuts fit into the initial capacity, so the loop runs once.
     for (Count capacity = std::max<Count>(1u << 16, pair_instance_.capacity());;
          capacity = counts.pairs) {
         const PairOutput<kFades> output{

@@ -1,6 +1,7 @@
 #pragma once
 
-// The decision whether a cluster is drawn, and with which weight. select_math.h proves it exact.
+// The decision whether a cluster is drawn, and with which weight. select_math.h proves
+// that the decision is exact.
 
 #include <cstddef>
 #include <cstdint>
@@ -13,9 +14,10 @@
 
 namespace v3dg {
 
-// Whether the top clusters, which nothing replaces, are the cut at full weight, and no page is
-// wanted. With the paper's footprint that does not follow from their groups: it may decrease
-// towards the root, so a group may fail to fit below one that does.
+// Whether the cut consists of the top clusters, which nothing replaces, at full weight,
+// and needs no page. All top groups are tested: with the paper's footprint a group may
+// fail to fit below a group that fits, because that footprint may decrease towards the
+// root.
 V3DG_HD inline bool tops_fit(const ClusterTable& table, const InstanceView& view,
                              const SelectRule& rule) {
     if (rule.footprint == Footprint::paper) return false;
@@ -24,20 +26,21 @@ V3DG_HD inline bool tops_fit(const ClusterTable& table, const InstanceView& view
     return true;
 }
 
-// Which clusters the cut of an instance is found among.
+// The set of clusters that contains the cut of an instance.
 enum class CutSource {
-    nowhere,  // none: the instance is hidden
+    nowhere,  // no clusters: the instance is hidden
     tops,     // the top clusters
     table,    // all clusters
 };
 
-// Whether the instance is culled as a whole.
+// Whether the whole instance is culled.
 V3DG_HD inline bool is_hidden(const ClusterTable& table, const InstanceView& view,
                               const SelectRule& rule) {
     return rule.culls && is_outside(table.bounds, view);
 }
 
-// The source of an instance's cut. The tops are tried only where there are at most `most_tops`.
+// Returns the source of an instance's cut. The top clusters are tested only if there
+// are at most `most_tops`.
 V3DG_HD inline CutSource source_of_cut(const ClusterTable& table, const InstanceView& view,
                                        const SelectRule& rule, size_t most_tops) {
     if (is_hidden(table, view, rule)) return CutSource::nowhere;
@@ -52,8 +55,9 @@ struct BinRange {
     V3DG_HD bool is_empty() const { return first >= end; }
 };
 
-// Answers the questions of the decision about a group by computing them each time. The bins of a
-// budget count as if all pages were resident, so that the tolerance does not depend on which are.
+// Computes the answers about a group anew at each call. The bins of a budget are
+// computed as if all pages were resident, so that the tolerance does not depend on
+// residency.
 struct AskedGroups {
     const ClusterTable& table;
     const InstanceView& view;
@@ -63,7 +67,8 @@ struct AskedGroups {
         return min_of(v3dg::refinement(metric_px2(table, g, view, rule), rule),
                       arrival(table.pages, g, rule));
     }
-    // The first bins of a budget in which the group fits, and in which it is no longer refined.
+    // The first bin of a budget in which the group fits, and the first in which it is
+    // no longer refined.
     V3DG_HD uint32_t first_fitting(int32_t g) const {
         return bin_of_metric(wanted_metric_px2(table, g, view, rule) * rule.fade.factor,
                              rule.tolerance_px2);
@@ -74,8 +79,8 @@ struct AskedGroups {
     }
 };
 
-// The decision about each cluster of an instance's table. `Groups` is AskedGroups, or answers the
-// same questions from memory.
+// The decision about each cluster of an instance's table. `Groups` is AskedGroups, or a
+// type with the same members that looks up stored answers.
 template <class Groups>
 struct InstanceCut {
     const ClusterTable& table;
@@ -86,8 +91,9 @@ struct InstanceCut {
 
     V3DG_HD bool is_culled(size_t c) const { return culls && is_outside(table.box[c], view); }
 
-    // The weight of the cluster before culling, out of kWhole: the refinement of the group above
-    // less that of its own group. The head of select_math.h says why the cut is exact.
+    // Returns the weight of the cluster before culling, out of kWhole: the refinement
+    // of the group above minus the refinement of its own group. The head of
+    // select_math.h proves that the cut is exact.
     V3DG_HD int32_t weight(size_t c) const {
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
         const int32_t below = own < 0 ? 0 : groups.refinement(own);
@@ -101,7 +107,8 @@ struct InstanceCut {
         return drawn > 0 && !is_culled(c) ? drawn : 0;
     }
 
-    // The bins of a budget whose cuts contain the cluster; with a fade, those that may.
+    // Returns the bins of a budget whose cuts contain the cluster; with a fade, those
+    // whose cuts may contain it.
     V3DG_HD BinRange bins(size_t c) const {
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
         const BinRange range{own < 0 ? 0 : groups.first_unrefined(own),
@@ -110,7 +117,7 @@ struct InstanceCut {
     }
 };
 
-// The cut of an instance on a half that computes each answer when it is asked.
+// Returns the cut of an instance whose answers are computed at each call.
 V3DG_HD inline InstanceCut<AskedGroups> cut_by_asking(const ClusterTable& table,
                                                       const InstanceView& view,
                                                       const SelectRule& rule) {

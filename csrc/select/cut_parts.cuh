@@ -1,6 +1,7 @@
 #pragma once
 
-// The parts of a scene's tables that warps work on, and the clusters of a part that a lane has.
+// The parts of a scene's tables that warps process, and the clusters of a part that one
+// lane processes.
 
 #include "base/launch.cuh"
 #include "select/select_cuda.h"
@@ -10,47 +11,50 @@ namespace cuda {
 
 using Count = unsigned long long;
 
-constexpr unsigned kLaneClusters = kClustersOfBounds;  // of a part of a table
+constexpr unsigned kLaneClusters = kClustersOfBounds;  // clusters of a table's part for each lane
 constexpr unsigned kPartSize = 32 * kLaneClusters;
 constexpr unsigned kCutThreads = 256, kCutWarps = kCutThreads / 32;
 static_assert(kLaneClusters == 8, "a byte says which of them are drawn");
 
-// Clusters [first, first + kPartSize) of one instance's table. Or, where `lanes` is not zero, one
-// lane for each of its bits k: the top clusters of instance + k, or the last clusters of its table.
+// The work of one warp. If `lanes` is zero: clusters [first, first + kPartSize) of one
+// instance's table. Else each set bit k of `lanes` assigns instance + k to a lane,
+// which processes its top clusters or the last clusters of its table.
 struct CutPart {
     uint32_t instance, first, lanes;
 };
 
-// The first of the last clusters of a table, its coarsest, which a single lane can ask.
+// Returns the first of a table's last, coarsest clusters, which are few enough for a
+// single lane to test.
 __device__ inline uint32_t last_of_table(const ClusterTable& table) {
     return static_cast<uint32_t>(table.num_clusters() - 1) / kLaneClusters * kLaneClusters;
 }
 
-// A scene, and what place_kernel writes about its instances.
+// A scene, and the output of place_kernel about its instances.
 struct PlacedScene {
     const BundleOnDevice* bundles;
     InstanceTable instances;
-    InstanceView* views;  // of instances whose tables are asked
-    // For instances that a single lane asks: a bit for each top that is drawn, or 0 where the lane
-    // asks the last clusters of the table.
+    InstanceView* views;  // written for instances whose tables are tested
+    // For an instance that a single lane processes: a bit for each top cluster that is
+    // drawn, or 0 if the lane tests the last clusters of the table.
     uint8_t* tops;
     CutPart* parts;
 };
 
-// The state that one search for the tolerance of a budget leaves for the next.
+// The state that one search for the tolerance of a budget leaves for the next search.
 struct BudgetState {
-    float guess = 0.0f;          // a tolerance that is probably below the next choice
-    unsigned again = 0;          // whether it was above, so that the second round counts
+    float guess = 0.0f;  // a tolerance that is probably below the next choice
+    unsigned again = 0;  // nonzero if the guess was too high, so that the second round has to run
     uint32_t last_bin = kNoBin;  // the state of tolerance_of_budget()
 };
 
-// A round of the search for the tolerance of a budget. The first round considers no tolerance below
-// the guess, the second all of them. Without a budget there is one round, and no state.
+// A round of the search for the tolerance of a budget. The first round considers no
+// tolerance below the guess; the second considers all tolerances. Without a budget
+// there is one round, and no state.
 struct BudgetRound {
     const BudgetState* state;
     bool is_second;
 
-    // Whether there is nothing to do, because the first round was enough.
+    // Whether there is nothing to do, because the first round found the tolerance.
     __device__ bool is_over() const { return is_second && state->again == 0; }
     __device__ float least_tolerance(const SelectRule& rule) const {
         return state == nullptr || is_second ? rule.tolerance_px2
@@ -58,14 +62,16 @@ struct BudgetRound {
     }
 };
 
-// Enqueues the choice of the tolerance. `change` has kNumBudgetBins zeros before the first round.
-// `num_parts` is on the device, and becomes 0 where no cut fits the budget.
+// Enqueues the choice of the tolerance. `change` contains kNumBudgetBins zeros before
+// the first round. `num_parts` is on the device, and becomes 0 if no cut fits the
+// budget.
 void choose_tolerance(const PlacedScene& scene, const SelectRule& rule, const BudgetRound& round,
                       unsigned num_blocks, unsigned* num_parts, Count* change, CutChoice* choice,
                       BudgetState* state, cudaStream_t stream);
 
-// Weights of a lane's clusters, at most kWhole each: 16 bits for each, from the lowest on. A weight
-// is read by shifting, because an index would put the words into memory.
+// The weights of a lane's clusters, at most kWhole each, packed in 16 bits from the
+// lowest on. Weights are read by shifting: an index would move the two integers from
+// registers to memory.
 struct alignas(16) LaneWeights {
     uint64_t low, high;
 
@@ -79,13 +85,13 @@ struct alignas(16) LaneWeights {
 };
 static_assert(kLaneClusters == 8 && kWhole < 1 << 16, "two words hold the weights of a lane");
 
-// The clusters of a part that a lane has: those of one instance, and a bit for each that is drawn.
-// Weights are set in cuts with a fade alone.
+// The clusters of a part that one lane processes. All belong to one instance; a bit for
+// each says whether it is drawn. Weights are set only in cuts with a fade.
 struct LaneClusters {
     const BundleOnDevice* bundle;
     uint32_t instance;
-    uint32_t first;  // cluster of a table
-    bool is_alone;   // whether no other lane has the instance; else all lanes of the warp have it
+    uint32_t first;  // index in the table
+    bool is_alone;   // whether this lane alone has the instance; else all lanes of the warp have it
     bool are_tops;
     unsigned drawn;
     LaneWeights weights;
@@ -93,7 +99,8 @@ struct LaneClusters {
     __device__ int32_t cluster(unsigned k) const {
         return are_tops ? bundle->table.top_cluster[k] : static_cast<int32_t>(first + k);
     }
-    // The number of gaussians of `count` neighbours from the k-th cluster on.
+    // Returns the number of gaussians in `count` neighbouring clusters from the k-th
+    // on.
     __device__ unsigned size(unsigned k, unsigned count = 1) const {
         const int32_t c = cluster(k);
         return static_cast<unsigned>(bundle->table.offset[c + count] - bundle->table.offset[c]);
@@ -101,7 +108,7 @@ struct LaneClusters {
     __device__ const ClusterBounds& bounds() const { return bundle->bounds[first / kLaneClusters]; }
 };
 
-// The clusters of a lane, of which those of a table are not asked yet.
+// Returns the clusters of a lane. Those of a table are not tested yet.
 __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const CutPart& part) {
     const unsigned lane = threadIdx.x % 32;
     const bool is_alone = part.lanes != 0;
@@ -124,28 +131,30 @@ __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const 
     return mine;
 }
 
-// Asks the clusters of the tables that the warps of a block have parts of. For the whole block. A
-// lane owns clusters to ask where their bounds do not show that none of them is drawn. All warps
-// ask together, a lane a cluster and four owners at a time, so that no warp waits long for one
-// whose part has more to ask. Each owner receives a bit for each of its clusters for which
-// ask(bundle, view, cluster) is positive, and with `kKeepsWeights` also the number itself.
+// Tests the clusters of the tables that the warps of a block have parts of. Called by
+// the whole block. A lane owns clusters that need a test if their bounds do not exclude
+// all of them. All warps of the block share the tests, a lane per cluster and four
+// owners at a time, so that no warp waits long for one whose part needs more tests.
+// Each owner receives a bit for each of its clusters for which ask(bundle, view,
+// cluster) is positive, and with `kKeepsWeights` also the value itself.
 template <bool kKeepsWeights, class Ask>
 __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
                              Tolerances tolerances, LaneClusters& mine, const Ask& ask) {
     struct Table {
         const BundleOnDevice* bundle;  // null: each lane has an instance of its own
-        uint32_t first;                // cluster; there, the instance of the first lane
+        // first cluster; if each lane has an instance, the instance of the first lane
+        uint32_t first;
     };
     __shared__ InstanceView views[kCutWarps];
     __shared__ Table tables[kCutWarps];
     __shared__ unsigned num_owners[kCutWarps];
     __shared__ uint8_t owners[kCutThreads];  // threads that own clusters
-    __shared__ uint8_t drawn[kCutThreads];   // the bits of each thread
+    __shared__ uint8_t drawn[kCutThreads];   // a bit for each of a thread's clusters
     __shared__ LaneWeights weights[kKeepsWeights ? kCutThreads : 1];
     static_assert(kCutThreads <= 256, "a byte says which thread");
     const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
     bool is_owner = false;
-    if (!mine.is_alone && mine.bundle != nullptr) {  // uniform in the warp
+    if (!mine.is_alone && mine.bundle != nullptr) {  // the condition is uniform in the warp
         const auto* view = reinterpret_cast<const uint32_t*>(scene.views + mine.instance);
         for (unsigned w = lane; w < sizeof(InstanceView) / sizeof *view; w += 32)
             reinterpret_cast<uint32_t*>(views + warp)[w] = view[w];
@@ -179,7 +188,8 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
         if (is_one) {
             const Table& of = tables[owner / 32];
             const bool is_alone = of.bundle == nullptr;
-            const uint32_t instance = of.first + owner % 32;  // valid where it is alone
+            // valid only if the owner's lane has an instance of its own
+            const uint32_t instance = of.first + owner % 32;
             const BundleOnDevice* bundle =
                 is_alone ? &scene.bundles[scene.instances.bundle[instance]] : of.bundle;
             const InstanceView& view = is_alone ? scene.views[instance] : views[owner / 32];

@@ -9,34 +9,38 @@
 namespace v3dg {
 namespace cuda {
 
-// Of place_kernel: few, so that a few thousand instances spread over the device.
+// Threads in a block of place_kernel. They are few, so that a few thousand instances
+// spread over the whole device.
 constexpr unsigned kPlaceThreads = 64;
 
-// Memory of one round of a cut. It starts as zeros, except for the states of cut_kernel, which
-// place_kernel clears.
+// The memory of one round of a cut. It starts as zeros, except for the states of
+// cut_kernel, which place_kernel clears.
 struct CutScratch {
     unsigned *place_ticket, *cut_ticket;
     unsigned* num_parts;
-    Count* place_state;               // a word for each block of place_kernel
-    Count *unit_state, *count_state;  // a word for each ticket of cut_kernel
-    unsigned num_places;              // how many blocks of cut_kernel run at once
+    Count* place_state;               // one element per block of place_kernel
+    Count *unit_state, *count_state;  // one element per ticket of cut_kernel
+    unsigned num_places;              // number of cut_kernel's blocks that run at once
 
-    // How many parts a block takes together: one a warp, or fewer where that spreads them over all
-    // blocks, because warps without a part help the others to ask.
+    // Returns how many parts a block processes together: one per warp, or fewer where
+    // that spreads the parts over all blocks, because warps without a part help with
+    // the tests of the others.
     __device__ unsigned parts_at_once(unsigned parts) const {
         return min(max(blocks_for(parts, num_places), 1u), kCutWarps);
     }
 };
 
-// The number of blocks of place_kernel. At least one, because an empty scene has a picture, too.
+// Returns the number of blocks of place_kernel: at least one, because an empty scene
+// also has a picture.
 inline unsigned place_blocks(size_t num_instances) {
     return std::max(1u, blocks_for(num_instances, kPlaceThreads));
 }
 
-// How many zeros a CutScratch needs: for three counters and the states of place_kernel's blocks.
+// Returns how many zeros a CutScratch needs: three counters and the states of
+// place_kernel's blocks.
 inline size_t zeros_of_round(size_t num_instances) { return 2 + place_blocks(num_instances); }
 
-// `states` has two words a ticket.
+// `states` has two elements per ticket.
 inline CutScratch scratch_in(Count* zeros, Count* states, size_t num_tickets, unsigned num_places) {
     auto* counters = reinterpret_cast<unsigned*>(zeros);
     return {.place_ticket = counters,

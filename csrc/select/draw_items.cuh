@@ -1,19 +1,20 @@
 #pragma once
 
-// The lists that a cut is written to: pairs, or the items of a frame. A lane first counts what it
-// will write for its clusters, and writes once it knows how much is before it.
+// The output lists of a cut: pairs, or the items of a frame. A lane first counts what
+// it will write for its clusters. It writes after a prefix sum has given its position
+// in the list.
 
 #include "select/cut_parts.cuh"
 
 namespace v3dg {
 namespace cuda {
 
-// How much a lane will write.
+// The amount that a lane will write.
 struct WriteCount {
     unsigned units, gaussians;  // units are elements of the list
 };
 
-// Selected clusters as (instance, cluster), and with a fade their weights.
+// The list of selected pairs (instance, cluster), with weights if there is a fade.
 template <bool kHasFade>
 struct PairOutput {
     static constexpr bool kFades = kHasFade;
@@ -46,8 +47,9 @@ struct PairOutput {
     }
 };
 
-// Neighbouring clusters that are drawn together for the lane's instance; or one cluster that is
-// drawn for all instances of `sharers`, whose bits count from the first instance of the part.
+// Neighbouring clusters that are drawn together for the lane's instance; or one cluster
+// that is drawn for all instances of `sharers`, a bit mask that starts at the first
+// instance of the part.
 struct DrawnRun {
     unsigned k, num_clusters;
     uint32_t sharers;
@@ -56,15 +58,16 @@ struct DrawnRun {
     __device__ unsigned gaussians_an_item() const { return kItemSize / num_instances; }
 };
 
-// Whether a warp is faster when it takes a cluster's gaussians one by one, each for all instances
-// at once, than when it takes the instances one by one. An item costs as much as two more rounds.
+// Whether a warp is faster when it processes a cluster's gaussians one by one, each for
+// all instances at once, than when it processes the instances one by one. An item costs
+// as much as two more rounds.
 __device__ inline bool is_worth_sharing(unsigned num_gaussians, unsigned num_instances) {
     return num_instances > 1 &&
            num_gaussians <= num_instances * (blocks_for(num_gaussians, 32) + 2);
 }
 
-// Calls visit(DrawnRun) in the lane that writes the run. For the whole warp. With a fade, clusters
-// of different weights are not drawn together.
+// Calls visit(DrawnRun) in the lane that writes the run. Called by the whole warp. With
+// a fade, clusters of different weights are not drawn together.
 template <bool kFades, class Visit>
 __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
     if (!mine.is_alone) {
@@ -96,13 +99,14 @@ __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
     }
 }
 
-// Selected clusters as items. Neighbouring clusters share items, and so do coarse clusters that
-// neighbouring instances have in common. Each item is written for every picture.
+// The list of selected clusters as items of a frame. Neighbouring clusters share an
+// item, and so do neighbouring instances of a coarse cluster. Each item is written for
+// every picture.
 template <bool kHasFade>
 struct ItemOutput {
     static constexpr bool kFades = kHasFade;
     ItemList items;
-    uint32_t num_pictures, num_placements;  // placements of one picture
+    uint32_t num_pictures, num_placements;  // number of placements in one picture
 
     __device__ WriteCount count(const LaneClusters& mine) const {
         WriteCount count{0, 0};

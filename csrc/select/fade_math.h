@@ -1,7 +1,8 @@
 #pragma once
 
-// Comparisons of a metric with the tolerance, and how far a group is refined. The weight of a
-// cluster is the difference of the refinements of two groups (cut_math.h).
+// Comparisons of a metric with the tolerance, and the degree to which a group is
+// refined. The weight of a cluster is the difference of the refinements of two groups
+// (cut_math.h).
 
 #include <cstdint>
 
@@ -10,7 +11,8 @@
 
 namespace v3dg {
 
-// Without a fade, a group either fits or is refined. With one, neither holds within the fade.
+// Without a fade, a group either fits or is refined. With a fade, a group whose metric
+// lies within it does neither.
 V3DG_HD inline bool fits(float metric_px2, const SelectRule& rule) {
     return metric_px2 * rule.fade.factor <= rule.tolerance_px2;
 }
@@ -18,15 +20,17 @@ V3DG_HD inline bool is_refined(float metric_px2, const SelectRule& rule) {
     return !(metric_px2 * rule.fade.inverse <= rule.tolerance_px2);
 }
 
-// Weights are integers, of which kWhole is 1, so that they add up without rounding.
+// Weights are integers in units of 1 / kWhole, so that their sum has no rounding
+// errors.
 constexpr int32_t kWhole = 1 << 15;
 
 V3DG_HD inline float share_of(int32_t weight) {
     return static_cast<float>(weight) * (1.0f / kWhole);
 }
 
-// How far a group is refined: 0 where it fits, kWhole where it is refined, and a ramp in between.
-// It never decreases with the metric, because none of its steps does.
+// Returns the degree to which a group is refined: 0 if it fits, kWhole if it is
+// refined, and a ramp in between. The result never decreases as the metric grows,
+// because each step of the computation is monotonic.
 V3DG_HD inline int32_t refinement(float metric_px2, const SelectRule& rule) {
     const float low = rule.tolerance_px2 * rule.fade.inverse,
                 high = rule.tolerance_px2 * rule.fade.factor;
@@ -36,8 +40,9 @@ V3DG_HD inline int32_t refinement(float metric_px2, const SelectRule& rule) {
     return fits(metric_px2, rule) ? 0 : is_refined(metric_px2, rule) ? kWhole : rounded;
 }
 
-// How far the page of a group has faded in, of kWhole. A group is refined at most that far. Neither
-// number decreases towards the root, so their minimum does not, and the cut stays exact.
+// Returns how far the page of a group has faded in, out of kWhole; the refinement is
+// limited to it. Neither number decreases towards the root, so their minimum does not
+// either, and the cut stays exact.
 V3DG_HD inline int32_t arrival(const PageTable& pages, int32_t g, const SelectRule& rule) {
     static_assert(kWhole % kArrivalFrames == 0, "frames are whole parts");
     return rule.fade.is_on() ? pages.arrived(g, rule.frame) * (kWhole / kArrivalFrames) : kWhole;

@@ -1,11 +1,12 @@
 #pragma once
 
-// The footprint of a ball on the screen, and the metric of a group, which is its footprint times
-// its weight.
+// The footprint of a ball on the screen, and the metric of a group, which is its
+// footprint times its weight.
 //
-// A decision depends on every bit of it, so it is compiled without contraction, and it never
-// decreases when a ball grows (math/solid_angle.h). The density px2_per_steradian is one number a
-// camera: an upper bound over any ball (camera/camera.h).
+// Decisions depend on every bit of the footprint, so this code is compiled without
+// contraction. The footprint never decreases when a ball grows (math/solid_angle.h).
+// The density px2_per_steradian is one number per camera: an upper bound over any ball
+// (camera/camera.h).
 
 #include <cmath>
 
@@ -27,14 +28,16 @@ V3DG_HD inline float distance2_to(const Ball& ball, const InstanceView& view) {
     return view.has_other_eye ? min_of(distance2, distance2_from(view.other_eye, ball)) : distance2;
 }
 
-// Screen area, px2, of a ball at this squared distance of its centre from the eye.
+// The screen area, px2, of a ball whose centre is at this squared distance from the
+// eye.
 V3DG_HD inline float footprint_at(float radius, float distance2, const InstanceView& view) {
     const float x2 = radius * radius / distance2;
     const float area = solid_angle_of_ball(x2) * view.px2_per_steradian;
     return x2 < 1.0f ? area : INFINITY;
 }
 
-// Screen area that the ball covers, px2. +inf where the eye is inside or the result would be NaN.
+// The screen area that the ball covers, px2; +inf if the eye is inside or the result
+// would be NaN.
 V3DG_HD inline float footprint_px2(const Ball& ball, const InstanceView& view,
                                    Footprint footprint) {
     if (footprint == Footprint::solid_angle)
@@ -47,18 +50,18 @@ V3DG_HD inline float footprint_px2(const Ball& ball, const InstanceView& view,
     return area >= 0.0f ? area : INFINITY;
 }
 
-// The metric of group g: the screen area, px2, that one gaussian of the clusters made by it stands
-// for, whichever pages are resident. 0 where nothing finer may be drawn, so that the group always
-// fits.
+// The metric of group g if all pages were resident: the screen area, px2, per gaussian
+// of the clusters that the group made. It is 0 if nothing finer may be drawn, so that
+// the group always fits.
 V3DG_HD inline float wanted_metric_px2(const ClusterTable& table, int32_t g,
                                        const InstanceView& view, const SelectRule& rule) {
     const float metric = footprint_px2(table.ball[g], view, rule.footprint) * table.weight[g];
     return table.level[g] <= rule.min_level ? 0.0f : metric;
 }
 
-// The metric that the cut compares: also 0 where the finer clusters are not resident. Both the
-// groups that are wanted and those that are resident are closed towards the root, so their
-// intersection is, too, and the cut stays exact.
+// The metric that the cut compares. It is 0 also where the finer clusters are not
+// resident. The groups that are wanted and the groups that are resident are both closed
+// towards the root, so their intersection is closed, too, and the cut stays exact.
 V3DG_HD inline float metric_px2(const ClusterTable& table, int32_t g, const InstanceView& view,
                                 const SelectRule& rule) {
     return table.pages.is_resident(g) ? wanted_metric_px2(table, g, view, rule) : 0.0f;

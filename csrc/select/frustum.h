@@ -12,8 +12,8 @@ namespace v3dg {
 
 // The position of a box relative to a plane, in units of the plane's normal.
 struct PlaneSide {
-    float nearest, farthest;  // signed distance of the box's innermost and outermost corner
-    float reach;              // a bound on how far gaussians reach out of the box, and on rounding
+    float nearest, farthest;  // signed distances of the box's nearest and farthest corners
+    float reach;  // a bound on how far gaussians extend beyond the box, plus rounding errors
 };
 
 V3DG_HD inline PlaneSide side_of(const Box& box, const InstanceView& view, int p) {
@@ -31,7 +31,7 @@ V3DG_HD inline PlaneSide side_of(const Box& box, const InstanceView& view, int p
             plane.guard * half_depth + 16.0f * FLT_EPSILON * terms};
 }
 
-// Whether no gaussian in the box can touch a pixel. False where a number is NaN.
+// Whether no gaussian in the box can touch a pixel. False if a number is NaN.
 V3DG_HD inline bool is_outside(const Box& box, const InstanceView& view) {
     for (int p = 0; p < kNumPlanes; ++p) {
         const PlaneSide side = side_of(box, view, p);
@@ -40,7 +40,7 @@ V3DG_HD inline bool is_outside(const Box& box, const InstanceView& view) {
     return false;
 }
 
-// Whether no box within this one is outside. False where a number is NaN.
+// Whether no box inside this one is outside of the frustum. False if a number is NaN.
 V3DG_HD inline bool is_inside(const Box& box, const InstanceView& view) {
     for (int p = 0; p < kNumPlanes; ++p) {
         const PlaneSide side = side_of(box, view, p);

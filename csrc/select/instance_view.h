@@ -1,37 +1,39 @@
 #pragma once
 
-// The camera as one instance sees it, which is all that selection asks of a camera.
+// The camera in the coordinates of one instance; selection reads nothing else of a
+// camera.
 
 #include "camera/camera.h"
 #include "math/similarity.h"
 
 namespace v3dg {
 
-// Planes that bound what a camera sees.
+// The number of planes that bound what a camera sees.
 constexpr int kNumPlanes = Intrinsics<double>::kNumPlanes;
 
-// A camera, or two eyes, in the frame and the units of one instance. With two eyes the nearer one
-// counts, and the planes hold both frusta. Aligned, so that a thread reads and writes it in few
-// instructions.
+// A camera, or two eyes, in the coordinates and units of one instance. With two eyes,
+// distances are to the nearer one, and the planes enclose both frusta. The struct is
+// aligned so that a thread reads and writes it in few instructions.
 struct alignas(16) InstanceView {
     float eye[3], other_eye[3];
     bool has_other_eye;
     float forward[3];         // the direction of the camera, unit length
-    float px2_per_steradian;  // of the camera, times the instance's importance
-    Plane plane[kNumPlanes];  // what lies outside of one is not drawn
+    float px2_per_steradian;  // of the camera, times the importance of the instance
+    Plane plane[kNumPlanes];  // what lies outside of any plane is not drawn
 };
 
-// The planes of both eyes in camera coordinates, the same for all instances of a bundle.
+// The frustum planes of both eyes in camera coordinates, the same for all instances of
+// a bundle.
 using CameraSides = Intrinsics<double>::Sides;
 
-// They lie pad_px outside of the part of the image that is wanted.
+// Returns planes pad_px outside of the requested part of the image.
 V3DG_HD inline CameraSides sides_of_eyes(const Eyes& eyes, double pad_px) {
     return Intrinsics<double>::sides_of(eyes.camera, eyes.count(), pad_px);
 }
 
-// Places the cameras in front of an instance. `in` are the axes of the first eye, `sides` those of
-// the instance's bundle. Both halves compile it without contraction, so that both give the same
-// bits.
+// Transforms the cameras into the coordinates of an instance. `in` has the axes of the
+// first eye, `sides` the planes for the instance's bundle. The CPU and CUDA compile
+// this without contraction, so that both give the same bits.
 V3DG_HD inline InstanceView view_from_instance(const Eyes& eyes, const CameraSides& sides,
                                                const InstanceAxes& in, const Pose& pose,
                                                float importance) {

@@ -1,6 +1,7 @@
 #pragma once
 
-// Which pages a cut needs, where only some pages of a bundle are resident, and how urgently.
+// Finds the pages that a cut needs, and their urgency, if only some pages of a bundle
+// are resident.
 
 #include <cfloat>
 #include <cmath>
@@ -12,29 +13,32 @@
 
 namespace v3dg {
 
-// How urgently the page of a group is wanted: above 1 if this cut would refine the group, at most 1
-// if only a cut of a smaller tolerance would. With a fade it is wanted earlier.
+// Returns the priority of a group's page: above 1 if this cut would refine the group,
+// at most 1 if only a cut with a smaller tolerance would. A fade raises the priority.
 V3DG_HD inline float priority_of(float metric_px2, const SelectRule& rule) {
     const float ratio = metric_px2 * rule.fade.factor / rule.tolerance_px2;
     if (fits(metric_px2, rule)) return ratio <= 1.0f ? ratio : 0.0f;
     return ratio > 1.0f ? ratio : 1.0f + FLT_EPSILON;
 }
-// Pages are requested ahead of their use from this priority on.
+// Pages are requested ahead of use from this priority on.
 constexpr float kLeastPriority = 0.5f;
 
 // A page that a cut needs, and its priority.
 struct PageNeed {
-    int32_t page;  // -1: none
+    int32_t page;  // -1: no page
     float priority;
 };
 
-// The page that an instance needs because of a cluster that is not culled; the pages above it are
-// needed with it. `priority` maps a group to the priority of its page. Once all pages of a priority
-// above 1, and the pages above those, are resident, the cut is the same as with every page
-// resident: each cluster of that cut has its page, and a cluster that stands in for finer ones
-// requests theirs. It goes on requesting them once they are resident, because all of the finer
-// clusters may be culled, and a page that is needed only while it is absent would come and go
-// without end.
+// Returns the page that an instance needs because of a cluster that is not culled. The
+// pages above that page are needed, too. `priority` maps a group to the priority of its
+// page.
+//
+// Once all pages with a priority above 1 and the pages above those are resident, the
+// cut is the same as with every page resident: each cluster of that cut has its page,
+// and a cluster that stands in for finer ones requests their page. It requests that
+// page even when the page is resident, since all of the finer clusters may be culled: a
+// page that was needed only while absent would be loaded and evicted in an endless
+// cycle.
 template <class Priority>
 V3DG_HD inline PageNeed page_need(const ClusterTable& table, size_t c, const Priority& priority) {
     const int32_t own = table.own_group[c], parent = table.parent_group[c];

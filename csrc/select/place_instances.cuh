@@ -1,7 +1,8 @@
 #pragma once
 
-// Places instances in front of the cameras, chooses the source of each one's cut, and deals out the
-// tables that have to be asked as parts. A thread has an instance.
+// Places instances in front of the cameras, chooses the source of each instance's cut,
+// and divides the tables that need tests into parts. Each thread processes one
+// instance.
 
 #include "base/scan.cuh"
 #include "select/cut_scratch.cuh"
@@ -10,15 +11,16 @@ namespace v3dg {
 namespace cuda {
 
 constexpr unsigned kFewBundles = 8;
-// Parts are kept small where there are few instances, so that they spread over the device, too.
+// Parts are kept small if there are few instances, so that a few instances also occupy
+// the whole device.
 constexpr unsigned kFewInstances = 8192, kFewLanes = 8;
 
-// The sides of the frustum for each bundle, which would cost every instance eight divisions of
-// doubles. They are an argument of the kernel where there are few bundles, and in memory where
-// there are more.
+// The frustum sides for each bundle. Computing them per instance would cost eight
+// divisions of doubles each. They are a kernel argument if there are few bundles, and
+// in memory if there are more.
 struct BundleSides {
     CameraSides few[kFewBundles];
-    const CameraSides* many;  // null where there are few
+    const CameraSides* many;  // null if there are few bundles
 
     __device__ CameraSides operator[](size_t bundle) const {
         if (many != nullptr) return many[bundle];
@@ -26,8 +28,8 @@ struct BundleSides {
     }
 };
 
-// The placement of an instance in front of an eye. Of n instances, instance i has placement eye * n
-// + i.
+// Returns the placement of an instance in front of an eye. Of n instances, instance i
+// has placement eye * n + i.
 __device__ inline Placement placement_of(const InstanceAxes& axes, const Pose& pose, int32_t bundle,
                                          unsigned eye) {
     return {.view = model_view_from_instance(axes, pose),
@@ -35,13 +37,14 @@ __device__ inline Placement placement_of(const InstanceAxes& axes, const Pose& p
             .image = eye};
 }
 
-// One record for each lane of a warp, in shared memory on the way from registers to memory.
+// One record per lane of a warp, staged in shared memory so that the writes to memory
+// coalesce.
 template <class Record>
 struct RecordRow {
     Record* records;
 
     __device__ void set(const Record& mine) const { records[threadIdx.x % 32] = mine; }
-    // Writes the records of the lanes that have one to their places, which are consecutive from
+    // Writes the records of the lanes that have one to consecutive positions from
     // `first` on, as whole rows of memory. All lanes of the warp take part.
     __device__ void write(bool has_one, Record* first) const {
         constexpr unsigned kVectors = sizeof(Record) / sizeof(uint4);
@@ -57,19 +60,19 @@ struct RecordRow {
             const unsigned v = 32 * k + threadIdx.x % 32;
             if (writers >> v / kVectors & 1) to[v] = from[v];
         }
-        __syncwarp();  // before the next records are set
+        __syncwarp();  // the next records must not overwrite these
     }
 };
 
-// The source of an instance's cut.
+// The result of place_instance(): the source of an instance's cut.
 struct Placed {
     CutSource source;
-    ClusterRange asked;  // clusters, where the source is the table
-    bool is_alone;       // whether a single lane asks them
+    ClusterRange asked;  // the clusters to test, if the source is the table
+    bool is_alone;       // whether a single lane tests them
 };
 
-// Places instance i, if there is one, and writes its view, its placements and its tops. All lanes
-// of the warp take part, with consecutive instances.
+// Places instance i, if it exists, and writes its view, its placements and its top
+// clusters. All lanes of the warp take part, with consecutive instances.
 __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, const Eyes& eyes,
                                         const BundleSides& sides, const SelectRule& rule,
                                         Placement* placements) {
@@ -87,15 +90,15 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
     bool is_alone = false;
     int32_t bundle = 0;
     InstanceView view;
-    if (i < num_instances && is_placed(pose)) {
+    if (i < num_instances && scene.instances.is_drawn(i)) {
         bundle = scene.instances.bundle[i];
         const ClusterTable& table = scene.bundles[bundle].table;
         {
             const InstanceAxes axes = axes_of_instance(eyes.camera[0], pose);
             view =
                 view_from_instance(eyes, sides[bundle], axes, pose, scene.instances.importance[i]);
-            // Set before it is known whether the instance is seen, so that the axes need not be
-            // kept until then.
+            // The placement is staged before the instance is known to be visible, so
+            // that its axes occupy no registers until then.
             if (placements != nullptr) placement_row.set(placement_of(axes, pose, bundle, 0));
         }
         source = source_of_cut(table, view, rule, kLaneClusters);
@@ -107,7 +110,7 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
             scene.tops[i] = static_cast<uint8_t>(drawn);
             if (drawn == 0) source = CutSource::nowhere;
         }
-        // A budget's tolerance is not known yet.
+        // A budget's tolerance is not known yet, so it is read only here.
         if (source == CutSource::table) {
             asked = clusters_to_ask(
                 table, scene.bundles[bundle].runs, view, rule,
@@ -132,11 +135,12 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
     return {.source = source, .asked = asked, .is_alone = is_alone};
 }
 
-// Writes the parts of a block's instances behind those of the blocks before, and clears the states
-// of cut_kernel. For the whole block. Returns how many parts there are up to here.
+// Writes the parts of a block's instances behind those of earlier blocks, and clears
+// the states of cut_kernel. Called by the whole block. Returns the number of parts up
+// to and including this block.
 //
-// Neighbours that a single lane asks each, with no other table in between, make one part, which the
-// first of them writes.
+// Consecutive instances that a single lane can process, with no full table in between,
+// form one part, which the thread of the first instance writes.
 __device__ inline unsigned write_parts(const PlacedScene& scene, const Placed& placed, size_t block,
                                        size_t i, const CutScratch& scratch) {
     const unsigned lane = threadIdx.x % 32, below = (1u << lane) - 1;
@@ -174,8 +178,9 @@ __device__ inline unsigned write_parts(const PlacedScene& scene, const Placed& p
                        .first = placed.asked.first + p * kPartSize,
                        .lanes = 0};
     }
-    // Together, the blocks clear as many tickets as there are places. This block also clears those
-    // whose first part is its own where tickets have kCutWarps parts.
+    // Together, the blocks clear as many tickets as cut_kernel has concurrent blocks.
+    // This block also clears the tickets whose first part is its own, if tickets have
+    // kCutWarps parts.
     const auto clear = [&](unsigned first, unsigned end, unsigned step) {
         for (unsigned t = first; t < end; t += step)
             scratch.unit_state[t] = scratch.count_state[t] = 0;

@@ -11,14 +11,14 @@ namespace v3dg {
 // How the screen area of a ball is measured.
 enum class Footprint {
     solid_angle,  // the solid angle of the ball, so turning the camera changes nothing
-    paper,        // pi r^2 fx fy / depth^2, of pinholes; Yang et al., SIGGRAPH 2025
+    paper,        // pi r^2 fx fy / depth^2, for pinholes only; Yang et al., SIGGRAPH 2025
 };
 
 // The budget of a rule without one.
 constexpr uint64_t kNoBudget = ~uint64_t(0);
 
-// Where a metric is within this factor of the tolerance, both of two levels are drawn, with
-// weights.
+// If a metric is within this factor of the tolerance, both of two levels are drawn,
+// with weights.
 struct Fade {
     float factor = 1.0f, inverse = 1.0f;
 
@@ -28,25 +28,28 @@ struct Fade {
     }
 };
 
-// How the tolerance is chosen that meets a budget.
+// How the tolerance that meets a budget is chosen.
 enum class BudgetPace {
-    at_once,   // from one view alone
-    in_steps,  // also from the tolerance of the frame before, so that it does not leap in slow
-               // motion (budget_steps.h)
-    again,     // for a frame that is drawn once more: no step, unless the budget needs one
+    at_once,  // from one view alone
+    // also from the tolerance of the frame before, so that slow motion causes no leaps
+    // (budget_steps.h)
+    in_steps,
+    again,  // for a frame that is drawn again: no step, unless the budget requires one
 };
 
-// What a cut is to fulfil.
+// The requirements that a cut fulfils.
 struct SelectRule {
     float tolerance_px2;
     Footprint footprint = Footprint::solid_angle;
-    bool culls = true;            // drop what lies outside the frustum
-    int32_t min_level = 0;        // nothing finer is drawn
-    uint64_t budget = kNoBudget;  // most gaussians; the tolerance is raised until they fit
+    bool culls = true;            // leave out what lies outside of the frustum
+    int32_t min_level = 0;        // finer levels are not drawn
+    uint64_t budget = kNoBudget;  // most gaussians; the tolerance is raised until the cut fits
     BudgetPace pace = BudgetPace::at_once;
-    int32_t frames_at_rest = 0;  // in steps: for how many frames up to this one nothing has moved
-    Fade fade = {};     // off with the paper's footprint, which may decrease towards the root
-    int32_t frame = 0;  // with a fade: the frame up to which pages of a pool have faded in
+    int32_t frames_at_rest = 0;  // in steps: number of frames, including this one, without motion
+    Fade fade = {};  // off with the paper's footprint, which may decrease towards the root
+    // with a fade: the number of the frame, from which the fade of a pool's pages
+    // follows
+    int32_t frame = 0;
 
     bool operator==(const SelectRule& o) const {
         return tolerance_px2 == o.tolerance_px2 && footprint == o.footprint && culls == o.culls &&

@@ -1,6 +1,7 @@
 #pragma once
 
-// Contract of selection, and its CPU half. select_math.h says why a cut is exact.
+// The contract of selection, and its CPU implementation. select_math.h proves that a
+// cut is exact.
 
 #include <cstdint>
 #include <vector>
@@ -10,39 +11,41 @@
 
 namespace v3dg {
 
-// Chooses the clusters of all instances that are just detailed enough for one view: exactly one on
-// every path from a leaf to its root, when balls nest and weights never decrease towards the root.
-// For two eyes they are detailed enough for the nearer one. The paper's footprint, which uses the
-// depth of one camera, does not allow two.
+// Chooses the clusters of all instances that are just detailed enough for one view:
+// exactly one on every path from a leaf to its root, provided that balls nest and
+// weights never decrease towards the root. With two eyes, the clusters are detailed
+// enough for the nearer eye. The paper's footprint uses the depth of one camera, so it
+// does not allow two eyes.
 //
-// Selected pairs are in ascending order of instance, then cluster. Pairs outside the frustum are
-// left out, unless they could touch a pixel. Both halves give the same bits for any number of
-// threads.
+// Selected pairs are in ascending order of instance, then cluster. Pairs outside the
+// frustum are left out, unless they could touch a pixel. The CPU and CUDA give the same
+// bits, for any number of threads.
 //
 // Groups whose page is not resident are not refined.
 //
-// With a budget, the tolerance is the smallest bin (budget_math.h) from which on no cut has more
-// gaussians than the budget: a coarser cut can have more than a finer one where the frustum cuts
-// through it. There may be none: then `fits_budget` is false, nothing is selected, and
-// `num_gaussians` is that of the coarsest cut. All pages count as resident: while some are not, the
-// cut may have more or fewer gaussians. With a fade, every cluster that may be drawn at a tolerance
-// counts. In steps, the tolerance also depends on that of the frame before, and is never below that
-// smallest bin.
+// With a budget, the tolerance is the smallest bin (budget_math.h) from which on no cut
+// has more gaussians than the budget. A larger tolerance alone does not guarantee fewer
+// gaussians, because a coarser cut can have more of them inside the frustum. If there
+// is no such bin, `fits_budget` is false, nothing is selected, and `num_gaussians` is
+// that of the coarsest cut. The budget counts all pages as resident; while some are
+// not, the cut may have more or fewer gaussians. With a fade, every cluster that may be
+// drawn at a tolerance counts. In steps, the tolerance also depends on that of the
+// frame before, and is never below the smallest bin.
 //
-// With a fade there may be several clusters on a path. Their weights add up to 1, whichever pages
-// are resident and however far they have faded in, and depend only on that and on the metrics of
-// the groups above and below.
+// With a fade there may be several clusters on a path, whose weights add up to 1. The
+// weights depend only on the metrics of the groups above and below, and on which pages
+// are resident and how far they have faded in.
 //
-// Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the footprint and
-// the nesting balls are ours.
+// Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the
+// footprint and the nesting balls are ours.
 struct SelectInput {
     Span<const ClusterTable> bundles;
     InstanceTable instances;
     Eyes eyes;
     SelectRule rule;
-    // Receives which pages are needed, for bundles of which only some pages are resident: [G + 1] a
-    // bundle, the bits of the highest priority of each page (page_need.h). They start as 0, which
-    // means that a page is not needed. Empty where they are not wanted.
+    // Output for bundles of which only some pages are resident: [G + 1] per bundle, the
+    // bits of the highest priority of each page (page_need.h). The elements start as 0,
+    // which means that a page is not needed. Empty if not requested.
     Span<const Span<uint32_t>> needs = {};
     uint32_t* last_bin = nullptr;  // for a budget in steps: the state of tolerance_of_budget()
 };
@@ -55,7 +58,7 @@ struct SelectOutput {
     bool fits_budget = true;
 };
 
-// Pairs that were selected before. `weight` is empty where all are 1.
+// Pairs that were selected earlier. `weight` is empty if all weights are 1.
 struct GivenCut {
     Span<const int32_t> instance, cluster;
     Span<const float> weight;
@@ -73,21 +76,21 @@ struct BudgetCut {
 namespace cpu {
 void select(const SelectInput& in, SelectOutput& out);
 
-// Chooses the tolerance of each of several budgets for one view, as select() does with that budget
-// in its rule, at once. Costs little more than one of them.
+// Finds the tolerance for each of several budgets of one view at once, as select() does
+// for the budget of its rule. Costs little more than one of them.
 void choose_tolerances(const SelectInput& in, Span<const uint64_t> budgets, Span<BudgetCut> chosen);
 
-// Writes the metric of every group of every instance, px2. Those of instance i begin at
-// metric_offset[i].
+// Writes the metric of every group of every instance, px2. The metrics of instance i
+// begin at metric_offset[i].
 void group_metrics(const SelectInput& in, Span<const int64_t> metric_offset, Span<float> metric);
 
-// Writes the metric of the group that made the cluster of each pair, px2; 0 where the cluster is of
-// level 0. The pairs are of the whole scene.
+// Writes the metric of the group that made the cluster of each pair, px2; 0 for
+// clusters of level 0. The pairs are of the whole scene.
 void pair_metrics(const SelectInput& in, const GivenCut& given, Span<float> metric);
 
-// Writes what bounds show without asking a cluster, for tests: for each run of kClustersOfBounds
-// clusters of every instance, 0 if none of them is drawn at these tolerances, else 1. Those of
-// instance i begin at first[i].
+// For tests: writes 0 for each run of kClustersOfBounds clusters of every instance if
+// bounds alone show that none of them is drawn at these tolerances, else 1. The values
+// of instance i begin at first[i].
 void bounds_may_draw(const SelectInput& in, Tolerances tolerances, Span<const int64_t> first,
                      Span<uint8_t> may_draw);
 }  // namespace cpu

@@ -1,6 +1,6 @@
-// Selection on the CPU. Threads work on chunks of instances. Each question about a group is
-// answered once for an instance, and its clusters look the answer up; so the decision is composed
-// in two passes (select_math.h).
+// Selection on the CPU. Threads process chunks of instances. The refinement of each
+// group is computed once for an instance and then looked up by its clusters, so the
+// decision is made in two passes (select_math.h).
 
 #include "select/select.h"
 
@@ -17,10 +17,12 @@ namespace {
 
 constexpr size_t kChunk = 16;
 constexpr size_t kBudgetParts = 16;
-// Runs of a bundle are found where it has this many instances; they cost about as much as one.
+// Finding the runs of a bundle costs about as much as processing one instance, so it
+// pays from this many instances on.
 constexpr size_t kManyInstances = 16;
 
-// Answers for the groups of one instance: how far each is refined, and its bins.
+// The stored answers for the groups of one instance: how far each is refined, and its
+// bins.
 struct KnownRefinements {
     const uint16_t* of_group;
 
@@ -39,9 +41,9 @@ struct KnownBins {
 // The input, and numbers that all instances share.
 struct View {
     const SelectInput& in;
-    std::vector<CameraSides> sides;  // one a bundle
-    std::vector<ClusterRuns> runs;   // one a bundle after find_runs(); empty for few instances
-    size_t most_groups = 0, most_clusters = 0;  // the most that a bundle has
+    std::vector<CameraSides> sides;  // one per bundle
+    std::vector<ClusterRuns> runs;   // one per bundle after find_runs(); empty for few instances
+    size_t most_groups = 0, most_clusters = 0;  // largest numbers in any bundle
 
     explicit View(const SelectInput& input) : in(input) {
         for (const ClusterTable& table : in.bundles) {
@@ -61,33 +63,35 @@ struct View {
     }
 };
 
-// A range of clusters of a table, and a range of groups that contains all of theirs.
+// A range of clusters of a table, and a range of groups that includes all groups of
+// those clusters.
 struct Asked {
     ClusterRange clusters, groups;
 };
 
-// An instance in front of the camera. One without a pose is hidden.
+// An instance in front of the camera. An instance that is not drawn is hidden.
 struct SeenInstance {
     const ClusterTable& table;
     InstanceView view;
-    bool is_placed;
+    bool is_drawn;
 
     V3DG_INLINE SeenInstance(const View& of, size_t i)
-        : table(of.in.bundles[of.in.instances.bundle[i]]), view(), is_placed(false) {
+        : table(of.in.bundles[of.in.instances.bundle[i]]), view(), is_drawn(false) {
         const InstanceTable& instances = of.in.instances;
         const Pose pose = instances.pose(i);
-        is_placed = v3dg::is_placed(pose);
-        if (is_placed)
+        is_drawn = instances.is_drawn(i);
+        if (is_drawn)
             view = view_from_instance(of.in.eyes, of.sides[instances.bundle[i]],
                                       axes_of_instance(of.in.eyes.camera[0], pose), pose,
                                       instances.importance[i]);
     }
 
     CutSource source(const SelectRule& rule) const {
-        return is_placed ? source_of_cut(table, view, rule, SIZE_MAX) : CutSource::nowhere;
+        return is_drawn ? source_of_cut(table, view, rule, SIZE_MAX) : CutSource::nowhere;
     }
 
-    // The decision by answers that are filled in before it is asked.
+    // Returns the decision that looks its answers up in `groups`, which is filled in
+    // later.
     template <class Groups>
     InstanceCut<Groups> cut(const SelectRule& rule, const Groups& groups) const {
         return {table, view, rule, groups, rule.culls && !is_inside(table.bounds, view)};
@@ -95,15 +99,15 @@ struct SeenInstance {
 
     AskedGroups groups(const SelectRule& rule) const { return {table, view, rule}; }
 
-    // The clusters and groups that have to be asked at these tolerances.
+    // Returns the clusters and groups that have to be tested at these tolerances.
     Asked asked(const View& of, size_t i, const SelectRule& rule, Tolerances tolerances) const {
         const ClusterRuns& runs = of.runs[of.in.instances.bundle[i]];
         Asked asked{{0, static_cast<uint32_t>(table.num_clusters())},
                     {0, static_cast<uint32_t>(table.ball.size)}};
         if (runs.count == 0 || !table.pages.is_whole()) return asked;
         asked.clusters = clusters_to_ask(table, runs, view, rule, tolerances);
-        // Most clusters have most of the groups, and then finding the range costs more than asking
-        // all groups.
+        // Most of the clusters belong to most of the groups; then finding the range of
+        // groups costs more than testing all groups.
         if (asked.clusters.end - asked.clusters.first > table.num_clusters() / 2) return asked;
         int32_t first = static_cast<int32_t>(table.ball.size), last = -1;
         for (uint32_t c = asked.clusters.first; c < asked.clusters.end; ++c) {
@@ -119,9 +123,9 @@ struct SeenInstance {
 
 // Scratch memory of a thread.
 struct Scratch {
-    std::vector<uint16_t> refinement;  // one a group
-    std::vector<int32_t> chosen;       // clusters
-    std::vector<float> priority;       // one a group, where needs are wanted
+    std::vector<uint16_t> refinement;  // one element per group
+    std::vector<int32_t> chosen;       // selected clusters
+    std::vector<float> priority;       // one element per group, if needs are requested
 
     explicit Scratch(const View& view)
         : refinement(view.most_groups),
@@ -129,9 +133,10 @@ struct Scratch {
           priority(view.in.needs.empty() ? 0 : view.most_groups) {}
 };
 
-// Answers for the groups of an instance. The inputs are copies, which no write can alias, so that
-// the compiler vectorises the first loop. Which pages are resident would prevent that, so the
-// second loop lowers the answers for groups that are absent or still fade in.
+// Computes the answers for the groups of an instance. The inputs are passed by value:
+// no write can alias them, so the compiler vectorises the first loop. Residency tests
+// would prevent that; therefore a second loop lowers the answers for groups whose page
+// is absent or still fading in.
 template <Footprint footprint, bool kFades>
 void ask_groups(ClusterTable table, const InstanceView view, SelectRule rule,
                 const ClusterRange asked, uint16_t* __restrict refinement) {
@@ -159,7 +164,8 @@ void ask_groups(const SeenInstance& seen, const SelectRule& rule, const ClusterR
         ask_groups<Footprint::solid_angle, false>(seen.table, seen.view, rule, asked, refinement);
 }
 
-// The first pass of the decision: writes the clusters of positive weight, and returns their number.
+// The first pass of the decision: writes the clusters of positive weight, and returns
+// their number.
 size_t find_sufficient(const ClusterTable table, const InstanceView view, const SelectRule rule,
                        const ClusterRange asked, const uint16_t* __restrict refinement,
                        int32_t* __restrict cluster) {
@@ -173,7 +179,8 @@ size_t find_sufficient(const ClusterTable table, const InstanceView view, const 
     return num_sufficient;
 }
 
-// Raises a need to a priority, on any threads. Positive floats order as their bits do.
+// Raises a need to a priority; several threads may do so at once. Positive floats have
+// the same order as their bits.
 void raise(uint32_t& need, float priority) {
     uint32_t bits, before = __atomic_load_n(&need, __ATOMIC_RELAXED);
     std::memcpy(&bits, &priority, sizeof bits);
@@ -182,7 +189,7 @@ void raise(uint32_t& need, float priority) {
     }
 }
 
-// Records which pages an instance needs whose table is asked.
+// Records which pages an instance needs, if its table is tested.
 template <class Cut>
 void tell_needs(const Cut& cut, const SelectRule& rule, Span<uint32_t> needs,
                 std::vector<float>& priority) {
@@ -226,8 +233,9 @@ void select_instance(const View& view, const SelectRule& rule, size_t i, Scratch
     });
 }
 
-// Adds to `change`, for each bin of a budget, by how many gaussians the cut of instance i differs
-// from that of the bin before. `bins` has room for those of its groups.
+// Adds to `change`, for each bin of a budget, the number of gaussians by which the cut
+// of instance i differs from the cut of the bin before. `bins` has room for the bins of
+// the instance's groups.
 void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins,
                     std::vector<int64_t>& change) {
     const SelectRule& rule = view.in.rule;
@@ -254,12 +262,13 @@ void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins,
     }
 }
 
-// The numbers of gaussians by which the cut of each bin differs from that of the bin before, in
-// parts that add up.
+// The differences between the numbers of gaussians in the cuts of consecutive bins. The
+// parts have to be summed.
 using BinChanges = std::vector<std::vector<int64_t>>;
 BinChanges count_changes(const View& view) {
     const size_t num_instances = view.in.instances.bundle.size;
-    // Each part has every kBudgetParts-th instance, because neighbours cost about the same.
+    // Part p has the instances p, p + kBudgetParts, and so on: neighbours cost about
+    // the same, so this balances the load.
     BinChanges changes(std::min(kBudgetParts, num_instances));
     parallel_for(changes.size(), 1, [&](size_t part) {
         changes[part].assign(kNumBudgetBins + 1, 0);
@@ -369,7 +378,7 @@ void cpu::pair_metrics(const SelectInput& in, const GivenCut& given, Span<float>
     parallel_for(metric.size, kChunk, [&](size_t s) {
         const SeenInstance seen(view, given.instance[s]);
         const int32_t group = seen.table.own_group[given.cluster[s]];
-        const bool is_coarse = seen.is_placed && group >= 0;
+        const bool is_coarse = seen.is_drawn && group >= 0;
         metric[s] = is_coarse ? wanted_metric_px2(seen.table, group, seen.view, in.rule) : 0.0f;
     });
 }
@@ -386,7 +395,7 @@ void cpu::bounds_may_draw(const SelectInput& in, Tolerances tolerances, Span<con
     std::fill(may_draw.begin(), may_draw.end(), uint8_t(0));
     parallel_for(in.instances.bundle.size, kChunk, [&](size_t i) {
         const SeenInstance seen(view, i);
-        if (!seen.is_placed) return;
+        if (!seen.is_drawn) return;
         const int32_t bundle = in.instances.bundle[i];
         const ClusterRange asked =
             clusters_to_ask(seen.table, runs[bundle], seen.view, in.rule, tolerances);

@@ -1,5 +1,6 @@
-// Each block merges one group through all its rounds. Nodes are in device memory, where a group of
-// hundreds stays in the caches, and pass through shared memory in tiles while partners are sought.
+// Each block merges one group in all its rounds. Nodes are in device memory, where the
+// hundreds of nodes of a group stay in the caches. While partners are searched for,
+// nodes are loaded into shared memory in tiles.
 
 #include <algorithm>
 #include <cfloat>
@@ -16,10 +17,11 @@ namespace {
 constexpr int kBlockSize = 256, kWarps = kBlockSize / 32;
 constexpr int kTileSize = 128;  // nodes in shared memory
 constexpr int64_t kMostRows = int64_t(1)
-                              // Rows of the groups that are merged at once: 350 MiB of scratch.
+                              // Rows of the groups that are merged together: 350 MiB of
+                              // scratch memory.
                               << 21;
 
-// Scratch for one row of a group.
+// The scratch memory for one row of a group.
 struct Scratch {
     MergeNode* nodes;
     double* row_weight;
@@ -40,7 +42,7 @@ struct Scratch {
     }
 };
 
-// Makes each row a node; returns the inverse squared spacing that distances are compared with.
+// Makes each row a node; returns the inverse squared spacing that normalises distances.
 __device__ double start_nodes(const GaussianRows<const float>& in, int64_t first, int count,
                               int64_t wanted, const Scratch& group) {
     double low[3] = {DBL_MAX, DBL_MAX, DBL_MAX}, minus_high[3] = {DBL_MAX, DBL_MAX, DBL_MAX};
@@ -105,7 +107,7 @@ __device__ void find_partners(const Scratch& group, int n, double inverse_spacin
     }
 }
 
-// Sorts the pairs: the place of each is the number of pairs before it.
+// Sorts the pairs: the position of each is the number of pairs that precede it.
 __device__ void sort_pairs(const Scratch& group, int n) {
     __shared__ MergePair tile[kBlockSize];
     for (int base = 0; base < n; base += kBlockSize) {
@@ -130,8 +132,8 @@ __device__ void sort_pairs(const Scratch& group, int n) {
     }
 }
 
-// Moves the sorted pairs that share no gaussian with a pair before, `allowed` at most, to the front
-// of `pairs`; returns how many there are. Called by one warp.
+// Moves the sorted pairs that share no gaussian with an earlier pair, at most
+// `allowed`, to the front of `pairs`; returns their number. Called by one warp.
 __device__ int choose_pairs(const Scratch& group, int n, int64_t allowed) {
     const int lane = static_cast<int>(threadIdx.x % 32);
     int chosen = 0;
@@ -159,7 +161,7 @@ __device__ int choose_pairs(const Scratch& group, int n, int64_t allowed) {
     return chosen;
 }
 
-// Joins the first pairs and marks the nodes that are gone.
+// Joins the first pairs and marks the nodes that disappear.
 __device__ void join_pairs(const Scratch& group, int num_pairs) {
     for (int j = threadIdx.x; j < num_pairs; j += kBlockSize) {
         const MergePair pair = group.pairs[j];
@@ -219,7 +221,8 @@ __global__ void __launch_bounds__(kBlockSize)
     const Scratch group = scratch.at(first - in_offset[first_group]);
     const double inverse_spacing2 = start_nodes(in, first, n, wanted, group);
     __shared__ int num_pairs;
-    // In each round every node finds its cheapest partner, and the cheapest disjoint pairs join.
+    // In each round every node finds its cheapest partner, and the cheapest disjoint
+    // pairs join.
     while (n > wanted) {
         __syncthreads();
         find_partners(group, n, inverse_spacing2);
@@ -245,7 +248,7 @@ __global__ void __launch_bounds__(kBlockSize)
 void merge(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
            Span<const int64_t> out_offset, const GaussianRows<float>& out, Stream stream) {
     const size_t num_groups = in_offset.size - 1;
-    // A run is the groups that share the scratch.
+    // A run consists of the groups that share the scratch memory.
     const auto end_of_run = [&](size_t first) {
         size_t last = first + 1;
         while (last < num_groups && in_offset[last + 1] - in_offset[first] <= kMostRows) ++last;

@@ -1,12 +1,12 @@
-// Each block ranks the gaussians of one cell, of which the median split makes eight a group; the
-// rows that are kept are then compacted in ascending order.
+// A block finds the median of a group along one axis; then each block ranks gaussians
+// of one group within their octants, and the rows that are kept are compacted in
+// ascending order.
 
 #include <cub/device/device_select.cuh>
 
-#include <vector>
+#include <algorithm>
 
 #include "base/launch.cuh"
-#include "cluster/cluster.h"
 #include "simplify/simplify.h"
 #include "simplify/simplify_math.h"
 
@@ -16,33 +16,86 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kBlockSize = 128;
+constexpr unsigned kMostBlocksOfGroup = 64;
 
-// A cell of the split, as positions in `order`, and how many of its gaussians are kept.
-struct Cell {
-    int64_t first, last, share;
-};
+// Returns bits that ascend as unsigned numbers as the finite values do. -0 counts as 0.
+__device__ uint32_t ascending_bits(float value) {
+    const uint32_t bits = __float_as_uint(value + 0.0f);
+    return bits ^ (bits >> 31 ? 0xffffffffu : 0x80000000u);
+}
 
-__global__ void score_kernel(GaussianRows<const float> in, const int64_t* order, size_t count,
-                             double* score_at, int64_t* rows) {
+__device__ float value_of_bits(uint32_t ascending) {
+    return __uint_as_float(ascending ^ (ascending >> 31 ? 0x80000000u : 0xffffffffu));
+}
+
+// Finds the median of one axis of a group bit by bit, from the highest: of the values
+// that share the bits found so far, those whose next bit is 0 come first.
+__global__ void median_kernel(const float* means, const int64_t* in_offset, float* medians) {
+    const int64_t first = in_offset[blockIdx.x];
+    const int64_t last = in_offset[blockIdx.x + 1];
+    const unsigned axis = blockIdx.y;
+    if (first == last) return;
+    __shared__ unsigned long long num_low;
+    uint32_t prefix = 0;
+    int64_t rank = median_rank(last - first);
+    for (int bit = 31; bit >= 0; --bit) {
+        __syncthreads();
+        if (threadIdx.x == 0) num_low = 0;
+        __syncthreads();
+        unsigned long long own_low = 0;
+        for (int64_t i = first + threadIdx.x; i < last; i += kBlockSize)
+            own_low += ascending_bits(means[3 * i + axis]) >> bit == prefix >> bit;
+        atomicAdd(&num_low, own_low);
+        __syncthreads();
+        const int64_t low = static_cast<int64_t>(num_low);
+        if (rank >= low) {
+            rank -= low;
+            prefix |= 1u << bit;
+        }
+    }
+    if (threadIdx.x == 0) medians[3 * blockIdx.x + axis] = value_of_bits(prefix);
+}
+
+__global__ void score_kernel(GaussianRows<const float> in, size_t count, double* score_of_row,
+                             int64_t* rows) {
     const size_t i = blockIdx.x * size_t(kBlockSize) + threadIdx.x;
     if (i >= count) return;
-    const int64_t row = order[i];
-    score_at[i] = prune_score(in.scales + 3 * row, in.opacities[row]);
+    score_of_row[i] = prune_score(in.scales + 3 * i, in.opacities[i]);
     rows[i] = static_cast<int64_t>(i);
 }
 
-__global__ void keep_kernel(const Cell* cells, const int64_t* order, const double* score_at,
+__global__ void octant_kernel(const float* means, const int64_t* in_offset, const float* medians,
+                              uint8_t* octant_of_row) {
+    const unsigned group = blockIdx.x;
+    const int64_t step = int64_t(kBlockSize) * gridDim.y;
+    for (int64_t i = in_offset[group] + blockIdx.y * kBlockSize + threadIdx.x;
+         i < in_offset[group + 1]; i += step)
+        octant_of_row[i] = static_cast<uint8_t>(octant_of(means + 3 * i, medians + 3 * group));
+}
+
+__global__ void keep_kernel(const int64_t* in_offset, const int64_t* out_offset,
+                            const uint8_t* octant_of_row, const double* score_of_row,
                             uint8_t* is_kept) {
-    const Cell cell = cells[blockIdx.x];
-    for (int64_t i = cell.first + threadIdx.x; i < cell.last; i += kBlockSize) {
-        const double score = score_at[i];
+    const unsigned group = blockIdx.x;
+    const int64_t first = in_offset[group];
+    const int64_t last = in_offset[group + 1];
+    const int64_t wanted = out_offset[group + 1] - out_offset[group];
+    const int64_t step = int64_t(kBlockSize) * gridDim.y;
+    for (int64_t i = first + blockIdx.y * kBlockSize + threadIdx.x; i < last; i += step) {
+        const double score = score_of_row[i];
+        const uint8_t octant = octant_of_row[i];
+        int64_t num_before = 0;
+        int64_t num_here = 0;
         int64_t rank = 0;
-        // Rows ascend within a cell, so of equal scores the first has the lower index.
-        for (int64_t k = cell.first; k < cell.last; ++k) {
-            const double other = score_at[k];
-            rank += other > score || (other == score && k < i);
+        for (int64_t k = first; k < last; ++k) {
+            const bool is_here = octant_of_row[k] == octant;
+            const double other = score_of_row[k];
+            num_before += octant_of_row[k] < octant;
+            num_here += is_here;
+            // Among equal scores, the one with the lower index comes first.
+            rank += is_here && (other > score || (other == score && k < i));
         }
-        is_kept[order[i]] = rank < cell.share;
+        is_kept[i] = rank < octant_share(num_before, num_here, last - first, wanted);
     }
 }
 
@@ -50,27 +103,28 @@ __global__ void keep_kernel(const Cell* cells, const int64_t* order, const doubl
 
 void prune(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
            Span<const int64_t> out_offset, Span<int64_t> kept, Stream stream) {
-    const size_t num_groups = in_offset.size - 1,
-                 count = static_cast<size_t>(in_offset[num_groups]);
+    const auto num_groups = static_cast<unsigned>(in_offset.size - 1);
+    const auto count = static_cast<size_t>(in_offset[num_groups]);
     if (count == 0) return;
-    std::vector<int64_t> cell_offset(num_groups * kPruneCells + 1);
-    DeviceBuffer<int64_t> order(count, stream), rows(count, stream), num_kept(1, stream);
-    median_split({reinterpret_cast<const Point*>(in.means), count}, in_offset, kPruneHalvings,
-                 {order.data(), count}, {cell_offset.data(), cell_offset.size()}, stream);
-    std::vector<Cell> cells(num_groups * kPruneCells);
-    for (size_t c = 0; c < cells.size(); ++c) {
-        const size_t g = c / kPruneCells;
-        const CellShares shares{in_offset[g], in_offset[g + 1], out_offset[g + 1] - out_offset[g]};
-        cells[c] = {cell_offset[c], cell_offset[c + 1],
-                    shares.of(cell_offset[c], cell_offset[c + 1])};
-    }
-    const DeviceBuffer<Cell> cells_on_device(Span<const Cell>{cells.data(), cells.size()}, stream);
-    DeviceBuffer<double> score_at(count, stream);
+    const DeviceBuffer<int64_t> first_row(in_offset, stream);
+    const DeviceBuffer<int64_t> first_kept(out_offset, stream);
+    DeviceBuffer<float> medians(size_t(3) * num_groups, stream);
+    DeviceBuffer<double> score_of_row(count, stream);
+    DeviceBuffer<int64_t> rows(count, stream);
+    DeviceBuffer<int64_t> num_kept(1, stream);
+    DeviceBuffer<uint8_t> octant_of_row(count, stream);
     DeviceBuffer<uint8_t> is_kept(count, stream);
+    const unsigned blocks_of_group =
+        std::min(kMostBlocksOfGroup, blocks_for(count / num_groups + 1, kBlockSize));
+    const dim3 group_grid(num_groups, blocks_of_group);
+    launch("prune: medians", median_kernel, dim3(num_groups, 3), kBlockSize, 0, stream, in.means,
+           first_row.data(), medians.data());
     launch("prune: score", score_kernel, blocks_for(count, kBlockSize), kBlockSize, 0, stream, in,
-           order.data(), count, score_at.data(), rows.data());
-    launch("prune: keep", keep_kernel, static_cast<unsigned>(cells.size()), kBlockSize, 0, stream,
-           cells_on_device.data(), order.data(), score_at.data(), is_kept.data());
+           count, score_of_row.data(), rows.data());
+    launch("prune: octants", octant_kernel, group_grid, kBlockSize, 0, stream, in.means,
+           first_row.data(), medians.data(), octant_of_row.data());
+    launch("prune: keep", keep_kernel, group_grid, kBlockSize, 0, stream, first_row.data(),
+           first_kept.data(), octant_of_row.data(), score_of_row.data(), is_kept.data());
     const auto select = [&](void* scratch, size_t& bytes) {
         check(cub::DeviceSelect::Flagged(scratch, bytes, rows.data(), is_kept.data(), kept.data,
                                          num_kept.data(), static_cast<int64_t>(count), stream),

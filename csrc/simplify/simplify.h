@@ -1,6 +1,6 @@
 #pragma once
 
-// Makes the gaussians that a coarser level starts from, by pruning or by merging.
+// Computes the initial gaussians of a coarser level, by pruning or by merging.
 
 #include <cstdint>
 
@@ -10,25 +10,26 @@
 
 namespace v3dg {
 
-// Segment g reduces gaussians in_offset[g] .. in_offset[g + 1] to as many as out_offset says, which
-// is at most as many as come in. Decisions are made in the order of the rows, ties by index, and do
-// not depend on threads; both halves give the same bits.
+// Segment g reduces gaussians in_offset[g] .. in_offset[g + 1] to the number that
+// out_offset gives, which is at most the number of inputs. Ties are decided by index,
+// and results do not depend on threads; the CPU and CUDA give the same bits.
 namespace cpu {
-// Finds the gaussians with the largest opacity * (s1 s2 s3)^(2/3), the same share of each of eight
-// cells of a median split (V3DG, section 3.2). kept: [out_offset[S]], the rows in ascending order.
+// Finds the gaussians with the largest opacity * (s1 s2 s3)^(2/3), the same share of
+// each of the eight octants around the medians of a segment (V3DG, section 3.2). kept:
+// [out_offset[S]], the rows in ascending order.
 void prune(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
            Span<const int64_t> out_offset, Span<int64_t> kept);
 
-// Joins pairs of gaussians, cheapest first, until as many are left as wanted. A pair becomes the
-// gaussian with the same first and second moments, each weighted by opacity times surface area, and
-// the same area times opacity as far as an opacity of 1 allows; its cost is how much its members
-// differ in place and colour.
+// Joins pairs of gaussians, cheapest first, until the wanted number is left. A pair
+// becomes the gaussian with the same first and second moments, each weighted by opacity
+// times surface area, and the same area times opacity as far as an opacity of 1 allows.
+// The cost of a pair grows with the differences of its members in position and colour.
 void merge(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
            Span<const int64_t> out_offset, const GaussianRows<float>& out);
 }  // namespace cpu
 
-// As cpu::, with rows and `kept` on the device; offsets stay on the host. Work is queued on the
-// stream. Throws std::runtime_error when CUDA reports an error.
+// As cpu::, with rows and `kept` on the device; offsets stay on the host. Work is
+// queued on the stream. Throws std::runtime_error if CUDA reports an error.
 namespace cuda {
 void prune(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
            Span<const int64_t> out_offset, Span<int64_t> kept, Stream stream);

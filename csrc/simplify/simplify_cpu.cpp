@@ -7,38 +7,71 @@
 #include <vector>
 
 #include "base/parallel_for.h"
-#include "cluster/cluster.h"
 #include "simplify/simplify_math.h"
 
 namespace v3dg {
 
+namespace {
+
+// Finds the median position of rows first .. last along each axis.
+void find_medians(const float* means, int64_t first, int64_t last, std::vector<float>& scratch,
+                  float median[3]) {
+    const int64_t count = last - first;
+    scratch.resize(count);
+    for (int axis = 0; axis < 3; ++axis) {
+        for (int64_t i = 0; i < count; ++i) scratch[i] = means[3 * (first + i) + axis];
+        const auto middle = scratch.begin() + median_rank(count);
+        std::nth_element(scratch.begin(), middle, scratch.end());
+        median[axis] = *middle;
+    }
+}
+
+// Writes the rows of the group first .. last that are kept, in ascending order.
+void prune_group(const GaussianRows<const float>& in, int64_t first, int64_t last, int64_t wanted,
+                 int64_t* out) {
+    const int64_t count = last - first;
+    if (count == 0) return;
+    std::vector<float> coordinates;
+    float median[3];
+    find_medians(in.means, first, last, coordinates, median);
+    std::vector<int64_t> octants[kOctants];
+    std::vector<double> score(count);
+    for (int64_t row = first; row < last; ++row) {
+        octants[octant_of(in.means + 3 * row, median)].push_back(row);
+        score[row - first] = prune_score(in.scales + 3 * row, in.opacities[row]);
+    }
+    const auto is_more_important = [&](int64_t a, int64_t b) {
+        const double score_a = score[a - first];
+        const double score_b = score[b - first];
+        return score_a != score_b ? score_a > score_b : a < b;
+    };
+    int64_t* const begin = out;
+    int64_t num_before = 0;
+    for (std::vector<int64_t>& rows : octants) {
+        const auto num_here = static_cast<int64_t>(rows.size());
+        const int64_t share = octant_share(num_before, num_here, count, wanted);
+        std::sort(rows.begin(), rows.end(), is_more_important);
+        out = std::copy_n(rows.begin(), share, out);
+        num_before += num_here;
+    }
+    std::sort(begin, out);
+}
+
+}  // namespace
+
 void cpu::prune(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
                 Span<const int64_t> out_offset, Span<int64_t> kept) {
-    const size_t num_groups = in_offset.size - 1, count = in_offset[num_groups];
-    std::vector<int64_t> order(count), cell(num_groups * kPruneCells + 1);
-    median_split({reinterpret_cast<const Point*>(in.means), count}, in_offset, kPruneHalvings,
-                 {order.data(), count}, {cell.data(), cell.size()});
-    std::vector<double> score(count);
-    parallel_for(count, 4096,
-                 [&](size_t i) { score[i] = prune_score(in.scales + 3 * i, in.opacities[i]); });
+    const size_t num_groups = in_offset.size - 1;
     parallel_for(num_groups, 1, [&](size_t g) {
-        const CellShares shares{in_offset[g], in_offset[g + 1], out_offset[g + 1] - out_offset[g]};
-        int64_t* out = kept.data + out_offset[g];
-        for (size_t c = g * kPruneCells; c < (g + 1) * kPruneCells; ++c) {
-            const int64_t share = shares.of(cell[c], cell[c + 1]);
-            std::sort(order.begin() + cell[c], order.begin() + cell[c + 1],
-                      [&](int64_t a, int64_t b) {
-                          return score[a] != score[b] ? score[a] > score[b] : a < b;
-                      });
-            out = std::copy_n(order.begin() + cell[c], share, out);
-        }
-        std::sort(kept.data + out_offset[g], out);
+        const int64_t wanted = out_offset[g + 1] - out_offset[g];
+        prune_group(in, in_offset[g], in_offset[g + 1], wanted, kept.data + out_offset[g]);
     });
 }
 
 namespace {
 
-// Merges rows first .. first + count to `wanted` rows, which are written from row `to` on.
+// Merges rows first .. first + count to `wanted` rows, which are written from row `to`
+// on.
 void merge_segment(const GaussianRows<const float>& in, int64_t first, int count, int64_t wanted,
                    const GaussianRows<float>& out, int64_t to) {
     // A node is identified by its first row; its other rows follow in a linked list.
@@ -58,7 +91,8 @@ void merge_segment(const GaussianRows<const float>& in, int64_t first, int count
     }
     const double inverse_spacing2 = inverse_spacing2_of(low, high, wanted);
 
-    // In each round every node finds its cheapest partner, and the cheapest disjoint pairs join.
+    // In each round every node finds its cheapest partner, and the cheapest disjoint
+    // pairs join.
     std::vector<MergeFeature> features(count);
     std::vector<MergePair> pairs;
     std::vector<char> is_used;

@@ -1,7 +1,8 @@
 #pragma once
 
-// Formulas of pruning and merging. They are compiled without contraction and use no function whose
-// last bits differ between libraries, so that both halves get the same bits.
+// Formulas of pruning and merging. They are compiled without contraction and use no
+// function whose last bits differ between libraries, so that the CPU and CUDA get the
+// same bits.
 
 #include <cmath>
 #include <cstdint>
@@ -13,34 +14,45 @@
 
 namespace v3dg {
 
-// Returns the importance by which pruning decides: the cube of opacity * (s1 s2 s3)^(2/3) (V3DG,
-// section 3.2: product of scale and opacity). It orders gaussians as the product does and needs no
-// roots, whose last bits differ from library to library. Squares of volumes of float32 scales do
-// not overflow float64; what underflows is too small to be seen.
+// Returns the importance that pruning compares: the cube of opacity * (s1 s2 s3)^(2/3)
+// (V3DG, section 3.2: product of scale and opacity). The cube gives the same order and
+// needs no roots, whose last bits differ between libraries. Squared volumes of float32
+// scales do not overflow float64; those that underflow are invisibly small.
 V3DG_HD inline double prune_score(const float scale[3], float opacity) {
     const double volume = static_cast<double>(scale[0]) * scale[1] * scale[2];
     const double o = opacity;
     return o * o * o * (volume * volume);
 }
 
-// Pruning splits the gaussians at medians into these cells and keeps the same share of each cell.
-constexpr int kPruneHalvings = 3, kPruneCells = 1 << kPruneHalvings;
+// Pruning keeps the same share of each octant of a group, so that no side of it is left
+// empty. The octants meet at the median of each axis, as in the published code of V3DG:
+// halving the longest axis again and again makes other cells for long groups, and
+// levels that are visibly worse.
+constexpr int kOctants = 8;
 
-// Computes how many of a cell's gaussians are kept when `wanted` of first .. last are. The shares
-// are rounded so that they add up.
-struct CellShares {
-    int64_t first, last, wanted;
-    V3DG_HD int64_t of(int64_t cell_first, int64_t cell_last) const {
-        if (cell_first == cell_last) return 0;
-        const int64_t count = last - first;
-        return (cell_last - first) * wanted / count - (cell_first - first) * wanted / count;
-    }
-};
+// Returns the octant of a position around the medians of its group. A coordinate at the
+// median lies in the upper half.
+V3DG_HD inline int octant_of(const float mean[3], const float median[3]) {
+    return 4 * (mean[0] >= median[0]) + 2 * (mean[1] >= median[1]) + (mean[2] >= median[2]);
+}
 
-// Returns the surface area of an ellipsoid over 4 pi, within 1.2 %. It is the mean of the
-// ellipsoid's shadow, sqrt(b2c2 x2 + a2c2 y2 + a2b2 z2), over directions along axes, between two
-// and between all three; the weights minimise the largest error of any shape. It uses no function
-// but roots, whose bits are the same in every library.
+// Returns the place, in ascending order, of the median among `count` coordinates: of
+// two in the middle, the lower one.
+V3DG_HD inline int64_t median_rank(int64_t count) { return (count - 1) / 2; }
+
+// Returns how many gaussians of an octant are kept when a group of `count` keeps
+// `wanted`. The octants before this one hold `num_before` gaussians, this one
+// `num_here`. The shares are rounded so that they add up to `wanted`.
+V3DG_HD inline int64_t octant_share(int64_t num_before, int64_t num_here, int64_t count,
+                                    int64_t wanted) {
+    return (num_before + num_here) * wanted / count - num_before * wanted / count;
+}
+
+// Returns the surface area of an ellipsoid over 4 pi, within 1.2 %. It averages the
+// area of the ellipsoid's shadow, sqrt(b2c2 x2 + a2c2 y2 + a2b2 z2), over directions
+// along axes, between two axes and between all three; the weights minimise the largest
+// error of any shape. The only functions used are square roots, whose bits are the same
+// in every library.
 V3DG_HD inline double ellipsoid_area(double a, double b, double c) {
     constexpr double kAlongOne = 0.0604247, kBetweenTwo = 0.1013528, kBetweenThree = 0.5029995;
     const double bc = b * c, ac = a * c, ab = a * b;
@@ -64,8 +76,8 @@ V3DG_HD inline void covariance_of(const double quat[4], const double scale[3], d
         }
 }
 
-// Computes the scales of a covariance and the rotation to its axes, whose columns belong to the
-// scales, by cyclic Jacobi rotations.
+// Computes the scales of a covariance and the rotation to its axes, whose columns
+// belong to the scales, by cyclic Jacobi rotations.
 V3DG_HD inline void scale_and_axes_of(const double cov[6], double scale[3], double e[3][3]) {
     double a[3][3] = {{cov[0], cov[1], cov[2]}, {cov[1], cov[3], cov[4]}, {cov[2], cov[4], cov[5]}};
     for (int i = 0; i < 3; ++i)
@@ -107,7 +119,8 @@ V3DG_HD inline void scale_and_axes_of(const double cov[6], double scale[3], doub
 
 // Computes the quaternion of a rotation matrix.
 V3DG_HD inline void quat_of_axes(const double e[3][3], double quat[4]) {
-    // The largest of the four components comes first, so that nothing small is divided by.
+    // The component with the largest magnitude is computed first, so that there is no
+    // division by a small number.
     const double four[4] = {1 + e[0][0] + e[1][1] + e[2][2], 1 + e[0][0] - e[1][1] - e[2][2],
                             1 - e[0][0] + e[1][1] - e[2][2], 1 - e[0][0] - e[1][1] + e[2][2]};
     int largest = 0;
@@ -150,9 +163,9 @@ V3DG_HD inline MergeNode merge_node_of(const GaussianRows<const float>& in, int6
     return node;
 }
 
-// Returns what a pair loses: the variance that joining adds, in place (relative to the area of each
-// gaussian that will be left) and in colour. This is Ward's criterion, weighted by what the
-// gaussians cover.
+// Returns the cost of joining a pair: the increase of the variance in position
+// (relative to the area per remaining gaussian) and in colour. This is Ward's
+// criterion, weighted by covered area.
 V3DG_HD inline double merge_cost(const MergeFeature& a, const MergeFeature& b,
                                  double inverse_spacing2) {
     constexpr double kColorWeight = 6;
@@ -165,7 +178,7 @@ V3DG_HD inline double merge_cost(const MergeFeature& a, const MergeFeature& b,
            (place * inverse_spacing2 + kColorWeight * color);
 }
 
-// Returns one over the squared size of the box around the means, per gaussian that is wanted.
+// Returns one over the squared size of the box around the means, per wanted gaussian.
 V3DG_HD inline double inverse_spacing2_of(const double low[3], const double high[3],
                                           int64_t wanted) {
     double extent2 = 0;
@@ -173,8 +186,8 @@ V3DG_HD inline double inverse_spacing2_of(const double low[3], const double high
     return extent2 > 0 ? static_cast<double>(wanted) / extent2 : 0;
 }
 
-// Two gaussians, a before b, and the cost of joining them. Cheaper pairs come first; ties go by
-// index.
+// Two gaussians, a before b, and the cost of joining them. Cheaper pairs come first;
+// ties are ordered by index.
 struct MergePair {
     double cost;
     int a, b;
@@ -183,8 +196,8 @@ V3DG_HD inline bool is_before(const MergePair& x, const MergePair& y) {
     return x.cost != y.cost ? x.cost < y.cost : (x.a != y.a ? x.a < y.a : x.b < y.b);
 }
 
-// Returns the largest number of pairs of `count` gaussians that one round joins: half of what
-// remains to be joined, so that costs are updated in between.
+// Returns the largest number of pairs among `count` gaussians that one round joins:
+// half of the remaining joins, so that costs are updated in between.
 V3DG_HD inline int64_t pairs_in_round(int64_t count, int64_t wanted) {
     return (count - wanted + 1) / 2;
 }
@@ -213,7 +226,7 @@ V3DG_HD inline void join(MergeNode& a, const MergeNode& b) {
     a.opacity = opacity < 1 ? opacity : 1;
 }
 
-// Writes place, shape and opacity of a joined gaussian.
+// Writes position, shape and opacity of a joined gaussian.
 V3DG_HD inline void write_joined(const MergeNode& node, const GaussianRows<float>& out,
                                  int64_t to) {
     double scale[3], axes[3][3], quat[4];

@@ -1,7 +1,7 @@
 #pragma once
 
-// Lists of the records that each tile of a picture is blended from: on the CPU sorted tile by tile,
-// on CUDA in any order.
+// The lists of records from which the tiles of a picture are blended: sorted tile by
+// tile on the CPU, unsorted on CUDA.
 
 #include <atomic>
 #include <cstddef>
@@ -31,18 +31,19 @@ struct TileGrid {
     int row(size_t tile) const { return first_row + static_cast<int>(tile / columns); }
 };
 
-// The records that touch each tile t are entries offset[t] to offset[t + 1], in the order of the
-// chunks that they came in.
+// The records that touch tile t are entries offset[t] to offset[t + 1], in the order of
+// the chunks.
 struct TileLists {
     EntryFormat format;
     Buffer<uint64_t> offset;
     Buffer<uint64_t> entry;
     uint64_t num_entries = 0;
-    // The lists of one chunk alone, whose records are [first, first + count).
+    // The lists of a single chunk, whose records are [first, first + count).
     struct Chunk {
         uint64_t first, count;
         uint32_t least_depth, most_depth;  // bits of the records' depths
-        Buffer<uint64_t> entry;  // entries with places in the chunk and all bits of a depth
+        // Entries with the record's index in the chunk and all bits of a depth.
+        Buffer<uint64_t> entry;
     };
     Buffer<uint32_t> chunk_offset;  // (chunk, tile + 1)
     std::vector<Chunk> chunk;
@@ -56,51 +57,52 @@ struct TileLists {
 // A chunk has at most this many records.
 constexpr uint64_t kMostChunkRecords = uint64_t(1) << 21;
 
-// Bins the records of one chunk, which are records[first .. first + count). It is fastest while
-// they are in the cache. Chunks may be binned concurrently.
+// Bins the records of one chunk, which are records[first .. first + count). It is
+// fastest while they are in the cache. Chunks may be binned concurrently.
 template <class T>
 void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const TileGrid& grid,
                size_t chunk, TileLists& out);
 
-// Joins the lists of the chunks into one list a tile. Once `stop` is true, it returns soon and
-// leaves the lists unfinished.
+// Joins the lists of the chunks into one list per tile. Once `stop` is true, it returns
+// soon and leaves the lists unfinished.
 void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out,
                  const std::atomic<bool>* stop = nullptr);
 
-// Sorts one tile's entries by the depths of their records; equal depths keep their order.
-// `scratch` has room for as many entries.
+// Sorts the entries of one tile by the depths of their records; equal depths keep their
+// order. `scratch` has room for as many entries.
 template <class T>
 void sort_tile(const Record<T>* records, EntryFormat format, uint64_t* entry, size_t count,
                uint64_t* scratch);
 
 namespace cuda {
 
-// The input of tile_bin(), all of it on the device.
+// The input of tile_bin(), all on the device.
 struct TileBinInput {
     const ItemTiles* items;
-    const FewTiles* few;  // tiles of each record, or kManyTiles where it is in `large`
+    const FewTiles* few;  // tiles of each record, or kManyTiles if it is in `large`
     RecordPlanes records;
     const FrameImage* images;
     uint32_t num_images, num_tiles;
     Capacity capacity;
     const LargeRecord* large;
     TileCounts counts;
-    // Their `entries` are set. Where the large records had too little room, these are not counted.
+    // This function sets `entries` of the counters. If there was too little room for
+    // the large records, these are not counted.
     FrameCounters* counters;
 };
 
-// The lists: tile t has entries tile_first[t] to tile_first[t + 1].
+// The output lists: tile t has entries tile_first[t] to tile_first[t + 1].
 struct TileBinOutput {
     unsigned long long* tile_first;  // [num_tiles + 1]
     uint32_t* image_of_tile;         // [num_tiles]
     TileEntry* entries;
 };
 
-// Returns the number of words of TileCounts::state.
+// Returns the number of elements of TileCounts::state.
 size_t tile_bin_parts(size_t num_tiles);
 
-// Puts a frame's records into the lists of the tiles that they may touch. Work is queued on the
-// stream. Throws std::runtime_error when CUDA reports an error.
+// Adds a frame's records to the lists of the tiles that they may touch. Work is queued
+// on the stream. Throws std::runtime_error if CUDA reports an error.
 void tile_bin(const TileBinInput& in, const TileBinOutput& out, Stream stream);
 
 }  // namespace cuda

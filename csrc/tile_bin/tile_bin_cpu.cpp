@@ -1,6 +1,6 @@
-// Each chunk is counted, scanned and scattered alone, and most reach few tiles. Then each tile
-// collects its entries, chunk by chunk, so the order of the entries does not depend on which thread
-// took which chunk.
+// Each chunk is counted, scanned and scattered separately; most chunks reach few tiles.
+// Then each tile collects its entries chunk by chunk, so the order of the entries does
+// not depend on the assignment of chunks to threads.
 
 #include "tile_bin/tile_bin.h"
 
@@ -12,10 +12,11 @@
 
 namespace v3dg {
 
-// Entries of a chunk have all of a depth's bits, and the place in the chunk.
+// Entries of a chunk have all bits of a depth, and the index in the chunk.
 static constexpr EntryFormat kChunkFormat = EntryFormat::of(kMostChunkRecords, 0, INT32_MAX);
 
-// Calls visit(tile, box in it) for the tiles that a record's box meets; most boxes meet one.
+// Calls visit(tile, box in the tile) for the tiles that a record's box meets; most
+// boxes meet one.
 template <class T, class Visit>
 static V3DG_INLINE void for_each_tile(const Record<T>& r, const TileGrid& grid,
                                       const Visit& visit) {
@@ -39,8 +40,8 @@ template <class T>
 void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const TileGrid& grid,
                size_t chunk, TileLists& out) {
     const size_t num_tiles = grid.size();
-    // The offsets are first counts, then the begins of tiles, then the places of the next entries;
-    // the last place of a tile is the begin of the next tile.
+    // The offsets are first counts, then the beginnings of tiles, then the positions of
+    // the next entries. The last position of a tile is the beginning of the next tile.
     uint32_t* offset = out.chunk_offset.data() + chunk * (num_tiles + 1);
     std::memset(offset, 0, (num_tiles + 1) * sizeof *offset);
     const Record<T>* record = records + first;
@@ -69,7 +70,7 @@ void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const T
     out.chunk[chunk].most_depth = most;
 }
 
-// Returns the format of the entries of these chunks together.
+// Returns the format of the joined entries of these chunks.
 static EntryFormat format_of(const TileLists::Chunk* chunk, size_t num_chunks) {
     uint64_t end = 0;
     uint32_t least = UINT32_MAX, most = 0;
@@ -120,7 +121,7 @@ void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out,
     });
 }
 
-// Sorts entries by the bits of depth that they hold; equal entries keep their order.
+// Sorts entries by the depth bits that they contain; equal entries keep their order.
 static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_t* scratch) {
     constexpr size_t kSmall = 256;
     if (count <= kSmall) {
@@ -133,8 +134,8 @@ static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_
         for (size_t i = 0; i < count; ++i) entry[i] = (entry[i] & ~low) | scratch[entry[i] & low];
         return;
     }
-    // This is a stable radix sort, least significant digit first, over the bits in which depths
-    // differ after the least is subtracted.
+    // This is a stable radix sort, least significant digit first, over the bits that
+    // differ after the smallest depth is subtracted.
     constexpr int kMostBits = 12;
     const int most_bits = count < 1024 ? 8 : kMostBits;  // few counters for few entries
     uint64_t least = ~uint64_t(0), most = 0;
@@ -189,7 +190,7 @@ void sort_tile<float>(const Record<float>* records, EntryFormat format, uint64_t
     }
 }
 
-// Entries hold fewer bits of a depth than a double has.
+// Entries contain fewer depth bits than a double has.
 template <>
 void sort_tile<double>(const Record<double>* records, EntryFormat format, uint64_t* entry,
                        size_t count, uint64_t*) {

@@ -1,7 +1,7 @@
-// Binning counts, scans and scatters. Records over few tiles have been counted where they were
-// projected; here records over many tiles are counted, their rows of tiles spread over a warp. The
-// file is compiled without contraction, so that the counting and the scattering kernel see the same
-// ellipse.
+// Binning counts, scans and scatters. project() has counted records over few tiles;
+// here records over many tiles are counted, with their rows of tiles distributed over a
+// warp. The file is compiled without contraction, so that the counting and the
+// scattering kernel compute the same ellipses.
 
 #include "tile_bin/tile_bin.h"
 
@@ -18,23 +18,23 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kThreads = 256, kWarps = kThreads / 32;
-constexpr unsigned kBlocks = 5;  // blocks on a multiprocessor with 164 KiB of shared memory
+constexpr unsigned kBlocks = 5;  // blocks per multiprocessor with 164 KiB of shared memory
 
 // The shape of the kernel that counts large records.
 constexpr unsigned kCountThreads = 512, kCountBlocks = 3;
-// The number of large records a tile from which blocks count in their own memory.
+// The number of large records per tile from which blocks count in their shared memory.
 constexpr unsigned kLeastLarge = 16;
 
-// Large records that a warp takes together; lanes 16 apart have the same record.
+// Large records that a warp processes together; lanes 16 apart have the same record.
 struct LargeBatch {
     uint32_t image;
     uint32_t record;  // the record of this lane
     RecordBox box;    // the box of that record
-    int rows;         // rows of tiles of this lane's record; 0 without a record
-    int rows_after;   // rows of all records up to this one
+    int rows;         // number of tile rows of this lane's record; 0 without a record
+    int rows_after;   // number of rows of all records up to this one
 };
 
-// A warp's part of the rows of a batch, which has 2^log2_parts parts.
+// A warp's part of the rows of a batch, which is divided into 2^log2_parts parts.
 struct LargePart {
     int number, log2_parts;
 };
@@ -56,8 +56,8 @@ __device__ RecordBox box_of_lane(const RecordBox& box, int lane) {
             static_cast<uint16_t>(rows), static_cast<uint16_t>(rows >> 16)};
 }
 
-// Returns the first of `kCount` lanes whose number, which does not decrease from lane to lane, is
-// above `at`; the last lane if none is.
+// Returns the first of `kCount` lanes whose number is above `at`; the last lane if
+// there is none. The numbers do not decrease from lane to lane.
 template <int kCount>
 __device__ int first_lane_above(int number, int at) {
     int lane = 0;
@@ -67,9 +67,9 @@ __device__ int first_lane_above(int number, int at) {
     return lane;
 }
 
-// Calls begin_row(number, record) for 32 rows of a batch's records, a lane a row, and then
-// visit(from, row, column) for each 32 tiles of those rows: each lane has a tile in the row of lane
-// `from`. A column below 0 means no tile.
+// Calls begin_row(number, record) for 32 rows of a batch's records, one per lane, and
+// then visit(from, row, column) for each 32 tiles of those rows: each lane has a tile
+// in the row of lane `from`. A column below 0 means no tile.
 template <class BeginRow, class Visit>
 __device__ void for_each_tile(const TileBinInput& in, const LargeBatch& batch,
                               const LargePart& part, const BeginRow& begin_row,
@@ -98,8 +98,8 @@ __device__ void for_each_tile(const TileBinInput& in, const LargeBatch& batch,
     }
 }
 
-// Calls visit(batch, part) for all large records, batch by batch, by whole warps of the grid. Where
-// there are few batches, several warps take parts of each.
+// Calls visit(batch, part) for all large records, batch by batch, with all warps of the
+// grid. If there are few batches, several warps process parts of each.
 template <class Visit>
 __device__ void for_each_part(const TileBinInput& in, const Visit& visit) {
     constexpr int kLog2MostParts = 2;
@@ -114,7 +114,8 @@ __device__ void for_each_part(const TileBinInput& in, const Visit& visit) {
               LargePart{static_cast<int>(at & ((1u << log2_parts) - 1)), log2_parts});
 }
 
-// Calls visit(tile) for the tiles of all large records, a lane a tile; kNoTile means none.
+// Calls visit(tile) for the tiles of all large records, one per lane; kNoTile means
+// none.
 template <class Visit>
 __device__ void for_each_large_tile(const TileBinInput& in, const Visit& visit) {
     for_each_part(in, [&](const LargeBatch& batch, const LargePart& part) {
@@ -127,8 +128,8 @@ __device__ void for_each_large_tile(const TileBinInput& in, const Visit& visit) 
     });
 }
 
-// Counts large records. Where there are many, a block counts in its shared memory first, if the
-// tiles fit into it.
+// Counts large records. If there are many, a block first counts in its shared memory,
+// provided that the tiles fit.
 __global__ void __launch_bounds__(kCountThreads, kCountBlocks)
     count_large_kernel(TileBinInput in, bool has_room) {
     await_kernel_before();
@@ -144,7 +145,8 @@ __global__ void __launch_bounds__(kCountThreads, kCountBlocks)
         if (tile != kNoTile) atomicAdd(counts + tile, 1u);
     });
     __syncthreads();
-    // Each block begins with another tile, so that they do not access the same one at once.
+    // Each block starts at a different tile, so that blocks do not access the same one
+    // at once.
     const uint32_t first = static_cast<uint32_t>(size_t(in.num_tiles) * blockIdx.x / gridDim.x);
     for (uint32_t i = threadIdx.x; i < in.num_tiles; i += kCountThreads) {
         const uint32_t tile = first + i < in.num_tiles ? first + i : first + i - in.num_tiles;
@@ -153,7 +155,7 @@ __global__ void __launch_bounds__(kCountThreads, kCountBlocks)
 }
 
 __device__ uint32_t image_of(const TileBinInput& in, uint32_t tile) {
-    // Finds the last image that begins at the tile or before.
+    // Finds the last image that begins at or before the tile.
     uint32_t first = 0, count = in.num_images;
     while (count > 1) {
         const uint32_t half = count / 2;
@@ -164,7 +166,7 @@ __device__ uint32_t image_of(const TileBinInput& in, uint32_t tile) {
     return first;
 }
 
-// Scans the counts, a thread a tile.
+// Scans the counts, one thread per tile.
 __global__ void scan_kernel(TileBinInput in, TileBinOutput out) {
     await_kernel_before();
     __shared__ unsigned long long before_block;
@@ -187,36 +189,36 @@ __global__ void scan_kernel(TileBinInput in, TileBinOutput out) {
     }
 }
 
-// The destination of entries. A tile's list is filled from its end on, and its count goes down to
-// 0.
+// The destination of entries. A tile's list is filled from its end backwards, while its
+// count decreases to 0.
 struct Scatter {
     const unsigned long long* tile_first;
-    uint32_t* left;  // [num_tiles] places that are left
+    uint32_t* left;  // [num_tiles] free positions
     TileEntry* entries;
 };
 
-// The places of a warp's lanes in the lists of their tiles. Lanes of one tile share an atomic
-// operation.
+// The positions of a warp's lanes in the lists of their tiles. Lanes with the same tile
+// share one atomic operation.
 struct Places {
     unsigned peers;
-    uint32_t left;  // places that are left to the peers
+    uint32_t left;  // free positions before those of the peers
 
-    // Called by a whole warp; kNoTile gets no place.
+    // Called by a whole warp; kNoTile gets no position.
     __device__ Places(const Scatter& to, uint32_t tile)
         : peers(__match_any_sync(kAllLanes, tile)), left(0) {
         if (tile != kNoTile && threadIdx.x % 32 + 1 == unsigned(__ffs(peers)))
             left = atomicSub(to.left + tile, unsigned(__popc(peers)));
     }
-    // Returns the place of this lane, relative to the begin of its tile's list; called by a whole
-    // warp.
+    // Returns the position of this lane, relative to the beginning of its tile's list.
+    // Called by a whole warp.
     __device__ uint32_t own() const {
         const uint32_t of_peers = __shfl_sync(kAllLanes, left, __ffs(peers) - 1);
         return of_peers - 1 - __popc(peers & ((1u << threadIdx.x % 32) - 1));
     }
 };
 
-// Entries of records over few tiles that a warp scatters at once: two a lane, because the atomic
-// operation for a place has a long latency.
+// Entries of records over few tiles that a warp scatters at once: two per lane, because
+// the atomic operation for a position has a long latency.
 constexpr unsigned kAtOnce = 2, kFewAtOnce = 32 * kAtOnce;
 
 // A record over few tiles, and one of its tiles.
@@ -226,15 +228,15 @@ struct FewPlace {
     unsigned tile;
 };
 
-// Records for their tiles beyond the first; they are collected until there are kFewAtOnce.
+// Records and their tiles beyond the first; collected until there are kFewAtOnce.
 struct WaitingPlaces {
     static constexpr unsigned kMost = kFewAtOnce - 1 + kFewAtOnce * (kFewTiles - 1);
     FewTiles few[kMost];
-    uint32_t record[kMost];  // the highest bits have the tile
+    uint32_t record[kMost];  // the highest bits contain the tile
 };
 static_assert(kFewTiles <= 1u << (32 - kMostRecordBits), "a tile fits above a record");
 
-// Writes the entries of these records; called by a whole warp.
+// Writes the entries of these records. Called by a whole warp.
 __device__ void scatter_few(const Scatter& to, const ItemTiles& item,
                             const FewPlace (&places)[kAtOnce]) {
     EntryBox box[kAtOnce];
@@ -261,7 +263,7 @@ __device__ void scatter_few(const Scatter& to, const ItemTiles& item,
     }
 }
 
-// Scatters an item's records over few tiles; called by a whole warp.
+// Scatters an item's records over few tiles. Called by a whole warp.
 __device__ void scatter_item(const TileBinInput& in, const Scatter& to, const ItemTiles& item,
                              WaitingPlaces& waiting) {
     const unsigned lane = threadIdx.x % 32;
@@ -308,7 +310,7 @@ __device__ void scatter_item(const TileBinInput& in, const Scatter& to, const It
     __syncwarp();
 }
 
-// Scatters a part of a batch of records over many tiles; called by a whole warp.
+// Scatters a part of a batch of records over many tiles. Called by a whole warp.
 __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const LargeBatch& batch,
                               const LargePart& part) {
     const FrameImage& image = in.images[batch.image];
@@ -336,8 +338,8 @@ __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const L
         });
 }
 
-// Scatters all records. A warp requests its next item when it begins with one; records over many
-// tiles come last.
+// Scatters all records. A warp claims its next item when it starts with one; records
+// over many tiles come last.
 __global__ void __launch_bounds__(kThreads, kBlocks)
     scatter_kernel(TileBinInput in, TileBinOutput out) {
     await_kernel_before();

@@ -7,14 +7,15 @@
 namespace v3dg {
 namespace cuda {
 
-// The columns [first, first + count) of one row of tiles that a record's ellipse may reach.
+// The columns [first, first + count) of one row of tiles that a record's ellipse may
+// reach.
 struct TileRun {
     int row, first, count;
 };
 
-// Returns the tiles of one row, which counts from the record's first row of tiles. Rounding ignores
-// pixel centres, and NaN keeps the whole box: the same comparisons count and scatter, and a
-// superfluous tile only costs an entry.
+// Returns the tiles of one row, counted from the record's first row of tiles. It does
+// not round to pixel centres, and NaN keeps the whole box: counting and scattering use
+// the same comparisons, and a superfluous tile only costs an entry.
 V3DG_HD inline TileRun tile_run(const Record<float>& r, int row) {
     row += r.y0 / kFrameTileHeight;
     const int top = max_of(static_cast<int>(r.y0), row * kFrameTileHeight);

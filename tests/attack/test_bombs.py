@@ -35,6 +35,7 @@ import sys, warnings
 from pathlib import Path
 warnings.simplefilter("error")
 import v3dg
+warnings.simplefilter("ignore", v3dg.cleaning.AssetWarning)
 for warm_up in sys.argv[2:]:  # what is imported late
     v3dg.read_asset(warm_up)
 def kib(name):
@@ -331,12 +332,45 @@ def glb_of_one_stream(times):
     return glb_of(document, stream)
 
 
+def glb_of_zeros(nodes, count, times=1, **fields):
+    """As many gaussians without a single number of their own."""
+    names = ("SCALE", "ROTATION", "OPACITY", "SH_DEGREE_0_COEF_0")
+    attributes = {f"KHR_gaussian_splatting:{name}": i for i, name in enumerate(names, 1)}
+    primitive = {
+        "attributes": {"POSITION": 0, **attributes},
+        "extensions": {"KHR_gaussian_splatting": {}},
+    }
+    kinds = ("VEC3", "VEC3", "VEC4", "SCALAR", "VEC3")
+    accessor = {"componentType": 5126, "count": count, **fields}
+    document = {
+        "nodes": nodes,
+        "meshes": [{"primitives": [primitive] * times}],
+        "accessors": [{**accessor, "type": kind} for kind in kinds],
+        "bufferViews": [{"buffer": 0, "byteLength": 16}],
+        "buffers": [{}],
+    }
+    return glb_of(document, bytes(16))
+
+
 GLB = {
     "many accessors": lambda: glb_of(b'{"accessors":[' + b"{}," * 1_000_000 + b"{}]}"),
     "many accessors in 1 MiB": lambda: glb_of(
         b'{"buffers":[],"bufferViews":[],"meshes":[],"accessors":[' + b"{}," * 300_000 + b"{}]}"
     ),
     "one stream many times": lambda: glb_of_one_stream(4000),
+    "many nodes": lambda: glb_of(b'{"nodes":[' + b"{}," * 340_000 + b"{}]}"),
+    "a chain of nodes": lambda: glb_of(
+        {"nodes": [{"children": [i + 1]} for i in range(40_000)] + [{}]}
+    ),
+    "a mesh of many nodes": lambda: glb_of_zeros([{"mesh": 0}] * 80_000, 1000),
+    "many primitives": lambda: glb_of_zeros([{"mesh": 0}], 1 << 17, 10_000),
+    "many meshes of many extensions": lambda: glb_of({"extensionsUsed": ["x"] * 200_000}),
+    "a sparse accessor": lambda: glb_of_zeros(
+        [{"mesh": 0}],
+        FREE_GAUSSIANS,
+        sparse={"count": FREE_GAUSSIANS, "indices": {"bufferView": 0, "componentType": 5125}},
+    ),
+    "zeros that are believed": lambda: glb_of_zeros([{"mesh": 0}], FREE_GAUSSIANS),
 }
 
 BOMBS = {

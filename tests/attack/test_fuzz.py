@@ -14,6 +14,7 @@ from fuzz.targets import READERS
 CORPUS = Path(__file__).parents[1] / "fuzz" / "corpus"
 
 
+@pytest.mark.filterwarnings("ignore::v3dg.cleaning.AssetWarning")
 @pytest.mark.parametrize("name", READERS)
 def test_kept_inputs_are_read_or_refused(tmp_path, name):
     with zipfile.ZipFile(CORPUS / f"{name}.zip") as archive:

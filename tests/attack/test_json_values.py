@@ -16,6 +16,7 @@ import pytest
 
 import v3dg
 from fuzz.attacks.good_files import good_files, streamed
+from gltf_files import file_of_every_part
 from random_bundle import random_gaussians
 from v3dg._json import is_one_line
 
@@ -98,7 +99,15 @@ def glb_kind(folder, compressed):
         )
         path.write_bytes(header + text + rest)
 
-    return Kind(document, write, v3dg.read_asset, path)
+    return Kind(document, write, read_both, path)
+
+
+def gltf_kind(folder):
+    file = file_of_every_part()
+    path = folder / "a.gltf"
+    (folder / "a.bin").write_bytes(file.blob)
+    file.write(path, "a.bin")
+    return Kind(json.loads(path.read_text()), path.write_text, read_both, path)
 
 
 def sog_kind(folder):
@@ -114,7 +123,7 @@ def sog_kind(folder):
             for name, picture in files.items():
                 archive.writestr(name, picture)
 
-    return Kind(document, write, v3dg.read_asset, path)
+    return Kind(document, write, read_both, path)
 
 
 def json_kind(folder, good, read):
@@ -133,16 +142,29 @@ def read_both(path):
     """What is looked at first, and the gaussians."""
     from v3dg.io import open_asset
 
-    open_asset(path)
+    notes = open_asset(path).declared.notes
+    assert all(len(note) < 200 and is_one_line(note) for note in notes), notes
     return v3dg.read_asset(path)
 
 
-KINDS = ["glb", "glb of spz", "sog", "sog_folder", "streamed", "scene 0", "scene 1", "scene 2"]
+KINDS = [
+    "gltf",
+    "glb",
+    "glb of spz",
+    "sog",
+    "sog_folder",
+    "streamed",
+    "scene 0",
+    "scene 1",
+    "scene 2",
+]
 KINDS += ["cameras 0", "cameras 1", "cameras 2"]
 
 
 @pytest.fixture(params=KINDS)
 def kind(request, tmp_path):
+    if request.param == "gltf":
+        return gltf_kind(tmp_path)
     if request.param.startswith("glb"):
         return glb_kind(tmp_path, "spz" in request.param)
     if request.param == "sog":
@@ -156,6 +178,7 @@ def kind(request, tmp_path):
     return json_kind(tmp_path, good, read)
 
 
+@pytest.mark.filterwarnings("ignore::v3dg.cleaning.AssetWarning")  # read_both looks at notes
 def test_every_value_of_another_kind_is_named(kind):
     faults = []
     for document, change in variants(kind.document):

@@ -163,7 +163,7 @@ def settled(browser, server, address):
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto(f"http://127.0.0.1:{server.server_address[1]}/{address}")
     states = [None, None]
-    for _ in range(60):
+    for _ in range(180):
         page.wait_for_timeout(1000)
         states.append(page.evaluate("window.v3dg ? [window.v3dg.ready, window.v3dg.drawn] : null"))
         if states[-1] and states[-1][0] and states[-1] == states[-2] == states[-3]:
@@ -171,6 +171,7 @@ def settled(browser, server, address):
     picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")) / 255
     page.close()
     assert errors == []
+    assert states[-1][0], "the page did not settle"
     return picture, states[-1][1]
 
 
@@ -188,6 +189,138 @@ def test_the_page_of_a_scene_shows_what_we_do(browser, server, town):
 def test_the_page_of_a_scene_keeps_its_budget(browser, server, town, budget):
     _, drawn = page_of(browser, server, town, f"budget={budget}&tolerance=0.1")
     assert 0.9 * budget < drawn <= budget
+
+
+# Widths and heights in CSS px, by which the page chooses levels, and device pixels for
+# each: few on the desktop, because software draws them.
+SIZES = {"desktop": (1920, 1080, 0.1), "phone": (390, 844, 3)}
+BUDGET = 20_000
+
+
+@pytest.fixture(scope="module")
+def crowd(server, bundle):
+    """The folder of a page with 225 instances, in chunks of which the coarsest levels
+    of the bundle would leave most empty, and cameras inside of the crowd and around
+    it."""
+    rng = np.random.default_rng(1)
+    row = np.arange(15) * 1.5 - 10.5
+    positions = np.stack([*np.meshgrid(row, row), np.zeros((15, 15))], axis=-1).reshape(-1, 3)
+    scene = v3dg.Scene()
+    scene.add(bundle, positions, [1, 0, 0, 0], rng.uniform(0.8, 1.2, 225))
+    eyes = {
+        "inside": ((0.3, 0.6, 0.3), (5, 8, 0)),
+        "corner": ((-12, -12, 1), (0, 0, 0)),
+        "above": ((0, -3, 8), (0, 2, 0)),
+        "far": ((60, 60, 30), (0, 0, 0)),
+    }
+    cameras = {
+        name: v3dg.Camera.look_at(eye, target, width=1920, height=1080)
+        for name, (eye, target) in eyes.items()
+    }
+    write_site(scene, server.folder / "crowd", cameras, chunk=2048)
+    shutil.copy(ENGINE, server.folder / "crowd")
+    return "crowd"
+
+
+class WatchedPage:
+    """One of our pages, and the number of gaussians that each of its frames draws."""
+
+    RECORD = """
+        window.frames_drawn = [];
+        let last;
+        Object.defineProperty(window, "v3dg", {
+            get: () => last,
+            set(state) { last = state; window.frames_drawn.push(state.drawn); },
+        });
+    """
+
+    def __init__(self, browser, server, address, size):
+        width, height, pixels = SIZES[size]
+        viewport = {"width": width, "height": height}
+        self.context = browser.new_context(viewport=viewport, device_scale_factor=pixels)
+        self.page = self.context.new_page()
+        self.errors = []
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.add_init_script(self.RECORD)
+        self.page.goto(f"http://127.0.0.1:{server.server_address[1]}/{address}")
+
+    def settled(self):
+        """How many gaussians are drawn once all that the view needs is."""
+        self.page.wait_for_function("window.v3dg?.ready", timeout=120_000)
+        return self.page.evaluate("window.v3dg.drawn")
+
+    def drawn(self):
+        """How many each frame drew since the last call."""
+        return self.page.evaluate("window.frames_drawn.splice(0)")
+
+    def go_to(self, camera):
+        self.page.evaluate(
+            """(camera) => {
+                const views = document.getElementById("view");
+                views.value = camera;
+                views.dispatchEvent(new Event("change"));
+                window.v3dg = { ready: false, drawn: 0 };
+            }""",
+            camera,
+        )
+
+    def set_budget(self, budget):
+        self.page.evaluate(
+            """(budget) => {
+                const range = document.getElementById("budget");
+                range.value = Math.log10(budget);
+                range.dispatchEvent(new Event("input"));
+                window.v3dg = { ready: false, drawn: 0 };
+            }""",
+            budget,
+        )
+
+
+@pytest.fixture
+def watched(browser, server, crowd, request):
+    page = WatchedPage(
+        browser,
+        server,
+        f"{crowd}/index.html?webgl&noui&budget={BUDGET}&tolerance=0.1",
+        request.param,
+    )
+    yield page
+    page.context.close()
+    assert page.errors == []
+
+
+@needs_engine
+@pytest.mark.parametrize("watched", SIZES, indirect=True)
+def test_the_budget_holds_inside_a_crowd_and_after_jumps(watched):
+    """In every frame: while levels load, too."""
+    assert 0.8 * BUDGET < watched.settled() <= BUDGET
+    for camera in (1, 0, 3, 2):
+        watched.go_to(camera)
+        assert 0.8 * BUDGET < watched.settled() <= BUDGET
+        assert max(watched.drawn()) <= BUDGET
+
+
+@needs_engine
+@pytest.mark.parametrize("watched", SIZES, indirect=True)
+def test_the_budget_holds_in_movement(watched):
+    watched.settled()
+    for key in ("KeyW", "KeyA", "KeyE"):
+        watched.page.keyboard.down(key)
+        watched.page.wait_for_timeout(3000)
+        watched.page.keyboard.up(key)
+    assert 0.8 * BUDGET < watched.settled() <= BUDGET
+    drawn = watched.drawn()
+    assert len(set(drawn)) > 5  # the eye did move
+    assert max(drawn) <= BUDGET
+
+
+@needs_engine
+@pytest.mark.parametrize("watched", ["phone"], indirect=True)
+def test_a_budget_that_changes_holds(watched):
+    for budget in (100_000, 8_000, 40_000):
+        watched.settled()
+        watched.set_budget(budget)
+        assert 0.7 * budget < watched.settled() <= budget
 
 
 @pytest.mark.skipif(CESIUM is None, reason="CESIUM does not name its folder")

@@ -23,6 +23,7 @@ import chromium
 import v3dg
 from benchmarks.worlds.procedural import make_donut
 from v3dg.export import write_streamed_sog
+from v3dg.formats import _axes
 from v3dg.metrics import psnr
 
 pytest.importorskip("playwright.sync_api")
@@ -38,8 +39,11 @@ pytestmark = [
 
 SIDE, FOV = 300, 40
 EYE = (0.18, -0.38, 0.30)  # of the donut, whose z is up
+UP = (0.0, 0.0, 1.0)
+# The axes of files that are turned, from those of a donut whose z is up.
+AXES = {".spz": _axes.OPENGL, ".glb": _axes.GLTF}
 
-# Each page looks from EYE at the origin, with z up, and counts the pictures since its
+# Each page looks from EYE at the origin, with UP up, and counts the pictures since its
 # asset was there.
 HEAD = """<!doctype html>
 <style>
@@ -47,7 +51,7 @@ body { margin: 0; overflow: hidden }
 canvas { width: 100vw; height: 100vh; display: block }
 </style>
 <canvas id="canvas"></canvas>
-<script>const file = "FILE", eye = EYE, canvas = document.getElementById("canvas");
+<script>const file = "FILE", eye = EYE, up = UP, canvas = document.getElementById("canvas");
 window.frames_shown = 0;</script>
 """
 PAGES = {
@@ -67,7 +71,7 @@ const camera = new pc.Entity();
 camera.addComponent("camera", { clearColor: new pc.Color(0, 0, 0), fov: FOV, nearClip: 0.01 });
 app.root.addChild(camera);
 camera.setPosition(...eye);
-camera.lookAt(new pc.Vec3(0, 0, 0), new pc.Vec3(0, 0, 1));
+camera.lookAt(new pc.Vec3(0, 0, 0), new pc.Vec3(...up));
 const glb = file.endsWith(".glb");
 const asset = new pc.Asset(file, glb ? "container" : "gsplat", { url: file });
 app.assets.add(asset);
@@ -92,7 +96,7 @@ renderer.setSize(innerWidth, innerHeight);
 const scene = new THREE.Scene();
 const camera = new THREE.PerspectiveCamera(FOV, innerWidth / innerHeight, 0.01, 100);
 scene.add(new SparkRenderer({ renderer }));
-camera.up.set(0, 0, 1);
+camera.up.set(...up);
 camera.position.set(...eye);
 camera.lookAt(0, 0, 0);
 const mesh = new SplatMesh({ url: file });
@@ -108,9 +112,9 @@ const engine = new BABYLON.Engine(canvas, false), scene = new BABYLON.Scene(engi
 scene.clearColor = new BABYLON.Color4(0, 0, 0, 1);
 const glb = file.endsWith(".glb");
 scene.useRightHandedSystem = glb;
-const place = new BABYLON.Vector3(eye[0], glb ? eye[1] : -eye[1], eye[2]);
-const camera = new BABYLON.FreeCamera("camera", place, scene);
-camera.upVector = new BABYLON.Vector3(0, 0, 1);
+const reflected = ([x, y, z]) => new BABYLON.Vector3(x, glb ? y : -y, z);
+const camera = new BABYLON.FreeCamera("camera", reflected(eye), scene);
+camera.upVector = reflected(up);
 camera.setTarget(BABYLON.Vector3.Zero());
 camera.fov = FOV * Math.PI / 180;
 camera.minZ = 0.01;
@@ -148,7 +152,7 @@ def site(tmp_path_factory, asset):
     """The address of a folder with files of an asset, and the folder."""
     folder = tmp_path_factory.mktemp("files")
     for suffix in ("ply", "compressed.ply", "spz", "sog", "glb"):
-        v3dg.write_asset(folder / f"donut.{suffix}", asset)
+        v3dg.write_asset(folder / f"donut.{suffix}", asset, up="z")
     bundle = v3dg.build_bundle(asset, config=v3dg.BuildConfig(steps=0), progress=False)
     write_streamed_sog(bundle, folder / "streamed", chunk=6000, up="-y")
     (folder / "modules").symlink_to(MODULES)
@@ -163,7 +167,11 @@ def shown(browser, site, engine, file):
     """The picture, (H, W, 3), at which the page of an engine settles."""
     address, folder = site
     page_file = folder / f"{engine}.html"
-    html = HEAD.replace("FILE", file).replace("EYE", str(list(EYE))) + PAGES[engine]
+    turn = np.eye(3)
+    if page_file.with_name(file).suffix in AXES:
+        turn = _axes.turn(_axes.axes_of_up("z"), AXES[page_file.with_name(file).suffix])
+    html = HEAD.replace("FILE", file) + PAGES[engine]
+    html = html.replace("EYE", str((turn @ EYE).tolist())).replace("UP", str((turn @ UP).tolist()))
     page_file.write_text(html.replace("FOV", str(FOV)))
     page, errors = browser.new_page(viewport={"width": SIDE, "height": SIDE}), []
     page.on("pageerror", lambda error: errors.append(str(error)))

@@ -15,6 +15,7 @@ import chromium
 import scenes_lod
 import v3dg
 from v3dg.viewer.frame import SceneView
+from v3dg.viewer.link import read_link
 from v3dg.viewer.server import Site
 
 pytest.importorskip("websockets")
@@ -150,7 +151,7 @@ def test_picture_is_there_and_follows_the_camera_and_a_slider(tab):
     selected = tab.figure("selected")
     tab.set("Tolerance px²", 32)
     coarse = tab.settled()
-    assert tab.figure("selected") < 0.7 * selected
+    assert tab.figure("selected") < 0.9 * selected  # from near, most is fine detail
     assert differ(turned, coarse) > 0.001
 
 
@@ -386,6 +387,29 @@ def test_link_leads_to_the_same_picture(browser, site, tab):
         assert differ(first, other.settled()) < 0.002
         assert other.page.get_by_role("slider", name="Tolerance px²").input_value() == "12"
         assert other.page.get_by_role("radio", name="Fly").get_attribute("aria-checked") == "true"
+
+
+def test_python_reads_the_camera_of_a_link(tab):
+    tab.drag()
+    tab.settled()
+    camera = tab.page.evaluate("() => ({ ...viewer.camera.view(1), focus: viewer.camera.focus })")
+    place = read_link(tab.page.evaluate("() => location.origin + viewer.linkState.hash"))
+    assert place.view.position == pytest.approx(camera["position"], rel=1e-5, abs=1e-5)
+    assert place.view.wxyz == pytest.approx(camera["wxyz"], abs=1e-6)
+    assert place.view.fov_y == pytest.approx(camera["fov_y"], rel=1e-4)
+    assert place.focus == pytest.approx(camera["focus"], rel=1e-5, abs=1e-5)
+
+
+def test_background_is_chosen_and_kept_in_the_link(browser, tab):
+    assert (tab.settled()[:5, :5] == 0).all()
+    tab.page.get_by_label("Background").fill("#ff8000")
+    corner = tab.settled()[:5, :5].reshape(-1, 3).astype(int)
+    assert abs(corner - (255, 128, 0)).max() < 12
+    link = tab.page.evaluate("() => location.href.split('#')[0] + viewer.linkState.hash")
+    assert "background=ff8000" in link
+    with Tab(browser, link) as other:
+        corner = other.settled()[:5, :5].reshape(-1, 3).astype(int)
+        assert abs(corner - (255, 128, 0)).max() < 12
 
 
 @pytest.mark.parametrize(
@@ -710,3 +734,44 @@ def test_camera_goes_to_one_of_the_file_and_back(tab):
     tab.press("Show all")
     tab.page.wait_for_timeout(900)
     assert differ(first, tab.settled()) < 0.01
+
+
+def test_a_box_is_drawn_dragged_and_saved_as_a_new_asset(browser, site, tmp_path):
+    bundle = site.scene_view.scene.bundles[0]
+    alone = Site(SceneView(bundle, device="cpu"), name="blob", port=0, edits_folder=tmp_path)
+    try:
+        with Tab(browser, alone.url) as tab:
+            before = tab.settled()
+            tab.open("Crop")
+            tab.press("Draw a box")
+            tab.page.wait_for_function("() => viewer.crop.isOn")
+            assert differ(before, tab.settled()) > 0.002
+            face = "viewer.crop.inWorld(viewer.crop.middleOf({ axis: 0, end: 1 }))"
+            place = f"viewer.overlay.projection.place({face})"
+            handle = tab.page.evaluate(place)
+            low, high = tab.page.evaluate("viewer.crop.box")
+            target = [(low[0] + high[0]) / 2, *(np.add(low, high) / 2)[1:].tolist()]
+            end = tab.page.evaluate(f"viewer.overlay.projection.place({target})")
+            tab.drag(handle, end)
+            dragged = tab.page.evaluate("viewer.crop.box")
+            # The face is where the pointer let go of it, and no other has moved.
+            np.testing.assert_allclose(dragged[1][0], target[0], atol=0.02 * (high[0] - low[0]))
+            assert dragged[0] == low
+            assert dragged[1][1:] == high[1:]
+            assert tab.page.evaluate("viewer.crop.text").startswith("box:")
+            tab.page.get_by_label("Part").select_option("outside")
+            tab.page.get_by_label("New file").fill("rest.ply")
+            tab.press("Save as a new asset")
+            tab.page.wait_for_function(
+                "() => document.body.innerText.includes('rest.ply was written')"
+            )
+            whole = bundle.level_gaussians(0)
+            expected = v3dg.crop_box(whole, *dragged, keep="outside")
+            assert 0 < len(expected) < len(whole)
+            written = v3dg.read_asset(tmp_path / "rest.ply")
+            np.testing.assert_array_equal(written.means, expected.means)
+            tab.page.locator("#overlay").focus()
+            tab.page.keyboard.press("Escape")
+            assert differ(before, tab.settled()) < 0.002
+    finally:
+        alone.close()

@@ -68,9 +68,12 @@ def files(tmp_path_factory):
     config = v3dg.BuildConfig(steps=10, cluster_size=64)
     bundle = v3dg.build_bundle(asset, config=config, progress=False, device="cpu")
     bundle.write(folder / "donut.v3dg")
-    for name in ("plants", "assets", "trees", "tiles"):
+    for name in ("plants", "assets", "trees", "tiles", "parts"):
         (folder / name).mkdir()
     bundle.write(folder / "plants" / "tree.v3dg")
+    block = v3dg.Scene()
+    block.add(bundle)
+    v3dg.write_scene(folder / "parts" / "block.json", block, ["../donut.v3dg"])
     for i in range(8):
         tree = asset.subset(slice(100 * i, 100 * i + 100))
         v3dg.write_asset(folder / "trees" / f"tree{i}.ply", tree)

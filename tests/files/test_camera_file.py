@@ -245,3 +245,156 @@ def test_an_applied_transform_that_scales_is_not_undone(tmp_path):
 def test_unknown_choices_are_refused(tmp_path, argument):
     with pytest.raises(ValueError, match=f"{argument}: expected '.*' or '.*', got 'maybe'"):
         read_cameras(put(tmp_path, CAPTURE), **{argument: "maybe"})
+
+
+def cameras_of_3dgs(cameras):
+    """What the code of the 3DGS paper writes for cameras."""
+    entries = []
+    for number, (name, camera) in enumerate(cameras.items()):
+        to_world = np.linalg.inv(camera.viewmat)
+        entry = {
+            "id": number,
+            "img_name": name,
+            "width": camera.width,
+            "height": camera.height,
+            "position": to_world[:3, 3].tolist(),
+            "rotation": to_world[:3, :3].tolist(),
+            "fy": camera.fy,
+            "fx": camera.fx,
+        }
+        entries.append(entry)
+    return entries
+
+
+@pytest.mark.parametrize("names", [("DSC_1", "DSC_2"), ("a", "a"), ("", "b")])
+def test_cameras_of_the_3dgs_code_are_read(tmp_path, names):
+    pair = [
+        Camera.look_at((1, 2, 3), (0, 0, 0), width=640, height=480),
+        Camera.look_at((3, -2, 1), (0, 1, 0), fov_x=1.0, width=320, height=200),
+    ]
+    entries = cameras_of_3dgs(dict(zip("xy", pair, strict=True)))
+    for entry, name in zip(entries, names, strict=True):
+        entry["img_name"] = name
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps(entries))
+    wanted_names = list(names) if names == ("DSC_1", "DSC_2") else ["0", "1"]
+    for place in (path, tmp_path):
+        found = read_cameras(place)
+        assert list(found) == wanted_names
+        for camera, wanted in zip(found.values(), pair, strict=True):
+            np.testing.assert_allclose(camera.viewmat, wanted.viewmat, atol=1e-12)
+            np.testing.assert_allclose(camera.K, wanted.K, rtol=1e-12)
+            assert (camera.width, camera.height) == (wanted.width, wanted.height)
+
+
+PATH = {
+    "default_fov": 75,
+    "default_transition_sec": 2,
+    "keyframes": [{"matrix": [1.0] * 16, "fov": 60, "aspect": 1.5}],
+    "camera_type": "perspective",
+    "render_height": 480,
+    "render_width": 640,
+    "fps": 30,
+    "seconds": 2,
+    "is_cycle": False,
+    "camera_path": [
+        {"camera_to_world": np.array(MATRIX).ravel().tolist(), "fov": 60, "aspect": 4 / 3},
+        {"camera_to_world": MATRIX, "fov": 50.0, "aspect": 4 / 3},
+    ],
+}
+
+
+def test_a_path_of_the_viewer_of_nerfstudio_is_read(tmp_path):
+    path = tmp_path / "camera_path.json"
+    path.write_text(json.dumps(PATH))
+    for place in (path, tmp_path):
+        found = read_cameras(place)
+        assert list(found) == ["0", "1"]
+        for camera, fov in zip(found.values(), (60, 50), strict=True):
+            np.testing.assert_allclose(camera.viewmat, VIEWMAT, atol=1e-15)
+            # The field of view is vertical, and pixels are square.
+            focal = 240 / math.tan(math.radians(fov) / 2)
+            np.testing.assert_allclose(camera.K, [[focal, 0, 320], [0, focal, 240], [0, 0, 1]])
+            assert (camera.width, camera.height) == (640, 480)
+
+
+def test_frames_of_a_path_may_have_names(tmp_path):
+    frames = [
+        {**frame, "file_path": name} for frame, name in zip(PATH["camera_path"], "ba", strict=True)
+    ]
+    assert list(read_cameras(put(tmp_path, PATH | {"camera_path": frames}))) == ["b", "a"]
+
+
+def without_size():
+    return {key: value for key, value in PATH.items() if not key.startswith("render_")}
+
+
+def test_a_path_without_a_size_needs_one(tmp_path):
+    with pytest.raises(ValueError, match="expected render_width and render_height; give the s"):
+        read_cameras(put(tmp_path, without_size()))
+    camera = read_cameras(put(tmp_path, without_size()), size=(64, 48))["0"]
+    assert (camera.width, camera.height) == (64, 48)
+
+
+OTHER_FILES = {
+    "a path of another kind": (
+        PATH | {"camera_type": "equirectangular"},
+        'camera_type: expected "perspective", got "equirectangular"',
+    ),
+    "keyframes alone": (
+        {"keyframes": PATH["keyframes"]},
+        "top level: expected frames in camera_path, got none; save the path in",
+    ),
+    "keyframes and an empty path": (
+        PATH | {"camera_path": []},
+        "top level: expected frames in camera_path, got none; save the path in",
+    ),
+    "a path of another model": (
+        PATH | {"camera_model": "fisheye"},
+        'camera_model: expected "perspective", got "fisheye"',
+    ),
+    "an open angle": (
+        PATH | {"camera_path": [PATH["camera_path"][0] | {"fov": 180}]},
+        "camera_path[0].fov: expected degrees between 0 and 180, got 180",
+    ),
+    "a matrix of nine": (
+        PATH | {"camera_path": [{"camera_to_world": [1.0] * 9, "fov": 60}]},
+        "camera_path[0].camera_to_world: expected 4 rows of 4 numbers",
+    ),
+    "the transform of a training": (
+        {"transform": MATRIX[:3], "scale": 0.5},
+        "top level: expected cameras, got the transform of a run's training; give the folder",
+    ),
+    "poses without lenses": (
+        [{"file_path": "a.png", "transform": MATRIX[:3]}],
+        "[0]: expected position, rotation, fx and fy, got a pose alone, as ns-export",
+    ),
+    "a camera of 3DGS without a rotation": (
+        [{"position": [0, 0, 0], "fx": 1, "fy": 1, "width": 8, "height": 8}],
+        "[0]: expected the field rotation",
+    ),
+    "a camera of 3DGS that scales": (
+        [
+            {"position": [0, 0, 0], "fx": 1, "fy": 1, "width": 8, "height": 8}
+            | {"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}
+        ],
+        "[0].viewmat: expected a rotation in the upper left 3x3",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", OTHER_FILES)
+def test_other_files_are_named_by_what_they_are(tmp_path, case):
+    document, message = OTHER_FILES[case]
+    with pytest.raises(ValueError, match="^" + re.escape(f"transforms.json: {message}")):
+        read_cameras(put(tmp_path, document))
+
+
+def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path):
+    wanted = read_cameras(put(tmp_path, CAPTURE))
+    path = tmp_path / "transforms.json"
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert list(read_cameras(path)) == list(wanted)
+    path.write_bytes(json.dumps(CAPTURE).encode("utf-16"))
+    with pytest.raises(ValueError, match="does not parse: it is in UTF-16; save it as UTF-8"):
+        read_cameras(path)

@@ -51,8 +51,9 @@ def cameras():
 def test_models_of_colmap_are_read(tmp_path, cameras, text, place):
     write_model(tmp_path / "scene" / place, cameras, text=text)
     assert_same(read_cameras(tmp_path / "scene"), cameras)
-    file = "images.txt" if text else "images.bin"
-    assert_same(read_cameras(tmp_path / "scene" / place / file), cameras)
+    for file in ("images", "cameras"):
+        name = f"{file}.txt" if text else f"{file}.bin"
+        assert_same(read_cameras(tmp_path / "scene" / place / name), cameras)
 
 
 def test_distortion_is_refused_or_left_out(tmp_path, cameras):
@@ -70,22 +71,181 @@ def test_distortion_is_refused_or_left_out(tmp_path, cameras):
 
 
 def test_folders_without_cameras_are_refused(tmp_path, cameras):
-    with pytest.raises(ValueError, match=r"expected a model of COLMAP .* or a run of nerfstudio"):
+    with pytest.raises(ValueError, match=r"expected a model of COLMAP .* a run of nerfstudio"):
         read_cameras(tmp_path)
     write_model(tmp_path / "a", cameras)
     path = tmp_path / "a" / "images.bin"
     path.write_bytes(path.read_bytes()[:40])
-    with pytest.raises(ValueError, match="a: expected a model of COLMAP, got"):
+    with pytest.raises(ValueError, match=r"images\.bin: expected 3 entries, got 40 bytes"):
         read_cameras(tmp_path / "a")
 
 
-def test_without_pycolmap_the_error_says_how_to_get_it(tmp_path, cameras, monkeypatch):
+def test_models_need_no_package(tmp_path, cameras, monkeypatch):
     write_model(tmp_path / "a", cameras)
     monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
-    with pytest.raises(
-        ImportError, match=r"cameras of COLMAP: expected .*pip install 'pycolmap>=4.0'"
-    ):
-        read_cameras(tmp_path / "a")
+    assert_same(read_cameras(tmp_path / "a"), cameras)
+
+
+NAMES = {
+    "spaces": ["a b 1.jpg", "a b 2.jpg", " c.jpg"],
+    "folders": ["left/1.jpg", "right/1.jpg", "1.jpg"],
+    "other letters": ["größe.jpg", "写真.jpg", "é.jpg"],
+}
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("kind", NAMES)
+def test_no_name_makes_a_camera_vanish(tmp_path, kind, text):
+    rng = np.random.default_rng(0)
+    wanted = {name: random_camera(rng) for name in NAMES[kind]}
+    write_model(tmp_path / "a", wanted, text=text)
+    if text:  # which has no place for spaces before a name
+        wanted = {name.lstrip(): camera for name, camera in wanted.items()}
+    assert_same(read_cameras(tmp_path / "a"), wanted)
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("name", ["same.jpg", ""])
+def test_images_with_the_same_name_or_none_are_numbered(tmp_path, name, text):
+    rng = np.random.default_rng(0)
+    wanted = {"x1": random_camera(rng), "x2": random_camera(rng), "x3": random_camera(rng)}
+    write_model(tmp_path / "a", wanted, text=text)
+    path = tmp_path / "a" / ("images.txt" if text else "images.bin")
+    content = path.read_bytes()
+    for number in (1, 3):
+        content = content.replace(f"x{number}".encode(), name.encode())
+    path.write_bytes(content)
+    assert_same(read_cameras(path), dict(zip("012", wanted.values(), strict=True)))
+
+
+def test_texts_may_have_a_byte_order_mark_and_carriage_returns(tmp_path, cameras):
+    write_model(tmp_path / "a", cameras, text=True)
+    for name in ("images.txt", "cameras.txt"):
+        path = tmp_path / "a" / name
+        lines = path.read_bytes().splitlines()
+        path.write_bytes(b"\xef\xbb\xbf" + b"\r\n".join(lines) + b"\r\n")
+    assert_same(read_cameras(tmp_path / "a"), cameras)
+
+
+def test_a_name_in_another_encoding_is_kept_by_its_bytes(tmp_path, cameras):
+    write_model(tmp_path / "a", {"xx.jpg": next(iter(cameras.values()))})
+    path = tmp_path / "a" / "images.bin"
+    path.write_bytes(path.read_bytes().replace(b"xx.jpg", b"\xe9x.jpg"))
+    assert list(read_cameras(tmp_path / "a")) == ["\\xe9x.jpg"]
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_rigs_place_their_cameras(tmp_path, text):
+    """A model of COLMAP 3.12: two cameras on a rig, at two moments."""
+    model = pycolmap.Reconstruction()
+    rig = pycolmap.Rig(rig_id=1)
+    lenses = [
+        pycolmap.Camera(
+            model="PINHOLE", width=64, height=48, params=[50, 51, 32, 24], camera_id=number
+        )
+        for number in (1, 2)
+    ]
+    for lens in lenses:
+        model.add_camera(lens)
+    rig.add_ref_sensor(lenses[0].sensor_id)
+    beside = [[1, 0, 0, 0.1], [0, 0, -1, 0.2], [0, 1, 0, 0.3]]
+    rig.add_sensor(lenses[1].sensor_id, pycolmap.Rigid3d(np.array(beside)))
+    model.add_rig(rig)
+    for moment in (0, 1):
+        frame = pycolmap.Frame(frame_id=moment + 1, rig_id=1)
+        frame.rig_from_world = pycolmap.Rigid3d(np.hstack([np.eye(3), [[moment], [2], [3]]]))
+        numbers = (2 * moment + 1, 2 * moment + 2)
+        for number, lens in zip(numbers, lenses, strict=True):
+            frame.add_data_id(pycolmap.data_t(lens.sensor_id, number))
+        model.add_frame(frame)
+        for number, lens in zip(numbers, lenses, strict=True):
+            image = pycolmap.Image(name=f"{number}", camera_id=lens.camera_id, image_id=number)
+            image.frame_id = moment + 1
+            model.add_image(image)
+        model.register_frame(moment + 1)
+    (tmp_path / "a").mkdir()
+    (model.write_text if text else model.write_binary)(os.fspath(tmp_path / "a"))
+    found = read_cameras(tmp_path / "a")
+    assert list(found) == ["1", "2", "3", "4"]
+    for image in model.images.values():
+        wanted = image.cam_from_world().matrix()
+        np.testing.assert_allclose(found[image.name].viewmat[:3], wanted, atol=1e-9)
+
+
+def test_all_models_of_colmap_are_known(tmp_path):
+    """Which are pinholes, how many parameters they have, and when they are without
+    distortion is what COLMAP says."""
+    for name, kind in pycolmap.CameraModelId.__members__.items():
+        if name == "INVALID":
+            continue
+        theirs = pycolmap.Camera.create_from_model_name(1, name, 100, 640, 480)
+        for shift in (0.0, 0.01):
+            theirs.params = [
+                value + shift * (label.strip() not in ("f", "fx", "fy", "cx", "cy", "w", "h"))
+                for value, label in zip(theirs.params, theirs.params_info.split(","), strict=True)
+            ]
+            place = tmp_path / f"{name}{shift}"
+            model = pycolmap.Reconstruction()
+            model.add_camera_with_trivial_rig(theirs)
+            image = pycolmap.Image(name="a", camera_id=1, image_id=1)
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+            place.mkdir()
+            model.write_binary(os.fspath(place))
+            is_pinhole = theirs.is_perspective_pinhole()
+            # COLMAP calls every EUCM distorted, also where it is the plain pinhole.
+            is_plain = theirs.is_undistorted() or (name == "EUCM" and not theirs.params[4])
+            if is_pinhole and is_plain:
+                assert list(read_cameras(place)) == ["a"]
+                continue
+            with pytest.raises(ValueError, match=f"a pinhole without lens .*, got {name}; undis"):
+                read_cameras(place)
+            if is_pinhole:
+                assert len(read_cameras(place, distortion="ignore")) == 1
+        assert int(kind) < 18  # the number of models that are known
+
+
+TEXTS = {
+    "an image without its line of points": (
+        "1 1 0 0 0 0 0 0 1 a.jpg\n2 1 0 0 0 0 0 0 1 b c d.jpg\n",
+        "expected the points of an image, or an empty line, in line 2",
+    ),
+    "an image without a camera": (
+        "1 1 0 0 0 0 0 0 7 a.jpg\n\n",
+        "expected image 1 with a camera of cameras.txt, got 7",
+    ),
+    "an image twice": (
+        "1 1 0 0 0 0 0 0 1 a.jpg\n\n1 1 0 0 0 0 0 0 1 b.jpg\n\n",
+        "expected each image once, got 1 twice",
+    ),
+    "too few numbers": ("1 1 0 0\n\n", "expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME in"),
+    "no rotation": ("1 0 0 0 0 0 0 0 1 a.jpg\n\n", "a.jpg: expected a camera, got viewmat: expe"),
+    "no number": ("1 nan 0 0 0 0 0 0 1 a.jpg\n\n", "a.jpg: expected a camera, got viewmat: expe"),
+}
+
+
+@pytest.mark.parametrize("case", TEXTS)
+def test_texts_that_lose_an_image_are_refused(tmp_path, case):
+    text, message = TEXTS[case]
+    (tmp_path / "cameras.txt").write_text("# one\n1 PINHOLE 64 48 50 50 32 24\r\n")
+    (tmp_path / "images.txt").write_text(text)
+    with pytest.raises(ValueError, match=message) as error:
+        read_cameras(tmp_path)
+    assert "images.txt: " in str(error.value)
+
+
+def test_models_that_claim_too_much_are_refused(tmp_path, cameras):
+    write_model(tmp_path / "a", cameras)
+    for name in ("cameras.bin", "images.bin"):
+        path = tmp_path / "a" / name
+        good = path.read_bytes()
+        for size in range(len(good)):
+            path.write_bytes(good[:size])
+            with pytest.raises(ValueError, match=f"{name}: expected "):
+                read_cameras(tmp_path / "a")
+        path.write_bytes((1 << 60).to_bytes(8, "little") + good[8:])
+        with pytest.raises(ValueError, match=f"{name}: expected {1 << 60} entries, got"):
+            read_cameras(tmp_path / "a")
+        path.write_bytes(good)
 
 
 # As nerfstudio 1.1 writes it: a run's settings as YAML with Python's objects, of which
@@ -199,3 +359,17 @@ def test_the_viewer_offers_the_cameras_of_a_folder(tmp_path, monkeypatch, camera
     (tmp_path / "empty").mkdir()
     wrong = "view", "donut.ply", "--cameras", "empty"
     fails(1, "empty: expected a model of COLMAP", *wrong, cwd=tmp_path)
+
+
+def test_a_folder_of_frames_is_read(tmp_path, trained):
+    """With the transform of a training beside it, in the frame of that training."""
+    run, wanted = trained
+    folder = tmp_path / "data" / "poster"
+    plain = read_cameras(folder / "transforms.json")
+    assert_same(read_cameras(folder), plain)
+    transform = (run / "dataparser_transforms.json").read_bytes()
+    (folder / "dataparser_transforms.json").write_bytes(transform)
+    assert_same(read_cameras(folder), wanted)
+    assert_same(read_cameras(folder / "transforms.json"), plain)
+    with pytest.raises(ValueError, match="expected cameras, got the transform of a run's train"):
+        read_cameras(folder / "dataparser_transforms.json")

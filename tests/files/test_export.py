@@ -31,43 +31,53 @@ def leaves_of(node):
     return [leaf for child in node["children"] for leaf in leaves_of(child)]
 
 
+def level_of_chunks(bundle, leaves):
+    """The level at which every chunk is a single group."""
+    num_groups = np.bincount(bundle.groups.level, minlength=bundle.num_levels)
+    return int(np.flatnonzero(num_groups == len(leaves))[0])
+
+
 def assert_holds(folder, bundle, chunk):
-    """Every leaf has all levels; together the leaves have each gaussian once, and the
-    files nothing else."""
+    """Every leaf has gaussians at all levels; together the leaves have each gaussian of
+    the bundle's levels once, halves above those, and the files nothing else."""
     index = json.loads((folder / "lod-meta.json").read_text())
     leaves = leaves_of(index["tree"])
     files = [v3dg.read_asset(folder / name) for name in index["filenames"]]
     used = [np.zeros(len(file), int) for file in files]
+    top = level_of_chunks(bundle, leaves)
     for level in range(index["lodLevels"]):
-        wanted = bundle.level_gaussians(level)
-        assert index["counts"][level] == len(wanted)
         parts = []
         for leaf in leaves:
             lod = leaf["lods"][str(level)]
             rows = slice(lod["offset"], lod["offset"] + lod["count"])
             used[lod["file"]][rows] += 1
             part = files[lod["file"]].subset(rows)
-            assert len(part) == lod["count"] <= chunk
-            if level == 0:
-                assert len(part) > 0
-            # Else it is a share.
-            if level == 0 or np.sum(bundle.groups.level == level) >= len(leaves):
+            assert 0 < len(part) == lod["count"] <= chunk
+            if level <= top:
                 assert (part.means >= np.array(leaf["bound"]["min"]) - 1e-3).all()
                 assert (part.means <= np.array(leaf["bound"]["max"]) + 1e-3).all()
+            else:
+                assert len(part) == (leaf["lods"][str(level - 1)]["count"] + 1) // 2
             parts.append(part)
-        found = v3dg.Gaussians.concatenate(parts)
-        order = np.lexsort(wanted.means.T)
-        wanted = wanted.subset(order)
-        squared = np.square(found.means[:, None].astype(float) - wanted.means).sum(axis=2)
-        nearest = squared.argmin(axis=0)
-        assert len(set(nearest)) == len(wanted) == len(found)
-        found = found.subset(nearest)
-        np.testing.assert_allclose(found.means, wanted.means, atol=5e-4)
-        np.testing.assert_allclose(found.opacities, wanted.opacities, atol=0.003)
-        np.testing.assert_allclose(found.sh, wanted.sh, atol=0.06)
+        assert index["counts"][level] == sum(map(len, parts))
+        if level <= top:
+            assert_same(v3dg.Gaussians.concatenate(parts), bundle.level_gaussians(level))
     assert all((count == 1).all() for count in used)
     assert index["count"] == sum(index["counts"])
     return index, leaves
+
+
+def assert_same(found, wanted):
+    """The same gaussians in any order, up to the rounding of SOG."""
+    order = np.lexsort(wanted.means.T)
+    wanted = wanted.subset(order)
+    squared = np.square(found.means[:, None].astype(float) - wanted.means).sum(axis=2)
+    nearest = squared.argmin(axis=0)
+    assert len(set(nearest)) == len(wanted) == len(found)
+    found = found.subset(nearest)
+    np.testing.assert_allclose(found.means, wanted.means, atol=5e-4)
+    np.testing.assert_allclose(found.opacities, wanted.opacities, atol=0.003)
+    np.testing.assert_allclose(found.sh, wanted.sh, atol=0.06)
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +128,8 @@ def test_every_gaussian_is_in_one_chunk_of_its_level(tmp_path, bundle, chunk):
     )
     written = [file for file in (tmp_path / "web").rglob("*.*") if file.name != RECORD]
     assert done.bytes == sum(file.stat().st_size for file in written)
-    assert index["lodLevels"] == bundle.num_levels  # so that a viewer can come down to the coarsest
+    # So that a viewer can come down to a gaussian of each chunk.
+    assert index["counts"][-1] == len(leaves)
     if chunk == 10**9:
         assert len(leaves) == 1
     else:  # half of the chunk would do, or the tree would have been cut higher
@@ -220,8 +231,39 @@ def test_bundles_of_any_shape_are_exported(tmp_path, seed):
     bundle = random_bundle(seed, num_levels=1 + seed % 4, sh_degree=seed % 4, max_cluster=9)
     write_streamed_sog(bundle, tmp_path / "web", chunk=100)
     index = json.loads((tmp_path / "web" / "lod-meta.json").read_text())
+    leaves = leaves_of(index["tree"])
     for level, count in enumerate(index["counts"]):
-        assert count == len(bundle.level_gaussians(level))
+        counts = [leaf["lods"][str(level)]["count"] for leaf in leaves]
+        assert count == sum(counts)
+        assert min(counts) > 0
+    assert index["counts"][0] == len(bundle.level_gaussians(0))
+    assert index["counts"][-1] == len(leaves)
+
+
+def test_chunks_of_any_levels_are_one_picture_without_gaps(tmp_path, bundle):
+    """Above the level at which chunks are groups, too: every other chunk is one or two
+    levels coarser than its neighbours."""
+    write_streamed_sog(bundle, tmp_path / "web", chunk=250)
+    index = json.loads((tmp_path / "web" / "lod-meta.json").read_text())
+    leaves = leaves_of(index["tree"])
+    files = [v3dg.read_asset(tmp_path / "web" / name) for name in index["filenames"]]
+
+    def alpha(level_of_leaf):
+        parts = []
+        for leaf, level in zip(leaves, level_of_leaf, strict=True):
+            lod = leaf["lods"][str(level)]
+            rows = slice(lod["offset"], lod["offset"] + lod["count"])
+            parts.append(files[lod["file"]].subset(rows))
+        camera = v3dg.Camera.look_at((0, -6, 0.5), (0, 0, 0.5), fov_x=0.4, width=48, height=48)
+        return v3dg.rasterize(v3dg.Gaussians.concatenate(parts), camera, filter_px2=0.3).alpha
+
+    covered = alpha([0] * len(leaves)) > 0.9
+    assert covered.sum() > 100
+    top = level_of_chunks(bundle, leaves)
+    for step in (1, 2):
+        mixed = alpha([top + step * (number % 2) for number in range(len(leaves))])
+        # Shares of groups of several chunks have 0.90 and 0.89 here.
+        assert mixed[covered].mean() > 0.91
 
 
 def test_many_chunks_share_a_folder_up_to_its_size(tmp_path, bundle, monkeypatch):

@@ -43,10 +43,13 @@ def test_a_scene_has_each_bundle_once_with_all_levels(place):
     for listed, bundle in zip(site["bundles"], scene.bundles, strict=True):
         index = json.loads((place / "deep/er/site" / listed["url"]).read_text())
         assert index["counts"] == listed["counts"]
-        assert index["counts"] == [len(bundle.level_gaussians(i)) for i in range(bundle.num_levels)]
+        counts = [len(bundle.level_gaussians(i)) for i in range(bundle.num_levels)]
+        # Chunks are halved further, down to one gaussian in each.
+        assert index["counts"][: len(counts)] == counts
+        assert index["counts"][-1] == json.dumps(index["tree"]).count('"lods"')
     for level, name in ((0, "gaussians"), (-1, "coarsest")):
-        counts = [bundle.level_gaussians(level % bundle.num_levels) for bundle in scene.bundles]
-        assert result[name] == sum(len(counts[b]) for b in scene.instance_bundle)
+        counts = [listed["counts"][level] for listed in site["bundles"]]
+        assert result[name] == sum(counts[b] for b in scene.instance_bundle)
 
 
 def test_a_scene_has_its_instances_and_cameras(place):
@@ -83,6 +86,15 @@ def test_what_is_up_is_up_in_the_page(place, up):
     axis, sign = "xyz".index(up[-1]), -1 if up[0] == "-" else 1
     heights = sign * bundle.level_gaussians(0).means[:, axis]
     np.testing.assert_allclose(np.sort(written[:, 1]), np.sort(heights), atol=1e-3)
+
+
+def test_an_asset_of_one_level_has_coarser_ones_that_begin_somewhere(place):
+    bundle = random_bundle(5, num_levels=1)
+    write_site(bundle, "site")
+    (listed,) = site_of(place / "site")["bundles"]
+    assert listed["counts"][0] == bundle.num_gaussians
+    assert listed["counts"][-1] == 1
+    assert listed["reach"] > 0
 
 
 def test_levels_reach_as_far_as_selection_has_them():

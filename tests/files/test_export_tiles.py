@@ -37,7 +37,8 @@ def assert_inside(points, tile):
 
 def upright(gaussians):
     """Means of a tile's content, whose y is up, in the tile's frame, whose z is."""
-    return gaussians.means[:, [0, 2, 1]] * [1, -1, 1]
+    in_file = gaussians.means * [-1, -1, 1]  # reading a `.glb` turns them by half a turn about z
+    return in_file[:, [0, 2, 1]] * [1, -1, 1]
 
 
 @pytest.fixture(params=range(4))
@@ -118,6 +119,22 @@ def test_a_scene_is_a_tile_an_instance(tmp_path):
         assert below["root"]["boundingVolume"] == tile["boundingVolume"]
         assert_inside(corners(tile) @ matrix[:3, :3].T + matrix[:3, 3], root)
         assert below["extensionsRequired"] == ["3DTILES_content_gltf"]
+
+
+def test_the_page_frames_the_finest_level(tmp_path):
+    """Not the coarse gaussians, which reach far beyond it: at the start nothing would
+    be seen but a speck."""
+    bundle = random_bundle(3, num_levels=4)
+    scene = v3dg.Scene()
+    scene.add(bundle, [[5, 0, 0], [0, 9, 1]], [1, 0, 0, 0], [2, 1])
+    write_tiles(scene, tmp_path / "tiles", up="z")
+    document = json.loads((tmp_path / "tiles" / "tileset.json").read_text())
+    corners = bundle.clusters.box[np.array(bundle.level_range(0))].reshape(-1, 3)
+    placed = np.concatenate([2 * corners + np.array([5, 0, 0]), corners + np.array([0, 9, 1])])
+    low = placed.min(axis=0)
+    high = placed.max(axis=0)
+    ball = [*((low + high) / 2), np.linalg.norm(high - low) / 2]
+    np.testing.assert_allclose(document["extras"]["ball"], ball, rtol=1e-5)
 
 
 def test_up_is_up(tmp_path):

@@ -20,6 +20,7 @@ import pytest
 import torch
 
 import v3dg
+from gltf_files import GltfFile
 from random_bundle import random_bundle, random_gaussians
 from test_camera_file import CAPTURE
 from test_formats import FIXTURES, gsplat_tensors, hier_of
@@ -77,6 +78,12 @@ def written(path):
     return path.read_bytes()
 
 
+def gltf_content(path):
+    file = GltfFile()
+    file.nodes({"mesh": file.mesh(BUNDLE.level_gaussians(0)), "translation": [1, 2, 3]})
+    return file.write(path).read_bytes()
+
+
 def checkpoint(path):
     torch.save({"splats": gsplat_tensors(BUNDLE.level_gaussians(0))}, path)
     return path.read_bytes()
@@ -103,6 +110,7 @@ READERS = {
     ),
     "sog": ("a.sog", lambda _: (FIXTURES / "sh3.sog").read_bytes(), read_asset),
     "glb": ("a.glb", lambda folder: written(folder / "w.glb"), read_asset),
+    "gltf": ("a.gltf", lambda folder: gltf_content(folder / "w.gltf"), read_asset),
     "hier": ("a.hier", lambda _: hier_of(OF_DEGREE_3, half=False), read_asset),
     "half hier": ("a.hier", lambda _: hier_of(OF_DEGREE_3, half=True), read_asset),
     "checkpoint": ("a.pt", lambda folder: checkpoint(folder / "w.pt"), read_asset),
@@ -140,7 +148,7 @@ CONTENTS = {
     "text": lambda good: "Käse und Brot\n".encode() * 100,
     "latin-1": lambda good: "Käse und Brot\n".encode("latin-1") * 100,
     "utf-16": lambda good: "Käse und Brot\n".encode("utf-16") * 100,
-    "good after a byte order mark": lambda good: b"\xef\xbb\xbf" + good,
+    "good after two byte order marks": lambda good: 2 * b"\xef\xbb\xbf" + good,
     "good after a zero": lambda good: b"\0" + good,
     "good after a space": lambda good: b" \xa0" + good,
     "good but packed": gzip.compress,
@@ -158,6 +166,17 @@ CONTENTS = {
     "deep objects": lambda good: b'{"a":' * 100_000 + b"1" + b"}" * 100_000,
     "a long number": lambda good: b"1" * 100_000,
 }
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_only_text_may_have_a_byte_order_mark(tmp_path, reader):
+    """Programs of Windows write one before JSON."""
+    name, content, read = READERS[reader]
+    (tmp_path / name).write_bytes(b"\xef\xbb\xbf" + content(tmp_path))
+    if name.endswith((".json", ".gltf")):
+        read(tmp_path / name)
+    else:
+        assert_refused(read, tmp_path / name)
 
 
 @pytest.mark.parametrize("reader", READERS)
@@ -254,7 +273,7 @@ def test_every_truncation_is_refused(tmp_path, reader):
     last = good.rfind(b" ") + 1 if reader == "ply" else len(good)
     # Every offset of a bundle is in its own tests, and of the others most bytes are not
     # looked at.
-    step = {"bundle": 37, "sog": 37, "ksplat": 37, "checkpoint": 37}.get(reader, 1)
+    step = {"bundle": 37, "sog": 37, "ksplat": 37, "checkpoint": 37, "gltf": 37}.get(reader, 1)
     for size in range(0, last, step):
         (tmp_path / name).write_bytes(good[:size])
         assert_refused(read, tmp_path / name)

@@ -25,7 +25,15 @@ def test_written_scene_reads_back_the_same(tmp_path_factory, positions, seed):
     for position in positions:
         bundle = BUNDLE if rng.random() < 0.5 else OTHER
         importance = 1.0 if rng.random() < 0.5 else np.exp(rng.normal())
-        scene.add(bundle, position, rng.normal(size=4), np.exp(rng.normal()), importance)
+        scene.add(
+            bundle,
+            position,
+            rng.normal(size=4),
+            np.exp(rng.normal()),
+            importance,
+            opacity=rng.choice([1.0, rng.random()]),
+            tint=(1, 1, 1) if rng.random() < 0.5 else rng.random(3),
+        )
     eye = 100 * rng.normal(size=3)
     cameras = {
         "a": Camera.look_at(eye, eye + rng.normal(size=3), width=64, height=48, near=0.5),
@@ -42,6 +50,8 @@ def test_written_scene_reads_back_the_same(tmp_path_factory, positions, seed):
     np.testing.assert_allclose(again.quaternions, scene.quaternions, atol=1e-15)
     np.testing.assert_array_equal(again.scales, scene.scales)
     np.testing.assert_array_equal(again.importance, scene.importance)
+    np.testing.assert_array_equal(again.opacity, scene.opacity)
+    np.testing.assert_array_equal(again.tint, scene.tint)
     written = json.loads(path.read_text(encoding="utf-8"))["instances"]
     assert ["importance" in instance for instance in written] == (scene.importance != 1).tolist()
     assert list(cameras_again) == list(cameras)
@@ -93,7 +103,9 @@ def test_instances_are_added_at_once_whatever_their_order(tmp_path, monkeypatch)
     path = tmp_path / "scene.json"
     path.write_text(json.dumps(document))
     calls, add = [], Scene.add
-    monkeypatch.setattr(Scene, "add", lambda *given: calls.append(given) or add(*given))
+    monkeypatch.setattr(
+        Scene, "add", lambda *given, **named: calls.append(given) or add(*given, **named)
+    )
     scene, _ = read_scene(path, bundles={"a": BUNDLE, "b": OTHER})
     assert len(calls) == 1
     np.testing.assert_array_equal(scene.instance_bundle, np.arange(100) % 2)
@@ -189,7 +201,7 @@ def changed(place, value, document=GOOD):
         (
             ["instances", 1, "rotation"],
             1,
-            "instances[1].rotation: expected one of bundle, position",
+            "instances[1].rotation: expected one of bundle, scene, position",
         ),
         (["instances", 2], 7, "instances[2]: expected an object, got 7"),
         (["instances"], {}, "instances: expected an array, got {}"),

@@ -21,6 +21,7 @@ import pytest
 import v3dg
 from command_line import TESTS_ENVIRONMENT
 from fuzz.attacks import servers
+from gltf_files import GltfFile
 from random_bundle import random_bundle, random_gaussians
 from scenes_lod import blob, lod_bundle
 from v3dg import _urls, cli
@@ -193,7 +194,7 @@ def test_a_server_that_does_not_answer_ends_the_wait(there, many, monkeypatch):
 
     monkeypatch.setattr(type(there), "cat_file", slow)
     start = time.monotonic()
-    with pytest.raises(TimeoutError, match="pages are missing and none came in"):
+    with pytest.raises(TimeoutError, match="pages are missing and none arrived"):
         renderer.settle(NEAR, timeout=0.2, **FINE)
     assert renderer.render(NEAR, **FINE).stats.missing > 0  # which waits for nothing
     assert time.monotonic() - start < 30
@@ -379,7 +380,7 @@ def test_commands_take_urls_and_write_into_the_working_folder(
         ),
         ("nowhere://in/a.ply", "Protocol not known: nowhere"),
         ("memory://in/scene.json", "expected a scene that is here, got a URL"),
-        ("memory://in/lod-meta.json", "got one of a file that names others"),
+        ("memory://in/lod-meta.json", "got the URL of a file that names other files"),
         ("memory://in/a.txt", "memory://in/a.txt: expected a file ending in"),
     ],
 )
@@ -828,3 +829,18 @@ def test_every_format_is_read_from_a_url_and_names_it_in_errors(there, tmp_path,
         v3dg.open(f"memory://in/{name}")
     assert "/proc/" not in str(caught.value)
     assert tempfile.gettempdir() not in str(caught.value)
+
+
+def test_a_gltf_at_a_url_has_its_buffers_inside(there, tmp_path):
+    """It is read from an open file of this process, beside which are all others."""
+    asset = random_gaussians(np.random.default_rng(0), 30)
+    file = GltfFile()
+    file.nodes({"mesh": file.mesh(asset)})
+    there.put_file(str(file.write(tmp_path / "a.gltf")), "/in/a.gltf")
+    assert len(v3dg.open("memory://in/a.gltf")) == 30
+    (tmp_path / "a.bin").write_bytes(file.blob)
+    with open(tmp_path / "a.bin", "rb") as secret:
+        for uri in ("a.bin", str(secret.fileno())):
+            there.put_file(str(file.write(tmp_path / "a.gltf", uri)), f"/in/{uri}.gltf")
+            with pytest.raises(ValueError, match="got one that names others; fetch the folder"):
+                v3dg.open(f"memory://in/{uri}.gltf")

@@ -4,17 +4,20 @@ import json
 import math
 import os
 import sys
+import zipfile
 
 import numpy as np
 import pytest
 
 import v3dg
-from command_line import fails, run
+from command_line import run
+from half_turns import half_turn
 from random_bundle import random_bundle, random_gaussians
 from v3dg.export import write_usd
+from v3dg.io import open_asset
 
 pytest.importorskip("pxr")
-from pxr import Gf, Usd, UsdGeom, UsdLod, UsdValidation
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLod, UsdValidation, Vt
 
 
 def assert_same(found, wanted, rtol=0.0):
@@ -31,7 +34,7 @@ def assert_valid(path):
 
 
 @pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize("suffix", ["usd", "usda", "usdc"])
+@pytest.mark.parametrize("suffix", ["usd", "usda", "usdc", "usdz"])
 def test_an_asset_reads_back(tmp_path, suffix, degree):
     asset = random_gaussians(np.random.default_rng(degree), 50, degree)
     v3dg.write_asset(tmp_path / f"a.{suffix}", asset)
@@ -58,13 +61,13 @@ def test_prims_stand_where_their_transforms_put_them(tmp_path):
     scale = prim.AddScaleOp()
     scale.Set(Gf.Vec3f(2, 2, 2))
     stage.GetRootLayer().Save()
-    wanted = asset.transform((0.5, 0.5, -0.5, 0.5), (1, 2, 3), 2.0)
-    found = v3dg.read_asset(tmp_path / "a.usda")
+    wanted = half_turn(asset, "x").transform((0.5, 0.5, -0.5, 0.5), (1, 2, 3), 2.0)
+    found = half_turn(v3dg.read_asset(tmp_path / "a.usda"), "x")
     np.testing.assert_allclose(found.means, wanted.means, atol=1e-5)
     np.testing.assert_allclose(found.sh, wanted.sh, atol=1e-5)
     scale.Set(Gf.Vec3f(2, 2, 1))
     stage.GetRootLayer().Save()
-    with pytest.raises(ValueError, match="a transform of /gaussians that is no rotation"):
+    with pytest.raises(ValueError, match="a transform of /gaussians that is more than a rotation"):
         v3dg.read_asset(tmp_path / "a.usda")
 
 
@@ -79,7 +82,8 @@ def test_a_bundle_has_its_levels(tmp_path, seed):
         wanted = bundle.level_gaussians(level)
         np.testing.assert_array_equal(np.array(prim.GetAttribute("positions").Get()), wanted.means)
     assert len(levels) == bundle.num_levels
-    assert_same(v3dg.read_asset(tmp_path / "a.usdc"), bundle.level_gaussians(0))
+    turned = bundle.level_gaussians(0).transform((0.5**0.5, 0.5**0.5, 0, 0))  # z becomes -y
+    assert_same(v3dg.read_asset(tmp_path / "a.usdc"), turned)
 
 
 def test_usd_chooses_the_level_that_selection_has(tmp_path):
@@ -135,15 +139,8 @@ def test_the_command_writes_a_file(tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("b.usdc: ")
     assert len(v3dg.read_asset(tmp_path / "b.usdc")) == len(random_bundle(3).level_gaussians(0))
-    fails(
-        1,
-        "no/b.usdc: expected an existing folder",
-        "export",
-        "3 a.v3dg",
-        "-o",
-        "no/b.usdc",
-        cwd=tmp_path,
-    )
+    assert run("export", "3 a.v3dg", "-o", "new/b.usdc", cwd=tmp_path).returncode == 0
+    assert (tmp_path / "new" / "b.usdc").exists()
 
 
 def test_bad_files_are_refused(tmp_path):
@@ -156,7 +153,7 @@ def test_bad_files_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError):
         v3dg.read_asset(tmp_path / "none.usda")
     with pytest.raises(ValueError, match=r"path: expected '\.usd' or"):
-        write_usd(random_bundle(3), tmp_path / "a.usdz")
+        write_usd(random_bundle(3), tmp_path / "a.usdx")
     with pytest.raises(ValueError, match="scene: expected instances to export, got none"):
         write_usd(v3dg.Scene(), tmp_path / "none.usda")
 
@@ -164,19 +161,21 @@ def test_bad_files_are_refused(tmp_path):
 def test_a_file_of_another_kind_is_told_by_its_name(tmp_path):
     (tmp_path / "a.ply").touch()
     with pytest.raises(
-        ValueError, match=r"a\.ply: expected a file name ending in \.usd, \.usda, \.usdc$"
+        ValueError, match=r"a\.ply: expected a file name ending in \.usd, \.usda, \.usdc, \.usdz$"
     ):
         v3dg.read_usd_scene(tmp_path / "a.ply")
 
 
-def test_a_world_without_cameras_is_drawn_from_those_of_a_file(tmp_path):
+def test_a_world_without_cameras_is_drawn_as_a_whole_or_from_a_file(tmp_path):
     random_bundle(3).write(tmp_path / "a.v3dg")
     scene = v3dg.Scene()
     scene.add(v3dg.open(tmp_path / "a.v3dg"), positions=[[0, 0, 0], [1, 0, 0]])
     write_usd(scene, tmp_path / "world.usda")
     camera = v3dg.turntable((0, 0, 0), 8, 1, width=24, height=16)[0]
     v3dg.write_cameras(tmp_path / "cameras.json", {"front": camera})
-    fails(1, "a file without any; give some with --cameras", "render", "world.usda", cwd=tmp_path)
+    whole = run("render", "world.usda", "--size", 40, 30, "--json", cwd=tmp_path)
+    assert whole.returncode == 0, whole.stderr
+    assert json.loads(whole.stdout)["pictures"][0]["gaussians_in_frustum"] > 0
     done = run("render", "world.usda", "--cameras", "cameras.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "24 x 16" in done.stdout
@@ -200,13 +199,14 @@ def world_means(scene):
     return means[np.lexsort(np.round(means.T, 3))]
 
 
-def test_a_scene_reads_back_as_a_scene(tmp_path):
+@pytest.mark.parametrize("suffix", ["usdc", "usdz"])
+def test_a_scene_reads_back_as_a_scene(tmp_path, suffix):
     scene = v3dg.Scene()
     bundles = [random_bundle(seed, num_levels=3, sh_degree=1) for seed in (1, 2)]
     turns = [[1, 0, 0, 0], [0.5, 0.5, -0.5, 0.5], [1, 0, 0, 1]]
     scene.add([bundles[0], bundles[1], bundles[0]], np.eye(3) * 9, turns, [1, 2, 0.5])
-    write_usd(scene, tmp_path / "a.usdc", up="z")
-    found = v3dg.open(tmp_path / "a.usdc")
+    write_usd(scene, tmp_path / f"a.{suffix}", up="z")
+    found = v3dg.open(tmp_path / f"a.{suffix}")
     assert isinstance(found, v3dg.Scene)
     assert found.up == "z"
     assert found.instance_bundle.tolist() == [0, 1, 0]
@@ -289,3 +289,230 @@ def test_a_world_is_known_to_the_command_line(tmp_path):
     done = run("export", "a.usdc", "--to", "tiles", "--json", "--quiet", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["instances"] == 2
+
+
+def new_prim(stage, path="/gaussians", kind="ParticleField3DGaussianSplat"):
+    return stage.DefinePrim(path, kind)
+
+
+def new_stage(path):
+    stage = Usd.Stage.CreateNew(os.fspath(path))
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    return stage
+
+
+def read_with_notes(path):
+    """Gaussians with the axes of their stage, and what else is declared."""
+    file = open_asset(path)
+    return half_turn(file.read(0, file.num_gaussians), "x"), list(file.declared.notes)
+
+
+POINTS = [Gf.Vec3f(1, 2, 3), Gf.Vec3f(4, 5, 6)]
+
+
+def test_what_is_left_out_has_the_default_of_the_schema(tmp_path):
+    """Which its documentation has: no rotation, unit scale, opaque, of one grey."""
+    stage = new_stage(tmp_path / "a.usda")
+    new_prim(stage).GetAttribute("positions").Set(POINTS)
+    stage.GetRootLayer().Save()
+    found, notes = read_with_notes(tmp_path / "a.usda")
+    assert notes == []
+    assert len(found) == 2
+    np.testing.assert_array_equal(found.quats, [[1, 0, 0, 0]] * 2)
+    np.testing.assert_array_equal(found.scales, np.ones((2, 3)))
+    np.testing.assert_array_equal(found.opacities, np.ones(2))
+    np.testing.assert_array_equal(found.sh, np.zeros((2, 1, 3)))
+
+
+def test_no_positions_are_no_gaussians(tmp_path):
+    stage = new_stage(tmp_path / "a.usda")
+    new_prim(stage).GetAttribute("opacities").Set([1.0])
+    stage.GetRootLayer().Save()
+    found, notes = read_with_notes(tmp_path / "a.usda")
+    assert len(found) == 0
+    (note,) = notes
+    assert "1 values of opacities for 0 in /gaussians are too many" in note
+
+
+def test_the_degree_of_harmonics_is_3_by_default(tmp_path):
+    stage = new_stage(tmp_path / "a.usda")
+    prim = new_prim(stage)
+    prim.GetAttribute("positions").Set(POINTS)
+    values = np.arange(96, dtype=np.float32).reshape(32, 3)
+    name = "radiance:sphericalHarmonicsCoefficients"
+    prim.GetAttribute(name).Set(Vt.Vec3fArray.FromNumpy(values))
+    stage.GetRootLayer().Save()
+    found, notes = read_with_notes(tmp_path / "a.usda")
+    np.testing.assert_array_equal(found.sh, values.reshape(2, 16, 3))
+    assert notes == []
+    # Of degree 4 they are too few, and ignored; of degree 2 the last ones are left out.
+    prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(4)
+    stage.GetRootLayer().Save()
+    found, notes = read_with_notes(tmp_path / "a.usda")
+    np.testing.assert_array_equal(found.sh, np.zeros((2, 1, 3)))
+    assert notes[0] == (
+        f"32 values of {name} for 50 in /gaussians are too few, so the schema's default was used."
+    )
+    prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(2)
+    stage.GetRootLayer().Save()
+    found, notes = read_with_notes(tmp_path / "a.usda")
+    np.testing.assert_array_equal(found.sh, values[:18].reshape(2, 9, 3))
+    assert notes == [
+        f"32 values of {name} for 18 in /gaussians are too many, so the last ones were left out."
+    ]
+    prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(-1)
+    stage.GetRootLayer().Save()
+    with pytest.raises(ValueError, match="got the SH degree -1 in /gaussians"):
+        v3dg.read_asset(tmp_path / "a.usda")
+
+
+def test_coefficients_above_degree_3_are_left_out(tmp_path):
+    stage = new_stage(tmp_path / "a.usda")
+    prim = new_prim(stage)
+    prim.GetAttribute("positions").Set(POINTS)
+    values = np.arange(150, dtype=np.float32).reshape(50, 3)
+    prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(4)
+    name = "radiance:sphericalHarmonicsCoefficients"
+    prim.GetAttribute(name).Set(Vt.Vec3fArray.FromNumpy(values))
+    stage.GetRootLayer().Save()
+    found, notes = read_with_notes(tmp_path / "a.usda")
+    np.testing.assert_array_equal(found.sh, values.reshape(2, 25, 3)[:, :16])
+    assert notes == ["Coefficients above SH degree 3 were left out."]
+
+
+def test_halves_stand_for_floats(tmp_path):
+    """Where there are both, floats are used."""
+    stage = new_stage(tmp_path / "a.usda")
+    prim = new_prim(stage)
+    prim.GetAttribute("positionsh").Set([Gf.Vec3h(1, 2, 3), Gf.Vec3h(4, 5, 6)])
+    prim.GetAttribute("orientationsh").Set([Gf.Quath(0, 1, 0, 0)] * 2)
+    prim.GetAttribute("scalesh").Set([Gf.Vec3h(0.5, 1, 2)] * 2)
+    prim.GetAttribute("opacitiesh").Set([0.25, 0.5])
+    prim.GetAttribute("opacities").Set([0.75, 1.0])
+    prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(0)
+    name = "radiance:sphericalHarmonicsCoefficientsh"
+    prim.GetAttribute(name).Set([Gf.Vec3h(1, 0, -1)] * 2)
+    stage.GetRootLayer().Save()
+    found, notes = read_with_notes(tmp_path / "a.usda")
+    np.testing.assert_array_equal(found.means, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(found.quats, [[0, 1, 0, 0]] * 2)
+    np.testing.assert_array_equal(found.scales, [[0.5, 1, 2]] * 2)
+    np.testing.assert_array_equal(found.opacities, [0.75, 1])
+    np.testing.assert_array_equal(found.sh, [[[1, 0, -1]]] * 2)
+    assert notes == []
+
+
+def test_prims_of_several_degrees_are_one_asset(tmp_path):
+    assets = [random_gaussians(np.random.default_rng(seed), 9, seed) for seed in (0, 2)]
+    stage = new_stage(tmp_path / "a.usda")
+    UsdGeom.Xform.Define(stage, "/up").AddTranslateOp().Set(Gf.Vec3d(0, 5, 0))
+    v3dg.formats.usd.define(stage, "/up/small", assets[0])
+    v3dg.formats.usd.define(stage, "/large", assets[1])
+    stage.GetRootLayer().Save()
+    found, notes = read_with_notes(tmp_path / "a.usda")
+    np.testing.assert_allclose(found.means[:9], assets[0].means + np.array([0, 5, 0]), rtol=1e-6)
+    np.testing.assert_array_equal(found.sh[:9, :1], assets[0].sh)
+    assert not found.sh[:9, 1:].any()
+    np.testing.assert_array_equal(found.sh[9:], assets[1].sh)
+    assert notes == []
+
+
+@pytest.mark.parametrize("change", ["invisible", "proxy", "guide"])
+def test_what_is_not_drawn_is_left_out_and_told(tmp_path, change):
+    asset = random_gaussians(np.random.default_rng(0), 9, 1)
+    stage = new_stage(tmp_path / "a.usda")
+    for name in ("shown", "group/hidden"):
+        v3dg.formats.usd.define(stage, f"/world/{name}", asset)
+    place = UsdGeom.Imageable(stage.OverridePrim("/world/group"))
+    if change == "invisible":
+        place = UsdGeom.Xform.Define(stage, "/world/group")
+        place.MakeInvisible()
+    else:
+        place = UsdGeom.Imageable(stage.GetPrimAtPath("/world/group/hidden"))
+        place.GetPurposeAttr().Set(change)
+    stage.GetRootLayer().Save()
+    found, notes = read_with_notes(tmp_path / "a.usda")
+    np.testing.assert_array_equal(found.means, asset.means)
+    (note,) = notes
+    assert note.startswith("Prims that are invisible or not for drawing were left out: '/world/gr")
+    stage.RemovePrim("/world/shown")
+    stage.GetRootLayer().Save()
+    with pytest.raises(ValueError, match=r"no ParticleField3DGaussianSplat. Prims that are invis"):
+        v3dg.read_asset(tmp_path / "a.usda")
+
+
+def test_values_that_change_with_time_are_those_of_the_first_time(tmp_path):
+    asset = random_gaussians(np.random.default_rng(0), 2, 0)
+    stage = new_stage(tmp_path / "a.usda")
+    prim = v3dg.formats.usd.define(stage, "/a", asset)
+    prim.GetAttribute("positions").Set([Gf.Vec3f(0)] * 2, 9.0)
+    prim.GetAttribute("positions").Set(POINTS, 3.0)
+    step = UsdGeom.Xformable(prim).AddTranslateOp()
+    step.Set(Gf.Vec3d(1, 0, 0), 1.0)
+    step.Set(Gf.Vec3d(2, 0, 0), 2.0)
+    stage.GetRootLayer().Save()
+    found, notes = read_with_notes(tmp_path / "a.usda")
+    np.testing.assert_allclose(found.means, [[2, 2, 3], [5, 5, 6]])
+    assert notes == ["Values change with time, and were read at the first one."]
+
+
+def test_what_a_prim_says_besides_is_told(tmp_path):
+    asset = random_gaussians(np.random.default_rng(0), 2, 0)
+    stage = new_stage(tmp_path / "a.usda")
+    prim = v3dg.formats.usd.define(stage, "/a", asset)
+    prim.GetAttribute("sortingModeHint").Set("rayHitDistance")
+    prim.GetAttribute("projectionModeHint").Set("perspective")
+    prim.CreateAttribute("velocities", Sdf.ValueTypeNames.Float3Array).Set([Gf.Vec3f(1)] * 2)
+    UsdGeom.Sphere.Define(stage, "/ball")
+    points = new_prim(stage, "/points", "ParticleField")
+    points.ApplyAPI("ParticleFieldKernelConstantSurfletAPI")
+    stage.GetRootLayer().Save()
+    _, notes = read_with_notes(tmp_path / "a.usda")
+    assert notes == [
+        "Particles that are no gaussians were left out: '/points'.",
+        "Other geometry was left out: '/ball'.",
+        "The hint sortingModeHint is 'rayHitDistance', which was left out.",
+        "Attributes of gaussians were left out: 'velocities'.",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kernel", "depth"), [("GaussianEllipsoid", 1.0), ("GaussianSurflet", 0.0)]
+)
+def test_particles_of_other_prims_are_read_by_their_kernel(tmp_path, kernel, depth):
+    stage = new_stage(tmp_path / "a.usda")
+    prim = new_prim(stage, kind="ParticleField")
+    for api in ("PositionAttribute", "OpacityAttribute", f"Kernel{kernel}"):
+        prim.ApplyAPI(f"ParticleField{api}API")
+    prim.GetAttribute("positions").Set(POINTS)
+    prim.GetAttribute("opacities").Set([0.25, 0.5])
+    stage.GetRootLayer().Save()
+    found, notes = read_with_notes(tmp_path / "a.usda")
+    np.testing.assert_array_equal(found.means, POINTS)
+    np.testing.assert_array_equal(found.scales, [[1, 1, depth]] * 2)
+    np.testing.assert_array_equal(found.opacities, [0.25, 0.5])
+    assert len(notes) == (depth == 0)
+
+
+@pytest.mark.parametrize("damage", ["packed", "encrypted", "no layer", "no zip", "shortened"])
+def test_packages_must_be_stored(tmp_path, damage):
+    v3dg.write_asset(tmp_path / "a.usdz", random_gaussians(np.random.default_rng(0), 9, 1))
+    with zipfile.ZipFile(tmp_path / "a.usdz") as package:
+        members = {name: package.read(name) for name in package.namelist()}
+    content = (tmp_path / "a.usdz").read_bytes()
+    if damage == "packed":
+        with zipfile.ZipFile(tmp_path / "b.usdz", "w", zipfile.ZIP_DEFLATED) as package:
+            for name, member in members.items():
+                package.writestr(name, member)
+    elif damage == "encrypted":
+        place = content.rindex(b"PK\1\2") + 8
+        (tmp_path / "b.usdz").write_bytes(content[:place] + b"\1" + content[place + 1 :])
+    elif damage == "no layer":
+        with zipfile.ZipFile(tmp_path / "b.usdz", "w") as package:
+            package.writestr("a.txt", b"x")
+    elif damage == "no zip":
+        (tmp_path / "b.usdz").write_bytes(b"#usda 1.0\n")
+    else:
+        (tmp_path / "b.usdz").write_bytes(content[:-30])
+    with pytest.raises(ValueError, match=r"b\.usdz: expected "):
+        v3dg.read_asset(tmp_path / "b.usdz")

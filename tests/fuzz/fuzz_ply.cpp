@@ -28,7 +28,7 @@ bool is_printable(const std::string& text) {
 std::vector<float> read(const v3dg::PlyFile& ply, size_t first, size_t last,
                         v3dg::PlyPlace& place) {
     const size_t n = last - first;
-    std::vector<float> memory(n * (11 + 3 * ply.num_sh));
+    std::vector<float> memory(n * (11 + 3 * ply.layout.num_sh));
     float* next = memory.data();
     const auto span = [&](size_t size) {
         const v3dg::Span<float> result = {next, size};
@@ -36,7 +36,7 @@ std::vector<float> read(const v3dg::PlyFile& ply, size_t first, size_t last,
         return result;
     };
     const v3dg::PlyGaussians<float> out = {span(3 * n), span(4 * n), span(3 * n), span(n),
-                                           span(3 * n * ply.num_sh)};
+                                           span(3 * n * ply.layout.num_sh)};
     place = v3dg::read_ply(ply, first, place, out);
     return memory;
 }
@@ -44,9 +44,11 @@ std::vector<float> read(const v3dg::PlyFile& ply, size_t first, size_t last,
 void read(const char* path, size_t file_bytes) {
     const v3dg::PlyFile ply = v3dg::open_ply(path);
     const size_t n = ply.num_gaussians();
-    const size_t floats = n * (11 + 3 * ply.num_sh);
-    // A number occupies at least one byte in the file, and four in memory.
-    require(n == 0 || (floats / n == 11 + 3 * ply.num_sh && floats <= file_bytes));
+    const size_t row_floats = 11 + 3 * ply.layout.num_sh;
+    const size_t floats = n * row_floats;
+    // A number occupies at least one byte in the file, and four in memory; a flat gaussian has one
+    // number less in the file.
+    require(n == 0 || (floats / n == row_floats && floats - n <= file_bytes));
     v3dg::PlyPlace end = ply.begin(), start = ply.begin(), middle = ply.begin();
     read(ply, 0, n, end);
     // The second half must be the same whether the first was read before it or skipped.

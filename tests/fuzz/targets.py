@@ -90,6 +90,7 @@ FORMATS = (
     (".sog", bytes),
     (".sog", lambda meta: zip_bytes((SOG | {"meta.json": meta}).items())),
     (".sog", lambda picture: zip_bytes((SOG | {"shN_centroids.webp": picture}).items())),
+    (".gltf", bytes),
 )
 READERS = {"ply": read_ply, "bundle": read_bundle, "scene": read_json, "formats": read_format}
 

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from reference import cluster as reference_cluster
 from reference import project as reference_project
 
 # Y_00: what turns the first SH coefficient into a colour.
@@ -18,23 +17,21 @@ COLOR_WEIGHT = 6.0
 
 
 def survivors(gaussians, wanted: int) -> list[int]:
-    """V3DG, section 3.2: of each of eight median cells its share, those of highest
-    opacity and size."""
+    """V3DG, section 3.2, as its published code has it: of each octant around the
+    medians its share, those of highest opacity and size."""
     count = len(gaussians)
     scales = gaussians.scales.astype(np.float64)
     score = gaussians.opacities * np.prod(scales, axis=1) ** (2 / 3)
-    cells = [list(range(count))]
-    for _ in range(3):
-        if all(len(cell) <= 1 for cell in cells):
-            break
-        halves = [reference_cluster._halves(gaussians.means, cell) for cell in cells]
-        cells = [half for pair in halves for half in pair]
-    kept, before = [], 0
-    for cell in cells:
-        after = before + len(cell)
-        share = after * wanted // count - before * wanted // count
-        kept += sorted(cell, key=lambda i: (-score[i], i))[:share]
-        before = after
+    medians = np.sort(gaussians.means, axis=0)[(count - 1) // 2]
+    octant = (gaussians.means >= medians) @ np.array([4, 2, 1])
+    kept = []
+    num_before = 0
+    for number in range(8):
+        rows = [int(i) for i in np.flatnonzero(octant == number)]
+        end = num_before + len(rows)
+        share = end * wanted // count - num_before * wanted // count
+        kept += sorted(rows, key=lambda i: (-score[i], i))[:share]
+        num_before = end
     return sorted(kept)
 
 

@@ -1,10 +1,10 @@
-"""How tests start Chromium, for pages that draw with WebGL."""
+"""Starts Chromium in tests, for pages that draw with WebGL."""
 
 import shutil
 
 PROGRAM = shutil.which("chromium") or shutil.which("google-chrome")
 
-# WebGL in software, and nothing that asks the network.
+# These draw WebGL in software, and prevent requests to the network.
 ARGUMENTS = [
     "--no-sandbox",
     "--use-angle=swiftshader",

@@ -1,4 +1,4 @@
-"""The command line as a user starts it, and other Pythons that tests start."""
+"""The command line as a user starts it, and other Python processes that tests start."""
 
 import os
 import subprocess
@@ -10,7 +10,8 @@ import v3dg
 PACKAGE = str(Path(v3dg.__file__).parents[1])
 # The package under test, wherever the command starts.
 ENVIRONMENT = os.environ | {"PYTHONPATH": PACKAGE}
-# And what tests import, for a Python that runs a part of one: pytest's `pythonpath`.
+# Also the modules that tests import (pytest's `pythonpath`), for a process that runs a
+# part of a test.
 TESTS = Path(__file__).parents[1]
 IMPORTED = [entry for entry in sys.path if Path(entry).is_relative_to(TESTS)]
 TESTS_ENVIRONMENT = os.environ | {
@@ -25,8 +26,8 @@ def run(*arguments, cwd=None):
 
 
 def fails(code, message, *arguments, cwd):
-    """Runs a command that must fail with one line on stderr, an exit code and nothing
-    new in the folder."""
+    """Run a command that must fail with one line on stderr and an exit code, without
+    creating files in the folder."""
     before = sorted(os.listdir(cwd))
     done = run(*arguments, cwd=cwd)
     assert done.returncode == code, done.stderr

@@ -1,4 +1,4 @@
-"""Arrays on either device: NumPy's on the CPU, torch tensors on CUDA. For tests that
+"""Arrays on either device, NumPy's on the CPU and torch tensors on CUDA, for tests that
 run on both."""
 
 import numpy as np
@@ -7,7 +7,7 @@ from v3dg import Gaussians
 
 
 def on(device, value):
-    """The array or the gaussians on `device`; a tuple or list of them becomes a
+    """Return the array or the gaussians on `device`; a tuple or list of them becomes a
     tuple."""
     if isinstance(value, (tuple, list)):
         return tuple(on(device, v) for v in value)
@@ -23,7 +23,8 @@ def on(device, value):
 
 
 def host(value):
-    """The same as NumPy: of an array, gaussians, or a tuple or list of them."""
+    """Return the same as NumPy arrays: of an array, gaussians, or a tuple or list of
+    them."""
     if isinstance(value, (tuple, list)):
         return tuple(host(v) for v in value)
     if isinstance(value, Gaussians):

@@ -1,14 +1,15 @@
-"""Counts how often a path from a leaf to a root has not exactly one selected cluster:
-it must be never.
+"""Counts the paths from a leaf to a root on which not exactly one cluster is selected.
+There must be none.
 
-A trial is an instance, a camera and a tolerance. Each leaf gets a random 64-bit number,
-each group the sum of the numbers below it, split at random over the clusters that it
-made. Then the numbers of the selected clusters add up to those of all leaves if every
-path has exactly one; if not, with a chance of 2^-64.
+A trial is an instance, a camera and a tolerance. Each leaf gets a random 64-bit number.
+Each group gets the sum of the numbers below it, split at random over the clusters that
+it made. If every path has exactly one selected cluster, the numbers of the selected
+clusters add up to those of all leaves; otherwise they do so only with probability
+2^-64.
 
-With a fade, numbers are multiplied by weights: then what has to add up on every path
-are the weights, to exactly 1, which they are whole parts of; if they do not, the chance
-to miss it is 2^-49.
+With a fade, the numbers are multiplied by the weights. Then the weights have to add up
+to exactly 1 on every path; they are multiples of 1 / WHOLE. An error is missed with
+probability 2^-49.
 """
 
 import time
@@ -21,14 +22,14 @@ from scenes_lod import blob, group_metrics, lod_bundle
 from v3dg import Camera, Scene, select
 
 BATCH = 10_000  # instances that share a camera and a tolerance
-WHOLE = 1 << 15  # parts of a weight
+WHOLE = 1 << 15  # a weight of 1, in units of the smallest weight
 
 
 def numbers_of_clusters(bundle, rng):
-    """(C,) uint64 and their sum over any exact cut."""
+    """Return (C,) uint64 numbers, and their sum over any exact cut."""
     clusters, groups = bundle.clusters, bundle.groups
     number = rng.integers(1 << 64, size=len(clusters), dtype=np.uint64)
-    for g in range(len(groups)):  # ordered by level, so what is below is final
+    for g in range(len(groups)):  # groups are ordered by level, so those below are final
         below, made = (
             np.flatnonzero(links == g) for links in (clusters.parent_group, clusters.own_group)
         )
@@ -38,7 +39,7 @@ def numbers_of_clusters(bundle, rng):
 
 
 def random_trees(rng):
-    """Trees and groupings of several shapes."""
+    """Return trees and groupings of several shapes."""
     bundles = [
         lod_bundle(rng, blob(rng, 1500, origin=origin), 12, group_size=group_size, past_root=3)
         for group_size, origin in ((2, 0.0), (4, 0.0), (8, 10.0), (32, 1e4))
@@ -53,8 +54,8 @@ def log_uniform(rng, low, high, size=None):
 
 
 def random_batch(bundle, rng, count):
-    """A scene of instances, a camera among or around them, and a tolerance that cuts
-    most of them inside."""
+    """Return a scene of instances, a camera among or around them, and a tolerance at
+    which most cuts are between the leaves and the root."""
     radius = float(bundle.groups.ball[:, 3].max(initial=1.0))
     center = bundle.groups.ball[-1, :3].astype(np.float64) if len(bundle.groups) else np.zeros(3)
     origin = rng.choice([0.0, 1e3, 1e6]) * rng.normal(size=3)
@@ -62,7 +63,8 @@ def random_batch(bundle, rng, count):
     scales = log_uniform(rng, 1e-2, 1e2, count)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    # From within the ball to a few radii, or to very many; in units of the instance.
+    # The distance ranges from within the ball to a few radii or to very many, in units
+    # of the instance.
     farthest = rng.choice([5.0, 30.0, 1e4])
     distance = radius * scales * log_uniform(rng, 0.3, farthest, count)
     scene = Scene()
@@ -77,7 +79,7 @@ def random_batch(bundle, rng, count):
         width=int(rng.integers(16, 4096)),
         height=int(rng.integers(16, 4096)),
     )
-    # The metric of some group of some instance, exactly or about.
+    # The metric of some group of some instance, exactly or approximately.
     i = int(rng.integers(count))
     one = Scene()
     one.add(bundle, scene.positions[i], quaternions[i], scales[i])
@@ -95,8 +97,8 @@ def random_batch(bundle, rng, count):
 
 
 def count_wrong(instance_ids, cluster_ids, num_instances, number, whole, parts=None):
-    """Instances whose selected clusters, of so many parts of their weight, do not add
-    up to the whole."""
+    """Return the instances whose selected clusters, multiplied by their weights, do not
+    add up to the whole."""
     bounds = np.searchsorted(instance_ids, np.arange(num_instances + 1))
     terms = number[cluster_ids]
     if parts is not None:
@@ -106,8 +108,8 @@ def count_wrong(instance_ids, cluster_ids, num_instances, number, whole, parts=N
 
 
 def check_counting(bundle, number, whole):
-    """A cut is counted as right; with a cluster taken out, doubled or replaced by its
-    neighbour as wrong."""
+    """Check that a cut counts as right, and as wrong with a cluster removed, doubled or
+    replaced by its neighbour."""
     cut = np.flatnonzero(bundle.clusters.own_group < 0).astype(np.int32)
     others = [cut[1:], np.append(cut, cut[:1]), np.append(cut[1:], len(number) - 1)]
     for cluster_ids, wrong in [(cut, 0), *((other, 1) for other in others)]:
@@ -124,8 +126,8 @@ def check_counting(bundle, number, whole):
 
 
 def random_options(rng, bundle, tolerance):
-    """What else a view may ask for, that changes which clusters are drawn but not that
-    paths add up."""
+    """Return random further options of a view, which change the drawn clusters but not
+    the sums on paths."""
     min_level = int(rng.choice([0, 0, rng.integers(bundle.num_levels + 1)]))
     return {
         "tolerance": tolerance,
@@ -135,8 +137,8 @@ def random_options(rng, bundle, tolerance):
 
 
 def parts_of(weights):
-    """(S,) whole parts of weights; an error where one is not drawn, or is not of whole
-    parts."""
+    """Return (S,) weights as integers; raise an error if a weight is 0 or not a
+    multiple."""
     parts = weights.astype(np.float64) * WHOLE
     if not ((parts > 0) & (parts <= WHOLE) & (parts == np.round(parts))).all():
         raise AssertionError("weights: expected positive whole parts of at most 1")
@@ -144,8 +146,8 @@ def parts_of(weights):
 
 
 def cut_of(scene, camera, options, pages, device):
-    """The cut, of pages at places, that fade in, in a frame; or of all. And the seconds
-    that it took."""
+    """Return the cut, with pages that are partly resident and fading in, or with all
+    pages; and its time in seconds."""
     if pages is None:
         selection = select(scene, camera, **options, cull=False, device=device)
         return selection, selection.seconds
@@ -157,12 +159,12 @@ def cut_of(scene, camera, options, pages, device):
 
 
 def run_trials(num_trials, bundles=None, *, seed=0, device="cpu", partial=False, fades=False):
-    """Violations among the trials, and what was tried; random trees if no bundles are
-    given.
+    """Return the violations among the trials, and statistics of the trials; random
+    trees are used if no bundles are given.
 
-    With ``partial``, of pages closed towards the root, other ones for each camera. With
-    ``fades``, views also have random fades, finest levels, importances and budgets, and
-    pages fade in.
+    With ``partial``, the resident pages are closed towards the root and differ between
+    cameras. With ``fades``, views also have random fades, finest levels, importances
+    and budgets, and pages fade in.
     """
     rng = np.random.default_rng(seed)
     bundles = bundles or random_trees(rng)

@@ -1,4 +1,4 @@
-"""The hash of a bundle's header and tables, as docs/format.md has it."""
+"""The hash of a bundle's header and tables, as defined in docs/format.md."""
 
 import hashlib
 

@@ -1,5 +1,5 @@
-"""What tests of whole frames share: a camera, a scene, and how pictures are
-compared."""
+"""Shared parts of the tests of whole frames: a camera, a scene, and the comparison of
+pictures."""
 
 import functools
 
@@ -18,7 +18,7 @@ render = functools.partial(v3dg.render, depth=True)
 
 
 class Renderer(v3dg.Renderer):
-    """Draws depth, too, so that it is compared."""
+    """Draws depth, too, so that tests compare it."""
 
     def render(self, camera, **options):
         return super().render(camera, **{"depth": True} | options)
@@ -34,7 +34,8 @@ def assert_same_bytes(image, other):
 
 
 def assert_close(planes, expected):
-    """Both round; a pixel more or less at a cut-off may differ by more."""
+    """Compare pictures that both have rounding errors; a pixel may differ by more at a
+    cut-off."""
     for got, wanted in zip(planes, expected, strict=True):
         assert got.shape == wanted.shape
         assert np.isfinite(got).all()

@@ -1,9 +1,9 @@
-"""What breaks rasterizers, case by case: drawn and differentiated by both halves
-against float64.
+"""Hard cases for rasterizers: the CPU and CUDA draw and differentiate them, and are
+compared with float64.
 
-Tests hold each case to its bounds, forward and backward, on both devices;
-benchmarks/studies/hard_cases.py measures how the errors spread and writes the table of
-docs/numerics.md.
+Tests check each case against its bounds, forward and backward, on both devices.
+benchmarks/studies/hard_cases.py measures the distribution of the errors and writes the
+table of docs/numerics.md.
 """
 
 from __future__ import annotations
@@ -41,22 +41,22 @@ NUM = 60
 
 @dataclass(frozen=True)
 class HardCase:
-    """One scene, what happens to it, and how far float32 may be from float64."""
+    """One scene, its settings, and how far float32 may be from float64."""
 
     what: str
     gaussians: Gaussians
     camera: Camera = PLAIN
     mode: dict[str, Any] = field(default_factory=dict)
     picture: PictureBound = PICTURE_FLOAT
-    gradient: GradientBound | None = GRADIENT_FLOAT  # None: as many as there are sides to fall on
+    gradient: GradientBound | None = GRADIENT_FLOAT  # None: the number of sides is unlimited
     is_drawn: bool = True  # at least one pixel
 
 
 def crowd(
     seed: int, camera: Camera = PLAIN, num: int = NUM, *, sh_degree: int = 1, **changes: Any
 ) -> Gaussians:
-    """Ordinary gaussians in front of the camera, with some arrays changed; a row may
-    hold for all."""
+    """Return ordinary gaussians in front of the camera, with some arrays replaced; one
+    row may be used for all."""
     g = scenes.random_gaussians(seed, camera, num, size_px=(1, 8), aspect=4.0, sh_degree=sh_degree)
     rows = {
         n: np.broadcast_to(np.asarray(v, np.float32), getattr(g, n).shape)
@@ -66,8 +66,8 @@ def crowd(
 
 
 def zoomed(factor: float) -> tuple[Gaussians, Camera]:
-    """A scene that is `factor` times as large, its camera moved and its near plane with
-    it."""
+    """Return a scene that is `factor` times as large, with its camera and near plane
+    scaled accordingly."""
     camera = scenes.CAMERAS["posed"]
     g = crowd(2, camera)
     viewmat = camera.viewmat.copy()
@@ -79,7 +79,7 @@ def zoomed(factor: float) -> tuple[Gaussians, Camera]:
 
 
 def away(distance: float) -> tuple[Gaussians, Camera]:
-    """A scene and its camera so far from zero, on no axis of the world or the
+    """Return a scene and its camera far from the origin, on no axis of the world or the
     camera."""
     posed = scenes.CAMERAS["posed"]
     viewmat = posed.viewmat.copy()
@@ -89,7 +89,7 @@ def away(distance: float) -> tuple[Gaussians, Camera]:
 
 
 def bad_rows(array: np.ndarray, value: float) -> np.ndarray:
-    """The array with `value` somewhere in every tenth row."""
+    """Return the array with `value` somewhere in every tenth row."""
     bad = array.copy()
     bad.reshape(len(bad), -1)[::10, 0] = value
     return bad
@@ -328,30 +328,30 @@ def hard_cases() -> dict[str, HardCase]:
     return {**shapes(), **values(), **places(), **cameras()}
 
 
-# Measures
+# These functions measure.
 
 
 def picture(case: HardCase, device: str) -> v3dg.Image:
-    """What float32 draws, as NumPy arrays."""
+    """Return the picture in float32, as NumPy arrays."""
     raster = v3dg.rasterize(on(device, case.gaussians), case.camera, **case.mode)
     return v3dg.Image(*host((raster.color, raster.alpha, raster.depth)))
 
 
 def expected_picture(case: HardCase) -> reference_rasterize.Picture:
-    with np.errstate(all="ignore"):  # some of the gaussians are not numbers
+    with np.errstate(all="ignore"):  # some of the gaussians are NaN
         return reference_rasterize.rasterize(case.gaussians, case.camera, **case.mode)
 
 
 def picture_error(raster: v3dg.Image, expected: reference_rasterize.Picture) -> np.ndarray:
-    """(H, W) largest error of colour and alpha."""
+    """Return (H, W) the largest error of colour and alpha."""
     return np.maximum(
         np.abs(raster.color - expected.color).max(axis=2), np.abs(raster.alpha - expected.alpha)
     )
 
 
 def drawn_rows(case: HardCase) -> np.ndarray:
-    """(N,) whether the gaussian is drawn, as far as projection tells, and its colour is
-    a number."""
+    """Return (N,) whether the gaussian is drawn according to its projection and has a
+    finite colour."""
     g = case.gaussians
     with np.errstate(all="ignore"):
         projection = reference_project.project(
@@ -364,11 +364,11 @@ def drawn_rows(case: HardCase) -> np.ndarray:
 def gradients(
     case: HardCase, draw: Callable[..., Any], dtype: Any, device: str = "cpu"
 ) -> list[np.ndarray]:
-    """Of a number that every pixel of colour, alpha and depth has a part in, by the
-    five inputs.
+    """Return the gradients by the five inputs of a number that depends on every pixel
+    of colour, alpha and depth.
 
-    `draw` takes the five as tensors, the camera and the mode. Depth counts in units of
-    the nearest one.
+    `draw` takes the five inputs as tensors, the camera and the mode. Depth counts in
+    units of the nearest one.
     """
     import torch
 
@@ -387,18 +387,18 @@ def gradients(
 
 
 def draw_core(inputs: Sequence[Any], camera: Camera, mode: dict[str, Any]) -> tuple[Any, Any, Any]:
-    """With v3dg, in the inputs' own precision."""
+    """Draw with v3dg, in the precision of the inputs."""
     g: Any = SimpleNamespace(**dict(zip(scenes.NAMES, inputs, strict=True)))
     raster = v3dg.rasterize(g, camera, **mode)
     return raster.color, raster.alpha, raster.depth
 
 
 def relative_changes(case: HardCase, by_inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Gradients by relative changes: of a mean by its distance, of a scale by itself,
-    and so on.
+    """Return gradients by relative changes: of a mean by its distance, of a scale by
+    itself, and so on.
 
-    So they can be compared with each other, however large a scene is. Of what is not a
-    number: 0.
+    They can be compared with each other for scenes of any size. The gradient of NaN
+    inputs is 0.
     """
     g = case.gaussians
     distance = np.linalg.norm(np.asarray(g.means, np.float64) - case.camera.position, axis=1)[
@@ -420,8 +420,8 @@ def relative_changes(case: HardCase, by_inputs: Sequence[np.ndarray]) -> list[np
 
 
 def gradient_errors(got: Sequence[np.ndarray], expected: Sequence[np.ndarray]) -> list[float]:
-    """L2 distance for each input, relative to its norm; to 1e-6 of the norm of all
-    where that is more."""
+    """Return the L2 distance for each input, relative to its norm, or to 1e-6 of the
+    norm of all inputs if that is larger."""
     whole = np.sqrt(sum((e * e).sum() for e in expected))
     return [
         float(np.linalg.norm(g - e) / max(np.linalg.norm(e), 1e-6 * whole, 1e-300))

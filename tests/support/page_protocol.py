@@ -1,7 +1,7 @@
-"""The types of the viewer's page, in TypeScript, from the messages in Python.
+"""Generates the TypeScript types of the viewer's page from the messages in Python.
 
-`python tests/support/page_protocol.py` writes `v3dg/viewer/page/protocol.d.ts` anew,
-which tests/test_viewer_protocol.py compares with the messages.
+`python tests/support/page_protocol.py` writes `v3dg/viewer/page/protocol.d.ts`. A test
+compares that file with the messages.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def protocol() -> str:
     """Return the text of the file."""
     said = typing.get_args(messages.Message)
     told = typing.get_args(answers.Answer)
-    # `_View` and `_Settings` are `View` and `Settings` with bounds; the latter, which
-    # are documented, come later and replace them.
+    # `_View` and `_Settings` are `View` and `Settings` with bounds. The documented
+    # versions come later and replace them.
     _, schemas = msgspec.json.schema_components([*said, *told], ref_template="{name}")
     named = {public_name(name): schema for name, schema in sorted(schemas.items(), reverse=True)}
     parts = [HEAD, shows_type()]
@@ -70,7 +70,7 @@ def interface(name: str, schema: dict[str, Any]) -> str:
     lines.append(f"export interface {name} {{")
     required = schema.get("required", [])
     for field, field_schema in schema["properties"].items():
-        # A field that has a default may be left out; all settings are always sent.
+        # A field with a default may be omitted; settings are always sent completely.
         mark = "" if field in required or field == "type" or name == "Settings" else "?"
         lines.append(f"  {field}{mark}: {type_text(field_schema)};")
     lines.append("}\n")
@@ -78,7 +78,7 @@ def interface(name: str, schema: dict[str, Any]) -> str:
 
 
 def comment_lines(docstring: str) -> list[str]:
-    """A docstring as a comment."""
+    """Return a docstring as a comment."""
     lines = inspect.cleandoc(docstring).splitlines()
     if len(lines) == 1:
         return [f"/** {lines[0]} */"]

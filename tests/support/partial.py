@@ -1,4 +1,4 @@
-"""Scenes of which only some pages are resident, as the core's functions take them."""
+"""Scenes with only some resident pages, as inputs of the core's functions."""
 
 import numpy as np
 
@@ -6,24 +6,24 @@ from v3dg import _core, _device
 from v3dg.select import rule_of
 
 ABSENT = np.iinfo(np.int64).min
-ARRIVAL_FRAMES = 8  # over which a page fades in
+ARRIVAL_FRAMES = 8  # frames over which a page fades in
 NEVER, LONG_AGO = np.iinfo(np.int32).max, -ARRIVAL_FRAMES
 
 
 def closed_residency(rng, bundle, share=None):
-    """(P,) whether each page is there: the last one, and others together with the pages
-    above them."""
+    """Return (P,) whether each page is resident: the last one, and others together with
+    the pages above them."""
     share = rng.choice([0.0, 0.5, 0.8, 0.95, 1.0]) if share is None else share
     parent = bundle.groups.parent
     there = np.append(rng.random(len(parent)) < share, True)
-    for g in range(len(parent) - 1, -1, -1):  # parents come later
+    for g in range(len(parent) - 1, -1, -1):  # parents come later in the table
         there[g] &= there[parent[g]]
     return there
 
 
 def page_rows(bundle):
-    """(P,) of each page the first gaussian and their number; of a bundle without
-    clusters 0 and 0."""
+    """Return (P,) the first gaussian of each page and their number; 0 and 0 for a
+    bundle without clusters."""
     first = [bundle.clusters.offset[bundle.page_range(p).start] for p in range(bundle.num_pages)]
     ends = [bundle.clusters.offset[bundle.page_range(p).stop] for p in range(bundle.num_pages)]
     if not first:
@@ -32,8 +32,8 @@ def page_rows(bundle):
 
 
 def random_shift(rng, bundle, there):
-    """(P,) by how many rows the pages lie behind their place, in any order, and how
-    many rows there are."""
+    """Return (P,) the shift in rows of each page, in random order, and the number of
+    rows."""
     first, count = page_rows(bundle)
     shift = np.full(len(first), ABSENT)
     row = 0
@@ -45,11 +45,11 @@ def random_shift(rng, bundle, there):
 
 
 def random_begins(rng, bundle):
-    """(P,) after which frames pages fade in, none before the one above it, and a frame
-    in which some do."""
+    """Return (P,) the frames after which pages fade in, none before the page above it,
+    and a frame in which some fade."""
     parent = bundle.groups.parent
     begins = np.full(len(parent) + 1, LONG_AGO, np.int32)
-    for g in range(len(parent) - 1, -1, -1):  # parents come later
+    for g in range(len(parent) - 1, -1, -1):  # parents come later in the table
         above = int(begins[parent[g]])
         if above == NEVER or rng.random() < 0.05:
             begins[g] = NEVER
@@ -62,12 +62,12 @@ def random_begins(rng, bundle):
 
 
 def arrived(begins, frame):
-    """(P,) shares to which pages have faded in."""
+    """Return (P,) how far pages have faded in, 0 to 1."""
     return np.clip(frame - begins.astype(np.int64), 0, ARRIVAL_FRAMES) / ARRIVAL_FRAMES
 
 
 def table_of(bundle, shift=None, begins=None):
-    """The core's table of a bundle with pages at their places."""
+    """Return the core's table of a bundle with these page shifts."""
     groups = {name: getattr(bundle.groups, name) for name in ("ball", "weight", "level")}
     return _core.ClusterTable(
         **(vars(bundle.clusters) | groups), page_shift=shift, page_begins=begins
@@ -75,7 +75,7 @@ def table_of(bundle, shift=None, begins=None):
 
 
 def resident_scene(scene, shifts, device="cpu", begins=None):
-    """The core's scene of bundles whose pages are at these places, and fade in then."""
+    """Return the core's scene of bundles with these page shifts and fades."""
     core = _core.ResidentScene(_device.resolve(device).number)
     pages = zip(scene.bundles, shifts, begins or [None] * len(shifts), strict=True)
     core.set_bundles([table_of(*of_bundle) for of_bundle in pages])

@@ -8,7 +8,7 @@ from v3dg.gaussians import Gaussians
 
 
 def random_gaussians(rng, count, sh_degree=0):
-    """Gaussians with unit-sized values; what they look like does not matter."""
+    """Return gaussians with values of about one; their appearance does not matter."""
     quats = rng.normal(size=(count, 4))
     quats /= np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-9)
     return Gaussians(
@@ -21,11 +21,11 @@ def random_gaussians(rng, count, sh_degree=0):
 
 
 def random_links(rng, num_levels, max_fan=3):
-    """Own and parent group and level of clusters, parent and level of groups, from the
-    last level down."""
-    # Of the last level: (own, parent) to be numbered.
+    """Return own and parent group and level of clusters, and parent and level of
+    groups, from the last level down."""
+    # Each cluster of the last level is (own, parent), to be numbered later.
     levels = [[(-1, -1)] * int(rng.integers(1, max_fan + 1))]
-    groups = []  # per level, from the last: (parent, number of clusters below)
+    groups = []  # per level, from the last one: (parent, number of clusters below)
     for _ in range(num_levels - 1):
         clusters, made = levels[-1], []
         owners = []
@@ -41,7 +41,7 @@ def random_links(rng, num_levels, max_fan=3):
     groups.reverse()
     first = np.concatenate([[0], np.cumsum([len(made) for made in groups])]).astype(int)
 
-    def number(g, level):  # of the group g of those that make `level`
+    def number(g, level):  # returns the index of group g among those that make `level`
         return -1 if g < 0 else first[level - 1] + g
 
     rows = [
@@ -58,12 +58,12 @@ def random_links(rng, num_levels, max_fan=3):
 
 
 def random_groups(rng, parent, level):
-    """Balls and weights that nest as they must, bottom up."""
+    """Return balls and weights that nest as required, from the bottom up."""
     count = len(parent)
     ball = rng.normal(size=(count, 4)).astype(np.float32)
     ball[:, 3] = rng.uniform(1e-3, 1, count)
     weight = rng.uniform(0.001, 1, count).astype(np.float32)
-    for g in range(count):  # groups are ordered by level, so what is below is final
+    for g in range(count):  # groups are ordered by level, so those below are final
         above = parent[g]
         if above >= 0:
             distance = np.linalg.norm(ball[above, :3].astype(np.float64) - ball[g, :3])
@@ -77,8 +77,8 @@ def random_groups(rng, parent, level):
 def random_bundle(
     seed=0, *, num_levels=3, sh_degree=0, max_cluster=5, max_fan=3, config=None, codec="float32"
 ):
-    """A valid bundle; clusters may be empty. ``num_levels`` 0 gives a bundle without
-    clusters."""
+    """Return a valid bundle; clusters may be empty. ``num_levels`` 0 gives a bundle
+    without clusters."""
     rng = np.random.default_rng(seed)
     if num_levels:
         links, group_links = random_links(rng, num_levels, max_fan)

@@ -1,9 +1,9 @@
-"""Small scenes: by hand, random with the sizes that trained assets have, poisoned and
+"""Small scenes: made by hand, random with the sizes of trained assets, invalid and
 degenerate.
 
-A scene is a `Gaussians` (NumPy, float32) and a `Camera`. Random gaussians are laid out
-in front of their camera: places in pixels, sizes in pixels, depths all different by far
-more than float32 can confuse.
+A scene is a `Gaussians` (NumPy, float32) and a `Camera`. Random gaussians are placed in
+front of their camera, with positions and sizes in pixels; their depths differ by far
+more than float32 rounding.
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ NAMES = ("means", "quats", "scales", "opacities", "sh")
 def camera(
     width=48, height=40, *, fx=50.0, fy=None, cx=None, cy=None, pose=None, near=0.01
 ) -> Camera:
-    """Square pixels and a centred principal point unless told otherwise; looks along z
-    unless posed."""
+    """Return a camera with square pixels and a centred principal point by default,
+    which looks along z unless it has a pose."""
     K = [[fx, 0, width / 2 if cx is None else cx], [0, fx if fy is None else fy, 0], [0, 0, 1]]
     K[1][2] = height / 2 if cy is None else cy
     return Camera(np.eye(4) if pose is None else pose, K, width, height, near)
 
 
 def pose(seed: int, distance: float = 2.0) -> np.ndarray:
-    """World to view: any rotation, an eye a few units from the world's origin."""
+    """Return a world-to-view matrix with a random rotation and an eye a few units from
+    the origin."""
     rng = np.random.default_rng(seed)
     viewmat = np.eye(4)
     viewmat[:3, :3] = reference_project.rotation(rng.normal(size=(1, 4)))[0]
@@ -41,15 +42,15 @@ def pose(seed: int, distance: float = 2.0) -> np.ndarray:
     return viewmat
 
 
-# One camera of each kind that a formula could get wrong.
+# One camera for each special case of the formulas.
 CAMERAS = {
     "plain": camera(),
     "posed": camera(pose=pose(1)),
     "off_centre": camera(61, 37, fx=45.0, cx=9.5, cy=31.25, pose=pose(2)),
     "non_square": camera(33, 70, fx=38.0, fy=81.0, cx=14.0, cy=40.5, pose=pose(3)),
-    # Principal point not in the image.
+    # The principal point is outside of the image.
     "outside": camera(40, 40, fx=60.0, cx=-25.0, cy=55.0, pose=pose(4)),
-    # 139 degrees: slopes are large, Jacobians get clamped.
+    # The field of view is 139 degrees: slopes are large, and Jacobians are clamped.
     "wide": camera(64, 32, fx=12.0, pose=pose(5)),
     "one_pixel": camera(1, 1, fx=3.0),
 }
@@ -58,8 +59,8 @@ CAMERAS = {
 def gaussians(
     means, quats=(1, 0, 0, 0), scales=0.1, opacities=0.8, color=(0.9, 0.5, 0.2), sh=None
 ) -> Gaussians:
-    """Gaussians by hand: what is given once holds for all; `color` is what degree 0
-    shows, unless `sh`."""
+    """Return explicit gaussians; a single row is used for all. `color` sets SH degree
+    0, unless `sh` is given."""
     means = np.atleast_2d(np.asarray(means, np.float32))
     num = len(means)
 
@@ -89,10 +90,10 @@ def random_gaussians(
     depth=(1.0, 4.0),
     margin=0.2,
 ) -> Gaussians:
-    """Gaussians all over the image and `margin` of its size beyond.
+    """Return gaussians all over the image and beyond it by `margin` of its size.
 
-    The largest standard deviation is log-uniform in `size_px` pixels, the others up to
-    `aspect` smaller.
+    The largest standard deviation is log-uniform in `size_px`, in pixels; the others
+    are smaller by up to `aspect`.
     """
     rng = np.random.default_rng(seed)
     step = (depth[1] - depth[0]) / max(num, 1)
@@ -119,8 +120,8 @@ def random_gaussians(
 
 
 def trained_like(seed, camera, num, sh_degree=3) -> Gaussians:
-    """What training makes: many small, some large, thin discs and needles, opacities
-    heaped at both ends."""
+    """Return gaussians like those of training: many small, some large, thin discs and
+    needles, with opacities concentrated at both ends."""
     g = random_gaussians(seed, camera, num, size_px=(0.1, 20.0), aspect=1e3, sh_degree=sh_degree)
     rng = np.random.default_rng(seed + 1)
     return replaced(g, opacities=rng.beta(0.4, 0.4, num).astype(np.float32))
@@ -131,8 +132,7 @@ def replaced(g, **arrays) -> Gaussians:
 
 
 def degenerate() -> dict[str, Gaussians]:
-    """Everything that a formula could trip over and that has a meaning, for the camera
-    `CAMERAS["plain"]`."""
+    """Return valid but extreme gaussians for the camera `CAMERAS["plain"]`."""
     on_grid = [[x / 5, y / 5, 2.0] for x in range(-4, 5) for y in range(-4, 5)]
     return {
         "empty": gaussians(np.zeros((0, 3))),
@@ -187,7 +187,7 @@ def degenerate() -> dict[str, Gaussians]:
 
 
 def poison() -> dict[str, Gaussians]:
-    """One gaussian each that has no meaning, large and in front of the camera
+    """Return single invalid gaussians, large and in front of the camera
     `CAMERAS["plain"]`."""
     good = {
         "means": [0, 0, 1.0],
@@ -219,7 +219,8 @@ def poison() -> dict[str, Gaussians]:
 
 
 def doubles(g, *, torch, requires_grad=False) -> SimpleNamespace:
-    """The same gaussians as float64 torch tensors, for the core's double precision."""
+    """Return the same gaussians as float64 torch tensors, for the core's double
+    precision."""
     return SimpleNamespace(
         **{
             name: torch.from_numpy(np.array(getattr(g, name), np.float64)).requires_grad_(
@@ -231,7 +232,7 @@ def doubles(g, *, torch, requires_grad=False) -> SimpleNamespace:
 
 
 def leaves(torch, gaussians, background, dtype, device="cpu"):
-    """The five inputs and the background as leaf tensors."""
+    """Return the five inputs and the background as leaf tensors."""
     arrays = [getattr(gaussians, name) for name in NAMES] + [background]
     return [
         torch.tensor(np.asarray(a), dtype=dtype, device=device, requires_grad=True) for a in arrays
@@ -239,8 +240,8 @@ def leaves(torch, gaussians, background, dtype, device="cpu"):
 
 
 def is_smooth(g, camera, *, filter_px2=0.0, antialiased=False, band=1e-3) -> bool:
-    """Whether nothing in the picture is near a step or a kink, so that finite
-    differences mean something."""
+    """Return whether nothing in the picture is near a discontinuity of a value or a
+    derivative, so that finite differences are accurate."""
     options = {"filter_px2": filter_px2, "antialiased": antialiased}
     picture = reference_rasterize.rasterize(g, camera, **options)
     projection = reference_project.project(g, camera, filter_px2=filter_px2)
@@ -266,7 +267,7 @@ def is_smooth(g, camera, *, filter_px2=0.0, antialiased=False, band=1e-3) -> boo
 
 
 def first_smooth(make, camera, **options) -> Gaussians:
-    """The first of `make(seed)`, seed = 0, 1, ..., that is smooth."""
+    """Return the first smooth result of `make(seed)`, seed = 0, 1, ..."""
     for seed in range(200):
         g = make(seed)
         if is_smooth(g, camera, **options):

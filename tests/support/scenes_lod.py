@@ -1,5 +1,5 @@
-"""Bundles with a real layout in space, random poses and cameras: what selection is
-tested on."""
+"""Bundles with a realistic layout in space, random poses and cameras, for the tests of
+selection."""
 
 import itertools
 
@@ -9,11 +9,11 @@ from v3dg import Bundle, Camera, Clusters, Gaussians, Groups, Scene, _core
 from v3dg.residency import residency
 from v3dg.select import rule_of
 
-REACH = 3.33  # standard deviations until an opaque gaussian falls below 1/255
+REACH = 3.33  # standard deviations at which the alpha of an opaque gaussian falls below 1/255
 
 
 def rotation_matrices(quats):
-    """(N,3,3) of (N,4) w x y z of any length."""
+    """Return (N,3,3) rotations of (N,4) w x y z of any length."""
     w, x, y, z = (np.asarray(quats, np.float64) / np.linalg.norm(quats, axis=1, keepdims=True)).T
     return np.array(
         [
@@ -30,7 +30,7 @@ def covariances(gaussians):
 
 
 def box_of(gaussians):
-    """(2,3) float32, rounded outwards: means and their reach."""
+    """Return (2,3) float32, rounded outwards: the box of means plus reach."""
     if len(gaussians) == 0:
         return np.zeros((2, 3), np.float32)
     reach = REACH * np.sqrt(np.diagonal(covariances(gaussians), axis1=1, axis2=2))
@@ -42,7 +42,8 @@ def box_of(gaussians):
 
 
 def blob(rng, count, *, origin=0.0, size=1.0, sh_degree=0):
-    """Gaussians of all shapes in and around a ball; some are needles or plates."""
+    """Return gaussians of all shapes in and around a ball; some are needles or
+    plates."""
     scales = size * np.exp(rng.normal(-3, 1, (count, 1)) + rng.normal(0, 1, (count, 3)))
     quats = rng.normal(size=(count, 4)) + 1e-3
     return Gaussians(
@@ -55,17 +56,17 @@ def blob(rng, count, *, origin=0.0, size=1.0, sh_degree=0):
 
 
 def lod_bundle(rng, asset, cluster_size, *, group_size=2, past_root=2, filter_px2=0.1):
-    """A bundle with the layout that a build gives: median split, groups of neighbours,
-    half the gaussians up.
+    """Return a bundle with the layout of a build: median split, groups of neighbours,
+    half the gaussians per level.
 
-    A group of ``group_size`` clusters is thinned to half as many clusters, at least
-    one; from one cluster on, ``past_root`` further levels halve it.
+    A group of ``group_size`` clusters is reduced to half as many clusters, at least
+    one. Once one cluster is left, it is halved for ``past_root`` further levels.
     """
     halvings = _core.num_halvings(len(asset), cluster_size)
     order, leaf_offset = _core.median_split(asset.means, np.array([0, len(asset)]), halvings)
     level = [asset.subset(order[a:b]) for a, b in itertools.pairwise(leaf_offset)]
-    # A unit: clusters made by one group, that group (-1: none), the ball that must be
-    # contained.
+    # A unit is: the clusters made by one group, that group (-1: none), and the ball
+    # that must be contained.
     units = [([cluster], -1, None) for cluster in level]
     clusters, balls, weights, group_level, group_parent, links = [], [], [], [], [], []
     depth = 0
@@ -154,7 +155,7 @@ def random_camera(rng, *, distance=5.0, origin=0.0, width=64, height=48, **chang
 
 
 def turned(camera, rng):
-    """The camera with another view direction."""
+    """Return the camera with another view direction."""
     axis = rng.normal(size=3)
     return Camera.look_at(
         camera.position,
@@ -166,7 +167,7 @@ def turned(camera, rng):
 
 
 def instances_of(scene):
-    """As the core's functions take them on the host."""
+    """Return the instances for the core's functions, on the host."""
     return _core.Instances(
         bundle=scene.instance_bundle,
         positions=scene.positions,
@@ -177,8 +178,8 @@ def instances_of(scene):
 
 
 def group_metrics(subject, camera, *, footprint="solid_angle"):
-    """For each instance what tolerance is compared with: its groups' metrics, (G,) in
-    px²."""
+    """Return the metrics of the groups of each instance, (G,) in px², which tolerances
+    are compared with."""
     scene = Scene.of(subject)
     tables = [residency.table(bundle) for bundle in scene.bundles]
     rule = rule_of(0.0, None, 0, footprint, cull=False)

@@ -1,5 +1,5 @@
-"""v3dg and benchmarks with worlds and builds so small that what the docs say can be
-run; a program, too."""
+"""Runs v3dg and benchmarks with tiny worlds and builds, so that the commands in the
+documentation can be executed."""
 
 import sys
 from dataclasses import replace
@@ -15,7 +15,7 @@ WORLDS = {
     "temples": {"instances": 2, "num_gaussians": 5000},
     "crowd": {"instances": 4, "num_gaussians": 2000, "persons": 1},
 }
-# Options that are added to a command, where its own sizes would take long.
+# Options that are added to commands whose default sizes would take long.
 OPTIONS = {
     "demo": ["--gaussians", "1000", "--instances", "20", "--size", "64", "64"],
     "compare": ["--size", "64", "64"],
@@ -23,7 +23,7 @@ OPTIONS = {
 
 
 def shrink(set_attribute=setattr, set_item=dict.__setitem__):
-    """Make worlds tiny whatever size is asked for, and levels not fitted."""
+    """Make worlds tiny for any requested size, and skip the fits of levels."""
 
     def tiny(make, arguments):
         return lambda **given: make(**arguments, seed=given.get("seed", 0))
@@ -53,10 +53,10 @@ if __name__ == "__main__":
     program, *arguments = sys.argv[1:]
     if program == "benchmarks":
         sys.exit(benchmarks.PROGRAM.main(arguments))
-    if arguments[0] == "view":  # serves until it is interrupted: here, its options are enough
+    if arguments[0] == "view":  # it serves until it is interrupted, so only its options are checked
         cli.parse(arguments)
         sys.exit()
-    views = ["--views", "2"]  # of a turntable, which a scene has none of
+    views = ["--views", "2"]  # for a turntable, which a scene does not have
     if arguments[0] != "compare" or any(argument.endswith(".json") for argument in arguments):
         views = []
     sys.exit(cli.main([*arguments, *OPTIONS.get(arguments[0], []), *views]))

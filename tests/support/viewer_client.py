@@ -1,5 +1,5 @@
-"""A page's side of the viewer's connection: moves a camera, changes settings, takes
-pictures."""
+"""The page's side of the viewer's connection: it moves a camera, changes settings, and
+receives pictures."""
 
 import io
 import json
@@ -11,15 +11,15 @@ from websockets.sync.client import connect
 
 
 class Tab:
-    """What a browser tab is to the server.
+    """A browser tab from the view of the server.
 
     Attributes:
-        hello, scene: What the server says first.
-        figures: Of the last picture, and all else that came with it.
+        hello, scene: The first messages of the server.
+        figures: Statistics of the last picture, and everything else that came with it.
         failures: Why pictures could not be drawn.
         notices: Notices that popped up.
-        answers: Other messages, by their types; the last of each.
-        files: Contents of the files that were downloaded, by name.
+        answers: Other messages by type; the last one of each.
+        files: Contents of the downloaded files, by name.
     """
 
     def __init__(self, port, path="/", **options):
@@ -36,12 +36,12 @@ class Tab:
         self._connection.close()
 
     def look(self, view, size):
-        """Say that the camera is there now, in a window of that size."""
+        """Send a camera and a window size."""
         self._look = {"type": "look", "view": asdict(view), "size": size}
         return self.change()
 
     def change(self, **settings):
-        """Change settings of what is shown; returns what was said."""
+        """Change settings of the picture; return the message that was sent."""
         self.settings |= settings
         self._number += 1
         self._look |= {"settings": self.settings, "number": self._number}
@@ -60,7 +60,7 @@ class Tab:
         return message
 
     def save(self, what, path=(), up="z"):
-        """Ask for a file of views with the seconds to each."""
+        """Request a file of views with the seconds to each."""
         stops = [(seconds, asdict(view)) for seconds, view in path]
         message = {"type": "save", "what": what, "look": self._look, "up": up, "path": stops}
         self.send(message)
@@ -73,7 +73,8 @@ class Tab:
             self.send(content[first : first + piece])
 
     def pictures(self, until):
-        """Take what comes until then; (time, picture) of each picture, 8 bit."""
+        """Receive messages until a time; return (time, picture) of each 8-bit
+        picture."""
         found = []
         while (left := until - time.perf_counter()) > 0:
             try:
@@ -86,7 +87,7 @@ class Tab:
         return found
 
     def _take(self, data):
-        """Keep what a message says; return the picture in it if there is one."""
+        """Store the content of a message; return its picture if it has one."""
         content = b""
         if isinstance(data, bytes):
             size = int.from_bytes(data[:4], "little")
@@ -110,12 +111,12 @@ class Tab:
 
     @property
     def is_answered(self):
-        """Whether the last picture is the final one of what was asked for last."""
+        """Return whether the last picture is the final one for the last request."""
         return (
             bool(self.figures) and self.figures["final"] and self.figures["number"] == self._number
         )
 
     def send(self, message):
-        """Send what becomes JSON, or else a text or bytes as they are."""
+        """Send a value as JSON, or a text or bytes unchanged."""
         raw = isinstance(message, (str, bytes))
         self._connection.send(message if raw else json.dumps(message))

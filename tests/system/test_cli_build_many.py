@@ -63,6 +63,18 @@ def test_bundles_go_to_the_output_folder_and_are_those_of_single_builds(folder):
     assert (folder / "c.v3dg").read_bytes() == (folder / "new" / "out" / "c.v3dg").read_bytes()
 
 
+def test_bundles_that_exist_are_replaced_only_if_asked(folder):
+    (folder / "b.ply").unlink()
+    (folder / "c.v3dg").write_text("mine")
+    done = run("build", ".", *FAST, cwd=folder)
+    assert done.returncode == 2
+    assert "c.v3dg: exists already; --resume keeps" in done.stderr
+    assert not (folder / "a.v3dg").exists()
+    assert (folder / "c.v3dg").read_text() == "mine"
+    assert run("build", ".", *FAST, "--overwrite", cwd=folder).returncode == 0
+    assert len(v3dg.open(folder / "c.v3dg").clusters) > 1
+
+
 def test_resume_keeps_what_is_done_with_these_settings(folder):
     (folder / "b.ply").unlink()
 

@@ -186,16 +186,6 @@ def test_what_cannot_be_meant_is_refused(folder):
     )
     fails(
         2,
-        "--up: expected a bundle or a scene",
-        "convert",
-        "tuft.ply",
-        "x.ply",
-        "--up",
-        "z",
-        cwd=folder,
-    )
-    fails(
-        2,
         "--views: expected one camera",
         "convert",
         "tuft.v3dg",

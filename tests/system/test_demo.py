@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import v3dg
 from command_line import run
 from v3dg import cli
 from v3dg.demo import run_demo
@@ -45,10 +46,22 @@ def test_demo_writes_its_picture_and_nothing_else(demo):
 
 
 def test_demo_refuses_a_bad_path_before_it_works(tmp_path):
-    with pytest.raises(ValueError, match="create it first"):
-        run_demo(tmp_path / "no" / "demo.png", num_gaussians=10**9)
     with pytest.raises(ValueError, match=r"\.png"):
         run_demo(tmp_path / "demo.tiff", num_gaussians=10**9)
+
+
+def test_demo_keeps_its_files_to_go_on_with(tmp_path):
+    small = {"num_gaussians": 1000, "instances": 5, "size": (32, 32), "views": VIEWS[:1]}
+    folder = tmp_path / "new" / "kept"
+    result = run_demo(tmp_path / "demo.png", keep=folder, progress=False, **small)
+    assert result["kept"] == [str(folder / f"donut{end}") for end in (".ply", ".v3dg", "s.json")]
+    scene, cameras = v3dg.read_scene(folder / "donuts.json")
+    assert len(scene) == 5
+    assert scene.bundles[0].path == str(folder / "donut.v3dg")
+    assert len(v3dg.read_asset(folder / "donut.ply")) == 1000
+    assert list(cameras) == ["0, distance 3.3"]
+    with pytest.raises(ValueError, match=r"donut\.ply: expected a new file"):
+        run_demo(tmp_path / "demo.png", keep=folder, progress=False, **small)
 
 
 def test_demo_command(tmp_path):

@@ -460,7 +460,7 @@ def test_what_a_pool_cannot_do_is_refused(asset, device):
     with pytest.raises(ValueError, match=r"memory: expected None for an asset, .*; leave it out"):
         Renderer(asset.gaussians, device=device, memory="1MB")
     cut = v3dg.select(asset, CAMERA, device=device)
-    with pytest.raises(ValueError, match="cut: expected none for a pool"):
+    with pytest.raises(ValueError, match="cut: a renderer with a pool selects its own cut"):
         render(asset, CAMERA, cut=cut, device=device, memory="1MB")
     renderer = Renderer(asset, device=device)
     renderer.settle(CAMERA)  # all is there
@@ -519,7 +519,7 @@ def test_truncated_file_is_an_error_and_not_a_crash(path, device):
     os.truncate(path, int(bundle._file.places[2]))
     draws_coarser(renderer)
     with pytest.raises(
-        ValueError, match=r"asset\.v3dg: page \d+ is not there; the file was truncated"
+        ValueError, match=r"asset\.v3dg: page \d+ is missing; the file was truncated"
     ):
         renderer.settle(CAMERA, tolerance=0.0)
 
@@ -572,7 +572,7 @@ def test_disk_that_does_not_answer_ends_the_wait(path, device, monkeypatch):
     monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
     renderer = Renderer(Bundle.open(path), device=device, memory="64MB")
     start = time.monotonic()
-    with pytest.raises(TimeoutError, match="pages are missing and none came in"):
+    with pytest.raises(TimeoutError, match="pages are missing and none arrived"):
         renderer.settle(CAMERA, timeout=0.2, **FINE)
     assert time.monotonic() - start < 20
     for _ in range(3):
@@ -775,5 +775,5 @@ def test_graphs_of_a_pool_are_refused(scene):
     renderer.render(CAMERA).stats  # noqa: B018
     with torch.cuda.graph(torch.cuda.CUDAGraph()):
         torch.zeros(1, device="cuda")  # for torch warns of graphs without work
-        with pytest.raises(RuntimeError, match="no CUDA graph of a pool"):
+        with pytest.raises(RuntimeError, match="cannot be captured in a CUDA graph"):
             renderer.render(CAMERA)

@@ -51,6 +51,22 @@ def size_of(path, device):
     return residency.bytes_to_add([Bundle.open(path)], _device.resolve(device))
 
 
+def test_a_picture_asks_once_for_the_scene(path, device, monkeypatch):
+    renderer = Renderer(Bundle.open(path), device=device)
+    renderer.render(CAMERA)
+    num_calls = 0
+    scene_of = residency.scene
+
+    def counted(*arguments):
+        nonlocal num_calls
+        num_calls += 1
+        return scene_of(*arguments)
+
+    monkeypatch.setattr(residency, "scene", counted)
+    renderer.render(CAMERA)
+    assert num_calls == 1
+
+
 def test_all_is_resident_where_it_fits(path, device):
     renderer = Renderer(Bundle.open(path), device=device)
     assert renderer.memory is None
@@ -144,7 +160,9 @@ def test_what_needs_all_is_drawn_of_all(path, device, free):
     free(max(size_of(path, device).values()))
     other = Bundle.open(path)
     cut = v3dg.select(other, CAMERA, device=device)
-    with pytest.raises(ValueError, match=r"cut: expected none for a pool, .*; give memory=None"):
+    with pytest.raises(
+        ValueError, match=r"cut: a renderer with a pool selects its own cut; .*memory=None"
+    ):
         render(other, CAMERA, device=device, cut=cut)
     assert render(other, CAMERA, device=device, cut=cut, memory=None).stats.memory is None
 

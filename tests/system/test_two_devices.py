@@ -189,13 +189,13 @@ def test_frame_refuses_what_is_on_the_other_device():
     bundle = scenes_lod.lod_bundle(np.random.default_rng(12), asset(12), 64)
     frame = _core.SceneFrame(0)
     with pytest.raises(
-        ValueError, match="models: expected what is on the frame's device, got others"
+        ValueError, match="models: expected objects on the frame's device, got others"
     ):
         frame.set_models([residency.model(bundle, Device(1))], [])
     colors = np.zeros((len(bundle.clusters.level), 3), np.float32)
     palette = _core.Palette(residency.table(bundle), colors, 1)
     with pytest.raises(
-        ValueError, match="palettes: expected what is on the frame's device, got others"
+        ValueError, match="palettes: expected objects on the frame's device, got others"
     ):
         frame.set_models([residency.model(bundle, Device(0))], [palette])
     scene = Scene.of(bundle)
@@ -203,8 +203,10 @@ def test_frame_refuses_what_is_on_the_other_device():
     rule = _core.Rule(
         tolerance_px2=1.0, budget=None, min_level=0, footprint="solid_angle", culls=True
     )
-    with pytest.raises(ValueError, match="scene: expected one on the frame's device"):
+    with pytest.raises(ValueError, match="scene: expected a scene on the frame's device"):
         frame.draw(
             residency.scene(scene, Device(1)).core,
-            _core.FrameRequest(CAMERA.core, rule, shade_of([0, 0, 0], None, False, True)),
+            _core.FrameRequest(
+                CAMERA.core, rule, shade_of([0, 0, 0], None, is_asset=False, depth=True)
+            ),
         )

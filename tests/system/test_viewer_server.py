@@ -96,8 +96,8 @@ def test_tab_begins_with_all_of_the_scene_in_view(blob_view, up):
     view = start_view(blob_view, up)
     figures = blob_view.frame(view, (160, 90), Settings(tolerance=0.0)).figures
     assert figures.gaussians_in_frustum > 0.95 * blob_view.num_gaussians
-    above = np.dot(np.array(view.position) - blob_view.center, up)
-    assert above > 0.3 * blob_view.radius
+    above = np.dot(np.array(view.position) - blob_view.framing.center, up)
+    assert above > 0.3 * blob_view.framing.radius
     camera = view.camera(160, 90, blob_view.near)
     assert -camera.viewmat[1, :3] @ up > 0.8  # upright
 

@@ -197,9 +197,7 @@ def test_rows_that_begin_between_words_are_copied():
     """Part of a tensor, of which the core could not read four floats at once."""
     many = scenes.gaussians([[0, 0, 1], [1, 2, 3], [4, 5, 6]])
     there, last = many.torch("cuda"), slice(1, None)
-    with pytest.raises(
-        ValueError, match="quats, sh: expected memory that begins at a multiple of 16 bytes"
-    ):
+    with pytest.raises(ValueError, match="quats, sh: expected memory aligned to 16 bytes"):
         _core.Rows(*(getattr(there, name)[last] for name in scenes.NAMES))
     box = _core.bound_by_boxes(there.subset(last).rows, np.array([0, 2]))
     np.testing.assert_array_equal(
@@ -236,7 +234,7 @@ def test_build_of_doubles_is_refused():
         (64, "out of memory"),  # torch's, which has the result to hold
         (
             1024,
-            r"cuda: out of memory: asked for .* MiB, free are .* MiB of .* MiB",
+            r"cuda: out of memory: requested .* MiB, free: .* MiB of .* MiB",
         ),  # ours, for scratch
     ],
 )

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import PIL.Image
 import pytest
 
 from v3dg.image import Image, RenderedImage, Stats
@@ -74,3 +75,24 @@ def test_stats_are_those_of_the_finished_picture():
     assert image.stats is STATS
     assert STATS.levels == ()
     assert (STATS.missing, STATS.failed, STATS.bytes_in, STATS.memory) == (0, 0, 0, None)
+
+
+def test_an_image_is_saved_as_it_is_or_transparent(tmp_path):
+    color = np.full((4, 6, 3), 0.25, np.float32)
+    alpha = np.full((4, 6), 0.5, np.float32)
+    color[0] = 0
+    alpha[0] = 0
+    image = Image(color, alpha, None)
+    image.save(tmp_path / "new" / "a.png")
+    image.save(tmp_path / "b.png", transparent=True)
+    opaque = PIL.Image.open(tmp_path / "new" / "a.png")
+    assert (opaque.mode, opaque.getpixel((1, 1))) == ("RGB", (64, 64, 64))
+    straight = PIL.Image.open(tmp_path / "b.png")
+    assert straight.getpixel((1, 1)) == (128, 128, 128, 128)
+    assert straight.getpixel((1, 0)) == (0, 0, 0, 0)
+    color[0] = 1
+    with pytest.raises(ValueError, match="drawn on black, got one on another background"):
+        image.save(tmp_path / "c.png", transparent=True)
+    with pytest.raises(ValueError, match=r"ending in \.png for a transparent picture"):
+        image.save(tmp_path / "c.jpg", transparent=True)
+    assert not (tmp_path / "c.png").exists()

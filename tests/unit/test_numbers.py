@@ -43,6 +43,12 @@ def exported(write, **given):
 
 # Each function with arguments that are right; those that are numbers, or arrays of
 # them, are tried.
+def drawn_small(camera):
+    """A picture for panoramas of any width, which costs nothing."""
+    shape = (min(camera.height, 64), min(camera.width, 64))
+    return v3dg.Image(np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32), None)
+
+
 CALLS = {
     "refine_bundle": (
         lambda **numbers: v3dg.refine_bundle(BUNDLE, device="cpu", progress=False, **numbers),
@@ -73,14 +79,65 @@ CALLS = {
             **{"fov_x": 0.9, "width": 8, "height": 8, "near": 0.1},
         },
     ),
+    "first_camera": (
+        lambda **given: v3dg.first_camera(BUNDLE, **given),
+        {"width": 8, "height": 6, "up": (0, 0, 1)},
+    ),
+    "draw_panorama": (
+        lambda **given: v3dg.draw_panorama(drawn_small, CAMERA, **given),
+        {"up": (0.1, 0.9, 0.3), "width": 8},
+    ),
     "Scene.add": (
         lambda **given: v3dg.Scene().add(BUNDLE, **given),
-        {"positions": (1, 2, 3), "quaternions": (1, 0, 0, 0), "scales": 1.0, "importance": 1.0},
+        {
+            "positions": (1, 2, 3),
+            "quaternions": (1, 0, 0, 0),
+            "scales": 1.0,
+            "importance": 1.0,
+            "opacity": 0.5,
+            "tint": (0.5, 1, 1),
+        },
+    ),
+    "Scene.add by a matrix": (
+        lambda **given: v3dg.Scene().add(BUNDLE, **given),
+        {"matrix": EYE4},
+    ),
+    "Scene.add_scene": (
+        lambda **given: v3dg.Scene().add_scene(scene_of_two(), **given),
+        {
+            "position": (1, 2, 3),
+            "quaternion": (1, 0, 0, 0),
+            "scale": 1.0,
+            "importance": 1.0,
+            "opacity": 0.5,
+            "tint": (0.5, 1, 1),
+        },
     ),
     "Scene.move": (
         lambda **given: scene_of_two().move(**given),
         {"ids": [0], "positions": [(1, 2, 3)], "quaternions": (1, 0, 0, 0), "scales": 1.0},
     ),
+    "Scene.set_opacity": (
+        lambda **given: scene_of_two().set_opacity(**given),
+        {"opacity": 0.5, "ids": [0]},
+    ),
+    "Scene.set_tint": (
+        lambda **given: scene_of_two().set_tint(**given),
+        {"tint": (0.5, 1, 1), "ids": [0]},
+    ),
+    "crop_box": (
+        lambda **given: v3dg.crop_box(ASSET, **given),
+        {"low": (-1, -1, -1), "high": (1, 1, 1)},
+    ),
+    "crop_sphere": (
+        lambda **given: v3dg.crop_sphere(ASSET, **given),
+        {"center": (0, 0, 0), "radius": 1.0},
+    ),
+    "drop_transparent": (
+        lambda **given: v3dg.drop_transparent(ASSET, **given),
+        {"min_opacity": 0.5},
+    ),
+    "to_degree": (lambda **given: v3dg.to_degree(ASSET, **given), {"degree": 1}),
     "Scene.remove": (lambda **given: scene_of_two().remove(**given), {"ids": [1]}),
     "Scene.set_importance": (
         lambda **given: scene_of_two().set_importance(**given),

@@ -5,11 +5,16 @@ import struct
 import subprocess
 import sys
 import termios
+import time
+
+import pytest
 
 from command_line import ENVIRONMENT
+from v3dg import _progress
 
 LONG = """
 import time
+from v3dg import _progress
 from v3dg._progress import Bar
 with Bar(100, "work", True) as bar:
     for i in range(100):
@@ -41,3 +46,17 @@ def test_a_log_gets_four_lines():
         "75 %",
         "100 %",
     ]
+
+
+@pytest.mark.parametrize("show", [True, False])
+def test_long_work_of_unknown_amount_says_that_it_goes_on(capsys, monkeypatch, show):
+    monkeypatch.setattr(_progress, "_PATIENCE_SECONDS", 0.05)
+    with _progress.waiting("reading a.ply", show=show):
+        time.sleep(0.5)
+    assert capsys.readouterr().err == "reading a.ply ...\n" * show
+
+
+def test_short_work_shows_nothing(capsys):
+    with _progress.waiting("reading a.ply", show=True):
+        pass
+    assert capsys.readouterr().err == ""

@@ -7,7 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from random_bundle import random_bundle
-from v3dg import Camera, Scene, render, select
+from v3dg import Bundle, Camera, Scene, render, select
+from v3dg.cameras import AXES
+from v3dg.rotations import rotation_from_quaternion, similarity_of
+from v3dg.upright import direction_of
 
 CAMERA = Camera.look_at((0.5, -9, 4), (3, 4, 5), width=24, height=16)
 BUNDLE = random_bundle(1)
@@ -205,3 +208,171 @@ def test_an_axis_that_is_none_is_refused_where_it_is_set():
     assert scene.up == "-y"
     scene.up = None
     assert scene.up is None
+
+
+def with_up(up):
+    """A bundle whose file says which axis is up."""
+    return Bundle(OTHER.clusters, OTHER.groups, OTHER.gaussians, {"up": up}, OTHER.codec)
+
+
+@pytest.mark.parametrize("up", AXES)
+def test_up_turns_what_is_up_in_a_bundle_to_the_axis(up):
+    scene = Scene()
+    scene.add(BUNDLE, up=up)
+    scene.add(with_up("z"), up=up)
+    scene.add([with_up("x"), BUNDLE], np.zeros((2, 3)), up=up)
+    assert scene.up == up
+    for rotation, bundle_up in zip(scene.rotations, ("-y", "z", "x", "-y"), strict=True):
+        np.testing.assert_allclose(rotation @ direction_of(bundle_up), direction_of(up), atol=1e-12)
+
+
+def test_up_keeps_what_is_right_and_applies_before_the_pose():
+    scene = Scene()
+    quarter = (np.sqrt(0.5), 0, 0, np.sqrt(0.5))  # about z: x to y
+    scene.add(BUNDLE, (1, 2, 3), quarter, 2.0, up="z")
+    np.testing.assert_allclose(scene.rotations[0] @ (1, 0, 0), (0, 1, 0), atol=1e-12)
+    np.testing.assert_allclose(scene.rotations[0] @ (0, -1, 0), (0, 0, 1), atol=1e-12)
+    before = scene.rotations
+    scene.move(quaternions=quarter, up="z")
+    np.testing.assert_allclose(scene.rotations, before, atol=1e-12)
+    with pytest.raises(ValueError, match="up: expected quaternions or a matrix beside up"):
+        scene.move(positions=[(0, 0, 0)], up="z")
+
+
+def test_a_scene_has_one_axis_that_is_up():
+    scene = Scene()
+    scene.up = "y"
+    with pytest.raises(ValueError, match="up: expected y, which is up in this scene, got z"):
+        scene.add(BUNDLE, up="z")
+    assert len(scene) == 0
+    with pytest.raises(ValueError, match="up: expected 'x' or 'y'"):
+        scene.add(BUNDLE, up="w")
+
+
+@given(
+    quaternion=st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 1e-3),
+    position=st.tuples(*[st.floats(-1e9, 1e9)] * 3),
+    scale=st.floats(1e-100, 1e100),
+)
+def test_a_matrix_is_the_pose_that_it_is_made_of(quaternion, position, scale):
+    scene = Scene()
+    scene.add(BUNDLE, position, quaternion, scale)
+    matrix = np.eye(4)
+    matrix[:3, :3] = scene.rotations[0] * scale
+    matrix[:3, 3] = position
+    scene.add(BUNDLE, matrix=matrix)
+    scene.add(BUNDLE)
+    scene.move([2], matrix=matrix[None])
+    for row in (1, 2):
+        np.testing.assert_array_equal(scene.positions[row], position)
+        np.testing.assert_allclose(scene.scales[row], scale, rtol=1e-12)
+        np.testing.assert_allclose(scene.rotations[row], scene.rotations[0], atol=1e-12)
+
+
+def matrix_with(row, column, value):
+    matrix = np.eye(4)
+    matrix[row, column] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (
+            np.diag([1.0, 1, 2, 1]),
+            r"matrix: .*, got a scale for each axis: 1 1 2; instances cannot",
+        ),
+        (np.diag([1.0, 1, -1, 1]), "matrix: .*, got a mirror"),
+        (np.diag([-2.0, -2, -2, 1]), "matrix: .*, got a mirror"),
+        (matrix_with(0, 1, 0.3), "matrix: .*, got a shear"),
+        (np.diag([0.0, 0, 0, 1]), "matrix: .*, got a scale of 0;"),
+        (np.diag([1.0, 1, 0, 1]), "matrix: .*, got a scale of 0 along an axis"),
+        (matrix_with(3, 0, 0.5), "matrix: .*, got a last row of 0.5 0 0 1"),
+        (np.stack([np.eye(4), np.diag([1.0, 1, -1, 1])]), r"matrix\[1\]: .*, got a mirror"),
+        (np.eye(3), r"matrix: expected shape \(4, 4\)"),
+        (matrix_with(0, 0, np.nan), "matrix: expected finite numbers"),
+    ],
+)
+def test_a_matrix_that_is_no_similarity_is_explained(matrix, message):
+    with pytest.raises(ValueError, match=message):
+        Scene().add(BUNDLE, matrix=matrix)
+
+
+def test_rounded_matrices_are_similarities():
+    rotation = rotation_from_quaternion(np.array([0.5, 0.5, -0.5, 0.5]))
+    noisy = np.eye(4)
+    noisy[:3, :3] = 3 * rotation + 1e-5
+    pose = similarity_of(noisy)
+    np.testing.assert_allclose(rotation_from_quaternion(pose.quaternions)[0], rotation, atol=1e-4)
+    np.testing.assert_allclose(pose.scales, 3, rtol=1e-4)
+    with pytest.raises(
+        ValueError, match="matrix: it already places the instances; leave out positions"
+    ):
+        Scene().add(BUNDLE, (0, 0, 0), matrix=noisy)
+
+
+def test_opacity_and_tint_are_columns_like_others():
+    scene = Scene()
+    scene.add(BUNDLE, np.zeros((2, 3)), opacity=[0.25, 1], tint=(1, 0.5, 0))
+    assert scene.factors.tolist() == [[1, 0.5, 0, 0.25], [1, 0.5, 0, 1]]
+    revision = scene.revision
+    scene.set_opacity(0.5, [1])
+    scene.set_tint((2, 2, 2), [0])
+    assert scene.revision[0] == revision[0] + 2
+    assert scene.opacity.tolist() == [0.25, 0.5]
+    scene.remove([0])
+    assert scene.factors.tolist() == [[1, 0.5, 0, 0.5]]
+    scene.set_opacity(1)
+    scene.set_tint((1, 1, 1))
+    assert scene.factors is None
+    assert pickle.loads(pickle.dumps(scene)).opacity.tolist() == [1]
+
+
+@pytest.mark.parametrize(
+    ("factors", "message"),
+    [
+        ({"opacity": 1.5}, "opacity: expected numbers of 0 to 1, got 1.5"),
+        ({"opacity": -0.1}, "opacity: expected numbers of 0 to 1, got -0.1"),
+        ({"opacity": np.nan}, "opacity: expected finite numbers"),
+        ({"tint": (1, 1)}, "tint: expected shape"),
+        ({"tint": (1, -1, 1)}, "tint: expected numbers of 0 or more"),
+        ({"tint": (1, 1e39, 1)}, "tint: expected numbers of 0 or more that a float32 can hold"),
+    ],
+)
+def test_wrong_factors_are_named(factors, message):
+    with pytest.raises(ValueError, match=message):
+        Scene().add(BUNDLE, **factors)
+
+
+def test_a_scene_is_placed_as_a_whole():
+    inner = Scene()
+    inner.add(BUNDLE, [(1, 0, 0), (0, 2, 0)], (1, 0.2, 0.3, 0.4), [1, 3], 2.0, opacity=0.5)
+    inner.add(OTHER, tint=(0.5, 1, 1))
+    scene = Scene()
+    scene.add(OTHER)
+    quarter = (1, 0, 0, 1)
+    ids = scene.add_scene(inner, (10, 0, 0), quarter, 2.0, 4.0, opacity=0.5, tint=(1, 0.5, 1))
+    assert ids == range(1, 4)
+    assert scene.bundles == (OTHER, BUNDLE)
+    turn = rotation_from_quaternion(np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)]))
+    expected = 2 * inner.positions @ turn.T + (10, 0, 0)
+    np.testing.assert_allclose(scene.positions[1:], expected, atol=1e-12)
+    np.testing.assert_allclose(scene.rotations[1:], turn @ inner.rotations, atol=1e-12)
+    np.testing.assert_array_equal(scene.scales[1:], 2 * inner.scales)
+    np.testing.assert_array_equal(scene.importance[1:], 4 * inner.importance)
+    np.testing.assert_array_equal(scene.opacity[1:], 0.5 * inner.opacity)
+    np.testing.assert_array_equal(scene.tint[1:], inner.tint * (1, 0.5, 1))
+    inner.remove([0])
+    assert len(scene) == 4
+
+
+def test_a_placed_scene_is_turned_from_its_own_up():
+    inner = Scene()
+    inner.add(BUNDLE, up="y")
+    scene = Scene()
+    scene.add_scene(inner, up="z")
+    np.testing.assert_allclose(scene.rotations[0] @ (0, -1, 0), (0, 0, 1), atol=1e-12)
+    with pytest.raises(ValueError, match="scales: expected positive numbers"):
+        scene.add_scene(inner, scale=0)
+    with pytest.raises(TypeError, match="scene: expected a Scene"):
+        scene.add_scene(BUNDLE)

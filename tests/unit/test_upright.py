@@ -20,7 +20,10 @@ import v3dg
 from command_line import COMMAND, ENVIRONMENT, run
 from v3dg.cameras import AXES
 from v3dg.cli._views import choose_up
+from v3dg.formats._declared import Declared
 from v3dg.upright import direction_of, up_of
+
+UNFITTED = v3dg.BuildConfig(steps=0)
 
 
 @pytest.fixture
@@ -81,9 +84,14 @@ def test_few_or_tumbling_cameras_do_not_tell(rng):
     assert up_of(asset, tumbling)[0] == "z"
 
 
-def test_kind_of_file_tells(rng):
-    assert up_of(spread(rng, (3, 2, 0.5)), path="a.GLB")[0] == "y"
+def test_what_a_file_declares_tells(rng, tmp_path):
+    v3dg.write_asset(tmp_path / "a.GLB", spread(rng, (3, 2, 0.5)))
+    asset = v3dg.read_asset(tmp_path / "a.GLB")
+    assert up_of(asset) == ("-y", "as in glTF")
+    assert up_of(asset.subset(slice(0, 300))) == ("z", "guessed from the plane of its gaussians")
+    assert up_of(asset, declared=Declared(up="x", up_reason="so")) == ("x", "so")
     assert up_of(v3dg.Scene()) == ("z", "as in most scenes")
+    assert up_of(v3dg.build_bundle(asset, config=UNFITTED, progress=False))[0] == "-y"
 
 
 def test_nothing_is_no_error(rng):

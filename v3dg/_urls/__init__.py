@@ -7,6 +7,7 @@ errors, and `opened` has the local files.
 
 from v3dg._urls.names import beside as beside
 from v3dg._urls.names import cleaned as cleaned
+from v3dg._urls.names import folder_of as folder_of
 from v3dg._urls.names import is_url as is_url
 from v3dg._urls.names import shown as shown
 from v3dg._urls.opened import FileAtUrl as FileAtUrl

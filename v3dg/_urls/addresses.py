@@ -64,7 +64,7 @@ def reach_of(address: str) -> Reach:
 
 
 def is_address(host: str) -> bool:
-    """Whether a host is given by its address and not by a name."""
+    """Return whether a host is given by its address and not by a name."""
     try:
         ipaddress.ip_address(host.partition("%")[0])
     except ValueError:
@@ -73,8 +73,8 @@ def is_address(host: str) -> bool:
 
 
 def _inner(address: _Address) -> list[_Address]:
-    """The IPv4 addresses to which a gateway translates an IPv6 address; the address
-    itself if there are none."""
+    """Return the IPv4 addresses to which a gateway translates an IPv6 address; the
+    address itself if there are none."""
     if isinstance(address, ipaddress.IPv4Address) or any(address in network for network in _HOST):
         return [address]
     if address.ipv4_mapped is not None:

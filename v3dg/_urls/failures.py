@@ -24,7 +24,7 @@ class Problem(Exception):
 
 
 def status_problem(status: int) -> Problem:
-    """The problem of an answer whose status is not a success."""
+    """Return the problem of an answer whose status is not a success."""
     try:
         phrase = f"{status} {http.HTTPStatus(status).phrase}"  # a server's own text may be anything
     except ValueError:
@@ -71,8 +71,8 @@ def _failure_of(url: str, error: Exception) -> Exception:
 
 
 def _problem_of(url: str, error: Exception) -> Problem:
-    """The problem behind an error of the system, of fsspec or of aiohttp, whose types
-    are recognised by name."""
+    """Return the problem behind an error of the system, of fsspec or of aiohttp, whose
+    types are recognised by name."""
     names = {kind.__name__ for kind in type(error).__mro__}
     cause = error
     # Aiohttp's reason why a connection could not be made.
@@ -116,8 +116,8 @@ def _problem_of_connection(error: Exception, text: str) -> Problem:
 
 
 def _problem_of_answer(names: set[str]) -> Problem | None:
-    """The problem of a received answer, by the names of an error's types; None for
-    other errors."""
+    """Return the problem of a received answer, by the names of an error's types; None
+    for other errors."""
     if "ClientPayloadError" in names:
         return Problem(ConnectionError, f"the server's answer was not complete; {_AGAIN}")
     if names & {"ClientResponseError", "BadHttpMessage"}:
@@ -141,7 +141,7 @@ def _text_of(url: str, error: Exception) -> str:
 
 
 def no_room(folder: str, error: OSError | None = None) -> Problem:
-    """The problem of a full disk for temporary files."""
+    """Return the problem of a full disk for temporary files."""
     reason = "no space left"
     if error is not None:
         reason = error.strerror or reason

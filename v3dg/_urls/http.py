@@ -98,7 +98,7 @@ _sessions: dict[_SessionKey, "ClientSession"] = {}
 
 
 async def resolve(host: str, port: int) -> list[str]:
-    """Addresses of a host; tests replace this function."""
+    """Return the addresses of a host; tests replace this function."""
     loop = asyncio.get_running_loop()
     entries = await loop.getaddrinfo(
         host, port, type=socket.SOCK_STREAM, flags=socket.AI_ADDRCONFIG
@@ -217,8 +217,8 @@ class WebSource:
 
     @contextlib.asynccontextmanager
     async def _answer(self, method: str, part: str = "") -> "AsyncIterator[ClientResponse]":
-        """An answer that is not a redirect, after its headers; the caller may read the
-        body."""
+        """Yield the first answer that is not a redirect, once its headers have come;
+        the caller may read the body."""
         headers: dict[str, str] = {}
         if part:
             headers["Range"] = part
@@ -262,8 +262,8 @@ class WebSource:
         )
 
     def _session(self, reach: Reach) -> "ClientSession":
-        """A session whose connections stay open, to hosts that have at least this
-        reach."""
+        """Return a session that keeps its connections open and connects only to hosts
+        that have at least this reach."""
         loop = asyncio.get_running_loop()
         key = _SessionKey(os.getpid(), id(loop), reach, self._trust_env)
         if key not in _sessions:
@@ -300,7 +300,7 @@ def _close(process: int, loop: asyncio.AbstractEventLoop, session: "ClientSessio
 
 
 def _resolver(least_reach: Reach) -> "AbstractResolver":
-    """A resolver for aiohttp that returns no address of a smaller reach."""
+    """Return a resolver for aiohttp that leaves out addresses of a smaller reach."""
     from aiohttp.abc import AbstractResolver
 
     class Resolver(AbstractResolver):
@@ -363,7 +363,7 @@ def _refused() -> Problem:
 
 
 def _next_url(url: "URL", location: str) -> "URL":
-    """The URL that a redirect leads to, without another user or password."""
+    """Return the URL that a redirect leads to, without another user or password."""
     try:
         target = url.join(type(url)(location)).with_user(None).with_fragment(None)
         is_web = bool(location) and target.scheme in ("http", "https") and bool(target.host)

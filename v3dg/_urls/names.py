@@ -12,34 +12,43 @@ _SECRET = re.compile(r"[@?#]")
 
 
 def is_url(path: str | os.PathLike[str]) -> bool:
-    """Whether a name is a URL and not the name of an existing local file."""
+    """Return whether a name is a URL and not the name of an existing local file."""
     return bool(_URL.match(os.fspath(path))) and not os.path.lexists(path)
 
 
 def full(path: str | os.PathLike[str]) -> str:
-    """The complete URL: a `Path` of it has lost a slash."""
+    """Return the complete URL, with the slash that a `Path` of it has lost."""
     return _URL.sub(_with_slashes, os.fspath(path), count=1)
 
 
 def shown(path: str | os.PathLike[str]) -> str:
-    """The name of a file in messages and results; for a URL, without the parts that may
-    be secret."""
+    """Return the name of a file in messages and results; for a URL, without the parts
+    that may be secret."""
     if is_url(path):
         return _without_secrets(full(path))
     return os.fspath(path)
 
 
 def cleaned(text: str) -> str:
-    """A text from elsewhere, with every URL in it shown without the parts that may be
-    secret."""
+    """Return a text of another program or server, in which every URL is shown without
+    the parts that may be secret."""
     return _URL_IN_TEXT.sub(_cleaned_match, text)
 
 
 def beside(path: str | os.PathLike[str]) -> Path:
-    """The path of a local file; for a URL, its file name in the working folder."""
+    """Return the path of a local file; for a URL, its file name in the working
+    folder."""
     if not is_url(path):
         return Path(path)
     return Path(os.path.basename(unquote(_place_of(full(path))[1])))
+
+
+def folder_of(path: str | os.PathLike[str]) -> str:
+    """Return the name of the folder that a local file or a URL is in; empty for the
+    top."""
+    if not is_url(path):
+        return Path(path).resolve().parent.name
+    return os.path.basename(os.path.dirname(unquote(_place_of(full(path))[1])))
 
 
 def _with_slashes(match: re.Match[str]) -> str:
@@ -64,7 +73,7 @@ def _without_secrets(url: str) -> str:
 
 
 def _place_of(url: str) -> tuple[str, str]:
-    """Host with its port, and path, of a URL."""
+    """Return the host of a URL, with its port, and the path."""
     address = url.partition("://")[2]
     host = re.split("[/?#]", address, maxsplit=1)[0]
     if "@" in host:

@@ -32,7 +32,7 @@ _SPARE_BYTES = 256 << 20
 # open anyway.
 _MOST_OPENED = 256
 # The USD library depends on the end of a name.
-_NEEDS_NAME = (".usd", ".usda", ".usdc")
+_NEEDS_NAME = (".usd", ".usda", ".usdc", ".usdz")
 
 _opened: dict[str, "FileAtUrl"] = {}
 
@@ -59,7 +59,7 @@ def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUr
     check(
         shown(url),
         name and not name.endswith(".json"),
-        f"{expected}, got one of a file that names others",
+        f"{expected}, got the URL of a file that names other files",
     )
     check(shown(url), "::" not in url, f"{expected}, got a chain of places; fetch the file")
     with naming_errors(url):
@@ -75,8 +75,8 @@ def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUr
 
 @contextlib.contextmanager
 def reading(path: "str | os.PathLike[str] | FileAtUrl") -> Iterator[str | os.PathLike[str]]:
-    """A name under which a file is read, which for a URL is fetched whole; errors
-    inside name the URL."""
+    """Yield a name under which a reader can open a file; a URL is fetched as a whole,
+    and errors inside the context name the URL."""
     file = path
     if not isinstance(file, FileAtUrl):
         file = in_parts(file)
@@ -140,8 +140,8 @@ class FileAtUrl(os.PathLike[str]):
 
     @contextlib.contextmanager
     def named(self) -> Iterator[str]:
-        """The name of a local file with all of the content, valid inside the context;
-        errors as `fetch`.
+        """Yield the name of a local file with all of the content, which is valid inside
+        the context; raise the errors of `fetch`.
 
         The name is that of an open file of this process. For a reader that depends on
         the end of a name, it is a link to that, which is removed afterwards.
@@ -184,8 +184,8 @@ class FileAtUrl(os.PathLike[str]):
                 is_fetched[first - piece * _MOST_BLOCKS : last - piece * _MOST_BLOCKS] = True
 
     def _missing(self, parts: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Runs of blocks that the parts need and that are not fetched yet, none longer
-        than a piece."""
+        """Return the runs of blocks that the parts need and that are not fetched yet;
+        none is longer than a piece."""
         is_needed: dict[int, NDArray[np.bool_]] = {}
         for first, last in parts:
             expected = f"parts of its {self.num_bytes} bytes, got {first} to {last}"

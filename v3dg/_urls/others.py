@@ -86,7 +86,8 @@ class OtherSource:
 
 
 def changed(first: int, last: int, num_bytes: int) -> Problem:
-    """The problem of a part that has another number of bytes than was requested."""
+    """Return the problem of a part that has another number of bytes than was
+    requested."""
     text = (
         f"expected {last - first} bytes at {first}, got {num_bytes}; it has changed, open it again"
     )
@@ -94,7 +95,7 @@ def changed(first: int, last: int, num_bytes: int) -> Problem:
 
 
 def too_long(max_bytes: int) -> Problem:
-    """The problem of a file that does not end."""
+    """Return the problem of a file that does not end."""
     return Problem(
         ValueError,
         f"expected at most {max_bytes} bytes, got more; check the address, or fetch the file",

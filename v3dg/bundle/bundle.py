@@ -34,20 +34,20 @@ _RUN_BYTES = 64 << 20  # bytes of pages that are written together
 
 
 class Bundle:
-    """All clusters of all levels of one asset, in memory, or in a file of which pages
-    are read on demand.
+    """All clusters of all levels of one asset, in memory, or in a file whose pages are
+    read on demand.
 
     Attributes:
         config: The settings of the build, as JSON values.
         sh_degree: 0 to 3, the same for all gaussians.
-        codec: The encoding of gaussians in the file. "float32" keeps every bit.
-            "quantized" takes 16 (SH degree 0) to 40 bytes (degree 3), and gaussians are
-            rounded when the bundle is made; docs/format.md has the error.
+        codec: The encoding of gaussians in the file. "float32" is lossless. "quantized"
+            takes 16 bytes (SH degree 0) to 40 bytes (degree 3) per gaussian, and rounds
+            gaussians when the bundle is made; docs/format.md states the error.
 
     Raises:
-        ValueError: The tables do not fit each other or the gaussians, do not guarantee
-            an exact cut, ``config`` is not JSON, or the codec is unknown or cannot hold
-            a value.
+        ValueError: The tables are inconsistent with each other or with the gaussians,
+            or do not guarantee an exact cut; ``config`` is not JSON; or the codec is
+            unknown or cannot represent a value.
     """
 
     def __init__(
@@ -61,8 +61,8 @@ class Bundle:
         check_type("clusters", clusters, Clusters, "Clusters")
         check_type("groups", groups, Groups, "Groups")
         check_type("gaussians", gaussians, Gaussians, "Gaussians")
-        # Constructed again, because unpickled tables were not checked and their arrays
-        # are writable.
+        # The tables are constructed again, because unpickled ones were not checked and
+        # their arrays are writable.
         clusters = replace(clusters)
         groups = replace(groups)
         check_tables(clusters, groups, len(gaussians))
@@ -98,34 +98,34 @@ class Bundle:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Bundle:
-        """Open a bundle file: read and check its header and tables, leave the gaussians
-        on disk until used.
+        """Open a bundle file: read and check its header and tables, and leave the
+        gaussians on disk until they are used.
 
-        The file stays open, so a file that is later saved over it does not change this
-        bundle. With the extra `fsspec` it may be at a URL; only the parts in use are
+        The file stays open, so saving another file over it does not change this bundle.
+        With the extra `fsspec` the file may be at a URL; only the parts in use are
         fetched, once per process.
 
         Raises:
-            FileNotFoundError: There is no such file.
-            ValueError: It is not a bundle, is newer than this build can read, or is
-                damaged; the message says which file and field. Damage in the gaussians
-                is found when they are read.
+            FileNotFoundError: The file does not exist.
+            ValueError: It is not a bundle, is of a newer version, or is damaged; the
+                message names the file and the field. Damage in the gaussians is
+                detected when they are read.
         """
         return cls.open_all([in_parts(path)])[0]
 
     @classmethod
     def open_all(cls, paths: Iterable[str | os.PathLike[str]]) -> list[Bundle]:
-        """Open several bundle files as `open` does, at the same time.
+        """Open several bundle files concurrently, each as `open` does.
 
         Raises:
-            FileNotFoundError, ValueError: See `open`; the error is that of the first
+            FileNotFoundError, ValueError: See `open`; the error concerns the first
                 wrong file.
         """
         reader = _core.HashedReader()
         paths = list(paths)
         try:
-            # More threads than processors are useful: a disk serves several requests at
-            # a time.
+            # More threads than processors are useful, because a disk serves several
+            # requests at a time.
             return on_threads(
                 lambda path: cls._open(BundleFile(path, reader)), paths, max_threads=8
             )
@@ -141,7 +141,7 @@ class Bundle:
             clusters = Clusters(**{f.name: tables[f"clusters.{f.name}"] for f in fields(Clusters)})
             groups = Groups(**{f.name: tables[f"groups.{f.name}"] for f in fields(Groups)})
             num_gaussians = int(clusters.offset[-1])
-            # Checked before any size is derived from the number.
+            # This is checked before any size is derived from the number.
             max_gaussians = file.pages_bytes // file.codec.gaussian_bytes
             expected = f"at most {max_gaussians} gaussians, got {num_gaussians}"
             check("clusters.offset[-1]", num_gaussians <= max_gaussians, expected)
@@ -151,20 +151,19 @@ class Bundle:
             bundle = cls.__new__(cls)
             cls._set(bundle, clusters, groups, file.config, pages, file)
         except ValueError as error:
-            file.verify()  # wrong tables are mostly damage, which this reports instead
+            file.verify()  # wrong tables are mostly due to damage, which this reports instead
             raise ValueError(f"{file.path}: {error}") from None
-        file.verify()  # after the checks, because the tables are hashed at the same time
+        file.verify()  # after the checks, because the tables are hashed meanwhile
         return bundle
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the bundle to a file; the same bundle gives the same bytes.
 
-        The file appears at ``path`` when it is complete and not before: after an error
-        or an interrupt, an existing file is unchanged, and no temporary file remains.
+        The file appears at ``path`` only when it is complete. After an error or an
+        interrupt, an existing file is unchanged, and no temporary file remains.
 
         Raises:
-            ValueError: The name does not end in `.v3dg`, or is that of a device or a
-                pipe.
+            ValueError: The name does not end in `.v3dg`, or names a device or a pipe.
             OSError: The file cannot be written.
         """
         _files.check_bundle_name(path)
@@ -180,8 +179,8 @@ class Bundle:
             plan.write_header(file.fileno())
 
     def __reduce__(self) -> tuple[object, tuple[object, ...]]:
-        """Pickle a bundle in memory whole, and a bundle of a file as its path, which
-        the copy opens."""
+        """Pickle a bundle in memory completely, and a bundle in a file as its path,
+        which the copy opens."""
         path = self.path
         if path is not None:
             if not is_url(path):
@@ -201,7 +200,7 @@ class Bundle:
 
     @property
     def path(self) -> str | None:
-        """Name or whole URL of the file that the bundle was opened from; None for a
+        """Name or complete URL of the file that the bundle was opened from; None for a
         bundle in memory."""
         if self._file is None:
             return None
@@ -216,13 +215,13 @@ class Bundle:
 
     @property
     def num_pages(self) -> int:
-        """Number of pages: page g is the clusters that group g replaces, the last page
-        is the last level."""
+        """Number of pages: page g has the clusters that group g replaces, the last page
+        has the last level."""
         return self._layout.num_pages
 
     @property
     def num_gaussians(self) -> int:
-        """Number of gaussians of all levels."""
+        """Number of gaussians in all levels."""
         return int(self.clusters.offset[-1])
 
     def __repr__(self) -> str:
@@ -235,20 +234,20 @@ class Bundle:
         )
 
     def _repr_html_(self) -> str:
-        """A summary and a table of the levels, for notebooks."""
+        """Return a summary and a table of the levels, for notebooks."""
         names = ("level", "clusters", "gaussians", "bytes")
         rows = [names, *([f"{level[name]:,}" for name in names] for level in self.info()["levels"])]
         cells = "".join(f"<tr><td>{'<td>'.join(row)}" for row in rows)
         return f"<p>{html.escape(repr(self))}<table>{cells}</table>"
 
     def level_range(self, level: int) -> range:
-        """Ids of the clusters of one level."""
+        """Return the ids of the clusters of one level."""
         check_index("level", level, self.num_levels)
         first, last = np.searchsorted(self.clusters.level, [level, level + 1])
         return range(int(first), int(last))
 
     def page_range(self, page: int) -> range:
-        """Ids of the clusters of one page."""
+        """Return the ids of the clusters of one page."""
         check_index("page", page, self.num_pages)
         first = self._layout.first_cluster
         return range(int(first[page]), int(first[page + 1]))
@@ -258,7 +257,8 @@ class Bundle:
         """All gaussians, in the order of the clusters; read and verified on first use,
         then cached.
 
-        A quantised bundle caches its codes: each use decodes them to new rows.
+        A quantised bundle caches its codes instead: each use decodes them to new
+        arrays.
         """
         pages = self._in_memory()
         if isinstance(pages, MemoryPages):
@@ -282,31 +282,31 @@ class Bundle:
 
     @property
     def page_bytes(self) -> int:
-        """Size of all pages together, in memory and in the file."""
+        """Total size of all pages, in memory and in the file."""
         return int(self._layout.page_bytes(self._codec).sum())
 
     @property
     def is_in_memory(self) -> bool:
-        """Whether all gaussians are in memory; otherwise they are read page by page."""
+        """Whether all gaussians are in memory; if not, they are read page by page."""
         return not isinstance(self._pages, FilePages)
 
     @property
     def page_source(self) -> _core.Rows | _core.FileSource:
-        """The source of single pages for the core: the file, or all gaussians if they
-        are in memory."""
+        """The source of single pages for the core: the file, or all gaussians if
+        they are in memory."""
         if self._file is None or isinstance(self._pages, MemoryPages):
             return self.gaussians.rows
         return self._file.source
 
     def read_page(self, page: int) -> Gaussians:
-        """Gaussians of the clusters that share parent group ``page``, or of the last
-        level; verified."""
+        """Return the gaussians of the clusters that share parent group ``page``, or of
+        the last level; verified."""
         check_index("page", page, self.num_pages)
         return self._pages.read(page, page + 1)
 
     def cluster_gaussians(self, cluster: int) -> Gaussians:
-        """Gaussians of one cluster; reads its page and caches it until another page is
-        read."""
+        """Return the gaussians of one cluster. The cluster's page is cached until
+        another page is read."""
         check_index("cluster", cluster, len(self.clusters))
         page = int(np.searchsorted(self._layout.first_cluster, cluster, side="right")) - 1
         first = int(self._layout.first_gaussian[page])
@@ -315,14 +315,19 @@ class Bundle:
         return self.read_page(page).subset(slice(start, stop))
 
     def level_gaussians(self, level: int) -> Gaussians:
-        """Gaussians of one level; reads the pages of that level only."""
+        """Return the gaussians of one level; reads only the pages of that level. Those
+        of level 0 are antialiased if the asset is."""
         clusters = self.level_range(level)
         first, last = np.searchsorted(self._layout.first_cluster, [clusters.start, clusters.stop])
-        return self._pages.read(int(first), int(last))
+        gaussians = self._pages.read(int(first), int(last))
+        table = self.clusters.antialiased[clusters.start : clusters.stop]
+        if level == 0 and len(table) and table.all():
+            return gaussians.trained(antialiased=True)
+        return gaussians
 
     def info(self) -> JsonObject:
-        """Describe the bundle in JSON values, without reading gaussians; sizes are
-        those of its file."""
+        """Return a description of the bundle as JSON values, without reading gaussians;
+        sizes are those of its file."""
         page_level = self.clusters.level[self._layout.first_cluster[:-1]]
         page_sizes = self._layout.page_bytes(self._codec)
         sizes = [int(page_sizes[page_level == level].sum()) for level in range(self.num_levels)]
@@ -391,7 +396,8 @@ def _check_page_tables(pages: FilePages, file: BundleFile) -> None:
 
 
 def _mean_of_known(values: NDArray[np.float32]) -> float | None:
-    """The mean without NaN, which stands for unknown; None if all are unknown."""
+    """Return the mean without NaN, which means unknown; None if all values are
+    unknown."""
     numbers = values[~np.isnan(values)]
     if not numbers.size:
         return None

@@ -1,7 +1,7 @@
 """Codecs, which define the bytes of a page.
 
 Pages are encoded here and decoded in the core, which has a `PageCodec` for each codec
-(csrc/residency/page_source.h). docs/extending.md says how to add one.
+(csrc/residency/page_source.h). docs/extending.md describes how to add a codec.
 """
 
 from collections.abc import Sequence
@@ -16,18 +16,18 @@ from v3dg.gaussians import Gaussians, empty, gaussian_bytes
 
 
 class Codec:
-    """Gaussians of one SH degree as bytes: the float32 arrays of a page, one after
-    another.
+    """The codec "float32": a page has the float32 arrays of its gaussians, one after
+    another; all gaussians have one SH degree.
 
     Attributes:
         name: The name for users and in files.
-        alignment: A page begins in the file at a multiple of so many bytes.
-        gaussian_bytes, cluster_bytes: Bytes of a page for each gaussian and each
-            cluster.
+        alignment: A page begins in the file at a multiple of this number of bytes.
+        gaussian_bytes, cluster_bytes: Bytes of a page per gaussian and per cluster.
     """
 
     name: ClassVar[str] = "float32"
-    alignment: int = 4096  # the memory page, so that a page maps or loads directly
+    # The size of a memory page, so that the system can map or load pages directly.
+    alignment: int = 4096
 
     def __init__(self, sh_degree: int) -> None:
         self.sh_degree = sh_degree
@@ -37,30 +37,31 @@ class Codec:
     def page_bytes(
         self, num_gaussians: NDArray[np.int64], num_clusters: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Sizes of pages with so many gaussians and clusters, including padding."""
+        """Return the sizes of pages with these numbers of gaussians and clusters,
+        including padding."""
         num_bytes = num_gaussians * self.gaussian_bytes + num_clusters * self.cluster_bytes
-        return (num_bytes + self.alignment - 1) & -self.alignment  # a power of two
+        return (num_bytes + self.alignment - 1) & -self.alignment  # the alignment is a power of two
 
     def encode(
         self, gaussians: Gaussians, offset: NDArray[np.int64]
     ) -> Sequence[NDArray[np.generic]]:
-        """The page of the clusters that begin at these rows, as arrays whose bytes
-        follow each other."""
+        """Return the page of the clusters that begin at these rows, as arrays to be
+        concatenated."""
         return [array[offset[0] : offset[-1]] for array in vars(gaussians).values()]
 
     def rounded(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Gaussians:
-        """The gaussians of these clusters after encoding and decoding, on the device
-        where they are."""
+        """Return the gaussians of these clusters after encoding and decoding, on their
+        device."""
         return gaussians
 
     def empty(self, count: int) -> Gaussians:
-        """Uninitialised gaussians on the host, to decode into."""
+        """Return uninitialised gaussians on the host, to decode into."""
         return empty(count, self.sh_degree)
 
 
 class Quantized(Codec):
-    """Codes of 16 bytes and up to 24 for the higher degrees, relative to the ranges of
-    a cluster."""
+    """Codes of 16 bytes, and up to 24 more for the higher degrees, relative to the
+    ranges of a cluster."""
 
     name = "quantized"
 
@@ -84,6 +85,6 @@ CODECS: dict[str, type[Codec]] = {codec.name: codec for codec in (Codec, Quantiz
 
 
 def codec_of(name: str, sh_degree: int) -> Codec:
-    """The codec of that name; ValueError where there is none."""
+    """Return the codec of that name; raise ValueError if there is none."""
     one_of(name, "codec", tuple(CODECS))
     return CODECS[name](sh_degree)

@@ -1,8 +1,9 @@
 """The file of a bundle: a safetensors container with aligned, hashed pages in front of
 the tables.
 
-docs/format.md says what is in the file and why. This module reads and writes bytes and
-trusts none of them; `v3dg.bundle.tables` checks the values of the tables.
+docs/format.md describes the content of the file and the reasons. This module reads and
+writes bytes and trusts none of them; `v3dg.bundle.tables` checks the values of the
+tables.
 """
 
 import os
@@ -33,15 +34,15 @@ from v3dg.bundle.pages import PageLayout, PageRun, on_threads
 from v3dg.bundle.tables import Clusters, Column, Groups, check_tables, columns_of
 from v3dg.gaussians import Gaussians
 
-_FIRST_BYTES = 4096  # first bytes of the header, which a disk writes at once
-# Limit for tables at a URL, whose size is only a claim until they are fetched; the
+_FIRST_BYTES = 4096  # first bytes of the header, which a disk writes atomically
+# The limit for tables at a URL, whose size is only a claim until they are fetched. The
 # tables of a billion gaussians are smaller.
 _MOST_FETCHED_TABLE_BYTES = 1 << 30
-_FREE_CLUSTERS = 1 << 18  # clusters that may be empty; every further one has a gaussian
+_FREE_CLUSTERS = 1 << 18  # number of clusters that may be empty; every further one has a gaussian
 
 
 class BundlePlan:
-    """The places of all parts of a bundle's file, which follow from the layout, the
+    """The positions of all parts of a bundle's file, which follow from the layout, the
     codec and the config."""
 
     def __init__(self, layout: PageLayout, codec: Codec, config: JsonObject) -> None:
@@ -61,14 +62,14 @@ class BundlePlan:
         )
 
     def run(self, first_page: int, last_page: int) -> PageRun:
-        """A run of the pages."""
+        """Return a run of the pages."""
         return self.layout.run(first_page, last_page, self._places)
 
     def write_tables(
         self, descriptor: int, clusters: Clusters, groups: Groups, hashes: NDArray[np.uint8]
     ) -> None:
-        """Check the tables and write them behind the pages, whose hashes are (P,
-        16)."""
+        """Check the tables and write them behind the pages, which have (P, 16)
+        hashes."""
         check_tables(clusters, groups, int(self.layout.first_gaussian[-1]))
         tables = self._page_tables | columns_of(clusters, groups) | {"pages.hash": hashes}
         schema = schema_of(self.codec)
@@ -80,8 +81,8 @@ class BundlePlan:
         _files.write_at(descriptor, end, self._pages_end)
 
     def write_header(self, descriptor: int) -> None:
-        """Write the header; its first bytes are written last, so a file that has them
-        is complete."""
+        """Write the header. Its first bytes are written last, so a file that contains
+        them is complete."""
         _files.write_at(descriptor, self.header[_FIRST_BYTES:], _FIRST_BYTES)
         _files.write_at(descriptor, self.header[:_FIRST_BYTES], 0)
 
@@ -89,8 +90,8 @@ class BundlePlan:
 def write_pages(
     descriptor: int, run: PageRun, codec: Codec, gaussians: Gaussians
 ) -> NDArray[np.uint8]:
-    """Write the gaussians of a run of pages, on any device, to their place; (n, 16)
-    their hashes."""
+    """Write the gaussians of a run of pages, on any device, at their position; return
+    (n, 16) their hashes."""
     host = gaussians.numpy()
     sizes = np.diff(run.places)
     hashes = np.empty((len(run), HASH_BYTES), np.uint8)
@@ -112,8 +113,8 @@ def read_pages(
     codec: Codec,
     hashes: NDArray[np.uint8],
 ) -> Gaussians:
-    """The gaussians of a run of pages; ValueError unless they are there and have these
-    hashes."""
+    """Return the gaussians of a run of pages; raise ValueError if they are missing or
+    have other hashes."""
     result = codec.empty(run.rows.stop - run.rows.start)
     _core.read_pages(
         os.fspath(path), descriptor, result.rows, codec.name, hashes[: len(run)], run.core
@@ -122,15 +123,15 @@ def read_pages(
 
 
 class BundleFile:
-    """A bundle file whose header and tables are read, but no pages; `verify` checks
-    them for damage.
+    """A bundle file whose header and tables were read, but none of its pages; `verify`
+    checks header and tables for damage.
 
-    The size of the file bounds what is allocated; for a file at a URL, the number of
-    fetched bytes does. The file is closed when this object is dropped.
+    Memory is allocated only up to the size of the file or, for a URL, up to the number
+    of fetched bytes. The file is closed when this object is destroyed.
 
     Attributes:
         name: The file's name, or its URL, as the caller passed it.
-        path: The name in messages.
+        path: The name that messages use.
     """
 
     def __init__(self, path: str | os.PathLike[str], reader: _core.HashedReader) -> None:
@@ -267,8 +268,8 @@ class BundleFile:
     def _check_counts(
         self, num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int
     ) -> None:
-        """Refuse tables at a URL that are larger than the gaussians can need, before
-        they are fetched."""
+        """Raise ValueError for tables at a URL that are larger than the gaussians can
+        need, before fetching them."""
         if self._at_url is None:
             return
         limit = _FREE_CLUSTERS + pages_bytes // self.codec.gaussian_bytes
@@ -295,15 +296,15 @@ class BundleFile:
         self._check("tables", is_small, expected)
         self._fetch(place, self.num_bytes)
         self._reading = reader.read(self.path, self._fd, text, place, num_bytes, self.version > 2)
-        data = self._reading.wait()  # the tables, followed by the hash
-        self.tables: dict[str, Column] = {}  # `schema_of` has their types
+        data = self._reading.wait()  # the tables, followed by their hash
+        self.tables: dict[str, Column] = {}  # `schema_of` defines their types
         for name, dtype, _, _ in schema_of(self.codec):
             first, last = (offset - self.pages_bytes for offset in entries[name]["data_offsets"])
             self.tables[name] = data[first:last].view(DTYPES[dtype]).reshape(entries[name]["shape"])
 
     def verify(self) -> None:
-        """Wait for the hash of header and tables, and compare it with that of the file;
-        ValueError if they differ."""
+        """Wait for the hash of header and tables, and compare it with the hash in the
+        file; raise ValueError if they differ."""
         if not self._reading.is_sound():
             self._fail(f"hash: the header and tables do not match it; {_core.DAMAGED}")
         del self._reading
@@ -339,16 +340,16 @@ class BundleFile:
         )
 
     def read(self, run: PageRun, out: _core.Rows | NDArray[np.int32]) -> None:
-        """Fill rows with the gaussians of a run of pages, or words with quantised
-        pages; verified."""
+        """Fill rows with the gaussians of a run of pages, or an integer array with
+        quantised pages; verified."""
         self._fetch(*run.places[[0, -1]])
         hashes = self.tables["pages.hash"][run.first_page :][: len(run)]
         _core.read_pages(self.path, self._fd, out, self.codec.name, hashes, run.core)
 
 
 def _length_of_vector(entry: object) -> int | None:
-    """The length of a one-dimensional tensor, from its entry in a header; None for
-    anything else."""
+    """Return the length of a one-dimensional tensor, given its entry in a header; None
+    for any other entry."""
     if not isinstance(entry, dict):
         return None
     shape = entry.get("shape")

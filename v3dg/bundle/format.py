@@ -1,5 +1,5 @@
 """The parts of a bundle file: its tables, its header and its hashes. docs/format.md
-says why."""
+gives the reasons."""
 
 import hashlib
 import json
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
     from v3dg.bundle.pages import PageLayout
 
 FORMAT = "v3dg"
-VERSION = 3  # the newest one, which is written
+VERSION = 3  # the newest version, which is the one that is written
 HASH_BYTES = 16
-# The header holds 20 entries and the config; a longer one is damage or an attack.
+# The header has 20 entries and the config; a longer header is damaged or malicious.
 MAX_HEADER_BYTES = 1 << 20
 
 DTYPES = {"I64": "<i8", "F32": "<f4", "I32": "<i4", "U8": "|u1"}
 SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
-    # name, safetensors dtype, rows (C clusters, C+1, G groups, P pages), rest of the
-    # shape. In file order: wide types first, so that every table is aligned to its own
-    # type.
+    # Each row has a name, a safetensors dtype, the number of rows (C clusters, C+1, G
+    # groups, P pages), and the rest of the shape. The order is that of the file: wide
+    # types first, so that every table is aligned to its own type.
     ("clusters.offset", "I64", "C+1", ()),
     ("pages.offset", "I64", "P", ()),
     ("pages.bytes", "I64", "P", ()),
@@ -49,12 +49,12 @@ SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
 )
 
 
-# Tables of float32 files only: with codes, they follow from the other tables.
+# These tables are only in float32 files; for codes, they follow from the other tables.
 _ONLY_OF_FLOATS = ("pages.bytes", "pages.num_clusters")
 
 
 class Entry(TypedDict):
-    """The entry of a tensor in the header, as safetensors has it."""
+    """The header entry of a tensor, as in safetensors."""
 
     dtype: str
     shape: list[int]
@@ -62,13 +62,13 @@ class Entry(TypedDict):
 
 
 def schema_of(codec: "Codec") -> list[tuple[str, str, str, tuple[int, ...]]]:
-    """The tables of a file with pages of this codec."""
+    """Return the tables of a file whose pages have this codec."""
     return [table for table in SCHEMA if codec.name == "float32" or table[0] not in _ONLY_OF_FLOATS]
 
 
 def page_tables(layout: "PageLayout", codec: "Codec") -> dict[str, NDArray[np.generic]]:
-    """The tables of the pages except the hashes; they follow from the clusters of each
-    page."""
+    """Return the tables of the pages except the hashes; they follow from the clusters
+    of each page."""
     tables: dict[str, NDArray[np.generic]] = {
         "pages.offset": offset_of(layout.page_bytes(codec))[:-1],
         "pages.bytes": np.diff(layout.first_gaussian) * codec.gaussian_bytes,
@@ -79,13 +79,13 @@ def page_tables(layout: "PageLayout", codec: "Codec") -> dict[str, NDArray[np.ge
 
 
 def offset_of(sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(N + 1,) start of each of N parts that follow each other, and the end of the
-    last."""
+    """Return (N + 1,) the start of each of N consecutive parts, and the end of the last
+    one."""
     return np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes)])
 
 
 def page_hash(pieces: Iterable[NDArray[np.generic]]) -> bytes:
-    """BLAKE2b-128 of the bytes of the pieces, one after another."""
+    """Return the BLAKE2b-128 of the concatenated bytes of the pieces."""
     digest = hashlib.blake2b(digest_size=HASH_BYTES)
     for piece in pieces:
         digest.update(piece.reshape(-1).view(np.uint8).data)
@@ -93,8 +93,8 @@ def page_hash(pieces: Iterable[NDArray[np.generic]]) -> bytes:
 
 
 def hash_of_pieces(message: bytes) -> bytes:
-    """BLAKE2b-128 of the digests of the message's pieces, which are hashed side by
-    side."""
+    """Return the BLAKE2b-128 of the digests of the message's pieces, which are hashed
+    in parallel."""
     data = np.frombuffer(message, np.uint8)
     size = _core.HASH_PIECE_BYTES
     digests = _core.blake2b(np.split(data, range(size, len(data), size)))
@@ -104,8 +104,8 @@ def hash_of_pieces(message: bytes) -> bytes:
 def entries_of(
     codec: "Codec", num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int
 ) -> dict[str, Entry]:
-    """The entries of the header: dtype, shape and place of every tensor of the file, in
-    file order."""
+    """Return the entries of the header: dtype, shape and position of every tensor of
+    the file, in file order."""
     num_rows = {"C": num_clusters, "C+1": num_clusters + 1, "G": num_groups, "P": num_pages}
     tensors = [("pages", "U8", [pages_bytes])]
     for name, dtype, rows, row_shape in schema_of(codec):
@@ -121,8 +121,8 @@ def entries_of(
 
 
 def header_of(entries: dict[str, Entry], codec: "Codec", config: JsonObject) -> bytes:
-    """The length and the JSON of the header, padded with spaces so that the data starts
-    aligned.
+    """Return the length and the JSON of the header, padded with spaces so that the data
+    starts aligned.
 
     Raises:
         ValueError: The config is so long that the header exceeds its limit.
@@ -144,8 +144,8 @@ def header_of(entries: dict[str, Entry], codec: "Codec", config: JsonObject) -> 
 
 
 def config_to_json(config: JsonObject) -> str:
-    """The config as JSON; TypeError unless it is a dict, ValueError if JSON cannot hold
-    a value."""
+    """Return the config as JSON; raise TypeError unless it is a dict, and ValueError if
+    JSON cannot represent a value."""
     check_type("config", config, dict, "a dict")
     try:
         return json.dumps(config, sort_keys=True, separators=(",", ":"), allow_nan=False)

@@ -1,5 +1,5 @@
-"""Pages: the clusters of each, and the sources of their gaussians. codec.py defines
-their bytes."""
+"""Pages: the clusters of each, and the sources of their gaussians. codec.py defines the
+bytes of a page."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -28,15 +28,17 @@ _MAX_THREADS = min(8, os.cpu_count() or 1)
 
 @dataclass(frozen=True, eq=False)
 class PageLayout:
-    """P pages in file order: page g is what group g replaces, the last page is the last
-    level."""
+    """P pages in file order: page g has the clusters that group g replaces, the last
+    page has the last level."""
 
-    first_cluster: NDArray[np.int64]  # (P+1,) of each page, and the number of clusters
-    offset: NDArray[np.int64]  # (C+1,) gaussians of each cluster
+    # (P+1,) first cluster of each page, and the number of clusters.
+    first_cluster: NDArray[np.int64]
+    offset: NDArray[np.int64]  # (C+1,) boundaries of the clusters' gaussians
 
     @staticmethod
     def of(clusters: Clusters) -> "PageLayout":
-        """The pages of clusters: those that share a parent group are neighbours."""
+        """Return the pages of clusters; clusters that share a parent group must be
+        neighbours."""
         parent = clusters.parent_group
         starts = np.flatnonzero(parent[1:] != parent[:-1]) + 1
         count = len(clusters)
@@ -47,7 +49,7 @@ class PageLayout:
 
     @cached_property
     def first_gaussian(self) -> NDArray[np.int64]:
-        """(P+1,) of each page, and the number of gaussians."""
+        """(P+1,) first gaussian of each page, and the number of gaussians."""
         return self.offset[self.first_cluster]
 
     @property
@@ -55,16 +57,17 @@ class PageLayout:
         return len(self.first_cluster) - 1
 
     def clusters_of(self, page: int) -> NDArray[np.int64]:
-        """Gaussians of each cluster of a page, in the bundle; and the end."""
+        """Return the boundaries of the gaussians of a page's clusters, as indices in
+        the bundle."""
         return self.offset[self.first_cluster[page] : self.first_cluster[page + 1] + 1]
 
     def page_bytes(self, codec: Codec) -> NDArray[np.int64]:
-        """(P,) size of each page, including padding."""
+        """Return (P,) the size of each page, including padding."""
         return codec.page_bytes(np.diff(self.first_gaussian), np.diff(self.first_cluster))
 
     def run(self, first_page: int, last_page: int, places: NDArray[np.int64]) -> "PageRun":
-        """A run of the pages; ``places`` has the first byte of every page in a file,
-        and the end."""
+        """Return a run of the pages; ``places`` has the first byte of every page in a
+        file, and the end."""
         clusters = self.first_cluster[first_page : last_page + 1]
         return PageRun(
             first_page=first_page,
@@ -76,12 +79,14 @@ class PageLayout:
 
 @dataclass(frozen=True, eq=False)
 class PageRun:
-    """Neighbouring pages: their clusters, the rows of their gaussians and their place
-    in the file."""
+    """Neighbouring pages: their clusters, the rows of their gaussians and their
+    position in the file."""
 
-    first_page: int  # number in the bundle
-    first_cluster: NDArray[np.int64]  # (n+1,) of each page, in the run, and the end
-    offset: NDArray[np.int64]  # gaussians of each cluster of the run, in the bundle, and the end
+    first_page: int  # index of the first page in the bundle
+    # (n+1,) first cluster of each page, counted in the run, and the end.
+    first_cluster: NDArray[np.int64]
+    # Boundaries of the gaussians of the run's clusters, as indices in the bundle.
+    offset: NDArray[np.int64]
     places: NDArray[np.int64]  # (n+1,) first byte of each page in the file, and the end
 
     def __len__(self) -> int:
@@ -99,18 +104,18 @@ class PageRun:
 
     @property
     def rows(self) -> slice:
-        """Their gaussians in the bundle."""
+        """Their rows of gaussians in the bundle."""
         return slice(int(self.offset[0]), int(self.offset[-1]))
 
     def clusters_of(self, number: int) -> NDArray[np.int64]:
-        """Gaussians of each cluster of one page, by its place in the run, among those
-        of all; and the end."""
+        """Return the boundaries of the gaussians of one page's clusters, as indices in
+        the bundle; `number` counts in the run."""
         first, last = self.first_cluster[number : number + 2].tolist()
         return np.asarray(self.offset[first : last + 1] - self.offset[0])
 
 
 class MemoryPages:
-    """Pages of float32 whose gaussians are all in memory, on the host."""
+    """Pages of float32, all of whose gaussians are in memory on the host."""
 
     def __init__(self, layout: PageLayout, gaussians: Gaussians, codec: Codec) -> None:
         self.layout = layout
@@ -118,13 +123,14 @@ class MemoryPages:
         self.codec = codec
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
-        """Gaussians of a run of pages; they share memory with `gaussians`."""
+        """Return the gaussians of a run of pages; they share memory with
+        `gaussians`."""
         first, last = self.layout.first_gaussian[[first_page, last_page]].tolist()
         return self.gaussians.subset(slice(first, last))
 
 
 class CodePages:
-    """Quantised pages that are all in memory as codes, which are decoded on demand."""
+    """Quantised pages, all of whose codes are in memory; they are decoded on demand."""
 
     def __init__(self, layout: PageLayout, words: NDArray[np.int32], codec: Codec) -> None:
         self.layout = layout
@@ -133,8 +139,8 @@ class CodePages:
 
     @staticmethod
     def of(layout: PageLayout, gaussians: Gaussians, codec: Codec) -> "CodePages":
-        """The pages of gaussians on the host."""
-        places = offset_of(layout.page_bytes(codec) // 4)  # in words
+        """Return the pages of gaussians on the host."""
+        places = offset_of(layout.page_bytes(codec) // 4)  # in units of 32-bit integers
         words = np.empty(int(places[-1]), np.int32)
 
         def encode(page: int) -> None:
@@ -145,24 +151,24 @@ class CodePages:
         return CodePages(layout, words, codec)
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
-        """Gaussians of a run of pages."""
+        """Return the gaussians of a run of pages."""
         clusters = np.arange(*self.layout.first_cluster[[first_page, last_page]], dtype=np.int32)
         return Gaussians(*_core.Model(self.codes, CPU.number).decode(clusters))
 
 
 class FilePages:
-    """Pages that are read from a file on demand; the last single page that was read is
+    """Pages that are read from a file on demand; the page that was last read alone is
     cached."""
 
     def __init__(self, layout: PageLayout, file: "BundleFile") -> None:
         self.layout = layout
         self.codec = file.codec
         self._file = file
-        # Replaced as a whole, because threads read it without a lock.
+        # The tuple is replaced as a whole, because threads read it without a lock.
         self._last_page: tuple[int, Gaussians | None] = (-1, None)
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
-        """Gaussians of a run of pages, on the host; verified."""
+        """Return the gaussians of a run of pages, on the host; verified."""
         cached_page, cached = self._last_page
         if first_page == cached_page == last_page - 1 and cached is not None:
             return cached
@@ -174,7 +180,7 @@ class FilePages:
         return gaussians
 
     def in_memory(self) -> MemoryPages | CodePages:
-        """Read all pages into memory and verify them."""
+        """Read and verify all pages, and return them in memory."""
         if self.codec.name == Codec.name:
             return MemoryPages(self.layout, self.read(0, self.layout.num_pages), self.codec)
         run = self.layout.run(0, self.layout.num_pages, self._file.places)
@@ -189,8 +195,8 @@ class FilePages:
 def on_threads(
     work: Callable[[_Item], _Result], items: Sequence[_Item], max_threads: int = _MAX_THREADS
 ) -> list[_Result]:
-    """The results of ``work`` for all items, computed by several threads if there are
-    several items."""
+    """Return the results of ``work`` for all items; several items are computed by
+    several threads."""
     if len(items) < 2:
         return list(map(work, items))
     with ThreadPoolExecutor(max_threads) as pool:
@@ -200,8 +206,8 @@ def on_threads(
 def runs_of_pages(
     first_page: int, last_page: int, page_bytes: NDArray[np.int64], num_bytes: int
 ) -> Iterator[range]:
-    """Split a run of pages into runs of about ``num_bytes``, which bounds the memory
-    that a run takes."""
+    """Split a run of pages into runs of about ``num_bytes``, which limits the memory
+    for one run."""
     ends = np.cumsum(page_bytes[first_page:last_page]) // num_bytes
     cuts = (np.flatnonzero(np.diff(ends)) + first_page + 1).tolist()
     for start, stop in zip([first_page, *cuts], [*cuts, last_page], strict=True):

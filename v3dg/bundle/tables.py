@@ -12,11 +12,11 @@ from v3dg._numbers import check, check_type, refuse, value_text, whole_number
 from v3dg.bundle.format import DTYPES, SCHEMA
 from v3dg.gaussians import Gaussians
 
-Column: TypeAlias = NDArray[Any]  # its dtype is in `bundle.format.SCHEMA`
+Column: TypeAlias = NDArray[Any]  # `bundle.format.SCHEMA` has its dtype
 
 NESTING_MARGIN = _core.nesting_margin
-"""A group's ball contains the balls of the groups below it with this relative margin;
-see docs/format.md."""
+"""The relative margin by which a group's ball contains the balls of the groups below
+it; see docs/format.md."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,17 +25,15 @@ class Clusters:
     are read-only.
 
     Attributes:
-        offset: (C+1,) int64. Cluster c holds gaussians offset[c] to offset[c+1].
+        offset: (C+1,) int64. Cluster c has gaussians offset[c] to offset[c+1].
         level: (C,) int32.
-        own_group: (C,) int32. Group whose simplification made the cluster; -1 at level
-            0.
-        parent_group: (C,) int32. Group that the cluster is simplified in; -1 at the
-            last level.
-        box: (C,2,3) float32. Lower and upper corner of what the cluster draws, in the
-            asset's frame, without the reach of the filter.
-        filter_px2: (C,) float32. Variance of the low-pass on the screen that the
-            cluster is drawn with, but that level 0 has one in a fade, too.
-        antialiased: (C,) uint8. 1 where opacity is compensated for the filter.
+        own_group: (C,) int32. Group that made the cluster; -1 at level 0.
+        parent_group: (C,) int32. Group that replaces the cluster; -1 at the last level.
+        box: (C,2,3) float32. Lower and upper corner of the cluster's visible extent, in
+            the asset's frame, without the reach of the filter.
+        filter_px2: (C,) float32. Variance of the cluster's low-pass filter on the
+            screen. In a fade, level 0 has a filter, too.
+        antialiased: (C,) uint8. 1 if opacity is compensated for the filter.
     """
 
     offset: NDArray[np.int64]
@@ -53,8 +51,8 @@ class Clusters:
         return len(self.level)
 
     def around(self, gaussians: Gaussians) -> "Clusters":
-        """Return these clusters with boxes around other gaussians; boxes of empty
-        clusters stay."""
+        """Return these clusters with the boxes of other gaussians; boxes of empty
+        clusters do not change."""
         has_gaussians = np.diff(self.offset)[:, None, None] > 0
         box = np.where(has_gaussians, _core.bound_by_boxes(gaussians.rows, self.offset), self.box)
         return replace(self, box=box)
@@ -62,15 +60,15 @@ class Clusters:
 
 @dataclass(frozen=True, eq=False)
 class Groups:
-    """G groups, in the order of the clusters that they replace, hence by level; the
-    arrays are read-only.
+    """G groups, in the order of the clusters that they replace, and therefore by level;
+    the arrays are read-only.
 
     Attributes:
         ball: (G,4) float32. Centre and radius in the asset's frame; contains the balls
             of the groups below.
-        weight: (G,) float32. One over the number of gaussians the group was simplified
-            to by the build, at least the largest weight below.
-        parent: (G,) int32. Group above, -1 for those that made the last level.
+        weight: (G,) float32. One over the number of gaussians that the group was
+            simplified to, at least the largest weight below.
+        parent: (G,) int32. Group above; -1 for the groups that made the last level.
         level: (G,) int32. Level of the clusters that the group makes; 1 or more.
         error: (G,2) float32. Final residual of the fit in colour and alpha; NaN if it
             is unknown.
@@ -96,7 +94,7 @@ def check_index(name: str, index: int, count: int) -> None:
 
 def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
     """Check dtypes and shapes, and replace writable arrays by read-only copies, so that
-    the checks hold."""
+    the checks stay valid."""
     count = np.size(part.level)
     for name, kind, rows, row_shape in [
         column for column in SCHEMA if column[0].startswith(prefix)
@@ -116,14 +114,14 @@ def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
 
 
 def columns_of(clusters: Clusters, groups: Groups) -> dict[str, Column]:
-    """All tables, by their names in files."""
+    """Return all tables by their names in files."""
     columns = {f"clusters.{name}": array for name, array in vars(clusters).items()}
     columns.update({f"groups.{name}": array for name, array in vars(groups).items()})
     return columns
 
 
 def check_tables(clusters: Clusters, groups: Groups, num_gaussians: int) -> None:
-    """Raise ValueError unless the tables fit each other and the gaussians, and the cut
-    will be exact."""
+    """Raise ValueError unless the tables are consistent with each other and the
+    gaussians, and guarantee an exact cut."""
     check("clusters", len(clusters) < 1 << 31, f"fewer than 2^31, got {len(clusters)}")
     _core.check_tables(*columns_of(clusters, groups).values(), num_gaussians=num_gaussians)

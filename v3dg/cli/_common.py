@@ -12,10 +12,14 @@ from typing import Annotated, Literal, TypeAlias
 
 import tyro
 
-from v3dg._numbers import check
+from v3dg._numbers import check, refuse
+from v3dg._progress import waiting
 from v3dg._urls import beside, cleaned, is_url, shown
 from v3dg.bundle import Bundle
+from v3dg.cameras import Camera
 from v3dg.io import SUFFIXES
+from v3dg.opening import open_with_cameras
+from v3dg.scene import Subject
 
 
 class UsageError(Exception):
@@ -42,8 +46,8 @@ def failure_text(error: BaseException) -> str:
 
 
 def printable(line: str) -> str:
-    """A line with its control characters escaped, because file names and texts of files
-    may contain any."""
+    """Return a line with its control characters escaped, because file names and texts
+    of files may contain any."""
     return "".join(map(_printable_letter, line))
 
 
@@ -64,6 +68,7 @@ def option(metavar: str, *aliases: str) -> object:
 
 
 Flag: TypeAlias = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
+Color: TypeAlias = tuple[float, float, float]
 Threads: TypeAlias = Annotated[int | None, option("N")]
 
 
@@ -94,7 +99,8 @@ class OnPool(OnDevice):
     into the free memory, and otherwise uses half of the free memory."""
 
     def pool(self) -> str | None:
-        """The memory of the pool as `Renderer` takes it: None draws without a pool."""
+        """Return the memory of the pool as an argument of `Renderer`; None draws
+        without a pool."""
         if self.memory == "all":
             return None
         return self.memory
@@ -122,12 +128,35 @@ def check_range(name: str, value: float, minimum: float, maximum: float) -> None
     check_usage(name, minimum <= value <= maximum, f"{minimum:,} to {maximum:,}, got {value}")
 
 
+def color_of(value: Color | str) -> Color | None:
+    """Return the colour of --background; None if the value is `none`.
+
+    Raises:
+        UsageError: It is no colour.
+    """
+    if value == "none":
+        return None
+    if not isinstance(value, str):
+        is_color = all(0 <= part <= 1 for part in value)
+        check_usage("--background", is_color, f"three numbers from 0 to 1, got {value}")
+        return value
+    from PIL import ImageColor
+
+    try:
+        red, green, blue, *_ = ImageColor.getrgb(value)
+    except ValueError:
+        expected = "three numbers from 0 to 1, a colour such as white or #87ceeb, or none"
+        raise UsageError(f"--background: expected {expected}, got {value}") from None
+    return red / 255, green / 255, blue / 255
+
+
 def require_file(path: Path, *suffixes: str) -> None:
-    check(
-        path,
-        is_url(path) or path.exists(),
-        f"a file, got a path that does not exist{_similar(path)}",
-    )
+    if not is_url(path) and not path.exists():
+        if path.is_symlink():
+            expected = f"a file, got a link to {os.readlink(path)}, which does not exist"
+        else:
+            expected = f"a file, got a path that does not exist{_similar(path)}"
+        refuse(path, expected)
     problem = "another name"
     if path.is_dir():
         problem = "a folder"
@@ -139,14 +168,24 @@ def _similar(path: Path) -> str:
     """Advice for a file that does not exist: a file of a similar name, if there is
     one."""
     if path.parent.is_dir():
-        similar = difflib.get_close_matches(path.name, os.listdir(path.parent), 1, 0.75)
+        names = [name for name in os.listdir(path.parent) if path.with_name(name).exists()]
+        similar = difflib.get_close_matches(path.name, names, 1, 0.75)
         if similar:
             return f"; perhaps you meant {path.with_name(similar[0])}"
     return "; check it"
 
 
+def open_subject(path: Path, *, show: bool) -> tuple[Subject, dict[str, Camera] | None]:
+    """Open a scene with its cameras, a bundle or an asset, and show that it takes
+    time."""
+    with waiting(printable(f"reading {shown(path)}"), show=show):
+        return open_with_cameras(path)
+
+
 def check_output(output: Path, *inputs: Path) -> None:
-    """Refuse to overwrite an input, which may contain more than the output."""
+    """Refuse a URL, and to overwrite an input, which may contain more than the
+    output."""
+    check_usage(shown(output), not is_url(output), "a local file to write, got a URL")
     for path in inputs:
         is_another = not (output.exists() and path.exists() and output.samefile(path))
         check_usage(
@@ -167,8 +206,8 @@ def level_size(bundle: Bundle, level: int) -> int:
 
 
 def finite(number: float) -> float | None:
-    """A number for JSON, which has no infinity: None for the infinite tolerance of a
-    small budget."""
+    """Return a number for JSON, which has no infinity; None stands for the infinite
+    tolerance of a small budget."""
     if math.isfinite(number):
         return number
     return None
@@ -191,7 +230,7 @@ class Column:
     form: str
 
     def cell(self, row: Mapping[str, object]) -> str:
-        """The cell of a row; `-` if the row lacks a value."""
+        """Return the cell of a row; `-` if the row lacks a value."""
         try:
             return printable(self.form.format_map(row))
         except (KeyError, TypeError):  # the value is missing, or is None, which takes no format
@@ -199,8 +238,8 @@ class Column:
 
 
 def table_lines(columns: Sequence[Column], rows: Iterable[Mapping[str, object]]) -> list[str]:
-    """Lines of a table, whose first column is aligned to the left, the others to the
-    right."""
+    """Return the lines of a table; its first column is aligned to the left, the others
+    to the right."""
     table = [[column.head for column in columns]]
     for row in rows:
         table.append([column.cell(row) for column in columns])

@@ -85,8 +85,8 @@ class Program:
                 _join_help(kind)
 
     def _one_line(self, boxed: str, arguments: Sequence[str]) -> str:
-        """The message for a wrong command line: an unknown name, or else the text of
-        tyro's first box."""
+        """Return the message for a wrong command line: an unknown name, or else the
+        text of tyro's first box."""
         if not arguments:
             return f"{_text_of_first_box(boxed)}; run {self.name} --help"
         command = arguments[0]
@@ -98,8 +98,8 @@ class Program:
         return f"{text}; run {self.name} {command} --help"
 
     def _unknown_option(self, command: str, arguments: Sequence[str]) -> str | None:
-        """The message for the first option that a command does not have, if there is
-        one."""
+        """Return the message for the first option that the command does not have; None
+        if it has all of them."""
         options = self._options(command)
         for argument in arguments:
             name = argument.partition("=")[0].replace("_", "-")
@@ -109,7 +109,7 @@ class Program:
         return None
 
     def _options(self, command: str) -> list[str]:
-        """Names of the options in the help of a command."""
+        """Return the names of the options in the help of a command."""
         with contextlib.redirect_stdout(io.StringIO()) as printed, contextlib.suppress(SystemExit):
             self.parse([command, "--help"])
         return re.findall(r"--[a-z][a-z-]*", printed.getvalue())
@@ -200,8 +200,8 @@ def _legible_width() -> Iterator[None]:
 
 
 def _suggestion(name: str, choices: Sequence[str]) -> str:
-    """The choice that is most like an unknown name, as the end of a message; empty if
-    none is."""
+    """Return the end of a message that suggests the choice most like an unknown name;
+    empty if none is like it."""
     similar = difflib.get_close_matches(name, choices, 1, 0.7)
     if similar:
         return f"; perhaps you meant {similar[0]}"
@@ -209,15 +209,15 @@ def _suggestion(name: str, choices: Sequence[str]) -> str:
 
 
 def _text_of_first_box(boxed: str) -> str:
-    """The text of the first box that tyro draws, in our words."""
+    """Return the text of the first box that tyro draws, in our words."""
     lines = [line.strip("│╭╮╰╯─ ").strip() for line in boxed.splitlines()[1:]]
     end = next((i for i, line in enumerate(lines) if not line), len(lines))
     return _plainly(" ".join(lines[:end]).rstrip("."))
 
 
 def _plainly(text: str) -> str:
-    """A message of tyro without types of Python, with its choices in a fixed order and
-    without None."""
+    """Return a message of tyro without Python types and None, with the choices in a
+    fixed order."""
     if match := re.match(r"Error parsing (--[a-z-]+): (.*)", text):
         expected = "whole numbers"
         if "float" in match[2].lower():

@@ -1,43 +1,36 @@
-"""The cameras of commands: those of a file, a scene's own, or a turntable around the
-subject."""
+"""The cameras of commands: one that the options place, those of a file, a scene's own,
+or first views of the subject."""
 
 import math
 import os
 import re
 import sys
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 import tyro
 
-from v3dg._numbers import check, refuse
+from v3dg._numbers import check
 from v3dg._urls import beside, shown
-from v3dg.bundle import Bundle
 from v3dg.camera_file import read_cameras
-from v3dg.cameras import AXES, DEFAULT_FOV_X, Axis, Camera, VectorLike, turntable
-from v3dg.cleaning import ball_of_most, examine
+from v3dg.cameras import AXES, Axis, Camera, near_of
 from v3dg.cli._common import (
     check_range,
     check_usage,
-    level_size,
     option,
     printable,
     require_subject,
 )
-from v3dg.gaussians import Array, Gaussians
-from v3dg.pictures import MOST_SIDE, check_size
-from v3dg.scene import Scene, Subject
+from v3dg.framing import DEFAULT_ELEVATION, frame_subject
+from v3dg.pictures import MOST_SIDE, SUFFIXES, check_size
+from v3dg.scene import Subject
 from v3dg.scene.file import is_scene
 from v3dg.upright import ASSUMED, direction_of, up_of
 
-# Gaussians of the level that a turntable is centred on: enough to find the centre, and
-# quick to read.
-_ENOUGH_TO_FRAME = 50_000
-
-_DEFAULT_ELEVATION = 20.0  # degrees
+_DEFAULT_FOV = 45.0  # degrees
 
 # All cameras are made before the first picture is drawn.
 _MOST_VIEWS = 10_000
@@ -54,8 +47,8 @@ class CameraFile:
     """Whether lens distortion in that file is an error, or left out of the pictures."""
 
     def read(self, size: tuple[int, int] = (800, 800)) -> dict[str, Camera]:
-        """The cameras of --cameras, with this size if their file has none; empty
-        without the option."""
+        """Return the cameras of --cameras, with this size if their file has none;
+        return none without the option."""
         if self.cameras is None:
             return {}
         cameras = read_cameras(self.cameras, size=size, distortion=self.distortion)
@@ -65,22 +58,33 @@ class CameraFile:
 
 @dataclass
 class ViewOptions(CameraFile):
-    """The cameras of the pictures: those of a scene, of a camera file, or of a
-    turntable."""
+    """The cameras of the pictures: one that is placed here, those of a camera file or
+    of a scene, or first views of the subject."""
 
+    eye: Annotated[tuple[float, float, float] | None, option("X Y Z")] = None
+    """Look from this point of the world."""
+    target: Annotated[tuple[float, float, float] | None, option("X Y Z")] = None
+    """Look from --eye at this point; by default at the middle of the subject."""
+    fov: Annotated[float | None, option("DEGREES")] = None
+    """Field of view from --eye, across the width of the picture; 45 by default."""
+    link: Annotated[str | None, tyro.conf.arg(name="at", metavar="LINK", help_behavior_hint="")] = (
+        None
+    )
+    """Look from the camera of a link: an address of the page of `v3dg view`, in
+    quotes."""
     camera: Annotated[str | None, option("NAME")] = None
     """Draw only this camera of a file with cameras, given by its name or its number in
     the file, from 0."""
     views: Annotated[int | None, option("N")] = None
-    """Number of views around the turntable; 1 by default, 8 for `compare`."""
+    """Number of views around the subject, or around its viewer where it is a room; 1 by
+    default, 8 for `compare`."""
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="W H")] = (800, 800)
-    """Width and height in px of a turntable's pictures, and of cameras whose file has
-    no size."""
+    """Width and height in px of pictures whose camera's file has no size."""
     elevation: Annotated[float | None, option("DEGREES")] = None
-    """Height of the turntable's cameras above the horizon; 20 by default."""
+    """Height of the cameras around the subject above the horizon; 20 by default."""
     up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
-    """The turntable's axis; by default the one in the file, or a guess.
-    """
+    """The axis that is up around the subject and for --eye; by default the one in the
+    file, or a guess."""
 
     def check(self, *subjects: Path) -> None:
         """Refuse wrong subjects, and options that do not apply to them, before anything
@@ -89,21 +93,41 @@ class ViewOptions(CameraFile):
             require_subject(path)
         for side in self.size:
             check_range("--size", side, 1, MOST_SIDE)
-        file = self.cameras or next(filter(is_scene, subjects), None)
+        for name, value in (("--target", self.target), ("--fov", self.fov)):
+            check_usage(name, value is None or self.eye, "--eye beside it; give one")
+        check_range("--fov", self.fov or _DEFAULT_FOV, 0.001, 179)
+        sources = {"--eye": self.eye, "--at": self.link, "--cameras": self.cameras}
+        names = [name for name, value in sources.items() if value is not None]
+        check_usage(", ".join(names), len(names) < 2, "one of them; leave out the others")
+        is_placed = self.eye is not None or self.link is not None
+        has_file = self.cameras is not None or any(map(is_scene, subjects))
         expected = "--cameras or a scene (.json) to take it from; leave it out"
-        check_usage("--camera", self.camera is None or file, expected)
-        for name, value in self.turntable().items():
-            expected = (
-                f"a turntable to set with it, got the cameras of {shown(file or '')}; leave it out"
-            )
-            check_usage(name, value is None or not file, expected)
+        fits = self.camera is None or (has_file and not is_placed)
+        check_usage("--camera", fits, expected)
+        if self.cameras is not None:
+            self.check_turntable(f"the cameras of {shown(self.cameras)}")
+        elif names:
+            self.check_turntable(names[0])
         if self.views is not None:
             check_range("--views", self.views, 1, _MOST_VIEWS)
         check_range("--elevation", self.elevation or 0, -89.99, 89.99)
 
+    def check_turntable(self, source: str) -> None:
+        """Refuse options of the views around a subject where other cameras draw it."""
+        for name, value in self.turntable().items():
+            is_used = name == "--up" and self.eye is not None
+            expected = f"views around the subject to set with it, got {source}; leave it out"
+            check_usage(name, value is None or is_used, expected)
+
     def turntable(self) -> dict[str, object]:
-        """Options of the turntable, by name; None: not given."""
+        """Return the options of views around a subject by name; None stands for an
+        option that was not given."""
         return {"--views": self.views, "--elevation": self.elevation, "--up": self.up}
+
+    def needs_up(self, own_cameras: Mapping[str, Camera] | None) -> bool:
+        """Return whether the axis that is up has to be known."""
+        has_cameras = self.link is not None or self.cameras is not None or bool(own_cameras)
+        return self.eye is not None or not has_cameras
 
 
 # A field of a command's options; on the command line its options stand beside the
@@ -118,13 +142,21 @@ def choose_cameras(
     own_cameras: dict[str, Camera] | None,
     views: int = 1,
 ) -> dict[str, Camera]:
-    """The cameras of --cameras, else the subject's own, else a turntable around it, by
-    default of `views`."""
-    cameras = options.read(options.size) or own_cameras
-    if cameras is None and not isinstance(subject, Scene):
-        cameras = _around(subject, options, options.views or views, path)
+    """Return the camera of --eye or --at, else those of --cameras, else the subject's
+    own, else first views of the subject (`views` of them by default)."""
+    if options.link is not None:
+        cameras = {"link": _linked(options.link, options.size)}
+    elif options.eye is not None:
+        cameras = {"eye": _placed(options, subject)}
+    else:
+        cameras = options.read(options.size)
+        if not cameras and own_cameras:
+            options.check_turntable(f"the cameras of {shown(path)}")
+            cameras = own_cameras
     if not cameras:
-        refuse(shown(path), "cameras, got a file without any; give some with --cameras")
+        refuse_without = "a scene with cameras to take it from; leave it out"
+        check_usage("--camera", options.camera is None, refuse_without)
+        cameras = _around(subject, options, options.views or views)
     if options.camera is not None:
         name = _camera_name(options.camera, list(cameras))
         cameras = {name: cameras[name]}
@@ -133,8 +165,38 @@ def choose_cameras(
     return cameras
 
 
+def _linked(link: str, size: tuple[int, int]) -> Camera:
+    """Return the camera of a link of the viewer's page."""
+    from v3dg.viewer.link import read_link
+
+    place = read_link(link)
+    near = 0.01
+    if place.focus is not None:
+        distance = float(np.linalg.norm(np.subtract(place.focus, place.view.position)))
+        near = near_of(distance)
+    return replace(place.view, aspect=size[0] / size[1]).camera(*size, near)
+
+
+def _placed(options: ViewOptions, subject: Subject) -> Camera:
+    """The camera of --eye."""
+    assert options.eye is not None
+    up = direction_of(options.up or up_of(subject)[0])
+    target = options.target
+    if target is None:
+        x, y, z = frame_subject(subject).center.tolist()
+        target = (x, y, z)
+    return Camera.look_at(
+        options.eye,
+        target,
+        up,
+        math.radians(options.fov or _DEFAULT_FOV),
+        width=options.size[0],
+        height=options.size[1],
+    )
+
+
 def _camera_name(text: str, names: Sequence[str]) -> str:
-    """The name of the camera that --camera selects by name or number."""
+    """Return the name of the camera that --camera selects by name or number."""
     if text in names:
         return text
     if text.isdecimal() and int(text) < len(names):
@@ -145,57 +207,34 @@ def _camera_name(text: str, names: Sequence[str]) -> str:
     raise ValueError(f"--camera: expected one of {choices}, or 0 to {len(names) - 1}, got {text}")
 
 
-def _around(
-    subject: Bundle | Gaussians, options: ViewOptions, views: int, path: Path
-) -> dict[str, Camera]:
-    """Cameras around the ball of most gaussians, at a distance that shows nearly all of
-    it."""
-    means = _means_to_frame(subject)
-    centre: VectorLike = (0.0, 0.0, 0.0)
-    radius = 1.0
-    if len(means):
-        centre, radius = ball_of_most(means)
-    narrow = math.tan(DEFAULT_FOV_X / 2) * min(1.0, options.size[1] / options.size[0])
-    distance = 0.9 * radius / math.sin(math.atan(narrow))
-    elevation = _DEFAULT_ELEVATION
+def _around(subject: Subject, options: ViewOptions, views: int) -> dict[str, Camera]:
+    """Return first views of a subject, from around an object or inside a room.
+
+    A single one that no --views asks for is closer than views of a turntable.
+    """
+    elevation = DEFAULT_ELEVATION
     if options.elevation is not None:
-        elevation = options.elevation
-    cameras = turntable(
-        centre,
-        distance,
-        views,
-        math.radians(elevation),
-        up=direction_of(options.up or up_of(subject, path=path)[0]),
-        width=options.size[0],
-        height=options.size[1],
-        near=min(0.01, 0.01 * distance),
-    )
+        elevation = math.radians(options.elevation)
+    up = direction_of(options.up or up_of(subject)[0])
+    framing = frame_subject(subject)
+    if options.views is None and views == 1:
+        return {"0": framing.camera(up, *options.size, elevation=elevation)}
+    cameras = framing.turntable(up, views, *options.size, elevation=elevation)
     digits = len(str(views - 1))
     return {f"{i:0{digits}}": camera for i, camera in enumerate(cameras)}
-
-
-def _means_to_frame(subject: Bundle | Gaussians) -> Array:
-    """(N, 3) positions of gaussians that show where the subject is."""
-    if isinstance(subject, Gaussians):
-        return subject.means[examine(subject).drawable]
-    if not subject.num_levels:
-        return np.zeros((0, 3), np.float32)
-    levels = range(subject.num_levels)
-    small_levels = (i for i in levels if level_size(subject, i) <= _ENOUGH_TO_FRAME)
-    return subject.level_gaussians(next(small_levels, levels[-1])).means
 
 
 def choose_up(
     requested: Axis | None, subject: Subject, cameras: Mapping[str, Camera] | None, path: Path
 ) -> tuple[Axis, list[str]]:
-    """The axis that is up: that of --up, or else as `up_of` finds it, with a line that
-    says so.
+    """Return the axis that is up, from --up or else from `up_of`, and lines that say
+    why.
 
     If the axis is unknown, a user at a terminal is asked.
     """
     if requested:
         return requested, []
-    axis, reason = up_of(subject, cameras, path)
+    axis, reason = up_of(subject, cameras)
     if reason == ASSUMED and is_at_terminal():
         axis = ask_up(path, axis)
         reason = "as you answered"
@@ -203,15 +242,16 @@ def choose_up(
 
 
 def lines_of_up(path: Path, axis: Axis, reason: str) -> list[str]:
-    """The line that says which axis is up and why; none without a reason, which is for
-    --up."""
+    """Return a line that says which axis is up and why; no line without a reason, as
+    for --up."""
     if not reason:
         return []
     return [f"{beside(path).name}: {axis} is up, {reason}; change it with --up"]
 
 
 def is_at_terminal() -> bool:
-    """Whether a user can answer questions; a job in the background would be stopped."""
+    """Return whether a user can answer questions. A job in the background cannot ask:
+    reading would stop it."""
     is_open = sys.stdin and sys.stdin.isatty() and sys.stderr.isatty()
     return bool(is_open and os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp())
 
@@ -229,15 +269,24 @@ def ask_up(path: Path, axis: Axis) -> Axis:
 
 
 def picture_paths(output: Path, cameras: Collection[str]) -> list[Path]:
-    """The paths of the pictures of cameras; if there are several, each path has the
-    name of its camera.
+    """Return the paths of the pictures of cameras; if there are several, each path
+    contains the name of its camera.
 
     If two paths would be the same, all have the number of their camera in the file
     instead, from 0.
     """
     if len(cameras) == 1:
         return [output]
-    names = [re.sub(r"[^\w.-]", "_", name)[:100] for name in cameras]
+    names = [_file_stem(name) for name in cameras]
     if len(set(names)) < len(names):
         names = [str(place) for place in range(len(names))]
     return [output.with_name(f"{output.stem}_{name}{output.suffix}") for name in names]
+
+
+def _file_stem(name: str) -> str:
+    """Return the name of a camera as a part of a file's name, without the suffix of its
+    photograph."""
+    photograph = Path(name)
+    if photograph.suffix.lower() in SUFFIXES and photograph.stem:
+        name = str(photograph.with_suffix(""))
+    return re.sub(r"[^\w.-]", "_", name)[:100]

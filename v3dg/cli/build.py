@@ -24,7 +24,7 @@ from v3dg.cleaning import AssetWarning, describe
 from v3dg.cli import _common
 from v3dg.cli._views import ask_up, is_at_terminal
 from v3dg.gaussians import Gaussians
-from v3dg.io import SUFFIXES, open_asset, run_files
+from v3dg.io import SUFFIXES, open_asset, run_files, subject_name
 from v3dg.levels import BuildConfig, build_file, levels_path
 from v3dg.levels.quality import Quality
 from v3dg.levels.scheduler import SchedulerError
@@ -32,8 +32,8 @@ from v3dg.upright import ASSUMED, up_of
 
 _PATIENCE_S = 20  # time for a scheduler to answer
 _MOST_REASON = 200  # characters of an error of dask's
-# The axis that is up is guessed from so many samples of an asset, of so many gaussians
-# each.
+# The number and the size, in gaussians, of the samples from which the axis that is up
+# is guessed.
 _NUM_SAMPLES = 64
 _SAMPLE_SIZE = 256
 _SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
@@ -65,6 +65,9 @@ class Build(_common.OnDevice):
     up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
     """The axis that is up in the asset, which the bundle records; if it is unknown, a
     user at a terminal is asked."""
+    antialiased: Annotated[Literal["yes", "no"] | None, _common.option("{yes,no}")] = None
+    """Whether the asset was trained with antialiasing; by default what its file says,
+    or else no."""
     seed: int = 0
     """Seed of random numbers; the same seed gives the same file, byte for byte, on the
     same kind of device, with any number of threads."""
@@ -74,6 +77,9 @@ class Build(_common.OnDevice):
     resume: _common.Flag = False
     """Continue after the last finished level, and keep finished bundles of these
     gaussians and settings."""
+    overwrite: _common.Flag = False
+    """Replace the bundles of many assets that exist already. The bundle of one asset is
+    always replaced."""
     memory: Annotated[str | None, _common.option("SIZE")] = None
     """Memory of the host for the build, such as 8GiB; by default half of the free
     memory. An asset that does not fit is sorted on the disk of the output."""
@@ -100,8 +106,8 @@ def run(options: Build) -> None:
 
 
 def _asked_up(path: Path) -> Axis | None:
-    """The axis that is up, which a user at a terminal is asked if neither the format
-    nor the gaussians determine it."""
+    """Return the axis that is up; ask a user at a terminal if neither the format nor
+    the gaussians determine it."""
     if not is_at_terminal():
         return None
     _common.require_file(path, *SUFFIXES)
@@ -112,7 +118,7 @@ def _asked_up(path: Path) -> Axis | None:
     stride = max(asset.num_gaussians // _NUM_SAMPLES, _SAMPLE_SIZE)
     for start in range(0, asset.num_gaussians, stride):
         samples.append(asset.read(start, min(start + _SAMPLE_SIZE, asset.num_gaussians)))
-    axis, reason = up_of(Gaussians.concatenate(samples), path=path)
+    axis, reason = up_of(Gaussians.concatenate(samples), declared=asset.declared)
     if reason == ASSUMED:
         return ask_up(path, axis)
     return None
@@ -184,6 +190,8 @@ def _greet(address: str) -> None:
 
 def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor | None) -> None:
     outputs = _outputs(list(assets), options.output)
+    if not options.overwrite and not options.resume:
+        _check_new(list(outputs.values()))
     start = time.perf_counter()
     results: list[JsonObject] = []
     for asset, output in outputs.items():
@@ -242,8 +250,8 @@ def _print_many(options: Build, results: list[JsonObject], seconds: float) -> No
 
 
 def _assets_of(paths: Sequence[Path]) -> dict[Path, list[Path]]:
-    """The files of each asset, by the path that names it: a file, or the folder of a
-    trainer's run."""
+    """Return the files of each asset by the path that names it, which is a file or the
+    folder of a trainer's run."""
     assets: dict[Path, list[Path]] = {}
     for path in paths:
         if not path.is_dir():
@@ -262,18 +270,18 @@ def _assets_of(paths: Sequence[Path]) -> dict[Path, list[Path]]:
 
 
 def _output_of(asset: Path, folder: Path | None) -> Path:
-    """The path of the bundle that is named after an asset."""
+    """Return the path of the bundle that is named after an asset."""
     if asset.is_dir():
         place = asset.resolve()
         stem = place.name
     else:
         place = beside(asset)
-        stem = place.stem
+        stem = subject_name(asset)
     return (folder or place.parent) / f"{stem}.v3dg"
 
 
 def _outputs(assets: Sequence[Path], folder: Path | None) -> dict[Path, Path]:
-    """The path of the bundle of each asset."""
+    """Return the path of the bundle of each asset."""
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     asset_from_output: dict[Path, Path] = {}
@@ -288,6 +296,17 @@ def _outputs(assets: Sequence[Path], folder: Path | None) -> dict[Path, Path]:
     return {asset: output for output, asset in asset_from_output.items()}
 
 
+def _check_new(outputs: Sequence[Path]) -> None:
+    """Refuse to replace bundles that nobody named."""
+    existing = [output for output in outputs if output.exists()]
+    if existing:
+        ending = ""
+        if len(existing) > 1:
+            ending = f", and {len(existing) - 1} more"
+        advice = "--resume keeps finished bundles, --overwrite replaces them"
+        raise _common.UsageError(f"{existing[0]}: exists already{ending}; {advice}")
+
+
 def _build(
     options: Build, paths: Sequence[Path], output: Path, executor: Executor | None
 ) -> JsonObject:
@@ -296,12 +315,15 @@ def _build(
         _common.require_file(path, *SUFFIXES)
     advice = ""
     if output.is_dir():
-        advice = f", got a folder; {output / paths[0].stem}.v3dg is one"
+        advice = f", got a folder; {output / subject_name(paths[0])}.v3dg is one"
     check(output, output.suffix == ".v3dg", f"a file name ending in .v3dg{advice}")
     _common.check_output(output, *paths)
     start = time.perf_counter()
     with _resume_advised(output):
         bundle, is_built = _build_file(options, paths, output, executor)
+    notes = _notes(options, paths)
+    for note in notes:
+        _common.tell(note)
     asset: str | list[str] = [shown(path) for path in paths]
     if len(paths) == 1:
         asset = shown(paths[0])
@@ -320,17 +342,30 @@ def _build(
         "quality": options.quality,
         "bytes": output.stat().st_size,
         "seconds": time.perf_counter() - start,
+        "notes": notes,
     }
+
+
+def _notes(options: Build, paths: Sequence[Path]) -> list[str]:
+    """Lines about what the files of an asset declare."""
+    config = _config_of(options)
+    lines = []
+    for path in paths:
+        declared = open_asset(path).declared
+        if declared.up is not None:
+            lines.append(f"{shown(path)}: {declared.up} is up, {declared.up_reason}")
+        contradiction = config.contradiction(antialiased=declared.antialiased)
+        if contradiction:
+            lines.append(f"{shown(path)}: {contradiction}")
+        elif declared.antialiased:
+            lines.append(f"{shown(path)}: trained with antialiasing")
+        lines += [f"{shown(path)}: {note}" for note in declared.notes]
+    return lines
 
 
 def _build_file(
     options: Build, paths: Sequence[Path], output: Path, executor: Executor | None
 ) -> tuple[Bundle, bool]:
-    config = BuildConfig()
-    if options.config == "paper":
-        config = BuildConfig.paper()
-    if options.cluster_size is not None:
-        config = replace(config, cluster_size=options.cluster_size)
     unusable: Literal["drop", "refuse"] = "drop"
     if options.strict:
         unusable = "refuse"
@@ -339,7 +374,7 @@ def _build_file(
         return build_file(
             paths,
             output,
-            config=config,
+            config=_config_of(options),
             seed=options.seed,
             progress=not options.quiet,
             device=options.device,
@@ -351,6 +386,17 @@ def _build_file(
             quality=options.quality,
             up=options.up,
         )
+
+
+def _config_of(options: Build) -> BuildConfig:
+    config = BuildConfig()
+    if options.config == "paper":
+        config = BuildConfig.paper()
+    if options.cluster_size is not None:
+        config = replace(config, cluster_size=options.cluster_size)
+    if options.antialiased is not None:
+        config = replace(config, asset_antialiased=options.antialiased == "yes")
+    return config
 
 
 @contextmanager
@@ -370,7 +416,7 @@ def _resume_advised(output: Path) -> Iterator[None]:
 
 
 def _resume_advice(output: Path) -> str:
-    """The end of the message of an unfinished build, which says from which file it can
+    """Return the end of the message about an unfinished build: from which file it can
     continue."""
     levels = levels_path(output)
     if levels.exists():

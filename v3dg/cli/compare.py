@@ -10,7 +10,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 import tyro
 
-from v3dg import _device, pictures
+from v3dg import _device, _files, pictures
 from v3dg._json import JsonObject
 from v3dg._judges import Judges, mean_of
 from v3dg._numbers import check
@@ -19,8 +19,8 @@ from v3dg._urls import beside, shown
 from v3dg.bundle import Bundle
 from v3dg.cli import _common
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, picture_paths
+from v3dg.io import subject_name
 from v3dg.metrics import FLIP_MISSING, MIN_TRANSMITTANCE, draw_truth, error_image, errors_of
-from v3dg.opening import open_with_cameras
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import render
 
@@ -85,9 +85,10 @@ class _Pairs:
 
 
 def run(options: Compare) -> None:
-    output = pictures.check_picture_path(options.output)
     subjects = (options.reference, options.test)
-    _common.check_output(output, *subjects)
+    _common.check_output(options.output, *subjects)
+    output = pictures.check_picture_path(options.output)
+    _files.make_folder(output)
     are_pictures = [beside(path).suffix.lower() in pictures.SUFFIXES for path in subjects]
     is_pair = any(are_pictures) == all(are_pictures)
     _common.check_usage("PATH", is_pair, "two pictures, or two subjects to draw, got one of each")
@@ -161,7 +162,7 @@ def _read_pictures(options: Compare) -> _Pairs:
     test_height, test_width, _ = test.shape
     expected = f"{width} x {height} px like {options.reference}, got {test_width} x {test_height}"
     check(options.test, reference.shape == test.shape, expected)
-    name = beside(options.test).stem
+    name = subject_name(options.test)
     return _Pairs([name], iter([_Pair(name, reference, test)]), finest=None)
 
 
@@ -170,8 +171,8 @@ def _draw(options: Compare) -> _Pairs:
     options.view.check(options.reference, options.test)
     _common.check_range("--supersample", options.supersample, 1, 16)
     device = _device.resolve(options.device)
-    reference, reference_cameras = open_with_cameras(options.reference)
-    test, test_cameras = open_with_cameras(options.test)
+    reference, reference_cameras = _common.open_subject(options.reference, show=not options.quiet)
+    test, test_cameras = _common.open_subject(options.test, show=not options.quiet)
     if reference_cameras is None and test_cameras is not None:
         cameras = choose_cameras(options.view, options.test, reference, test_cameras, views=8)
     else:
@@ -214,7 +215,8 @@ def _errors(pair: _Pair) -> dict[str, float | None]:
 
 
 def _difference(row: JsonObject) -> float:
-    """The order of views: FLIP, or the negative PSNR if FLIP is missing."""
+    """Return the key by which views are sorted: FLIP, or the negative PSNR if FLIP is
+    missing."""
     if row["flip"] is not None:
         return float(row["flip"])
     if row["psnr"] is not None:

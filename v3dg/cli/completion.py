@@ -1,14 +1,20 @@
 """`v3dg completion`."""
 
+import ast
 import contextlib
 import io
 import json
+import re
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeAlias, cast
 
 import tyro
 
 from v3dg.cli._common import Common
+
+_Shell: TypeAlias = Literal["bash", "zsh", "fish"]
+# The completions of a command in the form of tyro's scripts: nested dicts and lists.
+_Spec: TypeAlias = dict[str, object]
 
 # Replacements in tyro's scripts that complete file names if neither a command nor an
 # option matches.
@@ -17,6 +23,9 @@ _OR_FILES = {
     "zsh": ('[[ "$completions" ==', '[[ -z "$completions" || "$completions" =='),
     "fish": ("complete --no-files", "complete"),
 }
+# The line of tyro's scripts that has all commands and options as a literal of Python.
+_SPEC = re.compile(r"^COMPLETION_SPEC = (.*)$", re.MULTILINE)
+_BASH_MATCH = 'matches+=("$completion")'
 
 
 @dataclass
@@ -24,7 +33,7 @@ class Completion(Common):
     """Print a shell script that completes commands, options and files (docs/install.md
     says where to put it)."""
 
-    shell: tyro.conf.Positional[Literal["bash", "zsh", "fish"]]
+    shell: tyro.conf.Positional[_Shell]
     """Shell that will run the script."""
 
 
@@ -34,7 +43,38 @@ def run(options: Completion) -> None:
     script = io.StringIO()
     with contextlib.redirect_stdout(script), contextlib.suppress(SystemExit):
         parse(["--tyro-write-completion", options.shell, "-"])
-    text = script.getvalue().replace(*_OR_FILES[options.shell])
+    text = _plain(script.getvalue(), options.shell).replace(*_OR_FILES[options.shell])
+    # An empty answer is no match, so that files are completed.
+    text = text.replace(_BASH_MATCH, f'[[ -z "$completion" ]] || {_BASH_MATCH}')
     if options.json:
         text = json.dumps({"shell": options.shell, "script": text})
     print(text)
+
+
+def _plain(script: str, shell: _Shell) -> str:
+    """Return a script that completes names without their help texts, and without None
+    as a value of optional options."""
+    match = _SPEC.search(script)
+    if match is None:
+        raise RuntimeError("completion: tyro wrote another script; install an earlier tyro")
+    literal = match[1]
+    if shell == "fish":  # whose script is in double quotes
+        literal = re.sub(r"\\(.)", r"\1", literal)
+    spec = cast(_Spec, ast.literal_eval(literal))
+    _simplify(spec)
+    literal = repr(spec)
+    if shell == "fish":
+        literal = re.sub(r'([\\"$])', r"\\\1", literal)
+    return script[: match.start(1)] + literal + script[match.end(1) :]
+
+
+def _simplify(spec: _Spec) -> None:
+    """Take the help and None out of the spec of a command, and of those below it."""
+    spec["description"] = ""
+    for option in cast(list[_Spec], spec["options"]):
+        option["description"] = ""
+        if "choices" in option:
+            choices = set(cast(list[str], option["choices"])) - {"None"}
+            option["choices"] = sorted(choices, key=lambda name: (name[:1] == "-", name))
+    for command in cast(dict[str, _Spec], spec["subcommands"]).values():
+        _simplify(command)

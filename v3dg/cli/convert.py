@@ -1,25 +1,46 @@
 """`v3dg convert`."""
 
 import time
-from dataclasses import dataclass, field
+import warnings
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 import tyro
 
 from v3dg import _files
 from v3dg._device import CPU
 from v3dg._numbers import check
+from v3dg._progress import waiting
+from v3dg._urls import shown
 from v3dg.bundle import Bundle
-from v3dg.cameras import Camera
+from v3dg.cameras import Axis, Camera
+from v3dg.cleaning import AssetWarning
 from v3dg.cli import _common
-from v3dg.cli._views import ViewOptions, Views, choose_cameras
+from v3dg.cli._editing import EditOptions, Editor, Edits
+from v3dg.cli._faults import FaultOptions, Faults, checked
+from v3dg.cli._moving import MoveOptions, Moves
+from v3dg.cli._views import ViewOptions, choose_cameras
+from v3dg.formats._declared import declared_of
 from v3dg.gaussians import Gaussians
-from v3dg.io import WRITE_SUFFIXES, write_asset
-from v3dg.opening import open_with_cameras
-from v3dg.scene import Scene
+from v3dg.io import WRITE_SUFFIXES, losses_of, turned_up, write_asset
+from v3dg.scene import Scene, Subject
 from v3dg.scene.file import is_scene
 from v3dg.select import select
+from v3dg.upright import ASSUMED, turned_upright, up_of
+
+
+@dataclass
+class ConvertViews(ViewOptions):
+    """The cameras of cuts, and the axis that is up in the input."""
+
+    up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
+    """The axis that is up in the input, which is turned to -y. By default the one that
+    `v3dg info` shows: outputs that have axes, .spz, .glb and .usd, are turned from it,
+    and others keep it."""
+
+
+_Views: TypeAlias = Annotated[ConvertViews, tyro.conf.OmitArgPrefixes]
 
 
 @dataclass
@@ -44,7 +65,10 @@ class Convert(_common.Cut, _common.Common):
     """Drop or keep the part of the cut that the camera does not see."""
     spz_version: Annotated[Literal[2, 3, 4] | None, _common.option("{2,3,4}")] = None
     """Version of a .spz; 3 by default."""
-    view: Views = field(default_factory=ViewOptions)
+    moves: Moves = field(default_factory=MoveOptions)
+    edits: Edits = field(default_factory=EditOptions)
+    faults: Faults = field(default_factory=FaultOptions)
+    view: _Views = field(default_factory=ConvertViews)
 
 
 @dataclass(frozen=True)
@@ -52,37 +76,32 @@ class _Part:
     """The gaussians to write, and the fields of the result that describe them."""
 
     gaussians: Gaussians
-    description: dict[str, str | int | float | None]
+    description: dict[str, object]
 
 
 def run(options: Convert) -> None:
-    options.view.check(options.subject)
+    # What is up is an option for every input, not only for the turntable.
+    replace(options.view, up=None).check(options.subject)
+    options.moves.check()
+    options.edits.check()
+    options.faults.check()
+    editor = Editor(options.edits)
     _check_output(options)
     part_options = _part_options(options)
     is_cut = is_scene(options.subject) or any(name != "--level" for name in part_options)
     expected = "no scene, camera, tolerance or budget with it; leave out one or the other"
     _common.check_usage("--level", options.level is None or not is_cut, expected)
     start = time.perf_counter()
-    subject, own_cameras = open_with_cameras(options.subject)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AssetWarning)  # the result says it
+        subject, own_cameras = _common.open_subject(options.subject, show=not options.quiet)
     output = options.output
+    notes: list[str] = []
     if _is_bundle(output):
-        if not isinstance(subject, Bundle) or part_options:
-            raise _common.UsageError(
-                f"{output}: expected a bundle as the input, without options that choose a part "
-                "of it; v3dg build makes a bundle from an asset"
-            )
-        part = _Part(subject.gaussians, {"codec": options.codec or subject.codec})
-        _write_bundle(options, subject)
+        part = _write_bundle(options, subject, part_options)
     else:
-        if isinstance(subject, Gaussians):
-            expected = "a bundle or a scene; build one first"
-            _common.check_usage(", ".join(part_options), not part_options, expected)
-            part = _Part(subject, {})
-        elif isinstance(subject, Bundle) and not is_cut:
-            part = _level(options, subject)
-        else:
-            part = _cut(options, subject, own_cameras)
-        write_asset(output, part.gaussians, version=options.spz_version)
+        part = _part(options, subject, own_cameras, part_options)
+        part = _written(options, subject, part, editor, notes)
     num_bytes = output.stat().st_size
     result = {
         "output": str(output),
@@ -91,10 +110,67 @@ def run(options: Convert) -> None:
         "bytes": num_bytes,
         "seconds": time.perf_counter() - start,
         **part.description,
+        "notes": notes,
+        **editor.result(),
     }
     text = f"{output}: {len(part.gaussians):,} gaussians, SH degree {part.gaussians.sh_degree}"
     line = f"{text}, {_common.bytes_text(num_bytes)}"
-    _common.print_result(result, [line], as_json=options.json)
+    for note in notes:
+        _common.tell(note)
+    _common.print_result(result, [line, *editor.lines()], as_json=options.json)
+
+
+def _written(
+    options: Convert, subject: Subject, part: _Part, editor: Editor, notes: list[str]
+) -> _Part:
+    """Join, move, trim, check and write a part; adds lines about what was turned and
+    lost, and returns what was written."""
+    output = options.output
+    name = shown(options.subject)
+    if isinstance(subject, Gaussians):
+        notes += [f"{name}: {note}" for note in declared_of(subject).notes]
+    gaussians = part.gaussians
+    if gaussians.antialiased:
+        notes.append(f"{name}: trained with antialiasing")
+    up, reason = up_of(subject)
+    if options.view.up is not None:
+        gaussians = turned_upright(gaussians, options.view.up)
+        reason = f"turned from {options.view.up}, as --up says"
+        up = "-y"
+    gaussians = options.moves.moved(editor.joined(gaussians))
+    if options.moves.rotate is not None and "guessed" in reason:
+        up, reason = up_of(gaussians)
+    notes += _lines_of_up(name, output, up, reason)
+    remaining = checked(options.faults, editor.trimmed(gaussians), options.subject, output)
+    if remaining.note:
+        notes.append(remaining.note)
+    gaussians = remaining.gaussians
+    with waiting(f"writing {output}", show=not options.quiet):
+        try:
+            write_asset(output, gaussians, up=up, version=options.spz_version)
+        except ValueError as error:
+            raise ValueError(f"{name}: cannot be written to {output}: {error}") from None
+        losses = losses_of(output, gaussians, up=up)
+    description: dict[str, object] = dict(part.description)
+    description |= {"up": up, "up_reason": reason, "dropped": remaining.dropped}
+    if losses is not None:
+        notes += [f"{output}: {line}" for line in losses.lines]
+        description |= losses.result()
+    return _Part(gaussians, description)
+
+
+def _lines_of_up(name: str, output: Path, up: Axis, reason: str) -> list[str]:
+    """Return lines that say what is up, and what was turned for the output."""
+    up_in_file = turned_up(output)
+    if up_in_file is not None:
+        text = f"{name}: {up} is up, {reason}; {output.name} is turned so that {up_in_file} is"
+        return [f"{text}; change it with --up"]
+    if up != "-y":
+        text = f"{name}: {up} is up, {reason}; {output.name} keeps it"
+        return [f"{text}, where most viewers take -y for up; --up {up} turns it"]
+    if reason != ASSUMED:
+        return [f"{name}: {up} is up, {reason}"]
+    return []
 
 
 def _is_bundle(path: Path) -> bool:
@@ -112,27 +188,54 @@ def _check_output(options: Convert) -> None:
     _common.check_usage("--codec", fits, f"an output that ends in .v3dg, got {output}")
     fits = not options.spz_version or name.endswith(".spz")
     _common.check_usage("--spz-version", fits, f"a .spz to write, got {output}; leave it out")
-    _files.check_folder(output)
-    _common.check_output(output, options.subject)
+    _common.check_output(output, options.subject, *options.edits.added_paths())
+    _files.make_folder(output)
 
 
 def _part_options(options: Convert) -> list[str]:
-    """The names of the options on the command line that ask for a level or a cut."""
+    """Return the names of the options on the command line that ask for a level or a
+    cut."""
     values = {
         "--level": options.level,
         "--tolerance": options.tolerance,
         "--budget": options.budget,
         "--cameras": options.view.cameras,
-        **options.view.turntable(),
+        **replace(options.view, up=None).turntable(),
     }
     return [name for name, value in values.items() if value is not None]
 
 
-def _write_bundle(options: Convert, bundle: Bundle) -> None:
-    codec = options.codec or bundle.codec
-    Bundle(bundle.clusters, bundle.groups, bundle.gaussians, bundle.config, codec).write(
+def _write_bundle(options: Convert, subject: Subject, part_options: list[str]) -> _Part:
+    changes = [*part_options, *options.moves.option_names(), *options.edits.option_names()]
+    if options.view.up is not None:
+        changes.append("--up")
+    if not isinstance(subject, Bundle) or changes:
+        raise _common.UsageError(
+            f"{options.output}: expected a bundle as the input, without options that choose a part "
+            "of it or change it; v3dg build makes a bundle from an asset"
+        )
+    codec = options.codec or subject.codec
+    Bundle(subject.clusters, subject.groups, subject.gaussians, subject.config, codec).write(
         options.output
     )
+    return _Part(subject.gaussians, {"codec": codec})
+
+
+def _part(
+    options: Convert,
+    subject: Subject,
+    own_cameras: dict[str, Camera] | None,
+    part_options: list[str],
+) -> _Part:
+    """Return the asset, a level of the bundle, or a cut."""
+    if isinstance(subject, Gaussians):
+        expected = "a bundle or a scene; build one first"
+        _common.check_usage(", ".join(part_options), not part_options, expected)
+        return _Part(subject, {})
+    is_cut = any(name != "--level" for name in part_options)
+    if isinstance(subject, Bundle) and not is_cut:
+        return _level(options, subject)
+    return _cut(options, subject, own_cameras)
 
 
 def _level(options: Convert, bundle: Bundle) -> _Part:
@@ -163,7 +266,7 @@ def _cut(options: Convert, subject: Scene | Bundle, own_cameras: dict[str, Camer
         )
     else:
         gaussians = selection.gaussians(device=CPU)
-    description = {
+    description: dict[str, object] = {
         "camera": name,
         "tolerance": _common.finite(selection.tolerance),
         "clusters": len(selection),

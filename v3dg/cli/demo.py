@@ -1,14 +1,33 @@
 """`v3dg demo`."""
 
+import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from v3dg.cli._common import Column, Common, check_range, print_result, table_lines
+from v3dg.cli._common import (
+    Column,
+    Common,
+    check_output,
+    check_range,
+    option,
+    print_result,
+    table_lines,
+)
 from v3dg.demo import run_demo
 from v3dg.select import DEFAULT_TOLERANCE, rule_of
+
+_COLUMNS = [
+    Column("drawn", "{name}, distance {distance:g}"),
+    Column("gaussians", "{gaussians:,}"),
+    Column("select ms", "{select_ms:.1f}"),
+    Column("draw ms", "{draw_ms:.1f}"),
+    Column("FLIP", "{flip:.4f}"),
+    Column("PSNR", "{psnr:.2f}"),
+]
 
 
 @dataclass
@@ -18,6 +37,8 @@ class Demo(Common):
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("v3dg_demo.png")
     """Picture to write, .png or .jpg."""
+    keep: Annotated[Path | None, option("FOLDER")] = None
+    """Keep the asset, its bundle and the scene in this folder, to go on with."""
     gaussians: int = 50_000
     """Gaussians of the asset."""
     instances: int = 2000
@@ -31,6 +52,7 @@ class Demo(Common):
 
 
 def run(options: Demo) -> None:
+    check_output(options.output)
     check_range("--gaussians", options.gaussians, 1000, 10_000_000)
     check_range("--instances", options.instances, 1, 1_000_000)
     for side in options.size:
@@ -45,15 +67,8 @@ def run(options: Demo) -> None:
         tolerance=options.tolerance,
         seed=options.seed,
         progress=not options.quiet,
+        keep=options.keep,
     )
-    columns = [
-        Column("drawn", "{name}, distance {distance:g}"),
-        Column("gaussians", "{gaussians:,}"),
-        Column("select ms", "{select_ms:.1f}"),
-        Column("draw ms", "{draw_ms:.1f}"),
-        Column("FLIP", "{flip:.4f}"),
-        Column("PSNR", "{psnr:.2f}"),
-    ]
     panels = [
         {"name": name, "distance": column["distance"], **column[name]}
         for column in result["columns"]
@@ -63,8 +78,17 @@ def run(options: Demo) -> None:
         f"{options.instances:,} instances of {options.gaussians:,} gaussians, {result['levels']} "
         f"levels built in {result['build_seconds']:.1f} s, tolerance {options.tolerance:g} px²",
         "",
-        *table_lines(columns, panels),
+        *table_lines(_COLUMNS, panels),
         "",
         f"wrote {result['picture']} in {result['seconds']:.0f} s",
+        *_advice(result["kept"]),
     ]
     print_result(result, lines, as_json=options.json)
+
+
+def _advice(files: Sequence[str]) -> list[str]:
+    """Return the lines that say what to do with files that were kept."""
+    if not files:
+        return []
+    asset, bundle, scene = map(shlex.quote, files)
+    return ["", "to go on:", f"  v3dg view {scene}", f"  v3dg compare {asset} {bundle}"]

@@ -87,7 +87,8 @@ def _findings() -> Iterator[_Finding]:
 
 
 def _answer(*command: str, line: int = 0) -> str | None:
-    """A line of the output of a program; None if the program is missing or fails."""
+    """Return a line of the output of a program; None if the program is missing or
+    fails."""
     with contextlib.suppress(OSError, subprocess.SubprocessError, IndexError):
         process = subprocess.run(
             command, capture_output=True, text=True, timeout=_PATIENCE_S, check=True

@@ -17,7 +17,7 @@ from v3dg.cli import _common
 from v3dg.cli._views import choose_up
 from v3dg.formats.usd import SUFFIXES as USD_SUFFIXES
 from v3dg.gaussians import Gaussians
-from v3dg.opening import open_with_cameras
+from v3dg.io import subject_name
 from v3dg.scene import Scene
 
 
@@ -53,17 +53,20 @@ def run(options: Export) -> None:
     folder = options.output or _web_folder(options.subject)
     _common.check_output(folder, options.subject)
     export.check_outside(folder, [options.subject])
+    is_usd = folder.suffix.lower() in USD_SUFFIXES
+    _common.check_usage(
+        "--to",
+        options.to == "sog" or not is_usd,
+        f"none for {folder}, got {options.to}; leave it out",
+    )
     start = time.perf_counter()
-    subject, cameras = open_with_cameras(options.subject)
+    subject, cameras = _common.open_subject(options.subject, show=not options.quiet)
     if isinstance(subject, Gaussians):
         name = shown(options.subject)
         advice = f"build a bundle from it: v3dg build {name}"
         raise ValueError(f"{name}: expected a scene or a bundle, got an asset; {advice}")
     up, notes = choose_up(options.up, subject, cameras, options.subject)
-    if folder.suffix.lower() in USD_SUFFIXES:
-        _common.check_usage(
-            "--to", options.to == "sog", f"none for {folder}, got {options.to}; leave it out"
-        )
+    if is_usd:
         size = export.write_usd(subject, folder, up=up)
         seconds = time.perf_counter() - start
         usd_result = {"output": str(folder), "bytes": size, "seconds": seconds}
@@ -130,7 +133,7 @@ def _lines(folder: Path, written: _Written, seconds: float) -> list[str]:
 
 
 def _advice(folder: Path, written: _Written) -> list[str]:
-    """The lines that say how to open an export in a browser."""
+    """Return the lines that say how to open an export in a browser."""
     quoted = shlex.quote(str(folder))
     lines = []
     if written.needs:
@@ -143,5 +146,4 @@ def _advice(folder: Path, written: _Written) -> list[str]:
 
 def _web_folder(subject: Path) -> Path:
     """The default folder of a page."""
-    local = beside(subject)
-    return local.with_name(f"{local.stem}_web")
+    return beside(subject).with_name(f"{subject_name(subject)}_web")

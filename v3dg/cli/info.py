@@ -11,16 +11,18 @@ import numpy as np
 import tyro
 
 from v3dg._json import Json, JsonObject
-from v3dg._urls import shown
+from v3dg._urls import is_url, shown
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cleaning import OUTLIER_DISTANCE, describe, examine, outliers
 from v3dg.cli import _common
+from v3dg.formats._declared import declared_of
+from v3dg.framing import frame_subject
 from v3dg.gaussians import Array, Gaussians
 from v3dg.io import asset_bytes
 from v3dg.levels import BuildConfig
-from v3dg.opening import open_with_cameras
-from v3dg.scene import Scene
+from v3dg.scene import Scene, Subject
+from v3dg.upright import direction_of, up_of
 
 # JSON values, and lines of text.
 _Description: TypeAlias = tuple[JsonObject, list[str]]
@@ -38,7 +40,7 @@ class Info(_common.Common):
 
 def run(options: Info) -> None:
     _common.require_subject(options.file)
-    subject, cameras = open_with_cameras(options.file)
+    subject, cameras = _common.open_subject(options.file, show=not options.quiet)
     if isinstance(subject, Scene):
         description = _scene_info(options.file, subject, cameras or {})
     elif isinstance(subject, Bundle):
@@ -46,11 +48,36 @@ def run(options: Info) -> None:
     else:
         description = _asset_info(options.file, subject)
     result, lines = description
+    up, reason = up_of(subject, cameras)
+    result = {**result, "up": up, "up_reason": reason}
+    lines.insert(1, f"{up} is up, {reason}")
+    if not cameras and not is_url(options.file):
+        first_view, line = _first_view(subject)
+        result["first_view"] = first_view
+        lines.append(line)
     _common.print_result(result, lines, as_json=options.json)
+
+
+def _first_view(subject: Subject) -> tuple[JsonObject | None, str]:
+    """Return the camera that first shows a subject, also in `v3dg render` and the
+    viewer; None if pages that it needs are damaged."""
+    try:
+        framing = frame_subject(subject)
+    except (OSError, ValueError) as error:
+        return None, f"first view unknown: {error}"
+    camera = framing.camera(direction_of(up_of(subject)[0]), 800, 800)
+    eye = camera.position.tolist()
+    target = framing.focus(camera).tolist()
+    side = "outside"
+    if framing.is_inside:
+        side = "inside, as a room"
+    view: JsonObject = {"eye": eye, "target": target, "is_inside": framing.is_inside}
+    return view, f"first seen from {side}, from {_point(eye)} to {_point(target)}"
 
 
 def _asset_info(path: Path, asset: Gaussians) -> _Description:
     num_bytes = asset_bytes(path)
+    declared = declared_of(asset)
     findings = examine(asset)
     drawable = asset.subset(findings.drawable)
     far = outliers(drawable.means)
@@ -72,16 +99,21 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
         "bytes": num_bytes,
         **boxes,
         "percentiles_5_50_95": spread,
+        "antialiased": declared.antialiased,
+        "notes": list(declared.notes),
     }
     lines = [f"{shown(path)}: asset, {_common.bytes_text(num_bytes)}"]
     lines += [f"{len(asset):,} gaussians, SH degree {asset.sh_degree}"]
     if findings.counts:
         lines.append(f"{findings.num_dropped:,} cannot be drawn: {describe(findings.counts)}")
-    return result, [*lines, *_extent_lines(result), *_spread_lines(spread)]
+    lines += [*_extent_lines(result), *_spread_lines(spread)]
+    if declared.antialiased:
+        lines.append("trained with antialiasing")
+    return result, lines
 
 
 def _extent_lines(result: JsonObject) -> list[str]:
-    """Lines about the positions of the gaussians that can be drawn."""
+    """Return lines about the positions of the gaussians that can be drawn."""
     lines = []
     if result["drawable"]:
         lines.append("means from {} to {}".format(*map(_point, result["box"])))
@@ -97,7 +129,7 @@ def _extent_lines(result: JsonObject) -> list[str]:
 
 
 def _spread_lines(spread: Mapping[str, Sequence[float]]) -> list[str]:
-    """A line about the percentiles of each value."""
+    """Return a line about the percentiles of each value."""
     lines = []
     for name, (p5, p50, p95) in spread.items():
         text = name.replace("_", " ")
@@ -150,7 +182,7 @@ def _bundle_info(bundle: Bundle) -> _Description:
 
 def _config_text(config: JsonObject) -> str:
     """The settings of a build that are not the default ones."""
-    defaults = asdict(BuildConfig())
+    defaults = asdict(BuildConfig().of_asset(antialiased=None))
     changes = []
     for name, value in _settings(config):
         if name not in defaults or value != defaults[name]:
@@ -211,8 +243,8 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
 
 
 def _settings(config: JsonObject, prefix: str = "") -> Iterator[tuple[str, Json]]:
-    """Names and values of a bundle's config; names of nested settings, but for the
-    build's, have a prefix."""
+    """Yield names and values of a bundle's config; the names of nested settings, except
+    for those of the build, have a prefix."""
     for name, value in config.items():
         if isinstance(value, dict):
             nested_prefix = f"{name} "

@@ -1,17 +1,33 @@
 """`v3dg refine`."""
 
+import math
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
-from v3dg._files import check_folder
+from v3dg import _device
+from v3dg._files import make_folder
+from v3dg._json import JsonObject
 from v3dg.bundle import Bundle
+from v3dg.cameras import Camera
 from v3dg.cli import _common
 from v3dg.cli._views import CameraFile
+from v3dg.framing import frame_subject
+from v3dg.metrics import MIN_TRANSMITTANCE, draw_truth
+from v3dg.pictures import to_8bit
 from v3dg.refine import refine_bundle
+from v3dg.render import render
+from v3dg.upright import direction_of, up_of
+
+# Widths of the pictures by which the result is judged, and how many of each.
+_WIDTHS = (512, 128, 32)
+_MOST_CAMERAS = 4
+_NOTICED_DB = 0.05
 
 
 @dataclass(kw_only=True)
@@ -41,12 +57,13 @@ def run(options: Refine) -> None:
     _common.check_usage(
         str(options.output), options.output.suffix == ".v3dg", "a file name ending in .v3dg"
     )
-    check_folder(options.output)
     _common.check_output(options.output, options.bundle)
+    make_folder(options.output)
     cameras = list(options.read().values())
     start = time.perf_counter()
+    bundle = Bundle.open(options.bundle)
     refined = refine_bundle(
-        Bundle.open(options.bundle),
+        bundle,
         cameras=cameras,
         steps=options.steps,
         drop=options.drop,
@@ -56,6 +73,62 @@ def run(options: Refine) -> None:
     )
     refined.write(options.output)
     seconds = time.perf_counter() - start
-    result = {"output": str(options.output), "steps": options.steps, "seconds": seconds}
+    rows = list(_compared(bundle, refined, options))
+    result = {
+        "output": str(options.output),
+        "steps": options.steps,
+        "seconds": seconds,
+        "psnr": rows,
+    }
     line = f"{options.output}: {options.steps:,} steps, {seconds:.1f} s"
-    _common.print_result(result, [line], as_json=options.json)
+    columns = [
+        _common.Column("picture", "{width} x {width}"),
+        _common.Column("PSNR before", "{before:.2f}"),
+        _common.Column("after", "{after:.2f}"),
+    ]
+    lines = [line, "", *_common.table_lines(columns, rows), *_warning(rows)]
+    _common.print_result(result, lines, as_json=options.json)
+
+
+def _compared(bundle: Bundle, refined: Bundle, options: Refine) -> Iterator[JsonObject]:
+    """Yield the mean PSNR of pictures before and after refining, for each picture width
+    from large to small."""
+    cameras = list(options.read().values())[:_MOST_CAMERAS]
+    up = direction_of(up_of(bundle)[0])
+    framing = frame_subject(bundle)
+    for width in _WIDTHS:
+        views = framing.turntable(up, _MOST_CAMERAS, width, width)
+        if cameras:
+            views = [_resized(camera, width) for camera in cameras]
+        errors: dict[str, list[float]] = {"before": [], "after": []}
+        for view in views:
+            truth = draw_truth(bundle, view, _device.resolve(options.device))
+            for name, subject in (("before", bundle), ("after", refined)):
+                image = render(
+                    subject, view, device=options.device, min_transmittance=MIN_TRANSMITTANCE
+                )
+                difference = to_8bit(image.color).astype(np.float64) - truth
+                errors[name].append(float(np.square(difference / 255).mean()))
+        values = {name: _psnr(float(np.mean(parts))) for name, parts in errors.items()}
+        yield {"width": width, **values}
+
+
+def _resized(camera: Camera, width: int) -> Camera:
+    """Return a camera with the same field of view and a picture of this width."""
+    height = max(round(camera.height * width / camera.width), 1)
+    scale = np.array([[width / camera.width], [height / camera.height], [1.0]])
+    return replace(camera, K=camera.K * scale, width=width, height=height)
+
+
+def _psnr(mean_square: float) -> float:
+    return -10 * math.log10(max(mean_square, 1e-10))
+
+
+def _warning(rows: list[JsonObject]) -> list[str]:
+    """Return a line that says in which sizes the result is worse."""
+    worse = [str(row["width"]) for row in rows if row["after"] < row["before"] - _NOTICED_DB]
+    if not worse:
+        return []
+    sizes = ", ".join(worse)
+    advice = "more --steps make it better; keep the bundle that was refined"
+    return ["", f"worse than before at {sizes} px: {advice}"]

@@ -1,83 +1,128 @@
 """`v3dg render`."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
-from v3dg import _device
+from v3dg import _device, _extras, _files
 from v3dg._json import JsonObject
 from v3dg._progress import counted
-from v3dg._urls import beside, shown
-from v3dg.cameras import Camera
+from v3dg._urls import shown
+from v3dg.cameras import Axis, Camera
 from v3dg.cli._common import (
+    Color,
     Column,
     Cut,
     OnPool,
+    check_output,
     check_usage,
+    color_of,
     finite,
+    open_subject,
     option,
     print_result,
     table_lines,
 )
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, choose_up, picture_paths
 from v3dg.false_color import ColorBy
-from v3dg.opening import open_with_cameras
-from v3dg.pictures import check_picture_path, write_picture
+from v3dg.image import Image, RenderedImage
+from v3dg.io import subject_name
+from v3dg.panorama import draw_panorama
+from v3dg.pictures import check_picture_path, check_size
 from v3dg.render import Renderer
 from v3dg.select import DEFAULT_FADE, CutOptions
+from v3dg.upright import direction_of
+from v3dg.video import write_video
 
 
 @dataclass
 class Render(Cut, OnPool):
-    """Draw a scene from its cameras, a bundle or an asset from a turntable, or any of
-    them from a camera file."""
+    """Draw a scene, a bundle or an asset: from its own cameras, from those of a camera
+    file, from a given position, or else from first views that show all of it."""
 
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg) or an asset (.ply, .spz, ...)."""
     output: Annotated[Path | None, option("PATH", "-o")] = None
-    """Picture to write, .png or .jpg; several pictures get a number or the camera's
-    name. By default the name is that of the subject."""
+    """Picture to write, .png or .jpg, or film, .mp4; several pictures get a number or
+    the camera's name. By default the name is that of the subject."""
     min_level: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Draw no level finer than this, except where an asset has no coarser one."""
     fade: Annotated[float | None, option("FACTOR")] = None
     """Blend two levels within this factor of the tolerance, and draw level 0 with a
     low-pass filter, so that a film neither pops nor flickers. By default 1.02 for
-    several views of a turntable, otherwise 1, which turns it off."""
+    several views around the subject and for a film, otherwise 1, which turns it off."""
     color_by: ColorBy = "appearance"
     """Property that the colours show."""
-    background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (
-        0.0,
-        0.0,
-        0.0,
-    )
-    """Red, green and blue of the background, each 0 to 1."""
+    background: Annotated[
+        tuple[float, float, float] | str, tyro.conf.arg(metavar="R G B|COLOR|none")
+    ] = (0.0, 0.0, 0.0)
+    """Background: red, green and blue from 0 to 1, a colour such as white or #87ceeb,
+    or none for a .png that is transparent (straight alpha)."""
+    projection: Literal["pinhole", "equirectangular"] = "pinhole"
+    """Draw what the camera sees, or all directions around it, for which --size has
+    twice as much width as height."""
+    fps: Annotated[int, tyro.conf.arg(metavar="N")] = 30
+    """Pictures a second of a film."""
     view: Views = field(default_factory=ViewOptions)
+
+    @property
+    def is_film(self) -> bool:
+        return self.output is not None and self.output.suffix.lower() == ".mp4"
+
+    @property
+    def is_panorama(self) -> bool:
+        return self.projection == "equirectangular"
+
+
+@dataclass(frozen=True)
+class _Style:
+    """How pictures are drawn, beside their cameras.
+
+    Attributes:
+        background: Colour behind the gaussians; None leaves pictures transparent.
+        up: The axis that is up, for panoramas.
+    """
+
+    background: Color | None
+    fade: float | None
+    up: Axis
 
 
 def run(options: Render) -> None:
     options.view.check(options.subject)
-    is_color = all(0 <= part <= 1 for part in options.background)
-    check_usage("--background", is_color, f"three numbers from 0 to 1, got {options.background}")
-    output = check_picture_path(
-        options.output or Path(beside(options.subject).with_suffix(".png").name)
-    )
+    background = color_of(options.background)
+    output = _checked_output(options, background)
     device = _device.resolve(options.device)
-    subject, own_cameras = open_with_cameras(options.subject)
-    is_turntable = options.view.cameras is None and own_cameras is None
+    subject, own_cameras = open_subject(options.subject, show=not options.quiet)
     notes: list[str] = []
-    if is_turntable:
-        options.view.up, notes = choose_up(options.view.up, subject, None, options.subject)
+    needs_up = options.view.needs_up(own_cameras)
+    if needs_up or options.is_panorama:
+        options.view.up, notes = choose_up(options.view.up, subject, own_cameras, options.subject)
     cameras = choose_cameras(options.view, options.subject, subject, own_cameras)
+    _check_sizes(options, cameras)
     fade = options.fade
-    if fade is None and is_turntable and len(cameras) > 1:
+    is_sequence = options.is_film or (needs_up and len(cameras) > 1)
+    if fade is None and is_sequence:
         fade = DEFAULT_FADE
+    style = _Style(background, fade, options.view.up or "z")
     # The pictures of a fade are a sequence, in which the tolerance of a budget changes
     # in steps.
     renderer = Renderer(subject, color_by=options.color_by, device=device, memory=options.pool())
-    pictures = _draw(options, renderer, cameras, output, fade)
+    pictures: list[JsonObject] = []
+    drawn = _drawn(options, renderer, cameras, style, pictures)
+    if options.is_film:
+        write_video(output, (image.color for image in drawn), fps=options.fps)
+    else:
+        _write_pictures(
+            picture_paths(output, cameras), drawn, pictures, is_transparent=background is None
+        )
+    _print(options, pictures, notes, output)
+
+
+def _print(options: Render, pictures: list[JsonObject], notes: list[str], output: Path) -> None:
     columns = [
         Column("picture", "{picture}"),
         Column("size", "{width} x {height}"),
@@ -86,35 +131,107 @@ def run(options: Render) -> None:
         Column("select ms", "{select_ms:.1f}"),
         Column("draw ms", "{draw_ms:.1f}"),
     ]
-    result = {"subject": shown(options.subject), "pictures": pictures}
-    print_result(result, [*table_lines(columns, pictures), *notes], as_json=options.json)
+    result: JsonObject = {"subject": shown(options.subject), "pictures": pictures}
+    lines = table_lines(columns, pictures)
+    if options.is_film:
+        result["film"] = str(output)
+        seconds = len(pictures) / options.fps
+        size = "{width} x {height}".format_map(pictures[0])
+        lines = [f"{output}: {len(pictures)} pictures of {size}, {seconds:.1f} s"]
+    print_result(result, [*lines, *notes], as_json=options.json)
 
 
-def _draw(
+def _checked_output(options: Render, background: Color | None) -> Path:
+    """Return the file to write, which can be written. Options that do not go with it
+    are refused before anything is read."""
+    output = options.output or Path(f"{subject_name(options.subject)}.png")
+    check_output(output, options.subject)
+    check_usage("--fps", 1 <= options.fps <= 1000, f"1 to 1000, got {options.fps}")
+    if options.is_panorama:
+        width, height = options.view.size
+        fits = width == 2 * height and width >= 8
+        advice = "--size 2048 1024 is one"
+        check_usage("--size", fits, f"twice the height as width, got {width} x {height}; {advice}")
+    if options.is_film:
+        check_usage("--background", background, "a colour for a film, got none")
+        _extras.load("av")
+        _files.make_folder(output)
+        _files.status_of_replaced(output)
+    else:
+        output = check_picture_path(output)
+        is_png = output.suffix.lower() == ".png"
+        check_usage("--background", background or is_png, f"a .png for none, got {output}")
+        _files.make_folder(output)
+    return output
+
+
+def _check_sizes(options: Render, cameras: Mapping[str, Camera]) -> None:
+    """Refuse pictures of which no film can be made."""
+    if options.is_panorama:
+        check_size("--size", *options.view.size)
+    if not options.is_film:
+        return
+    sizes = {(camera.width, camera.height) for camera in cameras.values()}
+    if options.is_panorama:
+        sizes = {options.view.size}
+    width, height = min(sizes)
+    fits = len(sizes) == 1 and width % 2 == 0 and height % 2 == 0
+    texts = ", ".join(f"{width} x {height}" for width, height in sorted(sizes)[:3])
+    expected = f"pictures of one size for a film, with even sides, got {texts}"
+    check_usage(str(options.output), fits, expected)
+
+
+def _drawn(
     options: Render,
     renderer: Renderer,
     cameras: Mapping[str, Camera],
-    output: Path,
-    fade: float | None,
-) -> list[JsonObject]:
-    """Draw and write the picture of each camera; returns their descriptions."""
-    views = list(zip(picture_paths(output, cameras), cameras.items(), strict=True))
-    show = len(views) > 1 and not options.quiet
+    style: _Style,
+    pictures: list[JsonObject],
+) -> Iterator[Image]:
+    """Draw the picture of each camera, and append its description to `pictures`."""
+    show = len(cameras) > 1 and not options.quiet
     cut = CutOptions(
-        tolerance=options.tolerance, budget=options.budget, min_level=options.min_level, fade=fade
+        tolerance=options.tolerance,
+        budget=options.budget,
+        min_level=options.min_level,
+        fade=style.fade,
     )
-    pictures: list[JsonObject] = []
-    for path, (name, camera) in counted(views, len(views), "render", show):
+    background = style.background or (0.0, 0.0, 0.0)
+    faces: list[RenderedImage] = []
+
+    def draw(camera: Camera) -> RenderedImage:
         renderer.settle(camera, **cut)
-        image = renderer.render(camera, **cut, background=options.background)
-        write_picture(path, _device.to_host(image.color))
-        picture: JsonObject = {
-            "picture": str(path),
-            "camera": name,
-            "width": camera.width,
-            "height": camera.height,
-            **image.stats._asdict(),
-        }
-        picture["tolerance"] = finite(image.stats.tolerance)
-        pictures.append(picture)
-    return pictures
+        image = renderer.render(camera, **cut, background=background)
+        faces.append(image)
+        return image
+
+    for name, camera in counted(cameras.items(), len(cameras), "render", show):
+        faces.clear()
+        image: Image
+        if options.is_panorama:
+            image = draw_panorama(draw, camera, direction_of(style.up), options.view.size[0])
+        else:
+            image = draw(camera)
+        height, width = image.alpha.shape
+        picture: JsonObject = {"camera": name, "width": width, "height": height}
+        pictures.append({**picture, **_costs(faces)})
+        yield image
+
+
+def _costs(faces: list[RenderedImage]) -> JsonObject:
+    """Return the costs of a picture; for a panorama, they are sums over its six
+    faces."""
+    stats = [face.stats for face in faces]
+    costs: JsonObject = stats[0]._asdict()
+    for name in ("gaussians_selected", "gaussians_in_frustum", "select_ms", "draw_ms"):
+        costs[name] = sum(getattr(face, name) for face in stats)
+    costs["tolerance"] = finite(max(face.tolerance for face in stats))
+    return costs
+
+
+def _write_pictures(
+    paths: list[Path], images: Iterator[Image], pictures: list[JsonObject], *, is_transparent: bool
+) -> None:
+    for path, image in zip(paths, images, strict=True):
+        image.save(path, transparent=is_transparent)
+        pictures[-1]["picture"] = str(path)

@@ -17,20 +17,26 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from v3dg._start import SIGNALS
-from v3dg._urls import beside, shown
+from v3dg._urls import is_url, shown
 from v3dg.cameras import Axis
 from v3dg.cli._common import (
+    Color,
     Cut,
     Flag,
     OnPool,
+    UsageError,
     check_usage,
+    color_of,
+    open_subject,
     option,
     print_result,
     require_subject,
     tell,
 )
 from v3dg.cli._views import CameraFile, lines_of_up
-from v3dg.opening import open_with_cameras
+from v3dg.gaussians import Gaussians
+from v3dg.io import subject_name
+from v3dg.scene import Subject
 from v3dg.upright import ASSUMED, direction_of, up_of
 
 if TYPE_CHECKING:
@@ -55,6 +61,9 @@ class View(CameraFile, Cut, OnPool):
     no_browser: Flag = False
     """Do not open a browser. It is also not opened over ssh, without a display, or if
     other machines can connect."""
+    background: Annotated[Color | str, tyro.conf.arg(metavar="R G B|COLOR")] = (0.0, 0.0, 0.0)
+    """Background at first: red, green and blue from 0 to 1, or a colour such as white
+    or #87ceeb."""
     up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
     """The axis that is up at first; by default the one in the file, or a guess from it
     or its cameras."""
@@ -63,20 +72,19 @@ class View(CameraFile, Cut, OnPool):
 def run(options: View) -> None:
     require_subject(options.subject)
     check_usage("--port", 0 <= options.port <= 65535, f"0 to 65535, got {options.port}")
-    from v3dg.gaussians import Gaussians
     from v3dg.viewer.frame import SceneView
     from v3dg.viewer.server import Site
 
+    background = _background_of(options)
     tolerance = _tolerance_of(options)
-    subject, cameras = open_with_cameras(options.subject)
+    subject, cameras = open_subject(options.subject, show=not options.quiet)
     cameras = options.read() or cameras
     photographs = _photographs(options.cameras, cameras or {})
-    expected = f"a bundle or a scene, got the asset {shown(options.subject)}; build a bundle of it"
-    check_usage("--budget", options.budget is None or not isinstance(subject, Gaussians), expected)
+    _check_budget(options, subject)
     up = options.up
     reason = ""
     if up is None:
-        up, reason = up_of(subject, cameras, options.subject)
+        up, reason = up_of(subject, cameras)
     scene_view = SceneView(subject, device=options.device, memory=options.pool())
     # Imported early because it takes long; the site reports errors.
     with contextlib.suppress(ImportError):
@@ -84,15 +92,17 @@ def run(options: View) -> None:
     with _interrupts() as interrupts:
         site = Site(
             scene_view,
-            name=beside(options.subject).stem,
+            name=subject_name(options.subject),
             cameras=cameras,
             photographs=photographs,
             host=options.host,
             port=options.port,
             tolerance=tolerance,
             budget=options.budget,
+            background=background,
             up=direction_of(up),
             asks_up=reason == ASSUMED,
+            edits_folder=_folder_of(options.subject),
         )
         try:
             _announce(options, site, lines_of_up(options.subject, up, reason))
@@ -103,9 +113,29 @@ def run(options: View) -> None:
     raise KeyboardInterrupt
 
 
+def _check_budget(options: View, subject: Subject) -> None:
+    """Refuse a budget for an asset, which is drawn whole."""
+    expected = f"a bundle or a scene, got the asset {shown(options.subject)}; build a bundle of it"
+    check_usage("--budget", options.budget is None or not isinstance(subject, Gaussians), expected)
+
+
+def _background_of(options: View) -> Color:
+    background = color_of(options.background)
+    if background is None:
+        raise UsageError("--background: expected a colour, got none")
+    return background
+
+
+def _folder_of(subject: Path) -> Path | None:
+    """The folder of a local file."""
+    if is_url(subject):
+        return None
+    return subject.absolute().parent
+
+
 def _tolerance_of(options: View) -> float:
-    """The tolerance to begin with; UsageError or ValueError for one that is not
-    finite, or a wrong budget."""
+    """Return the tolerance to begin with; UsageError or ValueError if it is not finite,
+    or the budget is wrong."""
     from v3dg.select import DEFAULT_TOLERANCE, rule_of
 
     tolerance = options.tolerance
@@ -130,8 +160,8 @@ def _announce(options: View, site: "Site", notes: list[str]) -> None:
 
 
 def _has_browser() -> bool:
-    """Whether to open a browser: not over ssh, on the wrong machine, nor a text browser
-    without a display."""
+    """Return whether to open a browser: not over ssh, where it would open on the other
+    machine, and no text browser without a display."""
     if "SSH_CONNECTION" in os.environ:
         return False
     has_display = any(os.environ.get(name) for name in ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY"))
@@ -139,8 +169,8 @@ def _has_browser() -> bool:
 
 
 def _photographs(cameras: Path | None, names: Iterable[str]) -> dict[str, Path]:
-    """The photographs of cameras by name, beside the file of the cameras or in a folder
-    `images` near it."""
+    """Return the photographs of cameras by name, beside the file of the cameras or in a
+    folder `images` near it."""
     if cameras is None:
         return {}
     folder = cameras

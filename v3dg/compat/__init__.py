@@ -1,1 +1,1 @@
-"""Stand-ins for functions of other packages, with their arguments and results."""
+"""Replacements for functions of other packages, with the same arguments and results."""

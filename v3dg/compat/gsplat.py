@@ -28,7 +28,7 @@ from v3dg.rasterize import (
 if TYPE_CHECKING:
     import torch
 
-Info: TypeAlias = dict[str, Any]  # gsplat's dict, of tensors and numbers
+Info: TypeAlias = dict[str, Any]  # gsplat's dict has tensors and numbers
 
 _LOCATED = (
     "means2d",
@@ -41,8 +41,8 @@ _LOCATED = (
     "is_seen",
 )
 _FARTHEST = 1e10
-_IGNORED = {"tile_size", "channel_chunk", "segmented"}  # they only affect how gsplat computes
-# Arguments of gsplat that are not supported, and what to do instead.
+_IGNORED = {"tile_size", "channel_chunk", "segmented"}  # these only affect how gsplat computes
+# Unsupported arguments of gsplat, and what to use instead.
 _UNSUPPORTED = {
     "camera_model": "undistort the pictures first",
     "radial_coeffs": "undistort the pictures first",
@@ -82,9 +82,9 @@ def rasterization(
     rasterize_mode: str = "classic",
     **options: object,
 ) -> tuple[torch.Tensor, torch.Tensor, Info]:
-    """Draw N gaussians for C cameras, as the function of this name in gsplat 1.5 does.
+    """Draw N gaussians for C cameras, like the function of this name in gsplat 1.5.
 
-    Takes torch tensors that are float32, or on the CPU all float64.
+    The tensors must be float32 or, on the CPU, all float64.
 
     Args:
         means: (N, 3).
@@ -99,10 +99,10 @@ def rasterization(
         height: Height of the pictures in px.
         near_plane: Gaussians nearer than this are not drawn.
         far_plane: Gaussians farther than this are not drawn.
-        radius_clip: Gaussians with a radius of at most so many px are not drawn.
+        radius_clip: Gaussians with a radius of at most this many px are not drawn.
         eps2d: Variance of the low-pass filter in px².
         sh_degree: Degree of the coefficients in `colors`; None for colours.
-        packed: Whether the dict has only the pairs of camera and gaussian in sight.
+        packed: Whether the dict has only the visible pairs of camera and gaussian.
         backgrounds: (C, 3) colours; black if None.
         render_mode: "RGB", "D", "ED", "RGB+D" or "RGB+ED", where D is depth and ED
             expected depth.
@@ -110,14 +110,15 @@ def rasterization(
         rasterize_mode: "classic", or "antialiased" to compensate opacities for the
             filter.
         options: The other arguments of gsplat. `tile_size`, `channel_chunk` and
-            `segmented` only affect how gsplat computes and are ignored. The rest must
+            `segmented` only affect how gsplat computes and are ignored. The others must
             have a value that turns them off.
 
     Returns:
         Pictures (C, H, W, D), alphas (C, H, W, 1), and a dict: `means2d`, `depths`,
-        `conics`, `opacities` and `radii`, (C, N, ...) or if `packed` of the pairs in
-        sight, with their `camera_ids` and `gaussian_ids`; `width`, `height`,
-        `n_cameras`. `means2d` takes gradients, and has `.absgrad` with `absgrad`.
+        `conics`, `opacities` and `radii`, which are (C, N, ...) or, if `packed`, have a
+        row per visible pair, with `camera_ids` and `gaussian_ids`; `width`, `height`,
+        `n_cameras`. `means2d` receives gradients, and has `.absgrad` if `absgrad` is
+        set.
 
     Raises:
         ValueError: A shape or a value is wrong, or is not supported.
@@ -143,7 +144,7 @@ def rasterization(
 
 
 def _check_tensors(tensors: Mapping[str, torch.Tensor]) -> None:
-    """Raise TypeError unless all are tensors, on a device that can draw."""
+    """Raise TypeError unless all arguments are tensors on a device that can draw."""
     for name, value in tensors.items():
         if not hasattr(value, "requires_grad"):
             raise TypeError(f"{name}: expected a torch tensor, got {type(value).__name__}")
@@ -159,7 +160,7 @@ def rasterization_2dgs(*arguments: object, **options: object) -> NoReturn:
 
 @dataclass
 class _Look:
-    """The arguments of a call that say how to draw, by gsplat's names."""
+    """The arguments of a call that affect drawing, by gsplat's names."""
 
     near_plane: float
     far_plane: float
@@ -195,8 +196,8 @@ class _Look:
 
 
 def _check_unsupported(options: dict[str, object]) -> None:
-    """Raise for arguments that gsplat does not have, and for values that v3dg does not
-    support."""
+    """Raise errors for arguments that gsplat does not have, and for values that v3dg
+    does not support."""
     for name in options.keys() - _IGNORED:
         if name not in _UNSUPPORTED:
             raise TypeError(
@@ -225,7 +226,8 @@ def _cameras(
 def _sh_of_views(
     look: _Look, colors: torch.Tensor, num_cameras: int, means: torch.Tensor
 ) -> list[torch.Tensor]:
-    """The sh (N, K, 3) that the core takes: one for all cameras, or one for each."""
+    """Return the sh (N, K, 3) for the core: one array for all cameras, or one per
+    camera."""
     count = len(means)
     if not look.has_color:
         return [means.new_zeros(count, 1, 3)]
@@ -244,7 +246,7 @@ def _sh_of_views(
 
 
 def _background_of_views(look: _Look, num_cameras: int, dtype: torch.dtype) -> list[torch.Tensor]:
-    """Colours (3,): black for all cameras, or one for each."""
+    """Return colours (3,): black for all cameras, or one colour per camera."""
     import torch
 
     if look.backgrounds is None or not look.has_color:
@@ -261,8 +263,8 @@ def _draw(
     colors: torch.Tensor,
     size: tuple[int, int],
 ) -> tuple[torch.Tensor, torch.Tensor, Info]:
-    """Pictures, alphas and the dict of gsplat; ``shape`` is means, quats, scales and
-    opacities, ``size`` the width and the height in px."""
+    """Return pictures, alphas and the dict of gsplat; ``shape`` is means, quats, scales
+    and opacities, ``size`` is width and height in px."""
     *geometry, opacity = (tensor.contiguous() for tensor in shape)
     gradient = CenterGradient()
     located = _locate()(look, cameras, gradient, *geometry, opacity)
@@ -298,7 +300,7 @@ def _draw(
 def _picture(
     look: _Look, color: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor | None
 ) -> torch.Tensor:
-    """(H, W, D) the channels that the render mode asks for."""
+    """Return (H, W, D) the channels that the render mode requests."""
     import torch
 
     if depth is None:
@@ -311,7 +313,8 @@ def _picture(
 
 
 class _Context(Protocol):
-    """The object that torch passes to both passes of a `torch.autograd.Function`."""
+    """The object that torch passes to the forward and backward pass of a
+    `torch.autograd.Function`."""
 
     gradient: CenterGradient
 
@@ -321,12 +324,12 @@ class _Context(Protocol):
 
 @functools.cache
 def _locate() -> Callable[..., tuple[torch.Tensor | None, ...]]:
-    """The operation that locates gaussians on the images, whose results are the tensors
-    of the dict.
+    """Return the operation that projects gaussians onto the images; its results are the
+    tensors of the dict.
 
     The gradient of a picture reaches the gaussians through the picture; `means2d` only
-    shows it to training strategies. A loss on `means2d` or `depths` would therefore be
-    lost, and is refused.
+    reports it to training strategies. A loss on `means2d` or `depths` would therefore
+    have no effect, and raises an error.
     """
     import torch
 
@@ -377,8 +380,8 @@ def _located(
     scales: torch.Tensor,
     opacities: torch.Tensor,
 ) -> tuple[list[torch.Tensor], list[torch.Tensor | None]]:
-    """Centres, depths, conics, opacities and radii; then, where they are needed, the
-    cameras and gaussians of the pairs, and which gaussians are in sight."""
+    """Return centres, depths, conics, opacities and radii; then, if needed, the cameras
+    and gaussians of the pairs, and which gaussians are visible."""
     import torch
 
     unused_colors = means[:, None]
@@ -397,7 +400,7 @@ def _located(
 
 
 def _ellipses(rows: _core.Rows, camera: _core.Camera, look: _Look) -> tuple[Array, ...]:
-    """Centres, depths, conics, opacities and radii of gaussians on an image."""
+    """Return centres, depths, conics, opacities and radii of gaussians on an image."""
     ellipses = _core.ellipses(
         rows,
         camera,

@@ -13,7 +13,7 @@ _FILE = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 
 
 def folders_above(name: str) -> list[str]:
-    """The folders that a relative name goes through, the highest first."""
+    """Return the folders that a relative name goes through, the highest first."""
     parts = name.split("/")[:-1]
     return ["/".join(parts[: count + 1]) for count in range(len(parts))]
 
@@ -35,7 +35,8 @@ class Folder(AbstractContextManager["Folder"]):
 
     @contextmanager
     def _folder_of(self, name: str) -> Iterator[tuple[int, str]]:
-        """A descriptor of the folder that something is in, and its name there."""
+        """Yield a descriptor of the folder that contains a file or folder, and its name
+        there."""
         *folders, last = name.split("/")
         descriptor = os.dup(self.descriptor)
         try:
@@ -53,8 +54,8 @@ class Folder(AbstractContextManager["Folder"]):
             os.close(descriptor)
 
     def status(self, name: str) -> os.stat_result | None:
-        """The status of a file, a folder or a link of this name; None if there is
-        none."""
+        """Return the status of a file, a folder or a link of this name; None if there
+        is none."""
         try:
             with self._folder_of(name) as (folder, last):
                 return os.stat(last, dir_fd=folder, follow_symlinks=False)
@@ -62,8 +63,8 @@ class Folder(AbstractContextManager["Folder"]):
             return None
 
     def open_file(self, name: str) -> int:
-        """A descriptor to read a file; OSError for a link, ValueError for a folder or a
-        device."""
+        """Return a descriptor to read a file; OSError for a link, ValueError for a
+        folder or a device."""
         with self._folder_of(name) as (folder, last):
             descriptor = os.open(last, _FILE, dir_fd=folder)
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -97,7 +98,6 @@ class Folder(AbstractContextManager["Folder"]):
             os.unlink(last, dir_fd=folder)
 
     def remove_empty_folder(self, name: str) -> None:
-        """Remove a folder with nothing in it; what is not there or is in use stays as
-        it is."""
+        """Remove an empty folder; do nothing if it is missing or in use."""
         with suppress(OSError), self._folder_of(name) as (folder, last):
             os.rmdir(last, dir_fd=folder)

@@ -1,9 +1,11 @@
 """Shared code of the exports: the axis that is up, rotations, names of bundles,
 documents."""
 
+import copy
 import json
 import math
 import re
+import warnings
 from collections.abc import Collection, Iterable, Mapping
 from importlib.resources import files
 from pathlib import Path
@@ -12,56 +14,61 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg._numbers import one_of
+from v3dg import _core
 from v3dg._urls import beside
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Floats
-from v3dg.rotations import rotation_from_quaternion
+from v3dg.formats import _axes
 from v3dg.scene import Scene
+
+_MIN_OPACITY = float(np.float32(_core.min_alpha))
+"""Instances of a smaller opacity are not drawn."""
+
+
+class ExportWarning(UserWarning):
+    """A property of instances is left out, because a format cannot hold it."""
+
 
 _OTHER_LETTERS = re.compile("[^A-Za-z0-9]")  # than names of folders have
 
-# Quaternions w x y z that turn an axis to -y, which is up where y is down, as viewers
-# take it.
-_HALF = math.sqrt(0.5)
-_TO_UPRIGHT: dict[Axis, tuple[float, float, float, float]] = {
-    "x": (_HALF, 0.0, 0.0, -_HALF),
-    "y": (0.0, 1.0, 0.0, 0.0),
-    "z": (_HALF, _HALF, 0.0, 0.0),
-    "-x": (_HALF, 0.0, 0.0, _HALF),
-    "-y": (1.0, 0.0, 0.0, 0.0),
-    "-z": (_HALF, -_HALF, 0.0, 0.0),
-}
-# Rotations from that frame to one with y up, as in WebGL, and to one with z up, as on a
-# globe.
-_FROM_UPRIGHT = {
-    "y": np.diag([-1.0, -1.0, 1.0]),
-    "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
-}
-
-
-def turn_upright(up: Axis) -> Floats:
-    """(4,) w x y z that turns what is up in an asset to -y; ValueError for another
-    name."""
-    one_of(up, "up", tuple(_TO_UPRIGHT))
-    return np.array(_TO_UPRIGHT[up])
+# The axes of a world of which this axis is up: y as in WebGL, z as on a globe.
+_WORLDS = {"y": _axes.GLTF, "z": _axes.Z_UP}
 
 
 def rotation_to(up: Axis, frame: Literal["y", "z"]) -> Floats:
-    """(3, 3) rotation that turns what is up to an axis."""
-    return np.asarray(_FROM_UPRIGHT[frame] @ rotation_from_quaternion(turn_upright(up))) + 0.0
+    """Return the (3, 3) rotation that turns the axis that is up to another axis."""
+    return _axes.turn(_axes.axes_of_up(up), _WORLDS[frame])
+
+
+def exported(scene: Scene, format_name: str) -> Scene:
+    """Return the instances of a scene that are drawn, for a format without opacity and
+    tint; warn if any has one."""
+    if scene.factors is None:
+        return scene
+    visible = copy.copy(scene)
+    visible.remove(np.flatnonzero(visible.opacity < _MIN_OPACITY))
+    factors = visible.factors
+    if factors is not None:
+        count = int((factors != 1).any(axis=1).sum())
+        warnings.warn(
+            f"{format_name} cannot hold the opacity and tint of instances; those of {count:,} are "
+            "left out",
+            ExportWarning,
+            stacklevel=3,
+        )
+    return visible
 
 
 def names_of(scene: Scene, reserved: Collection[str] = ()) -> list[str]:
-    """The name of a folder for each bundle, made from that of its file; no reserved
+    """Return a folder name for each bundle, made from the name of its file; no reserved
     name is used."""
     stems = [beside(bundle.path or "bundle").stem[:80] for bundle in scene.bundles]
     return distinct([_OTHER_LETTERS.sub("_", stem) for stem in stems], reserved)
 
 
 def distinct(names: Iterable[str], reserved: Collection[str] = ()) -> list[str]:
-    """The names with a number added to each that is reserved or repeats an earlier one,
-    whatever its case."""
+    """Return the names, with a number added to each that is reserved or repeats an
+    earlier one in upper or lower case."""
     results: list[str] = []
     used = {name.casefold() for name in reserved}
     for number, name in enumerate(names):
@@ -75,14 +82,15 @@ def distinct(names: Iterable[str], reserved: Collection[str] = ()) -> list[str]:
 
 
 def rows_by(numbers: NDArray[np.int32] | NDArray[np.int64], count: int) -> list[NDArray[np.intp]]:
-    """The rows that have each of the numbers 0 to `count` - 1, in ascending order."""
+    """Return for each number from 0 to `count` - 1 the rows that have it, in ascending
+    order."""
     order = np.argsort(numbers, kind="stable")
     return np.split(order, np.searchsorted(numbers[order], np.arange(count + 1)))[1:-1]
 
 
 def detail_of(bundle: Bundle) -> dict[str, float]:
-    """The distances of levels: level 1 is enough from `reach` times the focal length in
-    px over √tolerance.
+    """Return from which distances levels are fine enough: for level 1 it is `reach`
+    times the focal length in px, divided by √tolerance.
 
     Each further level is enough from `ratio` times the distance of the one before it.
     """
@@ -105,7 +113,7 @@ def write_document(path: Path, document: Mapping[str, object]) -> None:
 
 
 def write_page(folder: Path, name: str) -> None:
-    """The page of an export, which the package has by that name."""
+    """Write the page of an export, a copy of the package's file of that name."""
     (folder / "index.html").write_bytes(files("v3dg.export").joinpath(name).read_bytes())
 
 

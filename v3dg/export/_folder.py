@@ -2,10 +2,10 @@
 changed.
 
 New files are written to `new` in a hidden folder inside, so that all moves stay within
-one file system. Once they are complete, the record of them is written beside `new`,
-what they replace goes to `old`, and they take its place; the move of the record ends
-it. Until then everything can be moved back: on an error at once, and after a kill when
-the next export begins.
+one file system. Once they are complete, their record is written beside `new`, the files
+that they replace move to `old`, and they move into place; moving the record completes
+the export. Until then everything can be moved back: after an error at once, and after a
+kill when the next export begins.
 """
 
 import contextlib
@@ -73,8 +73,8 @@ def replacing_export(
     """Give a folder to fill; at the end its files take the place of those of an earlier
     export.
 
-    The folder itself stays, with its permissions. On a failure it is as it was, and
-    where it was not there, it is not there.
+    The folder itself stays, with its permissions. After an error, its content is as
+    before; a folder that did not exist is removed again.
 
     Args:
         folder: The folder to write; a link to a folder stays a link.
@@ -122,8 +122,8 @@ def _restore_and_remove(root: Folder, hidden: str, folder: Path) -> None:
 
 @contextlib.contextmanager
 def _made(folder: Path) -> Iterator[Path]:
-    """The folder without links, made with those above it, which are gone again on a
-    failure if empty."""
+    """Make the folder and those above it, and yield its path without links. After an
+    error, those that were made are removed if they are empty."""
     target = Path(os.path.realpath(folder))
     missing = [path for path in (target, *target.parents) if not path.exists()]  # the lowest first
     try:

@@ -61,8 +61,8 @@ class Record:
 
     @classmethod
     def of_files_below(cls, path: Path) -> "Record":
-        """The record of all files below a folder that nobody else writes to; without
-        folders.
+        """Return the record of all files, without folders, below a folder to which
+        nobody else writes.
 
         Files that others refer to come last.
         """
@@ -77,7 +77,7 @@ class Record:
         return json.dumps(document, separators=(",", ":")).encode("ascii")
 
     def unchanged(self, root: Folder, prefix: str = "") -> dict[str, Stamp]:
-        """The files below `prefix` whose content is unchanged since they were
+        """Return the files below `prefix` whose content is unchanged since they were
         written."""
         stamps: dict[str, Stamp] = {}
         for name, content in self.files.items():
@@ -130,8 +130,8 @@ def read_record(root: Folder, name: str, display_path: Path) -> Record | None:
 
 
 def _checked_name(node: Node, pattern: re.Pattern[str]) -> str:
-    """A name that an export can have written; others lead elsewhere, or to what is not
-    ours."""
+    """Return a name that an export can have written; ValueError for others, which may
+    lead out of the folder or to files of others."""
     name = node.value
     if not isinstance(name, str) or not pattern.fullmatch(name) or name == RECORD:
         raise node.error(
@@ -151,8 +151,8 @@ def _content_of_node(node: Node) -> Content:
 
 
 def stamp_of_content(root: Folder, name: str, content: Content) -> Stamp | None:
-    """The stamp of a file that holds just this; None for any other, or what cannot be
-    read."""
+    """Return the stamp of a file with exactly this content; None for other content, or
+    if the file cannot be read."""
     try:
         descriptor = root.open_file(name)
     except (OSError, ValueError):
@@ -169,7 +169,7 @@ def stamp_of_status(status: os.stat_result) -> Stamp:
 
 
 def is_file(status: os.stat_result) -> bool:
-    """Whether a status is that of a regular file, and not of a link."""
+    """Return whether a status is that of a regular file, and not that of a link."""
     return stat.S_ISREG(status.st_mode)
 
 
@@ -179,7 +179,7 @@ def _content_of_path(path: Path) -> Content:
 
 
 def _digest_of(file: io.FileIO) -> str:
-    """The hash of all that is left to read."""
+    """Return the hash of all that is left to read."""
     state = hashlib.blake2b(digest_size=_HASH_BYTES)
     while piece := file.read(_PIECE_BYTES):
         state.update(piece)
@@ -187,7 +187,7 @@ def _digest_of(file: io.FileIO) -> str:
 
 
 def folders_of(names: Iterable[str]) -> list[str]:
-    """The folders that files are in, the highest first."""
+    """Return the folders that files are in, the highest first."""
     return sorted(
         {name[:end] for name in names for end, letter in enumerate(name) if letter == "/"}
     )

@@ -58,7 +58,7 @@ class ChunkErrors:
 
 
 def _cameras_around(gaussians: Gaussians) -> list[Camera]:
-    """Cameras on four sides that show most of the gaussians."""
+    """Return cameras on four sides that show most of the gaussians."""
     centre, radius = ball_of_most(gaussians.means.astype(np.float64))
     distance = max(radius, 1e-6) / np.sin(_FOV / 2)
     return [

@@ -23,13 +23,17 @@ from v3dg.cameras import Axis, Camera, Floats, check_cameras
 from v3dg.export import _common
 from v3dg.export._folder import NewFiles, check_outside, replacing_export
 from v3dg.export.streamed_sog import DEFAULT_CHUNK, INDEX, SETTINGS, Export, Plan, write_levels
+from v3dg.framing import frame_subject
 from v3dg.opening import File, open_with_cameras
+from v3dg.rotations import turn_upright
 from v3dg.scene import Scene, Subject
 from v3dg.select import DEFAULT_TOLERANCE
-from v3dg.upright import up_of
+from v3dg.upright import direction_of, up_of
 
 SITE = "site.json"
 ENGINE = "playcanvas.min.mjs"
+# Width over height of windows for which first views are framed.
+_START_ASPECTS = (0.4, 0.5, 0.6, 0.75, 1.0, 4 / 3, 16 / 9, 2.4)
 SITE_NEEDS = "npm install playcanvas@2.23.3", f"cp node_modules/playcanvas/build/{ENGINE} {{}}/"
 """Commands that bring PlayCanvas's engine, in the version that the page is tested with,
 to a folder."""
@@ -71,8 +75,9 @@ def write_site(
     once all is written.
 
     The levels of a bundle alone are in the folder itself, those of a scene's bundles in
-    folders of their own. PlayCanvas's engine is that of the folder, or taken from
-    `node_modules` here or above.
+    folders of their own. Opacity and tint of instances are left out with a warning.
+    PlayCanvas's engine is that of the folder, or taken from `node_modules` here or
+    above.
 
     Args:
         subject: A scene or a bundle, or its file; the file of a scene may also have
@@ -100,9 +105,10 @@ def write_site(
     cameras = cameras or {}
     check_cameras(cameras)
     scene = Scene.of(cast(Scene | Bundle, content))  # refuses anything else
+    scene = _common.exported(scene, "the web page")
     is_scene = isinstance(content, Scene)
     axes = _axes(up or up_of(cast(Subject, content), cameras)[0], is_scene=is_scene)
-    turn = _common.turn_upright(axes.asset)
+    turn = turn_upright(axes.asset)
     check("scene", len(scene), "instances to export, got none")
     plans = [Plan.of(bundle, chunk) for bundle in scene.bundles]
     names = ["."]
@@ -131,8 +137,8 @@ class _Axes(NamedTuple):
 
 
 def _axes(up: Axis, *, is_scene: bool) -> _Axes:
-    """A bundle alone is turned to what viewers take to be up; a scene's stay as its
-    instances have them."""
+    """Return the axes of the files: a single bundle is turned so that the axis that
+    viewers expect is up; bundles of a scene stay as its instances place them."""
     if is_scene:
         return _Axes(asset="-y", files=up, cameras=up)
     return _Axes(asset=up, files="-y", cameras=up)
@@ -144,7 +150,7 @@ def _write_bundles(
     """Write the levels of each bundle to the folder of its name, which is made unless
     it is `.`."""
     levels: list[Export] = []
-    with Bar(sum(plan.bundle.num_gaussians for plan in plans), "export", progress) as bar:
+    with Bar(sum(plan.num_gaussians for plan in plans), "export", progress) as bar:
         for name, plan in zip(names, plans, strict=True):
             (folder / name).mkdir(exist_ok=True)
             levels.append(write_levels(plan, folder / name, turn, bar.update))
@@ -154,7 +160,7 @@ def _write_bundles(
 def _document(
     scene: Scene, bundles: list[dict[str, object]], axes: _Axes, cameras: Mapping[str, Camera]
 ) -> dict[str, object]:
-    """The document that the page reads first."""
+    """Return the document that the page reads first."""
     return {
         "version": 1,
         "tolerance": DEFAULT_TOLERANCE,
@@ -165,18 +171,41 @@ def _document(
         "bundles": bundles,
         "instances": _instances(scene),
         "cameras": [_camera(name, camera) for name, camera in cameras.items()],
+        "start": _start_views(scene, axes.cameras),
     }
+
+
+def _start_views(scene: Scene, up: Axis) -> list[dict[str, object]]:
+    """Return the first views of a page without cameras, for windows from narrow to
+    wide."""
+    framing = frame_subject(scene)
+    views = []
+    for aspect in _START_ASPECTS:
+        camera = framing.camera(direction_of(up), round(1000 * aspect), 1000)
+        views.append({"aspect": aspect, **_camera("start", camera)})
+    return views
 
 
 def _bundle(name: str, plan: Plan, levels: Export) -> dict[str, object]:
     url = INDEX
     if name != ".":
         url = f"{name}/{INDEX}"
-    return {"url": url, "counts": levels.counts, **_common.detail_of(plan.bundle)}
+    detail = _common.detail_of(plan.bundle)
+    if plan.bundle.num_levels == 1:
+        detail["reach"] = _reach_of_half(plan.bundle)
+    return {"url": url, "counts": levels.counts, **detail}
+
+
+def _reach_of_half(bundle: Bundle) -> float:
+    """Return the `reach` of `detail_of` for the level to which a chunk of all gaussians
+    is halved."""
+    corners = bundle.clusters.box[np.diff(bundle.clusters.offset) > 0].reshape(-1, 3)
+    radius = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0))) / 2
+    return radius * math.sqrt(math.pi * 2 / (bundle.num_gaussians + 1))
 
 
 def _instances(scene: Scene) -> dict[str, list[int] | list[float]]:
-    """Columns, in a few digits more than float32 has."""
+    """Return the columns of the instances, with a few more digits than float32 has."""
     columns: dict[str, list[int] | list[float]] = {"bundle": scene.instance_bundle.tolist()}
     for name in ("positions", "quaternions", "scales", "importance"):
         values = getattr(scene, name).ravel().tolist()

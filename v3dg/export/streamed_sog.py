@@ -2,17 +2,19 @@
 PlayCanvas and SuperSplat.
 
 The asset is cut into chunks, which are subtrees of the bundle, and a viewer chooses a
-level for each. Up to the level at which a single group is left of a chunk, any choice
-is a cut of the bundle; of coarser levels a chunk has the gaussians that are nearest to
-it. Chunks of one level are stored side by side in folders of SOG, and `lod-meta.json`
-says which gaussians of which folder they are.
+level for each. Any choice is a cut without gaps: up to the level at which a single
+group is left of a chunk its levels are those of the bundle, and above it every chunk is
+halved alone. No level of a chunk is empty: PlayCanvas's engine may keep drawing a finer
+level in place of an empty one. Chunks of one level are stored side by side in folders
+of SOG, and `lod-meta.json` says which gaussians of which folder they are.
 """
 
+import functools
 import json
 import math
 import os
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple, TypeAlias, TypedDict
@@ -30,18 +32,19 @@ from v3dg.cleaning import ball_of_most
 from v3dg.export import _common
 from v3dg.export._folder import replacing_export
 from v3dg.export.chunk_errors import ChunkErrors
+from v3dg.export.chunk_levels import LevelFilter, halved_levels, num_halvings
 from v3dg.formats import sog
 from v3dg.formats._packing import check_writable
 from v3dg.gaussians import Gaussians
 from v3dg.opening import File, opened
-from v3dg.rotations import rotation_from_quaternion
+from v3dg.rotations import rotation_from_quaternion, turn_upright
 from v3dg.scene import Scene
 from v3dg.upright import up_of
 
 INDEX = "lod-meta.json"
 SETTINGS = "settings.json"
 DEFAULT_CHUNK = 16384
-# A folder is filled chunk by chunk until it holds so many gaussians: about a megabyte
+# A folder is filled chunk by chunk until it holds this many gaussians: about a megabyte
 # to load at once.
 _FOLDER_GAUSSIANS = 1 << 17
 _FOV_DEGREES = 50.0  # vertical, of the camera that a viewer starts with
@@ -129,8 +132,7 @@ def write_streamed_sog(
             Missing parent folders are created. `v3dg-export.json` in it lists the
             written files, and only those are replaced or removed by a later export.
         chunk: Most gaussians of the asset in a chunk. Smaller chunks follow the view
-            more closely, and fewer of their levels go together exactly, whichever each
-            of them has.
+            more closely; the least that a viewer can draw is a gaussian of each.
         up: The axis that is up in the asset, which is turned to the axis that viewers
             take for up. Most trained assets have y down and are not turned.
         progress: See `v3dg.build_bundle`.
@@ -148,11 +150,11 @@ def write_streamed_sog(
     """
     content = opened(bundle)
     plan = Plan.of(content, chunk)
-    turn = _common.turn_upright(up or up_of(content)[0])
+    turn = turn_upright(up or up_of(content)[0])
     certain = (INDEX, SETTINGS)
     with (
         replacing_export(Path(folder), Scene.of(content), certain, overwrite=overwrite) as new,
-        Bar(plan.bundle.num_gaussians, "export", progress) as bar,
+        Bar(plan.num_gaussians, "export", progress) as bar,
     ):
         return write_levels(plan, new.path, turn, bar.update)
 
@@ -190,12 +192,12 @@ def _write_folders(
     leaves: list[_Leaf] = [
         {"lods": {}, "errors": errors.of_chunk[number]} for number in range(plan.num_chunks)
     ]
-    counts = [0] * plan.bundle.num_levels
-    for level in range(plan.bundle.num_levels):
+    counts = [0] * plan.num_levels
+    for level, all_parts in enumerate(plan.levels()):
         num_earlier = len(names)
         parts: list[Gaussians] = []
         size = 0
-        for number, part in enumerate(plan.parts(level)):
+        for number, part in enumerate(all_parts):
             chunk = check_writable(part).transform(turn)
             errors.add(number, chunk)
             leaves[number]["lods"][str(level)] = {
@@ -224,8 +226,8 @@ def _write_sog(folder: Path, gaussians: Gaussians) -> None:
 
 
 def _viewer_settings(gaussians: Gaussians) -> dict[str, object]:
-    """The settings of SuperSplat's viewer: a camera that shows most of the asset, and
-    no effects."""
+    """Return the settings of SuperSplat's viewer: a camera that shows most of the
+    asset, and no effects."""
     # Viewers have y up and turn an asset, whose y is taken to be down, by half a turn
     # about z.
     centre, radius = ball_of_most(gaussians.means.astype(np.float64) * (-1.0, -1.0, 1.0))
@@ -253,6 +255,7 @@ class Plan:
     num_chunks: int
     chunk_of_cluster: NDArray[np.int64]
     chunk_of_group: NDArray[np.int64]
+    _clusters: dict[int, list[NDArray[np.int64]]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, bundle: Bundle, chunk: int) -> "Plan":
@@ -285,48 +288,90 @@ class Plan:
         chunk_of_cluster = np.where(clusters.level <= top, number[ancestor[group]], -1)
         return cls(bundle, top, len(tops), chunk_of_cluster, number)
 
-    def parts(self, level: int) -> Iterator[Gaussians]:
-        """Gaussians of one level, chunk by chunk."""
-        clusters = np.array(self.bundle.level_range(level))
-        if level <= self.top:
-            for ids in self.by_chunk(clusters):
-                yield Gaussians.concatenate([self.bundle.cluster_gaussians(int(c)) for c in ids])
-            return
-        gaussians = self.bundle.level_gaussians(level)
-        chunk = self._nearest_chunks(gaussians, clusters, level)
-        for number in range(self.num_chunks):
-            yield gaussians.subset(chunk == number)
+    @property
+    def num_levels(self) -> int:
+        return self.top + 1 + num_halvings(int(self._sizes[self.top].max()))
 
-    def _nearest_chunks(
-        self, gaussians: Gaussians, clusters: NDArray[np.int64], level: int
-    ) -> NDArray[np.int64]:
-        """The chunk of each gaussian of a level above `top`: the nearest one below the
-        gaussian's group."""
-        table = self.bundle.clusters
-        groups = self.bundle.groups
-        tops = np.flatnonzero(self.chunk_of_group >= 0)
-        ancestor: NDArray[np.intp] | NDArray[np.int32] = tops
-        for _ in range(level - self.top):
-            ancestor = groups.parent[ancestor]
-        sizes = np.diff(table.offset[clusters[0] : clusters[-1] + 2])
-        group_of_gaussian = np.repeat(table.own_group[clusters], sizes)
-        chunk = np.empty(len(gaussians), np.int64)
-        for group in np.unique(group_of_gaussian):
-            candidates = tops[ancestor == group]
-            rows = np.flatnonzero(group_of_gaussian == group)
-            offsets = gaussians.means[rows, None].astype(np.float64) - groups.ball[candidates, :3]
-            nearest = np.square(offsets).sum(axis=2).argmin(axis=1)
-            chunk[rows] = self.chunk_of_group[candidates[nearest]]
-        return chunk
+    @property
+    def num_gaussians(self) -> int:
+        """The number of gaussians of all levels."""
+        total = int(self._sizes.sum())
+        sizes = self._sizes[self.top]
+        for _ in range(self.top + 1, self.num_levels):
+            sizes = (sizes + 1) // 2
+            total += int(sizes.sum())
+        return total
+
+    @functools.cached_property
+    def _source(self) -> NDArray[np.int64]:
+        """(top + 1, K) the level of the bundle whose gaussians a chunk has at a level:
+        that one or, where the bundle has none there, the nearest finer one, else the
+        nearest coarser one."""
+        level = np.arange(self.top + 1)[:, None]
+        present = np.where(self._bundle_sizes > 0, level, -1)
+        finer = np.maximum.accumulate(present, axis=0)
+        coarser = np.where(self._bundle_sizes > 0, level, self.top + 1)
+        coarser = np.minimum.accumulate(coarser[::-1], axis=0)[::-1]
+        return np.where(finer >= 0, finer, np.minimum(coarser, self.top))
+
+    @functools.cached_property
+    def _bundle_sizes(self) -> NDArray[np.int64]:
+        """(top + 1, K) gaussians of the bundle in each chunk."""
+        sizes = np.zeros((self.top + 1, self.num_chunks), np.int64)
+        num_gaussians = np.diff(self.bundle.clusters.offset)
+        used = self.chunk_of_cluster >= 0
+        place = (self.bundle.clusters.level[used], self.chunk_of_cluster[used])
+        np.add.at(sizes, place, num_gaussians[used])
+        return sizes
+
+    @property
+    def _sizes(self) -> NDArray[np.int64]:
+        """(top + 1, K) gaussians that are written of each chunk."""
+        return np.take_along_axis(self._bundle_sizes, self._source, axis=0)
+
+    def levels(self) -> Iterator[Iterable[Gaussians]]:
+        """Yield the gaussians of all levels, each chunk by chunk."""
+        for level in range(self.top + 1):
+            yield self._parts(level)
+        yield from self._halved_levels()
+
+    def _parts(self, level: int) -> Iterator[Gaussians]:
+        """Yield the gaussians of a level up to `top`, chunk by chunk."""
+        for number, source in enumerate(self._source[level].tolist()):
+            clusters = self._clusters_of_level(source)[number]
+            yield Gaussians.concatenate([self.bundle.cluster_gaussians(int(c)) for c in clusters])
+
+    def _halved_levels(self) -> Iterator[list[Gaussians]]:
+        """Yield the levels above `top`; a chunk without gaussians has none there
+        either."""
+        chunks = list(self._parts(self.top))
+        used = [number for number, chunk in enumerate(chunks) if len(chunk)]
+        clusters = self.bundle.clusters
+        first = self.bundle.level_range(self.top).start
+        drawn = LevelFilter(0.0, is_compensated=False)
+        if self.top > 0:
+            is_compensated = bool(clusters.antialiased[first])
+            drawn = LevelFilter(float(clusters.filter_px2[first]), is_compensated)
+        for level in halved_levels([chunks[number] for number in used], drawn):
+            parts = [chunks[0].subset(slice(0, 0))] * len(chunks)
+            for number, part in zip(used, level, strict=True):
+                parts[number] = part
+            yield parts
+
+    def _clusters_of_level(self, level: int) -> list[NDArray[np.int64]]:
+        """Return the ids of the clusters of a level of the bundle, by chunk."""
+        if level not in self._clusters:
+            self._clusters[level] = self.by_chunk(np.array(self.bundle.level_range(level)))
+        return self._clusters[level]
 
     def by_chunk(self, clusters: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-        """Ids of clusters, by the chunk that they are in."""
+        """Return the ids of clusters, by the chunk that they are in."""
         chunks = _common.rows_by(self.chunk_of_cluster[clusters], self.num_chunks)
         return [clusters[rows] for rows in chunks]
 
     def tree(self, leaves: list[_Leaf], turn: Floats) -> _TreeNode:
-        """The spatial index: the groups above the chunks, with bounds, in boxes that
-        stay along the axes."""
+        """Return the spatial index: the groups above the chunks, with their bounds as
+        axis-aligned boxes."""
         parent = self.bundle.groups.parent
         nodes = self._leaf_nodes(leaves, turn)
         node_of_group = {
@@ -344,8 +389,8 @@ class Plan:
         return node_of_group[-1]
 
     def _leaf_nodes(self, leaves: list[_Leaf], turn: Floats) -> dict[int, _TreeNode]:
-        """The leaves with their bounds, by the numbers of those chunks that have
-        gaussians."""
+        """Return the leaves with their bounds, by the number of their chunk, for chunks
+        that have gaussians."""
         clusters = self.bundle.clusters
         used = np.flatnonzero((self.chunk_of_cluster >= 0) & (np.diff(clusters.offset) > 0))
         corners = clusters.box.astype(np.float64) @ rotation_from_quaternion(turn).T
@@ -359,7 +404,7 @@ class Plan:
 
 
 def _joined(nodes: list[_TreeNode]) -> _TreeNode:
-    """One node, or a node that bounds several."""
+    """Return the only node, or a node that bounds several."""
     if len(nodes) == 1:
         return nodes[0]
     corners: list[list[float]] = []
@@ -369,5 +414,5 @@ def _joined(nodes: list[_TreeNode]) -> _TreeNode:
 
 
 def _bound(points: ArrayLike) -> _Bound:
-    """The lowest and the highest of the coordinates of points."""
+    """Return the lowest and the highest coordinates of points."""
     return {"min": np.min(points, axis=0).tolist(), "max": np.max(points, axis=0).tolist()}

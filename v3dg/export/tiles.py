@@ -9,7 +9,7 @@ px, the usual limit, is v3dg's tolerance of 3 px².
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypedDict
@@ -97,8 +97,9 @@ def write_tiles(
     once all is written.
 
     Tiles are `.glb` files with KHR_gaussian_splatting, compressed as SPZ. The
-    importance of instances is left out. The world's origin is at that of the tiles, the
-    Earth's centre; viewers can put it elsewhere.
+    importance of instances is left out, and so are, with a warning, opacity and tint.
+    The world's origin is at that of the tiles, the Earth's centre; viewers can put it
+    elsewhere.
 
     Args:
         subject: A scene or a bundle, or its file.
@@ -124,6 +125,7 @@ def write_tiles(
         check_outside(Path(folder), [subject])
     content = opened(subject)
     scene = Scene.of(content)
+    scene = _common.exported(scene, "3D Tiles")
     root = np.eye(4)
     root[:3, :3] = _common.rotation_to(up or up_of(content)[0], "z")
     check("scene", len(scene), "instances to export, got none")
@@ -133,7 +135,8 @@ def write_tiles(
     with replacing_export(Path(folder), scene, (TILESET, "index.html"), overwrite=overwrite) as new:
         trees = _write_bundles(scene, names, new.path, progress)
         world = _parent(_instances(scene, names, trees))
-        _write_tileset(new.path / TILESET, {"transform": root.T.ravel().tolist(), **world})
+        world["transform"] = root.T.ravel().tolist()
+        _write_tileset(new.path / TILESET, world, {"ball": _ball_of_leaves(scene, root)})
         _common.write_page(new.path, "tiles.html")
         num_bytes = _common.bytes_below(new.path)
         num_tiles = len(list(new.path.rglob("*.glb")))
@@ -155,7 +158,7 @@ def _write_bundles(scene: Scene, names: list[str], folder: Path, progress: Progr
 
 
 def _instances(scene: Scene, names: list[str], trees: list[_Tile]) -> list[_Tile]:
-    """A tile for each instance, whose content is the tileset of its bundle."""
+    """Return a tile for each instance; its content is the tileset of the bundle."""
     return [
         {
             "transform": transform.T.ravel().tolist(),
@@ -189,8 +192,8 @@ class _Writer:
         self.tops = np.flatnonzero(groups.parent < 0).tolist() or [-1]
 
     def tile_of(self, group: int) -> _Tile:
-        """The tile of a group with all tiles below it; of -1, that of a bundle without
-        groups."""
+        """Return the tile of a group with all tiles below it; for -1, the tile of a
+        bundle without groups."""
         if group < 0:
             return self._tile("asset", np.arange(len(self._bundle.clusters)), 0.0, [])
         level = self._bundle.groups.level[group]
@@ -222,7 +225,8 @@ class _Writer:
 
 
 def _parent(tiles: list[_Tile]) -> _Tile:
-    """One tile, or a tile without content that is always refined to all of several."""
+    """Return the only tile, or a tile without content that is always refined to several
+    tiles."""
     if len(tiles) == 1 and "transform" not in tiles[0]:
         return tiles[0]
     volume = _box([_bounds(tile) for tile in tiles])
@@ -232,7 +236,8 @@ def _parent(tiles: list[_Tile]) -> _Tile:
 
 
 def _box(bounds: list[Floats]) -> _Volume:
-    """A bounding volume around boxes, each of a lower and an upper corner (2, 3)."""
+    """Return a bounding volume around boxes, each given by its lower and upper corner
+    (2, 3)."""
     low = np.min([corners[0] for corners in bounds], axis=0)
     high = np.max([corners[1] for corners in bounds], axis=0)
     half = np.maximum((high - low) / 2, np.finfo(np.float32).tiny)
@@ -241,30 +246,55 @@ def _box(bounds: list[Floats]) -> _Volume:
 
 def _bounds(tile: _Tile) -> Floats:
     """Lower and upper corner of a tile's box, after its transform."""
-    box = np.array(tile["boundingVolume"]["box"])
     matrix = np.reshape(tile.get("transform", np.eye(4).ravel()), (4, 4)).T
+    return _moved(tile["boundingVolume"], matrix)
+
+
+def _moved(volume: _Volume, matrix: Floats) -> Floats:
+    """Lower and upper corner of a volume after a transform."""
+    box = np.array(volume["box"])
     centre = matrix[:3, :3] @ box[:3] + matrix[:3, 3]
     half = np.abs(matrix[:3, :3] @ box[3:].reshape(3, 3).T).sum(axis=1)
     return np.array([centre - half, centre + half])
 
 
 def _transforms(scene: Scene) -> Floats:
-    """(I, 4, 4) matrices of the instances."""
+    """Return (I, 4, 4) matrices of the instances."""
     matrices = np.tile(np.eye(4), (len(scene), 1, 1))
     matrices[:, :3, :3] = scene.rotations * scene.scales[:, None, None]
     matrices[:, :3, 3] = scene.positions
     return matrices
 
 
-def _write_tileset(path: Path, root: _Tile) -> None:
+def _ball_of_leaves(scene: Scene, root: Floats) -> list[float]:
+    """Return the centre and the radius of a ball around the finest level of all
+    instances. The page shows it first, because coarse gaussians, and with them the
+    tiles, reach far beyond it."""
+    boxes: list[Floats] = []
+    for bundle in scene.bundles:
+        leaves = bundle.clusters.box[np.array(bundle.level_range(0))].astype(np.float64)
+        boxes.append(np.array([leaves[:, 0].min(axis=0), leaves[:, 1].max(axis=0)]))
+    bounds: list[Floats] = []
+    for bundle, transform in zip(scene.instance_bundle.tolist(), _transforms(scene), strict=True):
+        bounds.append(_moved(_box([boxes[bundle]]), root @ transform))
+    low, high = _moved(_box(bounds), np.eye(4))
+    return [*((low + high) / 2).tolist(), float(np.linalg.norm(high - low)) / 2]
+
+
+def _write_tileset(
+    path: Path, root: _Tile, extras: Mapping[str, list[float]] | None = None
+) -> None:
     extensions = {"extensionsUsed": _EXTENSIONS, "extensionsRequired": _EXTENSIONS}
-    document = {
+    document: dict[str, object] = {
         "asset": {"version": "1.1", "generator": f"v3dg {__version__}"},
         "extensionsUsed": [_CONTENT],
         "extensionsRequired": [_CONTENT],
-        # Also those of tiles in other tilesets: CesiumJS reads the first tileset.
+        # This includes the extensions of other tilesets: CesiumJS reads the first one
+        # only.
         "extensions": {_CONTENT: extensions},
         "geometricError": root["geometricError"],
         "root": {"refine": "REPLACE", **root},
     }
+    if extras is not None:
+        document["extras"] = extras
     _common.write_document(path, document)

@@ -38,11 +38,12 @@ def write_usd(
     Each bundle is a prim with UsdLod's LODRootAPI, whose children are its levels,
     finest first, as ParticleField3DGaussianSplat; they change where half of a level's
     groups have the default tolerance in a picture of 1920 x 1080. A scene is a
-    PointInstancer of them. Positions are float32, and importance is left out.
+    PointInstancer of them. Positions are float32; importance, opacity and tint are left
+    out, the latter two with a warning.
 
     Args:
         subject: A scene or a bundle, or its file.
-        path: File to write, .usd, .usda or .usdc.
+        path: File to write, .usd, .usda, .usdc or .usdz.
         up: The axis that is up in the world, which is turned to z; None uses the one of
             `v3dg.upright.up_of`.
 
@@ -55,10 +56,11 @@ def write_usd(
     Source: Pixar, OpenUSD 26.11, UsdVol and UsdLod.
     """
     one_of(Path(path).suffix.lower(), "path", usd.SUFFIXES)
-    _files.check_folder(Path(path))
+    _files.make_folder(Path(path))
     content = opened(subject)
     pxr = usd.pxr()
     scene = Scene.of(content)
+    scene = _common.exported(scene, "OpenUSD")
     check("scene", len(scene), "instances to export, got none")
     stage = usd.new_stage("Z")
     world = pxr.UsdGeom.Xform.Define(stage, "/world")

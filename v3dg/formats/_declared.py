@@ -1,13 +1,15 @@
-"""What a file declares about its gaussians beside their numbers."""
+"""The declarations of a file about its gaussians, beside their numbers."""
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 from v3dg.cameras import Axis
+from v3dg.gaussians import Gaussians
 
 
 @dataclass(frozen=True)
 class Declared:
-    """What a file, or its format, declares about its gaussians.
+    """The declarations of a file, or of its format, about its gaussians.
 
     Attributes:
         up: The axis that is up among the gaussians as they are read; None if neither
@@ -27,3 +29,17 @@ class Declared:
 
 NOTHING = Declared()
 """The declarations of a file that declares nothing."""
+
+_OF_GAUSSIANS: WeakKeyDictionary[Gaussians, Declared] = WeakKeyDictionary()
+
+
+def declare(gaussians: Gaussians, declared: Declared) -> Gaussians:
+    """Remember what the file of these gaussians declares; gaussians that are made from
+    them declare nothing."""
+    _OF_GAUSSIANS[gaussians] = declared
+    return gaussians
+
+
+def declared_of(gaussians: Gaussians) -> Declared:
+    """Return what a file declares about the gaussians that `read_asset` returned."""
+    return _OF_GAUSSIANS.get(gaussians, NOTHING)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -27,6 +28,22 @@ _BLOCK = 1 << 16
 _MIN_LOG_SCALE = -20.0  # 2e-9: stands for scales of 0, whose log no quantised format can hold
 _LEAST_VISIBLE_OPACITY = np.float32(_core.min_alpha)
 
+
+@dataclass(frozen=True)
+class Limits:
+    """The ranges of values in a quantised format; values outside of them are cut.
+
+    Attributes:
+        log_scale: Lowest and highest log of a scale.
+        color: Lowest and highest coefficient of degree 0.
+        harmonic: Lowest and highest coefficient of higher degrees.
+    """
+
+    log_scale: tuple[float, float] = (_MIN_LOG_SCALE, math.inf)
+    color: tuple[float, float] = (-math.inf, math.inf)
+    harmonic: tuple[float, float] = (-math.inf, math.inf)
+
+
 # The components of a quaternion that are stored, in ascending order, by the one that is
 # omitted.
 _STORED_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
@@ -49,8 +66,8 @@ def assemble(count: int, degree: int, decode: Callable[[slice], tuple[Floats, ..
 
 
 def quats_from_three(three: Floats, omitted: Integers) -> Floats:
-    """Unit quaternions (N, 4) from three components and the index of the omitted one,
-    which is >= 0."""
+    """Return unit quaternions (N, 4) from three components and the index of the omitted
+    one, which is >= 0."""
     omitted_component = np.sqrt(np.maximum(0.0, 1.0 - np.square(three).sum(axis=1)))
     quats = np.empty((len(three), 4))
     np.put_along_axis(quats, _STORED_COMPONENTS[omitted], three, axis=1)
@@ -59,8 +76,8 @@ def quats_from_three(three: Floats, omitted: Integers) -> Floats:
 
 
 def three_of_quats(quats: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """The inverse: three components (N, 3) within ±√½ and the index (N,) of the
-    largest, which is omitted."""
+    """Return the inverse of `quats_from_three`: three components (N, 3) within ±√½, and
+    the index (N,) of the largest component, which is omitted."""
     unit = normalised(quats)
     largest = np.abs(unit).argmax(axis=1)
     sign = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1.0, 1.0)
@@ -68,25 +85,25 @@ def three_of_quats(quats: Floats) -> tuple[Floats, NDArray[np.intp]]:
 
 
 def log_scales(scales: Floats) -> Floats:
-    """Natural logs in double precision, at least -20."""
+    """Return the natural logs of scales in double precision, at least -20."""
     with np.errstate(divide="ignore"):
         return np.maximum(np.log(scales.astype(np.float64)), _MIN_LOG_SCALE)
 
 
 def to_integers(values: Floats, largest: int) -> NDArray[np.uint32]:
-    """Nearest whole numbers within 0 to ``largest``."""
+    """Return the nearest whole numbers within 0 to ``largest``."""
     return np.clip(np.rint(values), 0, largest).astype(np.uint32)
 
 
 def opacity_bytes(opacities: Floats) -> NDArray[np.uint32]:
-    """The nearest of 255 steps, but 0 for opacities that are invisible: rounded up,
-    they would be visible."""
+    """Return the nearest of 255 steps of opacities, but 0 for those that are invisible:
+    if they were rounded up, they would be visible."""
     return np.where(opacities < _LEAST_VISIBLE_OPACITY, 0, to_integers(opacities * 255.0, 255))
 
 
 def check_writable(gaussians: Gaussians) -> Gaussians:
-    """The gaussians on the host; ValueError names the first value that a quantised
-    format cannot hold."""
+    """Return the gaussians on the host; the ValueError names the first value that a
+    quantised format cannot hold."""
     host = gaussians.numpy()
     for name, values in vars(host).items():
         check_all(

@@ -21,6 +21,7 @@ from v3dg.formats._declared import NOTHING, Declared
 from v3dg.gaussians import Gaussians, gaussian_bytes
 
 _FREE_GAUSSIANS = 1 << 18  # 15 to 62 MB: a file of any size may claim this many
+_MAX_NAMES = 8  # in a message
 _FREE_BYTES = 1 << 20  # a member of a zip may have this size, whatever the size of the zip
 
 
@@ -49,8 +50,18 @@ class AssetFile:
     declared: Declared = NOTHING
 
 
+def listed(names: Iterable[str]) -> str:
+    """Return names for a message: the first few, each shortened, and how many more
+    there are."""
+    all_names = list(names)
+    text = ", ".join(f"{name[:40]!a}" for name in all_names[:_MAX_NAMES])
+    if len(all_names) > _MAX_NAMES:
+        text += f" and {len(all_names) - _MAX_NAMES} more"
+    return text
+
+
 def bytes_of(files: Iterable[AnyPath]) -> int:
-    """Size on disk of the files that exist, together."""
+    """Return the total size on disk of those files that exist."""
     return sum(os.stat(file).st_size for file in set(files) if os.path.exists(file))
 
 
@@ -60,9 +71,10 @@ def whole_file(
     sh_degree: int,
     read: Callable[[AnyPath], Gaussians],
     files: Iterable[AnyPath] = (),
+    declared: Declared = NOTHING,
 ) -> AssetFile:
-    """A file, and others that it names, that can only be read whole: on the first read,
-    and then cached."""
+    """Return an asset file for a format that can only be read whole; the first read
+    caches all gaussians."""
     read_once = cache(lambda: read(path))
     # While it is read: the content of the files, and at most twice the gaussians.
     memory = bytes_of([path, *files]) + 2 * count * gaussian_bytes(sh_degree)
@@ -72,6 +84,7 @@ def whole_file(
         sh_degree=sh_degree,
         read=lambda first, last: read_once().subset(slice(first, last)),
         whole_bytes=memory,
+        declared=declared,
     )
 
 
@@ -92,13 +105,15 @@ class File:
         rows = np.empty(count, dtype)
         with _files.naming_errors(self.path):
             is_whole = _files.read_at(self._descriptor, rows, offset)
-        check(self.path, is_whole, "the file not to change while it is read, got a shorter one")
+        if not is_whole:
+            name = os.fspath(self.path)
+            raise ValueError(f"{name}: the file became shorter while it was read; read it again")
         return rows
 
 
 def least_bytes(count: int) -> int:
-    """Smallest size of a file that may claim `count` gaussians: a byte for each beyond
-    a free number."""
+    """Return the smallest size of a file that may claim `count` gaussians: one byte for
+    each beyond the first _FREE_GAUSSIANS."""
     return max(0, count - _FREE_GAUSSIANS)
 
 
@@ -120,11 +135,16 @@ class Claims:
         with self.open(path) as file:
             return file.read()
 
+    @property
+    def num_bytes(self) -> int:
+        """Bytes of all files together."""
+        return sum(self._files.values())
+
     def add(self, path: AnyPath, count: int) -> None:
-        """Accept that a file has so many gaussians, or raise ValueError; to be called
-        before allocation."""
+        """Accept that a file has `count` gaussians, or raise ValueError. Call this
+        before allocating memory for them."""
         self._gaussians += count
-        num_bytes = sum(self._files.values())
+        num_bytes = self.num_bytes
         is_plausible = least_bytes(self._gaussians) <= num_bytes
         claim = f"{self._gaussians} gaussians in {num_bytes} bytes"
         check(path, is_plausible, f"a byte a gaussian beyond {_FREE_GAUSSIANS}, got {claim}")
@@ -164,7 +184,7 @@ class Archive:
 
 
 def integer_of(node: Node, expected: str, low: int, high: int) -> int:
-    """A JSON value that must be a whole number of ``low`` to ``high``."""
+    """Return a JSON value that must be a whole number of ``low`` to ``high``."""
     if (
         not isinstance(node.value, int)
         or isinstance(node.value, bool)

@@ -1,28 +1,35 @@
-"""Checkpoints of trainers, `.pt` and `.ckpt`: gsplat's `simple_trainer`, and splatfacto
-of nerfstudio.
+"""Checkpoints of trainers, `.pt`, `.ckpt` and `.pth`: gsplat's `simple_trainer`,
+splatfacto of nerfstudio, and the code of the 3DGS paper and of 2DGS.
 
-Both hold means, log scales, quaternions w x y z, logits of opacities and SH
-coefficients as tensors, gsplat in a dict `splats`, nerfstudio among the values of
-`pipeline`. The file is a zip of a pickle and of the numbers of each tensor. The pickle
-is followed as far as it builds dicts, plain values and tensors; nothing that it names
-is imported or called, and only the numbers of the gaussians are read.
+All hold means, log scales, quaternions w x y z, logits of opacities and SH coefficients
+as tensors: gsplat in a dict `splats`, nerfstudio among the values of `pipeline`, the
+code of the papers in a tuple. What differs is in `_Layout`. The file is a zip of a
+pickle and of the numbers of each tensor. The pickle is followed as far as it builds
+dicts, plain values and tensors; nothing that it names is imported or called, and only
+the numbers of the gaussians are read. Of the settings of the run, which are beside it
+in YAML, single lines are.
 """
 
 import math
 import pickletools
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from v3dg._numbers import refuse
-from v3dg.formats._packing import DEGREES, Floats, assemble
+from v3dg.formats._declared import Declared
+from v3dg.formats._packing import DEGREES, SH_C0, Floats, assemble
 from v3dg.formats._reading import (
     AnyPath,
     Archive,
     AssetFile,
     Claims,
     check,
+    listed,
     value_errors,
     whole_file,
 )
@@ -31,7 +38,26 @@ from v3dg.rotations import normalised
 
 _FIELDS = ("means", "scales", "quats", "opacities", "sh0", "shN")
 _NERFSTUDIO = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
-_NERFSTUDIO_PREFIX = "_model.gauss_params."
+_NERFSTUDIO_PREFIXES = ("_model.gauss_params.", "_model.")  # the second before version 1.1
+# The indices of the tensors in the tuple of the papers' code, in the order of _FIELDS.
+_CAPTURED = (1, 4, 5, 6, 2, 3)
+_MIN_CAPTURE = 12  # values of that tuple; variants add some
+# Members of a checkpoint that say nothing about its gaussians.
+_GSPLAT_MEMBERS = ("step", "splats", "optimizers", "schedulers", "strategy_state")
+_NERFSTUDIO_MEMBERS = ("device_indicator_param", "background_color", "lpips", "psnr", "ssim")
+_NOT_GAUSSIANS = {
+    "app_module": "The appearance of single photographs (app_module) was left out: "
+    "colours are those without it.",
+    "bil_grids": "The bilateral grids of single photographs were left out: "
+    "colours are those before them.",
+    "pose_adjust": "Cameras were moved in training (pose_adjust), so those of the data are "
+    "not exactly its cameras.",
+    "camera_optimizer": "Cameras were moved in training (camera_optimizer), so those of the "
+    "data are not exactly its cameras.",
+}
+_NOT_GAUSSIANS["bilagrid"] = _NOT_GAUSSIANS["bil_grids"]
+_SETTINGS = ("cfg.yml", "config.yml")  # of gsplat, of nerfstudio
+_MAX_SETTINGS_BYTES = 1 << 20
 _MAX_PICKLE = 1 << 20  # bytes; trainers' have far less, and each byte can be an object
 _MAX_DIMENSIONS = 8
 # Operations that push a plain value.
@@ -55,6 +81,9 @@ _TYPES = {
 # Modules whose names a trainer's pickle may contain. Others are refused, and none is
 # imported.
 _ALLOWED_MODULES = (
+    "numpy",
+    "numpy.core.multiarray",
+    "numpy._core.multiarray",
     "torch",
     "torch._utils",
     "torch._tensor",
@@ -86,13 +115,54 @@ class _Tensor(NamedTuple):
     strides: tuple[int, ...]
 
 
+class _Layout(NamedTuple):
+    """The places and the encoding of the gaussians in a checkpoint.
+
+    Attributes:
+        fields: The tensors by the names that gsplat has for them. Without `shN`, `sh0`
+            has logits of colours without view dependence.
+        notes: Sentences about the other content of the checkpoint.
+    """
+
+    fields: dict[str, _Tensor]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def has_logits(self) -> bool:
+        return "shN" not in self.fields
+
+    @property
+    def num_scales(self) -> int:
+        """Stored scales a gaussian: 2 for 2DGS, whose gaussians are flat."""
+        if self.fields["scales"].shape[1:] == (2,):
+            return 2
+        return 3
+
+
+class _Settings(NamedTuple):
+    """The settings of a run that concern its gaussians."""
+
+    antialiased: bool | None = None
+    is_flat: bool = False
+    notes: tuple[str, ...] = ()
+
+
 def open_file(path: AnyPath) -> AssetFile:
     """Open a checkpoint; the gaussians are all read with the first rows."""
     claims = Claims()
     with claims.open(path) as file:
-        fields = _fields_of(path, Archive(path, file))[0]
-    count, num_higher = _size(path, fields, claims)
-    return whole_file(path, count, DEGREES[num_higher], read)
+        layout = _layout_of(path, Archive(path, file))[0]
+    count, num_higher = _size(path, layout, claims)
+    settings = _settings_of(path)
+    notes = [*layout.notes, *settings.notes]
+    if layout.num_scales == 2 or settings.is_flat:
+        notes.append(
+            "The gaussians are those of 2DGS; they were read as ellipsoids of no thickness."
+        )
+    if layout.has_logits:
+        notes.append("Colours are stored as logits without view dependence, and were read as such.")
+    declared = Declared(antialiased=settings.antialiased, notes=tuple(notes))
+    return whole_file(path, count, DEGREES[num_higher], read, declared=declared)
 
 
 def read(path: AnyPath) -> Gaussians:
@@ -100,32 +170,49 @@ def read(path: AnyPath) -> Gaussians:
     claims = Claims()
     with claims.open(path) as file:
         archive = Archive(path, file)
-        fields, root = _fields_of(path, archive)
-        count, num_higher = _size(path, fields, claims)
-        arrays = {name: _array(path, name, field, archive, root) for name, field in fields.items()}
+        layout, root = _layout_of(path, archive)
+        count, num_higher = _size(path, layout, claims)
+        arrays = {
+            name: _array(path, name, field, archive, root) for name, field in layout.fields.items()
+        }
     shapes = {
         "means": (count, 3),
-        "scales": (count, 3),
+        "scales": (count, layout.num_scales),
         "quats": (count, 4),
         "opacities": (count,),
         "sh0": (count, 1, 3),
         "shN": (count, num_higher, 3),
     }
-    for name, shape in shapes.items():
-        fits = arrays[name].size == math.prod(shape)
-        check(path, fits, f"{name} of shape {shape}, got {fields[name].shape}")
-        arrays[name] = arrays[name].reshape(shape)
+    for name, array in arrays.items():
+        shape = shapes[name]
+        fits = array.size == math.prod(shape)
+        check(path, fits, f"{name} of shape {shape}, got {layout.fields[name].shape}")
+        arrays[name] = array.reshape(shape)
+    is_flat = _settings_of(path).is_flat
 
     def decode(rows: slice) -> tuple[Floats, ...]:
-        means, scales, quats, logits, *sh = (_doubles(arrays[name][rows]) for name in _FIELDS)
-        opacities = 1.0 / (1.0 + np.exp(-logits))
-        return means, normalised(quats), np.exp(scales), opacities, np.concatenate(sh, axis=1)
+        block = {name: _doubles(array[rows]) for name, array in arrays.items()}
+        scales = np.zeros((len(block["means"]), 3))
+        scales[:, : layout.num_scales] = np.exp(block["scales"])
+        if is_flat:
+            scales[:, 2] = 0.0
+        sh = block["sh0"]
+        if layout.has_logits:
+            sh = (_sigmoid(sh) - 0.5) / SH_C0
+        else:
+            sh = np.concatenate([sh, block["shN"]], axis=1)
+        opacities = _sigmoid(block["opacities"])
+        return block["means"], normalised(block["quats"]), scales, opacities, sh
 
     return assemble(count, DEGREES[num_higher], decode)
 
 
-def _fields_of(path: AnyPath, archive: Archive) -> tuple[dict[str, _Tensor], str]:
-    """The tensors of the gaussians, and the folder of the zip that holds their
+def _sigmoid(logits: Floats) -> Floats:
+    return np.asarray(1.0 / (1.0 + np.exp(-logits)))
+
+
+def _layout_of(path: AnyPath, archive: Archive) -> tuple[_Layout, str]:
+    """Return where the gaussians are, and the folder of the zip that holds their
     numbers."""
     root = next((name[:-8] for name in archive.names if name.endswith("data.pkl")), "")
     pickle = archive.read(f"{root}data.pkl")
@@ -140,17 +227,58 @@ def _fields_of(path: AnyPath, archive: Archive) -> tuple[dict[str, _Tensor], str
     check(path, is_little, "little-endian numbers, got a checkpoint of another byte order")
     with value_errors(path, "a checkpoint of tensors and plain values"):
         content = _Unpickler().run(pickle)
-    return _fields(path, content), root
+    return _layout(path, content), root
 
 
-def _size(path: AnyPath, fields: dict[str, _Tensor], claims: Claims) -> tuple[int, int]:
-    """Number of gaussians, and of coefficients a channel past the first."""
-    count = fields["means"].shape[0]
+def _size(path: AnyPath, layout: _Layout, claims: Claims) -> tuple[int, int]:
+    """Return the number of gaussians, and of higher SH coefficients per channel."""
+    count = layout.fields["means"].shape[0]
     claims.add(path, count)
-    shape = fields["shN"].shape
+    if layout.has_logits:
+        return count, 0
+    shape = layout.fields["shN"].shape
     num_higher = math.prod(shape) // max(1, 3 * count)
     check(path, num_higher in DEGREES, f"SH degree 0 to 3, got shN of shape {shape}")
     return count, num_higher
+
+
+def _settings_of(path: AnyPath) -> _Settings:
+    """Return the settings from a file beside a checkpoint or in the folder above; empty
+    ones if there is no such file."""
+    folder = Path(path).absolute().parent
+    files = [place / name for place in (folder, folder.parent) for name in _SETTINGS]
+    file = next((file for file in files if file.is_file()), None)
+    if file is None:
+        return _Settings()
+    with Claims().open(file) as opened:
+        content = opened.read(_MAX_SETTINGS_BYTES + 1)
+    if len(content) > _MAX_SETTINGS_BYTES:
+        note = f"{file.name} is too large to be that of a run and was not read."
+        return _Settings(notes=(note,))
+    # YAML with Python objects, of which lines of a name and a plain value are read.
+    pattern = r"^[ ]*(\w+): +'?([\w.+-]+)'?[ ]*\r?$"
+    if file.name == _SETTINGS[0]:
+        pattern = pattern.replace("[ ]*", "", 1)  # those of the run, not of an object in it
+    text = content.decode("utf-8", errors="replace")
+    values: dict[str, str] = {}
+    for name, value in re.findall(pattern, text, re.MULTILINE):
+        values.setdefault(name, value)
+    return _settings(values)
+
+
+def _settings(values: Mapping[str, str]) -> _Settings:
+    antialiased: bool | None = None
+    if "rasterize_mode" in values:
+        antialiased = values["rasterize_mode"] == "antialiased"
+    elif "antialiased" in values:
+        antialiased = values["antialiased"] == "true"
+    notes = []
+    if values.get("with_eval3d") == "true":
+        notes.append(
+            "Gaussians were trained to be evaluated along rays (with_eval3d), so pictures of "
+            "their projections differ."
+        )
+    return _Settings(antialiased, values.get("model_type", "").startswith("2dgs"), tuple(notes))
 
 
 def _doubles(values: _Numbers) -> Floats:
@@ -159,23 +287,80 @@ def _doubles(values: _Numbers) -> Floats:
     return values.astype(np.float64)
 
 
-def _fields(path: AnyPath, content: _Value) -> dict[str, _Tensor]:
-    """The tensors of the gaussians by the names that gsplat has for them; ValueError if
-    one is missing."""
+def _layout(path: AnyPath, content: _Value) -> _Layout:
+    """Return where the gaussians are in the pickled object; ValueError if a part is
+    missing."""
     members: dict[str, _Value] = {}
     if isinstance(content, dict):
         members = content
     splats = members.get("splats")
     pipeline = members.get("pipeline")
     if isinstance(splats, dict):
-        values = [splats.get(name) for name in _FIELDS]
-    elif isinstance(pipeline, dict):
-        values = [pipeline.get(_NERFSTUDIO_PREFIX + name) for name in _NERFSTUDIO]
-    else:
-        keys = ", ".join(f"{key[:40]!a}" for key in list(members)[:6]) or "none"
-        refuse(path, f"'splats' (gsplat) or 'pipeline' (nerfstudio), got {keys}")
+        unread = _left_out(name for name in members if name not in _GSPLAT_MEMBERS)
+        return _gsplat_layout(path, splats, unread)
+    if isinstance(pipeline, dict):
+        return _nerfstudio_layout(path, pipeline)
+    is_captured = isinstance(content, tuple) and len(content) == 2
+    if not is_captured or not isinstance(content[0], tuple):
+        expected = "'splats' (gsplat), 'pipeline' (nerfstudio) or a tuple (the code of 3DGS)"
+        refuse(path, f"{expected}, got {listed(members) or 'none'}")
+    captured = content[0]
+    has_fields = len(captured) >= _MIN_CAPTURE
+    check(path, has_fields, f"{_MIN_CAPTURE} captured values, got {len(captured)}")
+    values = dict(zip(_FIELDS, (captured[i] for i in _CAPTURED), strict=True))
+    return _Layout(_tensors(path, values))
+
+
+def _gsplat_layout(path: AnyPath, splats: dict[str, _Value], notes: tuple[str, ...]) -> _Layout:
+    values = {name: splats.get(name) for name in _FIELDS}
+    used = set(_FIELDS)
+    if "colors" in splats and "sh0" not in splats:  # trained with app_opt
+        used = {*_FIELDS[:4], "colors", "features"}
+        values = {name: splats.get(name) for name in _FIELDS[:4]} | {"sh0": splats["colors"]}
+        notes = _left_out(["app_module"]) + tuple(
+            note for note in notes if note != _NOT_GAUSSIANS["app_module"]
+        )
+    unread = [name for name in splats if name not in used]
+    if unread:
+        notes += (f"Tensors of splats were left out: {listed(unread)}.",)
+    return _Layout(_tensors(path, values), notes)
+
+
+def _nerfstudio_layout(path: AnyPath, pipeline: dict[str, _Value]) -> _Layout:
+    prefix = next(
+        (prefix for prefix in _NERFSTUDIO_PREFIXES if f"{prefix}means" in pipeline),
+        _NERFSTUDIO_PREFIXES[0],
+    )
+    names = [prefix + name for name in _NERFSTUDIO]
+    values = {field: pipeline.get(name) for field, name in zip(_FIELDS, names, strict=True)}
+    modules = [
+        name.removeprefix("_model.").split(".")[0]
+        for name in pipeline
+        if name.startswith("_model.") and name not in names
+    ]
+    unread = dict.fromkeys(name for name in modules if name not in _NERFSTUDIO_MEMBERS)
+    notes = _left_out(unread)
+    tensors = _tensors(path, values)
+    if math.prod(tensors["shN"].shape) == 0 and tensors["means"].shape[0] > 0:
+        # For SH degree 0, splatfacto stores logits of colours.
+        del tensors["shN"]
+    return _Layout(tensors, notes)
+
+
+def _left_out(members: Iterable[str]) -> tuple[str, ...]:
+    """Return a sentence for each unread member that is known to change the picture, and
+    one for all others."""
+    names = list(members)
+    notes = [_NOT_GAUSSIANS[name] for name in names if name in _NOT_GAUSSIANS]
+    unknown = [name for name in names if name not in _NOT_GAUSSIANS]
+    if unknown:
+        notes.append(f"Parts of the checkpoint were left out: {listed(unknown)}.")
+    return tuple(notes)
+
+
+def _tensors(path: AnyPath, values: Mapping[str, _Value]) -> dict[str, _Tensor]:
     tensors = {}
-    for name, value in zip(_FIELDS, values, strict=True):
+    for name, value in values.items():
         if not isinstance(value, _Tensor) or not value.shape:
             kind = type(value).__name__
             if isinstance(value, _Named):
@@ -186,7 +371,8 @@ def _fields(path: AnyPath, content: _Value) -> dict[str, _Tensor]:
 
 
 def _array(path: AnyPath, name: str, tensor: _Tensor, archive: Archive, root: str) -> _Numbers:
-    """The numbers of a tensor; ValueError unless each of them is stored in the file."""
+    """Return the numbers of a tensor; ValueError unless the file stores each of
+    them."""
     steps = zip(tensor.shape, tensor.strides, strict=True)
     last = tensor.offset + sum((size - 1) * step for size, step in steps)
     count = math.prod(tensor.shape)
@@ -217,8 +403,8 @@ class _Unpickler:
         self._memo: dict[int, _Value] = {}
 
     def run(self, pickle: bytes) -> _Value:
-        """The object that a pickle holds; ValueError for an operation or a name that is
-        not allowed."""
+        """Return the object that a pickle holds; ValueError for an operation or a name
+        that is not allowed."""
         for opcode, argument, _ in pickletools.genops(pickle):
             if opcode.name == "STOP":
                 break
@@ -287,7 +473,7 @@ class _Unpickler:
 
 
 def _allowed_name(argument: str) -> _Named:
-    """The name of a class or function, "module name"; ValueError unless its module is
+    """Return the "module name" of a class or function; ValueError unless its module is
     allowed."""
     module, _, name = argument.partition(" ")
     short = f"{module[:60]}.{name[:60]}"
@@ -297,7 +483,7 @@ def _allowed_name(argument: str) -> _Named:
 
 
 def _called(name: str, arguments: tuple[_Value, ...]) -> _Value:
-    """The result of a call, without calling anything."""
+    """Return what stands for the result of a call; nothing is called."""
     if name.startswith("collections."):
         return {}
     if name == "torch._utils._rebuild_parameter":

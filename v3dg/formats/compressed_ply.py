@@ -8,20 +8,23 @@ colour and opacity (8 bits each), and element `sh` a byte a coefficient, channel
 channel, for -4 to 4. See docs/formats.md.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core, _files
-from v3dg.formats import _packing
+from v3dg.formats import _packing, _ply_comments
 from v3dg.formats._packing import SH_C0, SQRT2, Floats, assemble
-from v3dg.formats._reading import AnyPath, AssetFile, File, check
+from v3dg.formats._reading import AnyPath, AssetFile, File, check, listed
 from v3dg.gaussians import Gaussians
 
 _CHUNK = 256
+_MAX_LOG_SCALE = 20.0
+LIMITS = _packing.Limits(log_scale=(-20.0, _MAX_LOG_SCALE), harmonic=(-4.0, 4.0))
+"""What the format can hold."""
 _PLY_TYPES = {"float": "<f4", "uint": "<u4", "uchar": "u1"}
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _RANGES = {"": "xyz", "scale_": "xyz", "color": "rgb"}
@@ -84,7 +87,26 @@ def open_file(path: AnyPath) -> AssetFile:
 
         return assemble(last - first, degree, decode)
 
-    return AssetFile(path, count, degree, read_rows)
+    declared = _ply_comments.declared_by(_core.ply_comments(path))
+    declared = replace(declared, notes=(*declared.notes, *_notes(elements)))
+    return AssetFile(path, count, degree, read_rows, declared=declared)
+
+
+def _notes(elements: Mapping[str, _Element]) -> tuple[str, ...]:
+    """Return a sentence for each part of the file that is not read."""
+    used = {
+        "chunk": [name for kind in _RANGES for name in _range_names(kind)],
+        "vertex": list(_PACKED),
+    }
+    notes = []
+    for element, read_names in used.items():
+        names = [name for name in elements[element].kinds if name not in read_names]
+        if names:
+            notes.append(f"Properties of {element} were left out: {listed(names)}.")
+    unread = [name for name in elements if name not in (*used, "sh")]
+    if unread:
+        notes.append(f"Elements beside chunk, vertex and sh were left out: {listed(unread)}.")
+    return tuple(notes)
 
 
 def _decoded(
@@ -93,8 +115,8 @@ def _decoded(
     ranges: dict[str, tuple[Floats, Floats]],
     sh_bytes: NDArray[np.uint8],
 ) -> tuple[Floats, ...]:
-    """Means, quats, scales, opacities and sh of rows of `vertex` and `sh`, which are in
-    these chunks."""
+    """Return means, quats, scales, opacities and sh of rows of `vertex` and `sh`;
+    `chunks` has the chunk of each row."""
 
     def interpolated(kind: str, fractions: Floats) -> Floats:
         low, high = ranges[kind]
@@ -122,7 +144,7 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
     num_chunks = -(-count // _CHUNK)
     values = {
         "": host.means[order].astype(np.float64),
-        "scale_": np.minimum(_packing.log_scales(host.scales[order]), 20.0),
+        "scale_": np.minimum(_packing.log_scales(host.scales[order]), _MAX_LOG_SCALE),
         "color": host.sh[order, 0].astype(np.float64) * SH_C0 + 0.5,
     }
     starts = np.arange(num_chunks) * _CHUNK
@@ -137,7 +159,7 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
         extent = np.where(high > low, high.astype(np.float64) - low, 1.0)[chunks]
         fractions[kind] = np.clip((array - low[chunks]) / extent, 0.0, 1.0)
     with _files.replacing(path) as temporary, open(temporary, "wb") as file:
-        file.write(_header(count, num_chunks, num_rest))
+        file.write(_header(host, num_chunks))
         file.write(np.concatenate(ranges, axis=1).astype("<f4").tobytes())
         for block in _packing.blocks(count):
             rows = order[block]
@@ -157,11 +179,15 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
                 )
 
 
-def _header(count: int, num_chunks: int, num_rest: int) -> bytes:
+def _header(host: Gaussians, num_chunks: int) -> bytes:
+    count = len(host)
+    num_rest = 3 * (host.sh.shape[1] - 1)
+    comments = _ply_comments.comments_for(host.antialiased)
     lines = [
         "ply",
         "format binary_little_endian 1.0",
         "comment made by v3dg",
+        *(f"comment {comment}" for comment in comments),
         f"element chunk {num_chunks}",
     ]
     lines += [f"property float {name}" for kind in _RANGES for name in _range_names(kind)]
@@ -199,7 +225,8 @@ def _range_names(kind: str) -> list[str]:
 
 
 def _range_kinds(path: AnyPath, chunk: _Element) -> list[str]:
-    """The kinds of ranges that chunks have; older files have none of colours."""
+    """Return the kinds of ranges that chunks have; in older files, colours have
+    none."""
     kinds = [kind for kind in _RANGES if kind != "color" or chunk.kinds.keys() & _range_names(kind)]
     for kind in kinds:
         _require(path, "chunk", chunk, _range_names(kind), "float")
@@ -207,8 +234,8 @@ def _range_kinds(path: AnyPath, chunk: _Element) -> list[str]:
 
 
 def _ranges(chunk: NDArray[np.void], kinds: Sequence[str]) -> dict[str, tuple[Floats, Floats]]:
-    """Lowest and highest value of each chunk, (C, 3) each; without ranges of colour, it
-    is 0 to 1."""
+    """Return the lowest and the highest values of each chunk, (C, 3) each, by kind;
+    colours without ranges have 0 and 1."""
     shape = (len(chunk), 3)
     ranges: dict[str, tuple[Floats, Floats]] = {"color": (np.zeros(shape), np.ones(shape))}
     for kind in kinds:
@@ -244,7 +271,8 @@ def _require(path: AnyPath, label: str, element: _Element, names: Sequence[str],
 
 
 def _elements(file: File) -> dict[str, _Element]:
-    """The elements of the header, in file order, with the place of their rows."""
+    """Return the elements of the header in file order, with the offsets of their
+    rows."""
     path = file.path
     encoding, offset, header = _core.ply_header(path)
     is_little = encoding == "binary_little_endian"

@@ -74,7 +74,7 @@ def open_file(path: AnyPath) -> AssetFile:
 
 
 def _leaves(path: AnyPath, nodes: NDArray[np.void], count: int) -> NDArray[np.int64]:
-    """The gaussians that are leaves, in ascending order, each once."""
+    """Return the gaussians that are leaves, in ascending order, each once."""
     has_leaves = nodes["leaves"] != 0
     first = nodes["start"][has_leaves].astype(np.int64)
     size = nodes["leaves"][has_leaves].astype(np.int64)

@@ -18,16 +18,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from v3dg.formats._declared import NOTHING, Declared
 from v3dg.formats._packing import SH_C0, Floats, assemble
 from v3dg.formats._reading import AnyPath, AssetFile, Claims, check, whole_file
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import normalised
 
-_HEADER_BYTES = 4096
+HEADER_BYTES = 4096
+_USED_HEADER_BYTES = 44  # the rest is zeros
+_MINOR = 1  # the newest version is 0.1
 _SECTION_BYTES = 1024
 _MAX_SECTIONS = 1 << 16
-# By compression: types of a mean's coordinates, of scales and quaternions, and of
-# higher SH.
+# The types of a mean's coordinates, of scales and quaternions, and of higher SH, by
+# compression.
 _TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 _SH_RANGE = (-1.5, 1.5)  # if the header has none
 _DEFAULT_STEPS = 32767  # per half side of a bucket
@@ -61,9 +64,33 @@ def open_file(path: AnyPath) -> AssetFile:
     """Open a `.ksplat` file; all of it is read with its first rows."""
     with Claims().open(path) as file:
         size = os.fstat(file.fileno()).st_size
-        start = file.read(min(size, _HEADER_BYTES + _MAX_SECTIONS * _SECTION_BYTES))
+        start = file.read(min(size, HEADER_BYTES + _MAX_SECTIONS * _SECTION_BYTES))
     sections, degree, _ = _headers(path, start)
-    return whole_file(path, sum(section.num_gaussians for section in sections), degree, read)
+    count = sum(section.num_gaussians for section in sections)
+    return whole_file(path, count, degree, read, declared=_declared(start))
+
+
+def is_start_of_one(start: bytes) -> bool:
+    """Return whether the first bytes of a file, at least `HEADER_BYTES`, are a header
+    of this format. The format has no magic number, so the header must have plausible
+    numbers and zeros in the rest."""
+    if len(start) < HEADER_BYTES or any(start[_USED_HEADER_BYTES:HEADER_BYTES]):
+        return False
+    major, minor, most_sections, num_sections, _, _, compression = struct.unpack_from(
+        "<BB2xIIIIH", start
+    )
+    is_version = major == 0 < minor
+    has_sections = 0 < num_sections <= most_sections <= _MAX_SECTIONS
+    return bool(is_version and has_sections and compression <= 2)
+
+
+def _declared(start: bytes) -> Declared:
+    """Return a note if the header has a newer version, in which bytes may mean
+    something else."""
+    minor = start[1]
+    if minor <= _MINOR:
+        return NOTHING
+    return Declared(notes=(f"Version 0.{minor} was read as version 0.{_MINOR}.",))
 
 
 def read(path: AnyPath) -> Gaussians:
@@ -74,7 +101,7 @@ def read(path: AnyPath) -> Gaussians:
     sh_range = _SH_RANGE
     if low < high:
         sh_range = (low, high)
-    start = _HEADER_BYTES + len(sections) * _SECTION_BYTES
+    start = HEADER_BYTES + len(sections) * _SECTION_BYTES
     parts = []
     for i, section in enumerate(sections):
         rows, buckets, start = _section(path, content, start, i, section, compression)
@@ -87,18 +114,18 @@ def read(path: AnyPath) -> Gaussians:
 
 
 def _headers(path: AnyPath, content: bytes) -> tuple[list[_Section], int, int]:
-    """The headers of all sections, the SH degree and the compression; ``content`` is
-    the start of a file."""
+    """Return the headers of all sections, the SH degree and the compression;
+    ``content`` is the start of a file."""
     num_bytes = len(content)
-    check(path, num_bytes >= _HEADER_BYTES, f"a header of {_HEADER_BYTES} bytes, got {num_bytes}")
+    check(path, num_bytes >= HEADER_BYTES, f"a header of {HEADER_BYTES} bytes, got {num_bytes}")
     major, minor, num_sections, count, compression = struct.unpack_from("<BB2xI8xIH", content)
     is_known = major == 0 < minor and compression <= 2
     kind = f"{major}.{minor}, {compression}"
     check(path, is_known, f".ksplat 0.1 or later and compression 0 to 2, got {kind}")
-    has_headers = num_sections <= min(_MAX_SECTIONS, (num_bytes - _HEADER_BYTES) // _SECTION_BYTES)
+    has_headers = num_sections <= min(_MAX_SECTIONS, (num_bytes - HEADER_BYTES) // _SECTION_BYTES)
     check(path, has_headers, f"headers of {num_sections} sections, got {num_bytes} bytes")
-    end = _HEADER_BYTES + num_sections * _SECTION_BYTES
-    starts = range(_HEADER_BYTES, end, _SECTION_BYTES)
+    end = HEADER_BYTES + num_sections * _SECTION_BYTES
+    starts = range(HEADER_BYTES, end, _SECTION_BYTES)
     sections = [_Section(*_SECTION.unpack_from(content, start)) for start in starts]
     total = sum(section.num_gaussians for section in sections)
     check(path, total == count, f"{count} gaussians in the sections, got {total}")
@@ -110,8 +137,8 @@ def _headers(path: AnyPath, content: bytes) -> tuple[list[_Section], int, int]:
 def _section(
     path: AnyPath, content: bytes, start: int, number: int, section: _Section, compression: int
 ) -> tuple[NDArray[np.void], _Buckets | None, int]:
-    """The rows of a section, the buckets that their means are relative to, and the end
-    of the section."""
+    """Return the rows of a section, the buckets that their means are relative to, and
+    the end of the section."""
     mean_type, shape_type, sh_type = _TYPES[compression]
     count = section.num_gaussians
     max_count = section.max_gaussians
@@ -141,7 +168,7 @@ def _section(
 
 
 def _buckets(path: AnyPath, content: bytes, start: int, number: int, section: _Section) -> _Buckets:
-    """The buckets of a section that begins at ``start``."""
+    """Return the buckets of a section that begins at ``start``."""
     count = section.num_gaussians
     sizes = np.frombuffer(content, "<u4", section.num_partial_buckets, start)
     partial_sizes = sizes.astype(np.int64)
@@ -168,7 +195,7 @@ def _buckets(path: AnyPath, content: bytes, start: int, number: int, section: _S
 def _decoded(
     records: NDArray[np.void], buckets: _Buckets | None, degree: int, sh_range: tuple[float, float]
 ) -> Gaussians:
-    """The gaussians of a section, padded with zeros to the coefficients of
+    """Return the gaussians of a section; their coefficients are padded with zeros to
     ``degree``."""
 
     def decode(block: slice) -> tuple[Floats, ...]:

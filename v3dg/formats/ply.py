@@ -1,15 +1,26 @@
 """`.ply`, as trainers write it: the core reads and writes it. See docs/formats.md."""
 
 import os
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal, TypeAlias
+
+import numpy as np
 
 from v3dg import _core, _files
-from v3dg.formats import compressed_ply
-from v3dg.formats._reading import AnyPath, AssetFile
+from v3dg._numbers import check
+from v3dg.formats import _ply_comments, compressed_ply
+from v3dg.formats._declared import Declared
+from v3dg.formats._packing import SH_C0
+from v3dg.formats._reading import AnyPath, AssetFile, listed
 from v3dg.gaussians import Gaussians
 
 write_compressed = compressed_ply.write
 PlyEncoding = Literal["binary_little_endian", "binary_big_endian", "ascii"]
+_Elements: TypeAlias = Sequence[tuple[str, int, Sequence[tuple[str, str]]]]
+
+_NORMALS = ("nx", "ny", "nz")  # zeros in the files of the 3DGS code
+_MAX_COLOR = 8.0  # of a float for 0 to 1: larger ones are for 0 to 255
 
 
 def open_file(path: AnyPath) -> AssetFile:
@@ -19,12 +30,60 @@ def open_file(path: AnyPath) -> AssetFile:
     _, _, elements = _core.ply_header(name)
     if any("packed_position" in dict(properties) for _, _, properties in elements):
         return compressed_ply.open_file(path)
-    file = _core.PlyFile(name)
+    plain = _core.PlyFile(name)
+    has_base_colors = "f_dc_0" not in plain.used
 
     def read(first: int, last: int) -> Gaussians:
-        return Gaussians(*file.read(first, last))
+        gaussians = Gaussians(*plain.read(first, last))
+        if has_base_colors:
+            _check_colors(path, gaussians)
+        return gaussians
 
-    return AssetFile(path, file.num_gaussians, file.sh_degree, read)
+    return AssetFile(
+        path,
+        plain.num_gaussians,
+        plain.sh_degree,
+        read,
+        declared=_declared(_core.ply_comments(name), elements, set(plain.used)),
+    )
+
+
+def _check_colors(path: AnyPath, gaussians: Gaussians) -> None:
+    """Raise ValueError for base colours that were not stored for 0 to 1."""
+    largest = float(np.nan_to_num(gaussians.sh[:, 0]).max(initial=0.0)) * SH_C0 + 0.5
+    expected = "colours of 0 to 1 in properties of floats"
+    advice = "divide them by 255, or store them as uchar"
+    check(path, largest <= _MAX_COLOR, f"{expected}, got {largest:g}; {advice}")
+
+
+def _declared(comments: Sequence[str], elements: _Elements, used: set[str]) -> Declared:
+    """What a file has beside the numbers that are read as they are meant."""
+    by_comments = _ply_comments.declared_by(comments)
+    vertex = next(properties for name, _, properties in elements if name == "vertex")
+    unread = [name for name, _ in vertex if name not in used and name not in _NORMALS]
+    notes = list(by_comments.notes)
+    if "scale_2" not in used:
+        notes.append(
+            "scale_2 is missing, so these are the gaussians of 2DGS; "
+            "they were read as ellipsoids of no thickness."
+        )
+    if "f_dc_0" not in used:
+        notes.append("Red, green and blue were read as base colours, because f_dc_0 is missing.")
+    antialiased = by_comments.antialiased
+    if "filter_3D" in used:
+        if antialiased is None:
+            antialiased = True
+        notes.append("filter_3D of Mip-Splatting was applied to scales and opacities.")
+    high_coefficients = [name for name in unread if name.startswith("f_rest_")]
+    if high_coefficients:
+        notes.append("Coefficients of SH degree 4 were left out.")
+        unread = [name for name in unread if name not in high_coefficients]
+    if unread:
+        notes.append(f"Properties of vertex that no gaussian has were left out: {listed(unread)}.")
+    left_out = [name for name, count, _ in elements if name != "vertex" and count]
+    if left_out:
+        notes.append(f"Elements beside vertex were left out: {listed(left_out)}.")
+    return replace(by_comments, antialiased=antialiased, notes=tuple(notes))
 
 
 def write(
@@ -34,4 +93,5 @@ def write(
     host = gaussians.numpy()
     arrays = (host.means, host.quats, host.scales, host.opacities, host.sh)
     with _files.replacing(path) as temporary:
-        _core.ply_write(temporary, *arrays, encoding=encoding)
+        comments = _ply_comments.comments_for(host.antialiased)
+        _core.ply_write(temporary, *arrays, encoding=encoding, comments=comments)

@@ -20,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core, _files
-from v3dg._json import Node, parse_json
+from v3dg._json import Node, json_text, parse_json
 from v3dg._version import __version__
 from v3dg.formats import _packing
+from v3dg.formats._declared import Declared
 from v3dg.formats._packing import SQRT2, Floats, assemble, opacity_bytes
 from v3dg.formats._reading import (
     Archive,
@@ -31,6 +32,7 @@ from v3dg.formats._reading import (
     check,
     integer_of,
     least_bytes,
+    listed,
     value_errors,
     whole_file,
 )
@@ -38,15 +40,23 @@ from v3dg.gaussians import Gaussians
 
 _Pixels: TypeAlias = NDArray[np.uint8]
 _MAX_GAUSSIANS = 1 << 28  # pixels of the largest WebP
-# A picture may have up to so many pixels: a multiple of what is needed, because writers
-# round up differently, and a constant.
+# A picture may have this many times the pixels that are needed, because writers round
+# up differently, plus a constant.
 _MAX_PIXELS_FACTOR = 4
 _FREE_PIXELS = 1 << 16
+_LEAST_PALETTE = 1024
+_FULL_PALETTE = 32768
+_MOST_PALETTE = 65536  # labels have 16 bits
 _PALETTE_COLUMNS = 64  # entries of the palette side by side in its picture
 _MAX_LOG = 88.0  # about the log of the largest float32
 
+# Models of splat-transform, and whether they are antialiased.
+_MODELS: dict[str, bool | None] = {"default": False, "antialiased": True, "2dgs": None}
+_RESOURCE_FORKS = "__MACOSX/"  # the folder of what the Finder adds to a zip
+
 # Number of pictures of each part of meta.json.
 _PARTS = {"means": 2, "scales": 1, "quats": 1, "sh0": 1, "shN": 2}
+_FIELDS = ("version", "count", "asset", "model", "antialias", *_PARTS)
 
 
 def open_file(path: str | os.PathLike[str]) -> AssetFile:
@@ -56,9 +66,11 @@ def open_file(path: str | os.PathLike[str]) -> AssetFile:
         if path.suffix == ".json":
             text = file.read()
         else:
-            text = Archive(path, file).read("meta.json")
-    count, degree = _size(_meta(path, text))
-    return whole_file(path, count, degree, read, files(path))
+            archive = Archive(path, file)
+            text = archive.read(f"{_folder_in(path, archive)}meta.json")
+    meta = _meta(path, text)
+    count, degree = _size(meta)
+    return whole_file(path, count, degree, read, files(path), _declared(meta))
 
 
 def read(path: str | os.PathLike[str], claims: Claims | None = None) -> Gaussians:
@@ -71,11 +83,30 @@ def read(path: str | os.PathLike[str], claims: Claims | None = None) -> Gaussian
         )
     with claims.open(path) as file:
         archive = Archive(path, file)
-        return _read(path, archive.read("meta.json"), archive.read, claims)
+        folder = _folder_in(path, archive)
+        text = archive.read(f"{folder}meta.json")
+        return _read(path, text, lambda name: archive.read(folder + name), claims)
+
+
+def _folder_in(path: Path, archive: Archive) -> str:
+    """Return the folder of a zip that contains its meta.json, with a slash at the end;
+    "" if it is at the top."""
+    names = [name for name in archive.names if not name.startswith(_RESOURCE_FORKS)]
+    is_streamed = any(name.rsplit("/", 1)[-1] == "lod-meta.json" for name in names)
+    advice = "unpack it, and open its lod-meta.json"
+    check(path, not is_streamed, f"one SOG in the zip, got a streamed SOG; {advice}")
+    if "meta.json" in names:
+        return ""
+    folders = [name.removesuffix("meta.json") for name in names if name.endswith("/meta.json")]
+    names_of_folders = listed(folders)
+    check(
+        path, len(folders) <= 1, f"one SOG in the zip, got several: {names_of_folders}; unpack it"
+    )
+    return "".join(folders)
 
 
 def files(path: Path) -> list[Path]:
-    """The `.sog` file itself, or a `meta.json` and its pictures."""
+    """Return the `.sog` file itself, or a `meta.json` and its pictures."""
     if path.suffix != ".json":
         return [path]
     names = _names(_meta(path, Claims().read(path)))
@@ -90,7 +121,7 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
     claims.add(path, count)  # after all files are open, because their sizes bound the claim
 
     def pixels(name: str) -> _Pixels:
-        """(N, 4) red, green, blue and alpha, a pixel for each gaussian."""
+        """Return (N, 4) red, green, blue and alpha: one pixel for each gaussian."""
         return _decoded(path, name, pictures[name], count).reshape(-1, 4)[:count]
 
     low, high = (np.array(meta["means"].field(name).vector(3)) for name in ("mins", "maxs"))
@@ -150,7 +181,7 @@ def _palette(
 
 
 def _labels(path: Path, pixels: _Pixels, palette: _Palette) -> _packing.Integers:
-    """(N,) the entry of the palette that each gaussian refers to."""
+    """Return (N,) the index of the palette entry of each gaussian."""
     labels: _packing.Integers = pixels[:, 0] | (pixels[:, 1].astype(np.uint16) << 8)
     largest = labels.max(initial=0)
     expected = f"labels below {palette.num_entries}"
@@ -160,7 +191,7 @@ def _labels(path: Path, pixels: _Pixels, palette: _Palette) -> _packing.Integers
 
 def _meta(path: Path, text: bytes) -> dict[str, Node]:
     with value_errors(path, "JSON in meta.json"):
-        document = parse_json(text.decode("utf-8"))
+        document = parse_json(text)
     meta = Node(document, os.fspath(path), "")
     advice = "convert it with splat-transform first"
     check(path, "version" in meta.some_fields(()), f"SOG version 2, got an older file; {advice}")
@@ -169,8 +200,31 @@ def _meta(path: Path, text: bytes) -> dict[str, Node]:
     return meta.some_fields(("count", "means", "scales", "quats", "sh0"))
 
 
+def _declared(meta: dict[str, Node]) -> Declared:
+    """What meta.json declares beside the pictures: `antialias`, of the specification,
+    and `model`, of splat-transform, which counts where there are both."""
+    notes = []
+    antialiased: bool | None = None
+    if "antialias" in meta:
+        antialiased = meta["antialias"].value
+        if not isinstance(antialiased, bool):
+            raise meta["antialias"].error("true or false")
+    if "model" in meta:
+        model = meta["model"].text()
+        if model in _MODELS:
+            antialiased = _MODELS[model]
+        else:
+            notes.append(f"The model {json_text(model)} is not known and was left out.")
+        if model == "2dgs":
+            notes.append("The gaussians are those of 2DGS; they were read as flat ellipsoids.")
+    unread = [name for name in meta if name not in _FIELDS]
+    if unread:
+        notes.append(f"Fields of meta.json were left out: {listed(unread)}.")
+    return Declared(antialiased=antialiased, notes=tuple(notes))
+
+
 def _size(meta: dict[str, Node]) -> tuple[int, int]:
-    """Number of gaussians, and their SH degree."""
+    """Return the number of gaussians, and their SH degree."""
     count = integer_of(meta["count"], "a number of gaussians", 0, _MAX_GAUSSIANS)
     if "shN" not in meta:
         return count, 0
@@ -178,8 +232,8 @@ def _size(meta: dict[str, Node]) -> tuple[int, int]:
 
 
 def _names(meta: dict[str, Node]) -> dict[str, list[str]]:
-    """Names of the pictures of each part, beside meta.json; nothing outside of its
-    folder is read."""
+    """Return the names of the pictures of each part, which are beside meta.json; files
+    outside of its folder are not read."""
     names = {}
     for part, count in _PARTS.items():
         if part in meta:
@@ -210,8 +264,8 @@ def _codebook(part: Node) -> Floats:
 def _decoded(
     path: Path, name: str, content: bytes, num_pixels: int, row: int | None = None
 ) -> _Pixels:
-    """(H, W, 4) pixels of a picture, of at least ``num_pixels`` and not many more, in
-    rows of ``row``."""
+    """Return the pixels (H, W, 4) of a picture, which has at least ``num_pixels`` and
+    not many more, in rows of ``row``."""
     from PIL.WebPImagePlugin import WebPImageFile  # Image.open would also try other formats
 
     width, height = _size_of_webp(content)
@@ -233,8 +287,8 @@ def _decoded(
 
 
 def _size_of_webp(content: bytes) -> tuple[int, int]:
-    """Width and height from the first chunk, known before a decoder allocates; 0, 0 for
-    another file."""
+    """Return the width and the height from the first chunk, before a decoder allocates
+    memory for them; 0, 0 for another file."""
 
     def number(first: int, size: int) -> int:
         return int.from_bytes(content[first : first + size], "little")
@@ -253,7 +307,10 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     """Write a `.sog` file; gaussians are put in an order that keeps neighbours
     together."""
     host = _packing.check_writable(gaussians)
-    contents = encode(host.subset(_core.morton_order(host.means)))
+    # A small asset keeps the higher SH of every gaussian, and a larger one many: half
+    # the palette would halve its bytes and cost 5 to 30 dB.
+    size = max(len(host) // 4, min(len(host), _FULL_PALETTE))
+    contents = encode(host.subset(_core.morton_order(host.means)), palette_size=size)
     # Readers refuse files that are too small for what they claim; equal gaussians
     # compress to almost nothing.
     missing = least_bytes(len(host)) - sum(map(len, contents.values()))
@@ -265,9 +322,15 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
             bundle.writestr(zipfile.ZipInfo(name), content)
 
 
-def encode(gaussians: Gaussians) -> dict[str, bytes]:
-    """The files of a SOG by name; ``gaussians`` have passed `check_writable`, and their
-    order stays."""
+def encode(gaussians: Gaussians, *, palette_size: int | None = None) -> dict[str, bytes]:
+    """Return the files of a SOG by name; ``gaussians`` have passed `check_writable`,
+    and keep their order.
+
+    Args:
+        palette_size: Number of sets of higher SH, at most 65,536 of which are made;
+            None is a quarter of the gaussians and at least 1024, for chunks that are
+            fetched.
+    """
     count = len(gaussians)
     width = 4 * max(1, math.ceil(math.sqrt(count) / 4))
     height = 4 * max(1, math.ceil(count / width / 4))
@@ -292,7 +355,6 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
     }
     meta: dict[str, object] = {
         "version": 2,
-        "asset": {"generator": f"v3dg {__version__}"},
         "count": count,
         "means": {
             "mins": low.tolist(),
@@ -302,20 +364,31 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
         "scales": {"codebook": scale_table.tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_table.tolist(), "files": ["sh0.webp"]},
+        **_declarations(gaussians),
     }
     if gaussians.sh_degree:
-        part, centroids, labels = _encoded_palette(gaussians)
+        part, centroids, labels = _encoded_palette(gaussians, palette_size)
         meta["shN"] = part
         contents["shN_centroids.webp"] = centroids
         contents["shN_labels.webp"] = picture(labels & 255, labels >> 8, np.zeros(count, np.uint8))
     return {"meta.json": json.dumps(meta, separators=(",", ":")).encode(), **contents}
 
 
+def _declarations(gaussians: Gaussians) -> dict[str, object]:
+    """What meta.json says of gaussians beside their numbers."""
+    declarations: dict[str, object] = {"asset": {"generator": f"v3dg {__version__}"}}
+    if gaussians.antialiased is not None:
+        declarations["antialias"] = gaussians.antialiased
+    if gaussians.antialiased:
+        declarations["model"] = "antialiased"
+    return declarations
+
+
 def _encoded_means(
     means: NDArray[np.float32],
 ) -> tuple[NDArray[np.uint32], NDArray[np.float64], NDArray[np.float64]]:
-    """Positions as 16-bit steps (N, 3) between the lowest and the highest logs; these
-    bounds, (3,) each."""
+    """Return positions as 16-bit steps (N, 3) between the lowest and the highest logs,
+    and these two bounds, (3,) each."""
     doubles = means.astype(np.float64)
     logs = np.sign(doubles) * np.log1p(np.abs(doubles))
     low = np.zeros(3)
@@ -327,16 +400,17 @@ def _encoded_means(
     return _packing.to_integers(fractions * 65535.0, 65535), low, high
 
 
-def _encoded_palette(gaussians: Gaussians) -> tuple[dict[str, object], bytes, _packing.Integers]:
-    """The part of meta.json for higher SH, the picture of its palette, and a label for
-    each gaussian."""
+def _encoded_palette(
+    gaussians: Gaussians, palette_size: int | None
+) -> tuple[dict[str, object], bytes, _packing.Integers]:
+    """Return the part of meta.json for higher SH, the picture of its palette, and a
+    label for each gaussian."""
     count = len(gaussians)
     num_coefficients = (gaussians.sh_degree + 1) ** 2 - 1
-    # A quarter of the gaussians; at least 1024, so that a small asset loses nothing,
-    # and at most 16 bits.
-    size = min(max(1024, count // 4), 65536)
     vectors = np.ascontiguousarray(gaussians.sh[:, 1:]).reshape(count, 3 * num_coefficients)
-    palette, labels = _core.palette_of(vectors, size)
+    if palette_size is None:
+        palette_size = max(_LEAST_PALETTE, count // 4)
+    palette, labels = _core.palette_of(vectors, min(palette_size, _MOST_PALETTE))
     table = _table_of(palette)
     num_rows = -(-len(palette) // _PALETTE_COLUMNS)
     colors = _nearest(table, palette).reshape(-1, 3)
@@ -355,12 +429,13 @@ def _table_of(values: Floats) -> Floats:
 
 
 def _nearest(table: Floats, values: Floats) -> NDArray[np.uint8]:
-    """Index of the entry of an ascending table that is nearest to each value."""
+    """Return the index of the entry of an ascending table that is nearest to each
+    value."""
     return np.searchsorted((table[1:] + table[:-1]) / 2, values).astype(np.uint8)
 
 
 def _webp(values: _packing.Integers, width: int, height: int) -> bytes:
-    """A picture whose first pixels have these values (N, C), padded with 255."""
+    """Return a picture whose first pixels have these values (N, C), padded with 255."""
     from PIL import Image
 
     pixels = np.full((height, width, 4), 255, np.uint8)

@@ -4,21 +4,26 @@ positions.
 Versions 1 to 3 are one gzip stream: a header of 16 bytes, then positions, opacities,
 colours, scales, rotations and higher SH, each for all gaussians. Version 4 is a header
 of 32 bytes, a table of sizes and a zstd stream an attribute. Version 1 has positions in
-half precision, 1 and 2 quaternions without w. Coordinates are passed on as they are
-stored. See docs/formats.md.
+half precision, 1 and 2 quaternions without w. Axes are right, up, back, unless the
+extension SPZ_ADOBE_coordinate_system records others. Some programs store those of
+`.ply` without a record: a ground, where there is one, shows which they are. See
+docs/formats.md.
 """
 
 import math
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _files
-from v3dg.formats import _packing
+from v3dg.cameras import Axis
+from v3dg.formats import _axes, _packing
+from v3dg.formats._declared import Declared
 from v3dg.formats._packing import SQRT2, Floats, assemble
 from v3dg.formats._reading import (
     AnyPath,
@@ -36,18 +41,48 @@ _MAGIC = 0x5053474E  # NGSP
 _HEADER = struct.Struct("<IIIBBBB")
 _ZSTD_HEADER_BYTES = 32
 _STREAM_SIZES = struct.Struct("<QQ")
+MAX_START = 1 << 16
+"""Bytes that contain the header, also after the optional fields of a gzip header."""
 _MAX_TRAILER = 1 << 20  # bytes after the attributes, for extensions of vendors
-# Bytes that contain the header, also after the optional fields of a gzip header.
-_MAX_START = 1 << 16
 _COLOR_SCALE = 0.15
 _LARGEST_FIXED = (1 << 23) - 1
+# Bits of the flags.
+_ANTIALIASED = 1
+_HAS_EXTENSIONS = 2
+_MOST_POINTS = 100_000  # that a ground is sought among
+_EXTENSION = struct.Struct("<II")  # a type and the bytes that follow
+_AXES_EXTENSION = 0xADBE0003  # SPZ_ADOBE_coordinate_system
+# The axes by their number in that extension, of version 4 of the library.
+_AXES = (
+    *("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
+    *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
+)
+# Programs that turn nothing store gaussians that have these axes, by what is up.
+_STORED_AXES: dict[Axis, str] = {"y": _axes.OPENGL, "-y": _axes.MEMORY, "z": _axes.Z_UP}
 
 
-class _Header(NamedTuple):
+LIMITS = _packing.Limits(
+    log_scale=(-10.0, -10.0 + 255 / 16),
+    color=(-0.5 / _COLOR_SCALE, 0.5 / _COLOR_SCALE),
+    harmonic=(-1.0, 127.5 / 128),
+)
+"""The ranges of values in the format. Where values half a step beyond are rounded into
+the range, they include that half step."""
+
+
+class Header(NamedTuple):
+    """What the first bytes of a file say."""
+
     version: int
     sh_degree: int
     fraction_bits: int  # fraction bits of the fixed-point positions
     num_gaussians: int
+    flags: int
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether the gaussians were trained with antialiasing."""
+        return bool(self.flags & _ANTIALIASED)
 
     @property
     def section_bytes(self) -> list[int]:
@@ -63,58 +98,73 @@ class _Header(NamedTuple):
         return [self.num_gaussians * width for width in widths]
 
 
+@dataclass(frozen=True, eq=False)
+class _Content:
+    """What a file holds, expanded."""
+
+    header: Header
+    sections: list[memoryview]
+    extensions: bytes  # records of a type, a length and a payload
+
+
 def open_file(path: AnyPath) -> AssetFile:
-    """Open a `.spz` file; all of it is read with its first rows."""
+    """Open a `.spz` file of version 1 to 4, which is expanded; all of its gaussians are
+    decoded with the first."""
     claims = Claims()
-    with claims.open(path) as file:
-        header = file.read(_MAX_START)
+    content = _expanded(path, claims.read(path), claims)
+    axes, reason = _axes_of(path, content)
+
+    def read(_: AnyPath) -> Gaussians:
+        return _axes.turned(_decode(content), axes, _axes.MEMORY)
+
+    header = content.header
+    declared = Declared(_axes.MEMORY_UP, reason, header.antialiased, _notes(content))
+    return whole_file(path, header.num_gaussians, header.sh_degree, read, declared=declared)
+
+
+def header_of(path: AnyPath, start: bytes | memoryview, claims: Claims) -> Header:
+    """The header in the first `MAX_START` bytes of a `.spz` file's content."""
+    header = bytes(start)
     if header[:2] == b"\x1f\x8b":
         with value_errors(path, "a gzip stream that is not damaged"):
             header = zlib.decompressobj(31).decompress(header, _HEADER.size)
-    checked = _checked_header(path, header, claims)
-    return whole_file(path, checked.num_gaussians, checked.sh_degree, read)
-
-
-def read(path: AnyPath) -> Gaussians:
-    """Read a `.spz` file of version 1 to 4."""
-    claims = Claims()
-    return decode(path, claims.read(path), claims)
+    return _checked_header(path, header, claims)
 
 
 def decode(path: AnyPath, content: bytes, claims: Claims) -> Gaussians:
-    """The gaussians of a `.spz` file's content."""
+    """Return the gaussians of the content of a `.spz` file, in the axes of the file."""
+    return _decode(_expanded(path, content, claims))
+
+
+def _expanded(path: AnyPath, content: bytes, claims: Claims) -> _Content:
     if content[:2] == b"\x1f\x8b":
-        return _decode(*_sections_of_gzip(path, content, claims))
+        return _sections_of_gzip(path, content, claims)
     is_zstd = content[:4] == _MAGIC.to_bytes(4, "little")
     check(
         path, is_zstd, f"a .spz file, which begins with 1f 8b or NGSP, got {content[:4].hex(' ')}"
     )
-    return _decode(*_sections_of_zstd(path, content, claims))
+    return _sections_of_zstd(path, content, claims)
 
 
-def write(path: AnyPath, gaussians: Gaussians, version: int = 3) -> None:
-    """Write a `.spz` file of version 2, 3 or 4; the order stays."""
+def write(
+    path: AnyPath, gaussians: Gaussians, version: int = 3, *, up: Axis = _axes.MEMORY_UP
+) -> None:
+    """Write a `.spz` file of version 2, 3 or 4, of gaussians of which `up` is up; the
+    order stays."""
     check("version", version in (2, 3, 4), f"2, 3 or 4 for .spz, got {version}")
-    host = _packing.check_writable(gaussians)
+    host = _axes.turned(_packing.check_writable(gaussians), _axes.axes_of_up(up), _axes.OPENGL)
     with _files.replacing(path) as temporary, open(temporary, "wb") as file:
-        for part in encode(host, version):
+        for part in encode(host, version, axes=_axes.OPENGL):
             file.write(part)
         # Readers refuse files that are too small for what they claim, and ignore zeros
         # at the end.
         file.write(bytes(max(0, least_bytes(len(host)) - file.tell())))
 
 
-def encode(host: Gaussians, version: int = 3) -> Iterator[bytes]:
-    """Parts of a `.spz` file; ``host`` has passed `check_writable`."""
-    reach = float(np.abs(host.means).max(initial=0.0))
-    integer_bits = 0
-    if reach > 0:
-        integer_bits = math.ceil(math.log2(reach))
-    # Fraction bits: 12, as in Niantic's writer, or more if a step were above 2^-17 of
-    # the largest coordinate.
-    bits = max(0, min(max(12, 17 - integer_bits), 22 - integer_bits, 24))
-    fits = reach * 2**bits <= _LARGEST_FIXED
-    check("means", fits, f"coordinates within ±{_LARGEST_FIXED} for .spz, got {reach:g}")
+def encode(host: Gaussians, version: int = 3, *, axes: str = "") -> Iterator[bytes]:
+    """Parts of a `.spz` file, which records its axes if they are given; ``host`` has
+    passed `check_writable`."""
+    bits = _fraction_bits(host.means)
 
     def fixed(rows: slice) -> bytes:
         numbers = np.rint(host.means[rows].astype(np.float64) * 2**bits).astype("<i4")
@@ -131,30 +181,52 @@ def encode(host: Gaussians, version: int = 3) -> Iterator[bytes]:
         lambda rows: rotations(host.quats[rows]),
         lambda rows: _bytes(host.sh[rows, 1:] * 128.0 + 128.0),
     ]
-    header = _HEADER.pack(_MAGIC, version, len(host), host.sh_degree, bits, 0, 0)
+    flags = 0
+    extensions = b""
+    if host.antialiased:
+        flags |= _ANTIALIASED
+    if axes:
+        flags |= _HAS_EXTENSIONS
+        extensions = _EXTENSION.pack(_AXES_EXTENSION, 4) + struct.pack("<I", _AXES.index(axes))
+    header = _HEADER.pack(_MAGIC, version, len(host), host.sh_degree, bits, flags, 0)
     if version == 4:
         if not host.sh_degree:
             del sections[-1]
-        yield from _zstd_parts(header, len(host), sections)
+        yield from _zstd_parts(header, extensions, len(host), sections)
         return
     compressor = zlib.compressobj(6, zlib.DEFLATED, 31)
     yield compressor.compress(header)
     for section in sections:
         for rows in _packing.blocks(len(host)):
             yield compressor.compress(section(rows))
+    yield compressor.compress(extensions)
     yield compressor.flush()
 
 
+def _fraction_bits(means: NDArray[np.float32]) -> int:
+    """12, as in Niantic's writer, or more if a step were above 2^-17 of the largest
+    coordinate."""
+    reach = float(np.abs(means).max(initial=0.0))
+    integer_bits = 0
+    if reach > 0:
+        integer_bits = math.ceil(math.log2(reach))
+    bits = max(0, min(max(12, 17 - integer_bits), 22 - integer_bits, 24))
+    fits = reach * 2**bits <= _LARGEST_FIXED
+    check("means", fits, f"coordinates within ±{_LARGEST_FIXED} for .spz, got {reach:g}")
+    return bits
+
+
 def _zstd_parts(
-    header: bytes, count: int, sections: list[Callable[[slice], bytes]]
+    header: bytes, extensions: bytes, count: int, sections: list[Callable[[slice], bytes]]
 ) -> Iterator[bytes]:
-    """The header, with number of streams and offset of their table; the table of sizes;
-    the streams."""
+    """Yield the header, which has the number of streams and the offset of their table;
+    then the extensions, the table of sizes, and the streams."""
     import zstandard
 
     raw = [b"".join(map(section, _packing.blocks(count))) for section in sections]
     packed = [zstandard.ZstdCompressor(level=12).compress(stream) for stream in raw]
-    yield header[:15] + struct.pack("<BI12x", len(raw), _ZSTD_HEADER_BYTES)
+    yield header[:15] + struct.pack("<BI12x", len(raw), _ZSTD_HEADER_BYTES + len(extensions))
+    yield extensions
     for compressed, stream in zip(packed, raw, strict=True):
         yield _STREAM_SIZES.pack(len(compressed), len(stream))
     yield from packed
@@ -165,7 +237,7 @@ def _bytes(values: Floats) -> bytes:
 
 
 def _rotation_bytes(quats: Floats) -> bytes:
-    """x y z of the quaternion whose w is not negative."""
+    """Return x y z, as bytes, of the quaternions whose w is not negative."""
     unit = normalised(quats)
     return _bytes((unit[:, 1:] * np.where(unit[:, :1] < 0, -1.0, 1.0) + 1.0) * 127.5)
 
@@ -179,20 +251,69 @@ def _rotation_words(quats: Floats) -> bytes:
     return words.astype("<u4").tobytes()
 
 
-def _decode(header: _Header, sections: list[memoryview]) -> Gaussians:
+def _means(content: _Content, rows: slice) -> Floats:
+    """Return (N, 3) positions as they are stored."""
+    positions = np.frombuffer(content.sections[0], "u1")
+    if content.header.version == 1:
+        return positions.view("<f2").reshape(-1, 3)[rows].astype(np.float64)
+    three = positions.reshape(-1, 3, 3)[rows].astype(np.int32)
+    fixed = three[:, :, 0] | (three[:, :, 1] << 8) | (three[:, :, 2] << 16)
+    return ((fixed ^ 0x800000) - 0x800000) / float(1 << content.header.fraction_bits)
+
+
+def _axes_of(path: AnyPath, content: _Content) -> tuple[str, str]:
+    """Return the axes of the stored gaussians, and a phrase that says how they are
+    known."""
+    for kind, payload in _records(content.extensions):
+        if kind == _AXES_EXTENSION:
+            number = int.from_bytes(payload, "little")
+            is_known = len(payload) == 4 and number < len(_AXES)
+            expected = f"axes 0 to {len(_AXES) - 1} in their record, got {payload[:8].hex(' ')}"
+            check(path, is_known, expected)
+            if _AXES[number]:
+                return _AXES[number], f"as its record of axes says ({_AXES[number]})"
+    stride = max(1, content.header.num_gaussians // _MOST_POINTS)
+    up = _axes.up_of_ground(_means(content, slice(None, None, stride)))
+    if up is None:
+        return _axes.OPENGL, "as in .spz, which has y up"
+    return _STORED_AXES[up], f"guessed from its ground, with which {up} is up in the file"
+
+
+def _records(extensions: bytes) -> Iterator[tuple[int, bytes]]:
+    """Type and payload of each extension."""
+    first = 0
+    while first + _EXTENSION.size <= len(extensions):
+        kind, num_bytes = _EXTENSION.unpack_from(extensions, first)
+        first += _EXTENSION.size
+        yield kind, extensions[first : first + num_bytes]
+        first += num_bytes
+
+
+def _notes(content: _Content) -> tuple[str, ...]:
+    """Sentences about what is in the file and was not read."""
+    extensions = tuple(
+        f"Its extension {kind:#010x}, of {len(payload)} bytes, is not read."
+        for kind, payload in _records(content.extensions)
+        if kind != _AXES_EXTENSION
+    )
+    return (*flag_notes(content.header), *extensions)
+
+
+def flag_notes(header: Header) -> tuple[str, ...]:
+    """Sentences about flags that were not understood."""
+    unknown = header.flags & ~(_ANTIALIASED | _HAS_EXTENSIONS)
+    if not unknown:
+        return ()
+    return (f"Its flags {unknown:#04x} are unknown, and are not read.",)
+
+
+def _decode(content: _Content) -> Gaussians:
+    header = content.header
     count = header.num_gaussians
-    positions = np.frombuffer(sections[0], "u1")
     opacities, colors, scales, rotations, higher_sh = (
         np.frombuffer(section, "u1").reshape(count, len(section) // max(1, count))
-        for section in sections[1:]
+        for section in content.sections[1:]
     )
-
-    def means(block: slice) -> Floats:
-        if header.version == 1:
-            return positions.view("<f2").reshape(-1, 3)[block].astype(np.float64)
-        three = positions.reshape(-1, 3, 3)[block].astype(np.int32)
-        fixed = three[:, :, 0] | (three[:, :, 1] << 8) | (three[:, :, 2] << 16)
-        return ((fixed ^ 0x800000) - 0x800000) / float(1 << header.fraction_bits)
 
     def decode(block: slice) -> tuple[Floats, ...]:
         color = (colors[block] / 255.0 - 0.5) / _COLOR_SCALE
@@ -200,7 +321,7 @@ def _decode(header: _Header, sections: list[memoryview]) -> Gaussians:
         sh = np.concatenate([color[:, None], higher.reshape(len(color), -1, 3)], axis=1)
         log_scales = scales[block] / 16.0 - 10.0
         return (
-            means(block),
+            _means(content, block),
             _quats(rotations[block]),
             np.exp(log_scales),
             opacities[block, 0] / 255.0,
@@ -211,7 +332,8 @@ def _decode(header: _Header, sections: list[memoryview]) -> Gaussians:
 
 
 def _quats(rotations: NDArray[np.uint8]) -> Floats:
-    """Quaternions w x y z from words (version 3 and later), or from x y z as bytes."""
+    """Return quaternions w x y z from words (version 3 and later), or from x y z as
+    bytes."""
     if rotations.shape[1] == 3:
         xyz = rotations / 127.5 - 1.0
         return normalised(_packing.quats_from_three(xyz, np.zeros(len(xyz), np.intp)))
@@ -221,20 +343,18 @@ def _quats(rotations: NDArray[np.uint8]) -> Floats:
     return np.roll(_packing.quats_from_three(three, words >> 30), 1, axis=1)
 
 
-def _checked_header(path: AnyPath, header: bytes, claims: Claims) -> _Header:
+def _checked_header(path: AnyPath, header: bytes, claims: Claims) -> Header:
     check(path, len(header) >= _HEADER.size, f"a header of {_HEADER.size} bytes, got {len(header)}")
-    magic, version, count, degree, fraction_bits, _, _ = _HEADER.unpack_from(header)
+    magic, version, count, degree, fraction_bits, flags, _ = _HEADER.unpack_from(header)
     check(path, magic == _MAGIC, f".spz, which begins with NGSP, got {header[:4].hex(' ')}")
     check(path, 1 <= version <= 4, f".spz of version 1 to 4, got {version}")
     check(path, degree <= 3, f"SH degree 0 to 3, got {degree}")
     check(path, fraction_bits <= 24, f"at most 24 fraction bits, got {fraction_bits}")
     claims.add(path, count)
-    return _Header(version, degree, fraction_bits, count)
+    return Header(version, degree, fraction_bits, count, flags)
 
 
-def _sections_of_gzip(
-    path: AnyPath, content: bytes, claims: Claims
-) -> tuple[_Header, list[memoryview]]:
+def _sections_of_gzip(path: AnyPath, content: bytes, claims: Claims) -> _Content:
     stream = zlib.decompressobj(31)
     with value_errors(path, "a gzip stream that is not damaged"):
         start = stream.decompress(content, _HEADER.size)
@@ -252,12 +372,13 @@ def _sections_of_gzip(
     check(path, is_whole, f"a gzip stream that ends after {total} bytes of gaussians, got another")
     ends = np.cumsum(sizes).tolist()
     sections = [memoryview(body)[end - size : end] for size, end in zip(sizes, ends, strict=True)]
-    return header, sections
+    extensions = b""
+    if header.flags & _HAS_EXTENSIONS:
+        extensions = body[total:]
+    return _Content(header, sections, extensions)
 
 
-def _sections_of_zstd(
-    path: AnyPath, content: bytes, claims: Claims
-) -> tuple[_Header, list[memoryview]]:
+def _sections_of_zstd(path: AnyPath, content: bytes, claims: Claims) -> _Content:
     import zstandard
 
     num_bytes = len(content)
@@ -294,4 +415,7 @@ def _sections_of_zstd(
         first += packed
     if not header.sh_degree:
         sections.append(memoryview(b""))
-    return header, sections
+    extensions = b""
+    if header.flags & _HAS_EXTENSIONS:
+        extensions = content[_ZSTD_HEADER_BYTES:table]
+    return _Content(header, sections, extensions)

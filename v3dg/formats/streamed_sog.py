@@ -8,34 +8,80 @@ what is in its bounds.
 import os
 import re
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 
 from v3dg._json import Node, parse_json
 from v3dg.formats import sog
-from v3dg.formats._reading import AssetFile, Claims, check, integer_of, value_errors, whole_file
+from v3dg.formats._declared import Declared
+from v3dg.formats._reading import (
+    AssetFile,
+    Claims,
+    check,
+    integer_of,
+    listed,
+    value_errors,
+    whole_file,
+)
 from v3dg.gaussians import Gaussians
 
+_FIELDS = (
+    "version",
+    "asset",
+    "count",
+    "counts",
+    "environment",
+    "filenames",
+    "lodErrors",
+    "lodLevels",
+    "tree",
+)
 _LEVEL = re.compile(r"[0-9]{1,9}")
+
+
+class _Index(NamedTuple):
+    """What `lod-meta.json` says."""
+
+    tree: Node
+    names: list[PurePosixPath]  # of the files that the tree refers to by number
+    environment: PurePosixPath | None  # the file of what belongs to no leaf
+    unread: list[str]  # fields that are not read
 
 
 def open_file(path: str | os.PathLike[str]) -> AssetFile:
     """Open a `lod-meta.json`; all is read with its first rows."""
     path = Path(path)
-    finest, environment = _used(path, Claims())
+    index = _index(path, Claims())
+    finest = _used(path, index)
+    environment = index.environment
     parts = [sog.open_file(path.parent / name) for name in finest]
     count = sum(len(rows) for runs in finest.values() for rows in runs)
     if environment is not None:
         parts.append(sog.open_file(path.parent / environment))
         count += parts[-1].num_gaussians
-    return whole_file(path, count, parts[0].sh_degree, read, files(path))
+    declared = _declared(index, [part.declared for part in parts])
+    return whole_file(path, count, parts[0].sh_degree, read, files(path), declared)
+
+
+def _declared(index: _Index, parts: list[Declared]) -> Declared:
+    """Return what the index declares together with all of its parts."""
+    notes = list(dict.fromkeys(note for part in parts for note in part.notes))
+    if index.unread:
+        notes.append(f"Fields of lod-meta.json were left out: {listed(index.unread)}.")
+    antialiased = parts[0].antialiased
+    if any(part.antialiased != antialiased for part in parts):
+        antialiased = None
+        notes.append("Some folders were trained with antialiasing, others not or not known.")
+    return Declared(antialiased=antialiased, notes=tuple(notes))
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read the finest level of each leaf, and the environment, of a `lod-meta.json`."""
     path = Path(path)
     claims = Claims()
-    finest, environment = _used(path, claims)
+    index = _index(path, claims)
+    finest = _used(path, index)
     parts = []
     for name, rows in finest.items():
         gaussians = sog.read(path.parent / name, claims)
@@ -46,51 +92,48 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         parts.append(
             gaussians.subset(np.concatenate([np.arange(run.start, run.stop) for run in rows]))
         )
-    if environment is not None:
-        parts.append(sog.read(path.parent / environment, claims))
+    if index.environment is not None:
+        parts.append(sog.read(path.parent / index.environment, claims))
     degrees = sorted({part.sh_degree for part in parts})
     check(path, len(degrees) == 1, f"one SH degree in all folders, got {degrees}")
     return Gaussians.concatenate(parts)
 
 
 def files(path: Path) -> list[Path]:
-    """The index and the files of all levels and of the environment that exist."""
-    _, names, environment = _index(path, Claims().read(path))
-    parts = [
-        path.parent / name for name in dict.fromkeys([*names, environment]) if name is not None
-    ]
+    """Return the index and the files of all levels and of the environment that
+    exist."""
+    index = _index(path, Claims())
+    names = dict.fromkeys([*index.names, index.environment])
+    parts = [path.parent / name for name in names if name is not None]
     return [path, *(file for part in parts if part.exists() for file in sog.files(part))]
 
 
-def _used(
-    path: Path, claims: Claims
-) -> tuple[dict[PurePosixPath, list[range]], PurePosixPath | None]:
-    """The rows to read of each file, in their order, and the file of the
-    environment."""
-    tree, names, environment = _index(path, claims.read(path))
-    finest = _finest(tree, names)
-    check(path, finest or environment is not None, "gaussians in the tree, got none")
+def _used(path: Path, index: _Index) -> dict[PurePosixPath, list[range]]:
+    """Return the rows to read of each file, in the order of the files."""
+    finest = _finest(index.tree, index.names)
+    has_any = finest or index.environment is not None
+    check(path, has_any, "gaussians in the tree, got none")
     # A file that is listed twice is read once.
-    return {name: finest[name] for name in dict.fromkeys(names) if name in finest}, environment
+    return {name: finest[name] for name in dict.fromkeys(index.names) if name in finest}
 
 
-def _index(path: Path, text: bytes) -> tuple[Node, list[PurePosixPath], PurePosixPath | None]:
-    """The tree, the names of the files, and the name of the environment's file if there
-    is one."""
+def _index(path: Path, claims: Claims) -> _Index:
+    text = claims.read(path)
     with value_errors(path, "JSON"):
-        index = Node(parse_json(text.decode("utf-8")), os.fspath(path), "")
+        index = Node(parse_json(text), os.fspath(path), "")
     if index.has("version") and index.field("version").value != 1:
         raise index.field("version").error("streamed SOG version 1")
     names = [_inside(name) for name in index.field("filenames").items()]
     environment = None
     if index.has("environment") and index.field("environment").value is not None:
         environment = _inside(index.field("environment"))
-    return index.field("tree"), names, environment
+    unread = [name for name in index.some_fields(()) if name not in _FIELDS]
+    return _Index(index.field("tree"), names, environment, unread)
 
 
 def _inside(node: Node) -> PurePosixPath:
-    """The path of a file in the folder of the index or below it; ValueError for any
-    other."""
+    """Return the path of a file in the folder of the index or below it; ValueError for
+    a path that leads out of it."""
     path = PurePosixPath(node.text())
     if path.is_absolute() or ".." in path.parts or "\\" in node.text():
         raise node.error("a path below that of lod-meta.json")

@@ -1,8 +1,12 @@
 """OpenUSD: gaussians as prims `ParticleField3DGaussianSplat`, with Pixar's usd-core.
 
 One prim is written. All prims are read and transformed, into one asset, or into an
-asset each with the poses of its instances. Of levels of detail, the first is read.
-Coordinates are passed on as they are stored.
+asset each with the poses of its instances. Of levels of detail, the first is read; of
+values that change with time, the first, too. What is invisible or for other purposes
+than drawing is left out. An asset is turned from the axes of the stage to those of
+memory; a world keeps the stage's.
+
+Source: Pixar, OpenUSD 26.11, the schemas of UsdVol, and Usdz File Format Specification.
 """
 
 from __future__ import annotations
@@ -11,11 +15,14 @@ import contextlib
 import os
 import shutil
 import tempfile
+import zipfile
 from collections.abc import Iterator
+from dataclasses import replace
+from enum import Enum
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,16 +30,21 @@ from numpy.typing import NDArray
 from v3dg import _extras, _files
 from v3dg._numbers import check
 from v3dg.cameras import Axis, Floats, is_rotation
+from v3dg.formats import _axes
+from v3dg.formats._declared import Declared
 from v3dg.formats._packing import check_writable
-from v3dg.formats._reading import AnyPath, AssetFile, value_errors
+from v3dg.formats._reading import AnyPath, AssetFile, listed, value_errors
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import normalised, quaternion_from_rotation
 
 if TYPE_CHECKING:
     from pxr import Sdf, Usd
 
-SUFFIXES = (".usd", ".usda", ".usdc")
+SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+# The axes of a stage by the one that is up; its cameras look back.
+_AXES = {"Y": _axes.OPENGL, "Z": _axes.Z_UP}
 _Pose: TypeAlias = tuple[tuple[float, float, float, float], Floats, float]
+_ANTIALIASED = "antialiased"  # in the custom data of a prim: the schema has no place for it
 _SH = "radiance:sphericalHarmonics"
 _HALVES = (
     "positions",
@@ -42,15 +54,36 @@ _HALVES = (
     f"{_SH}Coefficients",
 )  # or in half precision
 _COLUMNS = (f"{_SH}Degree", *_HALVES, *(f"{name}h" for name in _HALVES))
+# Attributes that say nothing about how gaussians look, or that are looked at elsewhere.
+_HINTS = ("projectionModeHint", "sortingModeHint")
+_KNOWN = (*_COLUMNS, *_HINTS, "extent", "visibility", "purpose", "xformOpOrder")
+_MAX_DEGREE = 3  # that is kept
+_MOST_DEGREE = 100
+
+
+class _Kernel(Enum):
+    """The shapes of particles that can be read as gaussians."""
+
+    ELLIPSOID = "ParticleFieldKernelGaussianEllipsoidAPI"
+    SURFLET = "ParticleFieldKernelGaussianSurfletAPI"  # flat in its z
+
+
+class _Column(NamedTuple):
+    """The values of an attribute for the particles of a prim; none if the default of
+    the schema stands for them."""
+
+    values: NDArray[np.float32] | None
+    note: str = ""
 
 
 @cache
 def pxr() -> ModuleType:
-    """The package `pxr`; ImportError says how to get it."""
+    """Return the package `pxr`; ImportError says how to get it."""
     for part in (
         "Usd",
         "UsdGeom",
         "UsdLod",
+        "UsdUtils",
         "UsdVol",
         "Vt",
     ):  # importing them makes them attributes
@@ -61,31 +94,63 @@ def pxr() -> ModuleType:
 
 def open_file(path: AnyPath) -> AssetFile:
     """Open a USD file, which is read whole."""
-    gaussians = read(path)
+    gaussians, declared = read(path)
 
     def read_rows(first: int, last: int) -> Gaussians:
         return gaussians.subset(slice(first, last))
 
-    return AssetFile(path, len(gaussians), gaussians.sh_degree, read_rows)
+    return AssetFile(path, len(gaussians), gaussians.sh_degree, read_rows, declared=declared)
 
 
-def read(path: AnyPath) -> Gaussians:
-    """Read the gaussians of a USD file as one asset."""
-    with _opened(path, "OpenUSD with gaussians of one SH degree, without instances") as (usd, root):
+def read(path: AnyPath) -> tuple[Gaussians, Declared]:
+    """Read the gaussians of a USD file as one asset, and what the file declares."""
+    with _opened(path, "OpenUSD with gaussians, without instances") as (usd, root):
         for prim in _prims(usd, root):
             if prim.IsA(usd.UsdGeom.PointInstancer):
                 raise ValueError(f"instances in {prim.GetPath()}; open it as a scene")
         parts = []
+        notes = _left_out(usd, root)
         for prim, matrix in _placed(usd, root):
-            gaussians = _gaussians_of(prim)
+            gaussians, notes_of_prim = _gaussians_of(usd, prim)
             if not np.array_equal(matrix, np.eye(4)):
                 gaussians = gaussians.transform(*_similarity(prim, matrix))
             parts.append(gaussians)
-        return Gaussians.concatenate(parts)
+            notes += notes_of_prim
+        degree = max(part.sh_degree for part in parts)
+        joined = Gaussians.concatenate([_padded(part, degree) for part in parts])
+        letter = str(usd.UsdGeom.GetStageUpAxis(root.GetStage()))
+        if letter not in _AXES:
+            raise ValueError(f"the up axis {letter[:20]!a}; only Y and Z can be read")
+        gaussians = _axes.turned(joined, _AXES[letter], _axes.MEMORY)
+        declared = _declared(usd, root.GetStage(), letter, notes)
+        return gaussians, replace(declared, antialiased=gaussians.antialiased)
+
+
+def _declared(usd: ModuleType, stage: Usd.Stage, letter: str, notes: list[str]) -> Declared:
+    """Return what a stage declares, with the notes about its prims; `letter` is its
+    axis that is up."""
+    unit = usd.UsdGeom.GetStageMetersPerUnit(stage)
+    distinct = list(dict.fromkeys(notes))
+    if usd.UsdGeom.StageHasAuthoredMetersPerUnit(stage) and unit != 1:
+        distinct.append(f"Its unit is {unit:g} m; coordinates stay in that unit.")
+    reason = f"as its stage says ({letter} is up in the file)"
+    if not stage.HasAuthoredMetadata("upAxis"):
+        reason = f"as in OpenUSD ({letter} is up in the file)"
+    return Declared(up=_axes.MEMORY_UP, up_reason=reason, notes=tuple(distinct))
+
+
+def _padded(gaussians: Gaussians, degree: int) -> Gaussians:
+    """Return the same gaussians with zeros for the coefficients up to a degree."""
+    missing = (degree + 1) ** 2 - gaussians.sh.shape[1]
+    if missing == 0:
+        return gaussians
+    zeros = np.zeros((len(gaussians), missing, 3), np.float32)
+    padded = replace(gaussians, sh=np.concatenate([gaussians.numpy().sh, zeros], axis=1))
+    return padded.trained(antialiased=gaussians.antialiased)
 
 
 def has_instances(path: AnyPath) -> bool:
-    """Whether instances make a USD file a scene."""
+    """Return whether instances make a USD file a scene."""
     with _opened(path, "OpenUSD with gaussians") as (usd, root):
         kind = usd.UsdGeom.PointInstancer
         return any(prim.IsInstanceProxy() or prim.IsA(kind) for prim in _prims(usd, root))
@@ -112,7 +177,7 @@ def read_world(path: AnyPath) -> tuple[list[Gaussians], list[int], list[_Pose], 
                 )
                 if source not in asset_from_source:
                     asset_from_source[source] = len(assets)
-                    assets.append(_gaussians_of(prim))
+                    assets.append(_gaussians_of(usd, prim)[0])
                 asset_from_path[path_of_prim] = asset_from_source[source]
             asset_from_instance.append(asset_from_path[path_of_prim])
             poses.append(_similarity(prim, matrix))
@@ -124,37 +189,110 @@ def read_world(path: AnyPath) -> tuple[list[Gaussians], list[int], list[_Pose], 
 
 @contextlib.contextmanager
 def _opened(path: AnyPath, expected: str) -> Iterator[tuple[ModuleType, Usd.Prim]]:
-    """The package `pxr`, and the root of the prims of a file; ValueError unless some
-    are gaussians."""
+    """Yield the package `pxr`, and the root of the prims of a file; ValueError if no
+    prim has gaussians."""
     check(
         path, Path(path).suffix.lower() in SUFFIXES, f"a file name ending in {', '.join(SUFFIXES)}"
     )
     usd = pxr()
     os.close(_files.open_regular(path))
+    if Path(path).suffix.lower() == ".usdz":
+        _check_package(path)
     with value_errors(path, expected):
         stage = usd.Usd.Stage.Open(os.fspath(path))
-        if not any(_prims(usd, stage.GetPseudoRoot())):
-            raise ValueError("no ParticleField3DGaussianSplat")
-        yield usd, stage.GetPseudoRoot()
+        root = stage.GetPseudoRoot()
+        if not any(_prims(usd, root)):
+            raise ValueError(" ".join(["no ParticleField3DGaussianSplat.", *_left_out(usd, root)]))
+        yield usd, root
+
+
+def _check_package(path: AnyPath) -> None:
+    """Raise ValueError unless a file is a zip of a layer, and other files, that are
+    stored as they are: the library reads them in place."""
+    with value_errors(path, "a .usdz, which is a zip"), zipfile.ZipFile(path) as package:
+        members = package.infolist()
+    is_layer = bool(members) and members[0].filename.endswith(SUFFIXES[:3])
+    names = listed(member.filename for member in members) or "nothing"
+    check(path, is_layer, f"a .usdz whose first file is a layer of USD, got {names}")
+    for member in members:
+        is_stored = member.compress_type == zipfile.ZIP_STORED and not member.flag_bits & 1
+        has_size = member.compress_size == member.file_size
+        expected = f"{member.filename!a} stored in the .usdz as it is"
+        check(path, is_stored and has_size, f"{expected}, got a compressed or an encrypted file")
 
 
 def _prims(usd: ModuleType, root: Usd.Prim) -> Iterator[Usd.Prim]:
-    """Prims of gaussians and instancers at and below a root, without those of coarser
-    levels."""
+    """Yield the prims of gaussians, and the instancers, that are to be drawn at and
+    below a root; coarser levels are left out."""
     walk = iter(usd.Usd.PrimRange(root, usd.Usd.TraverseInstanceProxies()))
     for prim in walk:
-        parent = prim.GetParent()
         is_instancer = prim.IsA(usd.UsdGeom.PointInstancer)
-        is_coarse = parent and parent.HasAPI(usd.UsdLod.RootAPI) and prim != parent.GetChildren()[0]
-        if is_instancer or is_coarse:  # prims below an instancer are only drawn as its instances
+        is_left_out = _is_coarse(usd, prim) or _is_hidden(usd, prim)
+        if is_instancer or is_left_out:  # prims below an instancer are only drawn as its instances
             walk.PruneChildren()
-        if not is_coarse and (is_instancer or prim.IsA(usd.UsdVol.ParticleField3DGaussianSplat)):
+        if not is_left_out and (is_instancer or _kernel(usd, prim) is not None):
             yield prim
 
 
+def _is_coarse(usd: ModuleType, prim: Usd.Prim) -> bool:
+    """Return whether a prim is a level of detail other than the first."""
+    parent = prim.GetParent()
+    return bool(parent and parent.HasAPI(usd.UsdLod.RootAPI) and prim != parent.GetChildren()[0])
+
+
+def _is_hidden(usd: ModuleType, prim: Usd.Prim) -> bool:
+    """Return whether a prim and all below it are not drawn, because it is invisible, a
+    stand-in for others, or an aid for editing."""
+    imageable = usd.UsdGeom.Imageable(prim)
+    if not imageable:
+        return False
+    time = usd.Usd.TimeCode.EarliestTime()
+    is_invisible = imageable.GetVisibilityAttr().Get(time) == usd.UsdGeom.Tokens.invisible
+    purposes = (usd.UsdGeom.Tokens.proxy, usd.UsdGeom.Tokens.guide)
+    return is_invisible or imageable.GetPurposeAttr().Get() in purposes
+
+
+def _kernel(usd: ModuleType, prim: Usd.Prim) -> _Kernel | None:
+    """Return the shape of a prim's particles; None if they are not gaussians."""
+    if prim.IsA(usd.UsdVol.ParticleField):
+        for kernel in _Kernel:
+            if prim.HasAPI(getattr(usd.UsdVol, kernel.value)):
+                return kernel
+    return None
+
+
+def _left_out(usd: ModuleType, root: Usd.Prim) -> list[str]:
+    """Return a sentence for each part of the stage that is not read."""
+    hidden: list[str] = []
+    particles: list[str] = []
+    unread: list[str] = []
+    walk = iter(usd.Usd.PrimRange(root, usd.Usd.TraverseInstanceProxies()))
+    for prim in walk:
+        path = str(prim.GetPath())
+        if _is_coarse(usd, prim):
+            walk.PruneChildren()
+        elif _is_hidden(usd, prim):
+            hidden.append(path)
+            walk.PruneChildren()
+        elif prim.IsA(usd.UsdVol.ParticleField) and _kernel(usd, prim) is None:
+            particles.append(path)
+        elif prim.IsA(usd.UsdGeom.Gprim) and _kernel(usd, prim) is None:
+            unread.append(path)
+    notes = []
+    if hidden:
+        notes.append(
+            f"Prims that are invisible or not for drawing were left out: {listed(hidden)}."
+        )
+    if particles:
+        notes.append(f"Particles that are no gaussians were left out: {listed(particles)}.")
+    if unread:
+        notes.append(f"Other geometry was left out: {listed(unread)}.")
+    return notes
+
+
 def _placed(usd: ModuleType, root: Usd.Prim) -> Iterator[tuple[Usd.Prim, Floats]]:
-    """Prims of gaussians, each with the (4, 4) matrix from it, or from an instance of
-    it, to the root."""
+    """Yield each prim of gaussians with the (4, 4) matrix from the prim, or from an
+    instance of it, to the root."""
     root_from_world = np.linalg.inv(_to_world(usd, root))
     time = usd.Usd.TimeCode.EarliestTime()
     for prim in _prims(usd, root):
@@ -177,47 +315,142 @@ def _placed(usd: ModuleType, root: Usd.Prim) -> Iterator[tuple[Usd.Prim, Floats]
 
 def _to_world(usd: ModuleType, prim: Usd.Prim) -> Floats:
     # USD multiplies row vectors by matrices.
-    return np.transpose(np.array(usd.UsdGeom.XformCache().GetLocalToWorldTransform(prim)))
+    cache = usd.UsdGeom.XformCache(usd.Usd.TimeCode.EarliestTime())
+    return np.transpose(np.array(cache.GetLocalToWorldTransform(prim)))
 
 
 def _similarity(prim: Usd.Prim, matrix: Floats) -> _Pose:
-    """Quaternion, translation and scale of a (4, 4) matrix that places a prim."""
+    """Return the quaternion, the translation and the scale of a (4, 4) matrix that
+    places a prim."""
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not (scale > 0 and is_rotation(matrix[:3, :3] / scale)):
         raise ValueError(
-            f"a transform of {prim.GetPath()} that is no rotation, translation and one scale"
+            f"a transform of {prim.GetPath()} that is more than a rotation, a translation and "
+            "one scale"
         )
     return quaternion_from_rotation(matrix[:3, :3] / scale), matrix[:3, 3], scale
 
 
-def _gaussians_of(prim: Usd.Prim) -> Gaussians:
-    def column(name: str) -> NDArray[np.float32]:
-        values = prim.GetAttribute(name).Get()
-        if values is None:  # stored in half precision, under another name
-            values = prim.GetAttribute(f"{name}h").Get()
-        return np.array(values, np.float32)
-
-    means = column("positions")
-    degree = prim.GetAttribute(f"{_SH}Degree").Get()
-    return Gaussians(
+def _gaussians_of(usd: ModuleType, prim: Usd.Prim) -> tuple[Gaussians, list[str]]:
+    """Return the gaussians of a prim, and notes on values that were read otherwise than
+    they are written."""
+    means = _column(usd, prim, "positions", None).values
+    if means is None:
+        means = np.zeros((0, 3), np.float32)
+    count = len(means)
+    degree = _degree(usd, prim)
+    columns = {
+        name: _column(usd, prim, name, count) for name in ("orientations", "scales", "opacities")
+    }
+    harmonics = _column(usd, prim, f"{_SH}Coefficients", count * (degree + 1) ** 2)
+    notes = [column.note for column in (*columns.values(), harmonics) if column.note]
+    notes += _notes_of(usd, prim)
+    # The defaults of the schema, where an attribute is absent or ignored.
+    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
+    if columns["orientations"].values is not None:
+        quats = np.roll(columns["orientations"].values, 1, axis=1)
+    scales = columns["scales"].values
+    if scales is None:
+        scales = np.ones((count, 3), np.float32)
+    if _kernel(usd, prim) is _Kernel.SURFLET:
+        scales = scales * np.array([1, 1, 0], np.float32)
+        notes.append("Flat gaussians (surflets) were read as ellipsoids of no thickness.")
+    opacities = columns["opacities"].values
+    if opacities is None:
+        opacities = np.ones(count, np.float32)
+    sh = np.zeros((count, 1, 3), np.float32)
+    if harmonics.values is not None:
+        sh = harmonics.values.reshape(count, (degree + 1) ** 2, 3)
+    if degree > _MAX_DEGREE:
+        notes.append(f"Coefficients above SH degree {_MAX_DEGREE} were left out.")
+        sh = sh[:, : (_MAX_DEGREE + 1) ** 2]
+    gaussians = Gaussians(
         means=means,
-        quats=normalised(np.roll(column("orientations"), 1, axis=1)).astype(np.float32),
-        scales=column("scales"),
-        opacities=column("opacities"),
-        sh=column(f"{_SH}Coefficients").reshape(len(means), (degree + 1) ** 2, 3),
+        quats=normalised(quats).astype(np.float32),
+        scales=scales,
+        opacities=opacities,
+        sh=np.ascontiguousarray(sh),
     )
+    return gaussians.trained(antialiased=_antialiased(prim)), notes
 
 
-def write(path: AnyPath, gaussians: Gaussians) -> None:
-    """Write a USD file of one prim; the order stays."""
-    host = check_writable(gaussians)
+def _antialiased(prim: Usd.Prim) -> bool | None:
+    value = prim.GetCustomDataByKey(_ANTIALIASED)
+    if isinstance(value, bool):
+        return value
+    return None
+
+
+def _degree(usd: ModuleType, prim: Usd.Prim) -> int:
+    """Return the SH degree of a prim, which is 3 by default."""
+    degree = _value(usd, prim, f"{_SH}Degree")
+    if degree is None:  # the prim has no coefficients either
+        return 0
+    if not isinstance(degree, int) or not 0 <= degree <= _MOST_DEGREE:
+        raise ValueError(f"the SH degree {degree} in {prim.GetPath()}")
+    return degree
+
+
+def _column(usd: ModuleType, prim: Usd.Prim, name: str, count: int | None) -> _Column:
+    """Return the first `count` values of an attribute in single precision, or else in
+    half precision; the schema ignores an attribute with fewer values."""
+    stored = _value(usd, prim, name)
+    if stored is None:
+        stored = _value(usd, prim, f"{name}h")
+    if stored is None:
+        return _Column(None)
+    values: NDArray[np.float32] = np.array(stored, np.float32)
+    if count is None or len(values) == count:
+        return _Column(values)
+    lengths = f"{len(values)} values of {name} for {count} in {prim.GetPath()}"
+    if len(values) < count:
+        return _Column(None, f"{lengths} are too few, so the schema's default was used.")
+    return _Column(values[:count], f"{lengths} are too many, so the last ones were left out.")
+
+
+def _value(usd: ModuleType, prim: Usd.Prim, name: str) -> object:
+    """Return the first value of an attribute; None if the prim has none, or no such
+    attribute."""
+    attribute = prim.GetAttribute(name)
+    if not attribute:
+        return None
+    return attribute.Get(usd.Usd.TimeCode.EarliestTime())
+
+
+def _notes_of(usd: ModuleType, prim: Usd.Prim) -> list[str]:
+    """Return a sentence for everything else that a prim says about its gaussians."""
+    notes = []
+    authored = prim.GetAuthoredAttributes()
+    is_moving = usd.UsdGeom.Xformable(prim).TransformMightBeTimeVarying() or any(
+        attribute.GetNumTimeSamples() > 1 for attribute in authored
+    )
+    if is_moving:
+        notes.append("Values change with time, and were read at the first one.")
+    for name in _HINTS:
+        attribute = prim.GetAttribute(name)
+        if attribute and attribute.HasAuthoredValue():
+            value = str(attribute.Get())
+            default = str(prim.GetPrimDefinition().GetAttributeFallbackValue(name))
+            if value != default:
+                notes.append(f"The hint {name} is {value[:40]!a}, which was left out.")
+    names = [attribute.GetName() for attribute in authored]
+    unread = [name for name in names if name not in _KNOWN and not name.startswith("xformOp:")]
+    if unread:
+        notes.append(f"Attributes of gaussians were left out: {listed(unread)}.")
+    return notes
+
+
+def write(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) -> None:
+    """Write a USD file of one prim, of gaussians of which `up` is up; the order
+    stays."""
+    host = _axes.turned(check_writable(gaussians), _axes.axes_of_up(up), _AXES["Y"])
     stage = new_stage("Y")
     stage.SetDefaultPrim(define(stage, "/gaussians", host))
     export(stage, path)
 
 
 def new_stage(up: Literal["Y", "Z"]) -> Usd.Stage:
-    """An empty stage in metres; Y is USD's default for the axis that is up."""
+    """Return an empty stage in metres; Y is USD's default for the axis that is up."""
     usd = pxr()
     stage = usd.Usd.Stage.CreateInMemory()
     usd.UsdGeom.SetStageUpAxis(stage, up)
@@ -230,8 +463,19 @@ def export(stage: Usd.Stage, path: AnyPath) -> None:
     suffix."""
     with _files.replacing(path) as temporary, tempfile.TemporaryDirectory() as folder:
         # USD takes the encoding from the suffix.
-        file = Path(folder) / f"stage{Path(path).suffix.lower()}"
-        stage.GetRootLayer().Export(os.fspath(file))
+        suffix = Path(path).suffix.lower()
+        layer = Path(folder) / f"stage{suffix}"
+        if suffix == ".usdz":
+            layer = Path(folder) / "stage.usdc"
+        stage.GetRootLayer().Export(os.fspath(layer))
+        file = layer
+        if suffix == ".usdz":
+            file = Path(folder) / "stage.usdz"
+            usd = pxr()
+            with value_errors(path, "a .usdz to be written"):
+                is_made = usd.UsdUtils.CreateNewUsdzPackage(os.fspath(layer), os.fspath(file))
+                if not is_made:
+                    raise ValueError("none; write a .usdc instead")
         shutil.copyfile(file, temporary)
 
 
@@ -258,4 +502,6 @@ def define(stage: Usd.Stage, path: str, host: Gaussians) -> Usd.Prim:
     }
     for name, value in values.items():
         prim.GetAttribute(name).Set(value)
+    if host.antialiased is not None:
+        prim.SetCustomDataByKey(_ANTIALIASED, host.antialiased)
     return prim

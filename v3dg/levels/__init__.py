@@ -1,5 +1,5 @@
-"""Build a bundle from an asset: split it into clusters, then halve and fit level after
-level."""
+"""Build a bundle from an asset: split the asset into clusters, then halve and fit them
+level after level."""
 
 import os
 from concurrent.futures import Executor
@@ -34,56 +34,56 @@ def build_bundle(
     codec: Literal["float32", "quantized"] = "float32",
     quality: Quality = "draft",
 ) -> Bundle:
-    """Build all levels of one asset (V3DG, algorithm 1; what we do differently is in
-    docs/levels.md).
+    """Build all levels of one asset (V3DG, algorithm 1; docs/levels.md lists the
+    differences).
 
-    The same asset, config, seed and device give the same bundle, bit for bit, whatever
-    the number of threads (on one instruction set or one kind of GPU: others round
-    differently).
+    The same asset, config, seed and device give the same bundle, bit for bit, for any
+    number of threads. Other instruction sets or kinds of GPU round differently.
 
     Args:
         asset: Gaussians, at least one of which can be drawn; or a file, as for
             `read_asset`.
-        config: Settings; ours by default.
-        seed: Seed of the views that groups are fitted to.
-        progress: True shows a bar with the level, the number of fitted groups, the time
-            left and the mean loss, or prints four lines if stderr is not a terminal. A
-            function is called with the number of fitted gaussians, the total, and a
-            text; an exception that it raises ends the build. The four lines are always
-            logged, as INFO of the logger `v3dg`.
-        device: The device that computes; the bundle is always on the host. "cuda" is
-            the asset's CUDA device or else the current one, and all others of its kind.
-            "auto" is the same where torch can use CUDA, otherwise the CPU.
-        resume_path: The file of the bundle: the build writes each level there, and
+        config: Settings; the defaults of `BuildConfig` if None.
+        seed: Seed of the random views that groups are fitted to.
+        progress: True shows a bar with the level, the number of fitted groups, the
+            remaining time and the mean loss, or prints four lines if stderr is not a
+            terminal. A function is called with the number of fitted gaussians, the
+            total, and a text; an exception that it raises ends the build. The four
+            lines are always logged, as INFO of the logger `v3dg`.
+        device: The device that computes; the bundle is always on the host. "cuda" means
+            the asset's CUDA device, or else the current one, and all other devices of
+            its kind. "auto" means "cuda" if torch can use CUDA, otherwise the CPU.
+        resume_path: The file of the bundle. The build writes each level there, and
             opens the bundle from there at the end. A build of the same asset, config,
-            seed and device continues from the levels that it finds.
-        unusable: Whether gaussians with wrong values (not finite, negative scales,
-            opacities outside 0 to 1) are left out, with a `v3dg.cleaning.AssetWarning`,
-            or are an error. Gaussians that no pixel can show, because their opacity is
-            below 1/255, are always left out. The bundle's config has the number of each
-            kind as "dropped".
+            seed and device continues from the levels in the file.
+        unusable: What happens to gaussians with invalid values (not finite, negative
+            scales, opacities outside 0 to 1): they are left out, with a
+            `v3dg.cleaning.AssetWarning`, or raise an error. Invisible gaussians, whose
+            opacity is below 1/255, are always left out. The bundle's config stores the
+            number of each kind as "dropped".
         executor: The executor whose workers build, such as
-            `dask.distributed.Client.get_executor()`; threads of this process by
-            default. The workers need devices of the same kind as this process, which
-            builds the topmost levels, and access to `resume_path`, where they write
-            their parts (docs/cluster.md).
-        codec: The codec of the bundle, see `v3dg.Bundle`. If it rounds, levels are
-            fitted to the rounded gaussians of the levels below them.
+            `dask.distributed.Client.get_executor()`; by default threads of this
+            process. The workers need devices of the same kind as this process, which
+            builds the topmost levels. They also need access to `resume_path`, where
+            they write their parts (docs/cluster.md).
+        codec: The codec of the bundle, see `v3dg.Bundle`. With a lossy codec, levels
+            are fitted to the rounded gaussians of the levels below them.
         quality: "draft" leaves the levels as they are built. "standard" then refines
             them together (`v3dg.refine_bundle`) with 20,000 pictures and one more for
             every 50 gaussians, at most 100,000: seconds on a GPU, minutes on a CPU.
-            "best" takes five times as many. The levels at `resume_path` stay unrefined,
+            "best" uses five times as many. The levels at `resume_path` stay unrefined,
             and the refined bundle is in memory. A place that is seen from inside needs
             `v3dg.refine_bundle` with cameras instead.
 
     Raises:
-        ValueError: The asset has nothing that can be drawn, or a setting is wrong.
+        ValueError: The asset has no gaussian that can be drawn, or a setting is wrong.
         RuntimeError: The device is "cuda" and cannot be used; another build is using
-            `resume_path`; or a worker has a device of another kind, or ended.
+            `resume_path`; a worker has a device of another kind; or a worker ended.
         OSError: `resume_path` cannot be written; finished levels stay there.
-        MemoryError: The device has too little memory; the message says how much.
-        KeyboardInterrupt: Ctrl-C was pressed; threads have stopped, and finished levels
-            are at `resume_path`.
+        MemoryError: The device has too little memory; the message states the required
+            amount.
+        KeyboardInterrupt: Ctrl-C was pressed; all threads have stopped, and finished
+            levels are at `resume_path`.
     """
     asset = loaded(asset)
     check_type("asset", asset, Gaussians, "Gaussians")
@@ -94,6 +94,7 @@ def build_bundle(
     leaves = MemoryLeaves(asset, config, unusable, devices[0])
     has_place = executor is None or resume_path is not None
     check("resume_path", has_place, "a file that all workers of the executor reach, got None")
+    config = leaves.settings(config)
     return build_into(
         resume_path,
         leaves,

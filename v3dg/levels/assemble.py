@@ -1,4 +1,5 @@
-"""The tables of a bundle, from the plan and what was measured of each level."""
+"""The tables of a bundle, computed from the plan and from the measurements of each
+level."""
 
 from collections.abc import Sequence
 
@@ -14,7 +15,7 @@ from v3dg.levels.simplify import LevelTables
 def assemble(
     plan: Plan, tables: Sequence[LevelTables], config: BuildConfig
 ) -> tuple[Clusters, Groups]:
-    """The tables of all levels, in order."""
+    """Return the tables of all levels, in order."""
     levels = plan.levels
     num_clusters = [level.num_clusters for level in levels]
     # A bundle has no groups of level 0.
@@ -23,19 +24,20 @@ def assemble(
     level = np.repeat(np.arange(len(levels), dtype=np.int32), num_clusters)
     last_px2 = 0.0
     if config.filter_px2 > 0 or config.smooth == "yes":
-        # The last level is also drawn at all smaller sizes, with the variance of a
-        # whole pixel, 1/12.
+        # The last level is also drawn at all smaller sizes. Its filter has the variance
+        # of a whole pixel, 1/12.
         last_px2 = max(config.filter_px2, 1 / 12)
     coarse_px2 = np.where(level < len(levels) - 1, config.filter_px2, last_px2)
     antialiased = np.ones(len(level), np.uint8)
-    antialiased[level == 0] = config.asset_antialiased
+    asset_filter_px2, is_antialiased = config.asset_look
+    antialiased[level == 0] = is_antialiased
     clusters = Clusters(
         offset=np.concatenate([[0], np.cumsum(sizes)]),
         level=level,
         own_group=_groups_from(num_clusters, num_groups, 0),
         parent_group=_groups_from(num_clusters, num_groups, 1),
         box=np.concatenate([table.box for table in tables]),
-        filter_px2=np.where(level == 0, config.asset_filter_px2, coarse_px2).astype(np.float32),
+        filter_px2=np.where(level == 0, asset_filter_px2, coarse_px2).astype(np.float32),
         antialiased=antialiased,
     )
     groups = Groups(
@@ -53,8 +55,8 @@ def assemble(
 def _groups_from(
     counts: Sequence[int], num_groups: Sequence[int], num_up: int
 ) -> npt.NDArray[np.int32]:
-    """The group, `num_up` levels up, of each of the `counts` rows of every level; -1
-    where there is none.
+    """Return the group, `num_up` levels up, of each of the `counts` rows of every
+    level; -1 if there is none.
 
     All groups of a level have the same number of rows.
     """

@@ -5,17 +5,19 @@ from dataclasses import dataclass, fields, replace
 from typing import Annotated, Literal, NoReturn, get_args, get_origin
 
 from v3dg._numbers import check, refuse
+from v3dg.gaussians import TRAINED_FILTER_PX2
 
-# A target is drawn without a chance to interrupt it: in about a second at most.
+# Drawing a target cannot be interrupted; this limit keeps it below about a second.
 _MOST_SIDE = 8192
-# Samples along a pixel's side, in targets of deep levels; more samples gain nothing.
+# Samples along a pixel's side in targets of deep levels; more samples gain nothing.
 _MOST_SAMPLES = 8
-_DEEP = 64  # a level whose targets have that many samples
-# Pixels of all views of a group together: each thread that fits a group keeps them, 16
-# bytes each.
+_DEEP = 64  # a level whose targets have this many samples
+# Limit on the pixels of all views of a group together. Each thread that fits a group
+# stores them, 16 bytes each.
 _MOST_PIXELS_KEPT = 1 << 26
 
-# The classes of the values of a setting by its type, and what messages call them.
+# The classes that values of a setting may have, by the type of the setting, and their
+# names in messages.
 _KINDS: dict[type, tuple[tuple[type, ...], str]] = {
     int: ((int,), "a whole number"),
     float: ((int, float), "a number"),
@@ -23,60 +25,64 @@ _KINDS: dict[type, tuple[tuple[type, ...], str]] = {
 }
 _Weight = Annotated[float, (0, 1_000_000)]
 _StepSize = Annotated[float, (0, 1_000_000_000)]
-_Setting = int | float | bool | str
+_Setting = int | float | bool | str | None
 
 
 @dataclass(frozen=True)
 class BuildConfig:
-    """The settings of a build. docs/levels.md gives the reasons for the defaults;
-    `paper()` has the settings of V3DG.
+    """The settings of a build. docs/levels.md explains the defaults; `paper()` returns
+    the settings of V3DG.
 
-    Numbers have their least and their greatest value beside their type. Whole numbers
-    are 32 bits wide in the core, others float32, whose squares and products with each
-    other must be finite, and not 0 where they are divided by.
+    The type of each number is annotated with its smallest and largest value. Integers
+    have 32 bits in the core. The others are float32: squares and products of them must
+    be finite, and divisors must not be 0.
 
     Attributes:
         cluster_size: Maximum number of gaussians in a cluster of level 0.
-        group_size: Clusters that are simplified together, a power of two; 2 makes a
-            tree.
+        group_size: Number of clusters that are simplified together, a power of two; 2
+            makes a tree.
         min_clusters: Levels stop before there are fewer clusters than this ...
         min_gaussians: ... or fewer gaussians than this.
-        init: Start of a coarser cluster: "merge" alike gaussians in pairs, or "prune"
-            the lesser half.
+        init: How a coarser cluster is initialised: "merge" similar gaussians in pairs,
+            or "prune" the less important half.
         prune_growth: Factor for the scales of gaussians that survive pruning.
         targets: The level whose pictures a level is fitted to: the "finest" level below
-            that its views can show, or the "previous" one.
-        steps: Maximum number of steps of Adam for each group; 0 keeps the start.
-        first_steps: Steps at level 1; each level takes twice as many as the one below,
-            up to `steps`.
-        views_per_step: Views that one step looks at.
-        num_views: Views of a group, drawn once; 0 draws a fresh random one each time.
-        supersample: The factor by which targets of level 1 are drawn larger before they
-            are box-averaged. It grows by one every two levels, up to 8, because higher
-            levels show finer gaussians; targets of the previous level keep it.
-        image_size: Side of the views in px; 0 shows a group at the size at which it
-            will be selected.
-        px2_per_gaussian: The size at which a group is shown: px² of its footprint for
-            each gaussian that it is simplified to.
+            whose detail is visible in its views, or the "previous" one.
+        steps: Maximum number of steps of Adam for each group; 0 keeps the initial
+            gaussians.
+        first_steps: Steps at level 1; each level has twice as many as the one below, up
+            to `steps`.
+        views_per_step: Number of views in one step.
+        num_views: Number of views of a group, drawn once; 0 draws a new random view
+            each time.
+        supersample: The factor by which targets of level 1 are drawn larger before box
+            averaging. It grows by one every two levels, up to 8, because higher levels
+            show finer gaussians. With targets of the previous level it does not grow.
+        image_size: Side of the views in px; 0 shows a group at the size at which it is
+            selected.
+        px2_per_gaussian: The size at which a group is shown: px² of its footprint per
+            gaussian that it is simplified to.
         distance: Distance from the camera to the centre of the group, in radii of the
             group.
-        filter_px2: Variance of the low-pass that the coarser levels are drawn with,
-            px². The last level has at least the variance of a pixel, 1/12, unless this
-            is 0.
-        smooth: Whether the asset's gaussians are about as wide as they are far apart,
-            so that one sample a pixel shows it well from near. Coarser levels of such
-            an asset have no filter, except the last one, which has that of a pixel. A
-            group of level 1 is then selected where pictures of the asset show that it
-            is no worse than its leaves, or at half the size if there are more than a
-            million leaves. "measured" decides it by a measurement if levels are fitted
-            with a filter: some groups of level 1 are fitted with 0.05 px² and without,
-            and an asset that hardly gains by the filter is smooth.
-        asset_filter_px2: The filter of level 0. The filter of the training (0.3 for the
-            original 3DGS) suits pictures of the size of the photographs; without a
-            filter, the asset looks better from farther away. Coarser levels are fitted
-            to the asset without a filter.
-        asset_antialiased: Whether the asset was trained with opacities compensated for
-            its filter.
+        filter_px2: Variance, px², of the low-pass filter of the coarser levels. The
+            last level has at least the variance of a pixel, 1/12, unless this is 0.
+        smooth: Whether the asset is smooth: its gaussians are about as wide as the
+            distances between them, so that one sample per pixel suffices from near.
+            Coarser levels of a smooth asset have no filter, except the last one, which
+            has that of a pixel. A group of level 1 is then selected where pictures of
+            the asset show that it looks no worse than its leaves, or at half the size
+            if there are more than a million leaves. With "measured", and if levels are
+            fitted with a filter, a measurement decides: some groups of level 1 are
+            fitted with 0.05 px² and without a filter, and the asset is smooth if the
+            filter hardly improves it.
+        asset_filter_px2: The filter of level 0. None means no filter, or the filter of
+            the training if the asset is antialiased. The filter used for training (0.3
+            for the original 3DGS) suits pictures of the size of the photographs;
+            without a filter, the asset looks better from farther away. Coarser levels
+            are always fitted to the asset without a filter.
+        asset_antialiased: Whether the asset was trained with opacities that compensate
+            for its filter. None means what the asset says (`Gaussians.antialiased`),
+            and False if it says nothing.
         loss_l1, loss_dssim, loss_alpha: Weights of the parts of the loss.
         step_position: Step size of positions, in radii of the group, or in world units
             if `position_in_world`. The other step sizes are those of log scales,
@@ -86,31 +92,35 @@ class BuildConfig:
         beta2: Decay of Adam's running mean of squared gradients.
 
     Raises:
-        ValueError: A setting is of another kind or out of its range, or all views of a
-            group have too many pixels to be kept.
+        ValueError: A setting has the wrong type or is out of range, or all views of a
+            group together have too many pixels.
     """
 
     cluster_size: Annotated[int, (2, 1 << 30)] = 256
     group_size: Annotated[int, (2, 1 << 30)] = 2
-    # Counts that the core does not see; so many make level 0 the only one.
+    # The core does not read these counts. With the largest value, level 0 is the only
+    # level.
     min_clusters: Annotated[int, (1, 1 << 62)] = 1
     min_gaussians: Annotated[int, (1, 1 << 62)] = 1
     init: Literal["merge", "prune"] = "merge"
-    prune_growth: Annotated[float, (0.001, 1000)] = 2 ** (1 / 6)  # once a level
+    prune_growth: Annotated[float, (0.001, 1000)] = 2 ** (1 / 6)  # applied once per level
     targets: Literal["finest", "previous"] = "finest"
-    steps: Annotated[int, (0, 1_000_000)] = 600  # the largest number takes some hours
+    steps: Annotated[int, (0, 1_000_000)] = 600  # the largest value takes some hours
     first_steps: Annotated[int, (0, 1_000_000)] = 150
-    views_per_step: Annotated[int, (1, 1024)] = 2  # a step is not interrupted
+    views_per_step: Annotated[int, (1, 1024)] = 2  # a step cannot be interrupted
     num_views: Annotated[int, (0, 1 << 16)] = 64  # all are drawn before the first step
-    supersample: Annotated[int, (1, 64)] = 3  # at most more samples than a pixel has values
+    # More samples than a pixel has distinct values gain nothing.
+    supersample: Annotated[int, (1, 64)] = 3
     image_size: Annotated[int, (0, _MOST_SIDE)] = 0
-    px2_per_gaussian: Annotated[float, (0.001, 1_000_000)] = 2.0  # a picture for each, at most
-    # Outside the ball; from farther, float32 depths are coarser than gaussians.
+    # At most, every gaussian fills a picture.
+    px2_per_gaussian: Annotated[float, (0.001, 1_000_000)] = 2.0
+    # The camera is outside of the ball. At larger distances, float32 depths are coarser
+    # than gaussians.
     distance: Annotated[float, (1.1, 1000)] = 4.0
     filter_px2: _Weight = 0.05
     smooth: Literal["measured", "yes", "no"] = "measured"
-    asset_filter_px2: _Weight = 0.0
-    asset_antialiased: bool = False
+    asset_filter_px2: _Weight | None = None
+    asset_antialiased: bool | None = None
     loss_l1: _Weight = 1.0
     loss_dssim: _Weight = 0.0
     loss_alpha: _Weight = 0.5
@@ -127,12 +137,17 @@ class BuildConfig:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            arguments = get_args(field.type)
-            if get_origin(field.type) is Literal:
+            kind = field.type
+            if type(None) in get_args(kind):
+                if value is None:
+                    continue
+                kind = get_args(kind)[0]
+            arguments = get_args(kind)
+            if get_origin(kind) is Literal:
                 if value not in arguments:
                     self._refuse(field.name, " or ".join(map(repr, arguments)))
                 continue
-            kind, *ranges = arguments or (field.type,)
+            kind, *ranges = arguments or (kind,)
             classes, expected = _KINDS[kind]
             is_kind = isinstance(value, classes) and isinstance(value, bool) == (kind is bool)
             if not is_kind:
@@ -148,8 +163,8 @@ class BuildConfig:
         refuse(name, f"{expected}, got {getattr(self, name)!r}")
 
     def check_views(self, most_gaussians: int) -> None:
-        """Refuse views of groups of at most `most_gaussians` that have too many pixels,
-        with ValueError."""
+        """Raise ValueError if views of groups of at most `most_gaussians` have too many
+        pixels."""
         if self.image_size > 0:
             name = "image_size"
             side = self.image_size
@@ -168,39 +183,39 @@ class BuildConfig:
         )
 
     def _view_side(self, num_gaussians: int) -> int:
-        """The side, in px, of a view of a group of `num_gaussians`, as fit_view() of
-        the core chooses it."""
+        """Return the side, px, of a view of a group of `num_gaussians`, as fit_view()
+        of the core chooses it."""
         x2 = self.distance**-2
         footprint_of_focal = 2 * math.pi * (1 - math.sqrt(1 - x2))
         radius2 = num_gaussians * self.px2_per_gaussian / footprint_of_focal * x2 / (1 - x2)
         return math.ceil(2 * math.sqrt(radius2)) + 8
 
     def steps_at(self, level: int) -> int:
-        """Steps of the groups of a level."""
+        """Return the number of steps for the groups of a level."""
         return min(self.steps, self.first_steps << min(max(level - 1, 0), 32))
 
     def samples_at(self, level: int) -> int:
-        """The factor by which the targets of a level are drawn larger."""
+        """Return the factor by which the targets of a level are drawn larger."""
         if self.targets == "previous":
             return self.supersample
         return max(self.supersample, min(self.supersample + (level - 1) // 2, _MOST_SAMPLES))
 
     def target_of(self, level: int) -> int:
-        """The level that the groups of a level are fitted to.
+        """Return the level that the groups of a level are fitted to.
 
-        A level finer than one with two gaussians for each sample of a target picture
-        shows no more.
+        A level with more than two gaussians per sample of a target picture shows no
+        additional detail, so it is not used.
         """
         if self.targets == "previous":
             return max(0, level - 1)
         return max(0, level - self._visible_levels)
 
     def levels_at_once(self, first: int, end: int) -> range:
-        """The levels before `end` that are fitted together with level `first`.
+        """Return the levels before `end` that are fitted together with level `first`.
 
-        The lowest levels, which are seen most, start from the fitted level below. The
-        levels above them have few groups, which would take long one level after
-        another; they start together, by repeated merging of the last fitted level.
+        The lowest levels are seen most, so each of them starts from the fitted level
+        below. The levels above have few groups and would take long one after another;
+        so they are initialised together, by repeated merging of the last fitted level.
         """
         end = min(end, first + self._visible_levels)
         stop = first + 1
@@ -211,26 +226,55 @@ class BuildConfig:
 
     @property
     def _visible_levels(self) -> int:
-        """The number of levels down to gaussians about as small as half a sample of a
-        target picture."""
+        """The number of levels down to gaussians about as small as half a sample
+        of a target picture."""
         px2 = self.px2_per_gaussian
         if self.image_size > 0:  # the ball covers about 0.4 of the picture
             px2 = 0.4 * self.image_size**2 / (self.cluster_size * self.group_size / 2)
         return 1 + max(1, math.ceil(math.log2(px2 * self.supersample**2)))
 
+    def of_asset(self, *, antialiased: bool | None) -> "BuildConfig":
+        """The settings for an asset that says, or does not, that it is antialiased."""
+        if self.asset_antialiased is not None:
+            antialiased = self.asset_antialiased
+        filter_px2 = self.asset_filter_px2
+        if filter_px2 is None:
+            filter_px2 = 0.0
+            if antialiased:
+                filter_px2 = TRAINED_FILTER_PX2
+        return replace(self, asset_antialiased=bool(antialiased), asset_filter_px2=filter_px2)
+
+    def contradiction(self, *, antialiased: bool | None) -> str:
+        """What differs between these settings and what an asset says of itself, as a
+        sentence; empty if nothing does."""
+        setting = self.asset_antialiased
+        if setting is None or antialiased is None or setting == antialiased:
+            return ""
+        if antialiased:
+            return "It says that it was trained with antialiasing, but is built without."
+        return "It says that it was trained without antialiasing, but is built with it."
+
+    @property
+    def asset_look(self) -> tuple[float, bool]:
+        """The filter of level 0, px², and whether its opacities are compensated for
+        it."""
+        config = self.of_asset(antialiased=None)
+        return config.asset_filter_px2 or 0.0, bool(config.asset_antialiased)
+
     @staticmethod
     def leaves_only() -> "BuildConfig":
-        """Settings that make level 0 the only level."""
+        """Return settings that make level 0 the only level."""
         return BuildConfig(min_clusters=1 << 31)
 
     @staticmethod
     def paper(**changes: _Setting) -> "BuildConfig":
-        """The settings of the paper and its code (V3DG, section 3.2 and 5.1), with
-        `changes` to them.
+        """Return the settings of the paper and its code (V3DG, sections 3.2 and 5.1),
+        with `changes` to them.
 
-        4,096 gaussians a cluster, two clusters a group, stop at two clusters; prune,
-        grow scales by 2^(1/6); 640 fresh random views of 64 x 64 px at four radii,
-        against the previous level, without a filter; 0.8 L1 + 0.2 D-SSIM + 0.1 alpha.
+        They are: 4,096 gaussians per cluster and two clusters per group; stop at two
+        clusters; prune, and grow scales by 2^(1/6); 640 new random views of 64 x 64 px
+        at four radii, compared with the previous level without a filter; a loss of 0.8
+        L1 + 0.2 D-SSIM + 0.1 alpha.
         """
         config = BuildConfig(
             cluster_size=4096,

@@ -1,4 +1,4 @@
-"""The digest of an asset: docs/format.md has the definition."""
+"""The digest of an asset; docs/format.md has its definition."""
 
 import os
 from collections.abc import Iterable
@@ -10,15 +10,15 @@ from v3dg.bundle.format import page_hash
 from v3dg.gaussians import Gaussians
 
 PIECE = 1 << 16
-"""Number of gaussians that are read, examined and hashed at a time; the digest of an
+"""Number of gaussians that are read, examined and hashed at a time. The digest of an
 asset depends on it."""
 
 
 def digest_of(asset: Gaussians) -> str:
-    """The digest of an asset, which does not depend on the file that it was read
+    """Return the digest of an asset, which does not depend on the file that it was read
     from."""
     pieces = pieces_of(asset.numpy())
-    # To hash a few pieces is less work than to start threads, which Python does not do
+    # Hashing a few pieces costs less than starting threads, which Python does not do
     # safely when memory is short.
     if len(pieces) <= 3:
         return digest_of_hashes(map(hash_of, pieces))
@@ -27,7 +27,7 @@ def digest_of(asset: Gaussians) -> str:
 
 
 def pieces_of(gaussians: Gaussians) -> list[Gaussians]:
-    """Cut gaussians into pieces, which share their memory."""
+    """Cut gaussians into pieces that share their memory."""
     return [
         gaussians.subset(slice(start, start + PIECE)) for start in range(0, len(gaussians), PIECE)
     ]
@@ -38,11 +38,11 @@ def hash_of(piece: Gaussians) -> bytes:
 
 
 def digest_of_hashes(hashes: Iterable[bytes]) -> str:
-    """The digest of an asset from the hashes of its pieces, which all cores can compute
-    together."""
+    """Return the digest of an asset from the hashes of its pieces, which threads can
+    compute in parallel."""
     return page_hash([np.frombuffer(b"".join(hashes), np.uint8)]).hex()
 
 
 def new_pool() -> ThreadPoolExecutor:
-    """Threads to hash and copy with."""
+    """Return threads for hashing and copying."""
     return ThreadPoolExecutor(min(os.cpu_count() or 1, 16))

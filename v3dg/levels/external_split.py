@@ -1,8 +1,8 @@
-"""The median split of more points than memory holds.
+"""The median split of more points than fit in memory.
 
-A node that does not fit is split in passes over its points: for the longest side of its
-box, twice for the median of that axis (the upper and the lower half of its bits), and
-once to move the points.
+A node that does not fit in memory is split in passes over its points: one finds the
+longest side of its box, two find the median along that axis (the upper and the lower
+half of its bits), and one moves the points.
 """
 
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ Words = npt.NDArray[np.uint32]
 WordFile = RowFile[np.uint32]
 
 FITTING_BYTES = 48
-"""Memory for each point of a node that is split in memory."""
+"""Bytes per point of a node that is split in memory."""
 
 _AT_ONCE = 1 << 18  # points that are read at a time: 16 MB, including intermediate arrays
 
@@ -32,11 +32,11 @@ def points_of(means: npt.NDArray[np.float32], index: npt.NDArray[np.integer]) ->
 def split(
     files: tuple[WordFile, WordFile], count: int, depth: int, num_fitting: int, order: WordFile
 ) -> None:
-    """Write the indices of points in the order of `_core.median_split`, with which it
-    agrees in every bit.
+    """Write the indices of points in the order of `_core.median_split`; both give the
+    same bits.
 
-    The first `count` rows of one file have the points, finite, by ascending index; the
-    other is for passes.
+    The first `count` rows of one file are the points, finite and by ascending index;
+    the other file is temporary memory for passes.
     """
     todo = [(0, count, depth, 0)]
     while todo:
@@ -62,8 +62,8 @@ def _split_in_memory(points: Points, depth: int) -> Words:
 
 
 def _partition(source: WordFile, first: int, middle: int, last: int, target: WordFile) -> None:
-    """Write the lower half of a node at `first` and the upper half at `middle`, both in
-    the same order."""
+    """Write the lower half of a node from `first` on and the upper half from `middle`
+    on, preserving the order."""
     axis = _longest_axis(source, first, last)
     median, num_ties = _median(source, first, middle, last, axis)
     ends = [first, middle]
@@ -85,12 +85,12 @@ def _longest_axis(source: WordFile, first: int, last: int) -> int:
         means = points[:, :3].view(np.float32)
         low = np.minimum(low, means.min(axis=0))
         high = np.maximum(high, means.max(axis=0))
-    return int(np.argmax(high - low))  # the first of equal sides; in float32, as in the core
+    return int(np.argmax(high - low))  # ties go to the first side, in float32, as in the core
 
 
 def _median(source: WordFile, first: int, middle: int, last: int, axis: int) -> tuple[int, int]:
-    """The greatest key of the lower half, as of `_ordered`, and how many points of the
-    lower half have it."""
+    """Return the greatest key of the lower half, in the order of `_ordered`, and how
+    many points of the lower half have it."""
 
     def keys() -> Iterator[Words]:
         return (_ordered(points[:, axis]) for points in source.blocks(first, last, _AT_ONCE))
@@ -102,8 +102,8 @@ def _median(source: WordFile, first: int, middle: int, last: int, axis: int) -> 
 
 
 def _bin_of(rank: int, values: Iterator[Words]) -> tuple[int, int]:
-    """The 16-bit value of a rank, counted from 1, and its rank among the values that
-    are equal to it."""
+    """Return the 16-bit value of a rank, counted from 1, and its rank among equal
+    values."""
     counts = np.zeros(1 << 16, np.int64)
     for block in values:
         counts += np.bincount(block, minlength=1 << 16)
@@ -113,8 +113,8 @@ def _bin_of(rank: int, values: Iterator[Words]) -> tuple[int, int]:
 
 
 def _ordered(bits: Words) -> Words:
-    """Numbers that compare like the floats with these bits; zeros of both signs are
-    equal."""
+    """Return numbers that compare like the floats with these bits; zeros of both signs
+    are equal."""
     bits = (bits.view(np.float32) + np.float32(0)).view(np.uint32)
     sign = bits >> 31
     return np.asarray(bits ^ ((np.uint32(0) - sign) | np.uint32(1 << 31)))

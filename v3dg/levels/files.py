@@ -45,22 +45,21 @@ def build_file(
     quality: Quality = "draft",
     up: Axis | None = None,
 ) -> tuple[Bundle, bool]:
-    """Build the bundle of an asset's file, or of several that make one asset, straight
-    into a file.
+    """Build the bundle of an asset from its file, or from several files that form one
+    asset, and write it to a file.
 
     The unfinished bundle is at `levels_path`. An asset that does not fit in memory is
-    sorted in a scratch folder beside it.
+    sorted in a scratch folder beside that file.
 
     Args:
-        asset: The content of the asset's file, if it is in memory already.
-        resume: Keep a bundle whose config says that it was made of these gaussians with
-            these settings, and continue from the levels of a build that was
-            interrupted; otherwise everything is built again.
-        memory: Memory of the host that the build may use in addition to what the
-            process uses already: bytes, or text like "8GiB". Default: half of the free
-            memory.
-        up: The axis that is up in the asset, which the bundle records for viewers and
-            exports.
+        asset: The content of the asset's file, if it is already in memory.
+        resume: Keep an existing bundle if its config says that it was built from these
+            gaussians with these settings, and continue from the levels of an
+            interrupted build. If false, everything is built again.
+        memory: Host memory that the build may use in addition to the current use of the
+            process: bytes, or text like "8GiB". Default: half of the free memory.
+        up: The axis of the asset that points up, which the bundle stores for viewers
+            and exports.
         config, seed, progress, device, unusable, executor, codec, quality: See
             `build_bundle`. A build that is interrupted during the refinement leaves the
             levels as they are built.
@@ -69,7 +68,7 @@ def build_file(
         The bundle, opened from its file, and whether it was built.
 
     Raises:
-        ValueError: The memory is too small (the message says how much is needed), or
+        ValueError: The memory is too small (the message states the required amount), or
             the file name does not end in .v3dg.
         ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: See
             `read_asset` and `build_bundle`.
@@ -106,9 +105,9 @@ def _checked_config(config: BuildConfig | None) -> BuildConfig:
 
 
 def _check_output(bundle_path: Path) -> None:
-    """Refuse, before long work, a path to which no bundle can be written."""
+    """Raise an error early if no bundle can be written to this path."""
     _files.check_bundle_name(bundle_path)
-    _files.check_folder(bundle_path)
+    _files.make_folder(bundle_path)
     _files.status_of_replaced(bundle_path)
 
 
@@ -120,7 +119,7 @@ def _paths_of(asset_path: AssetPath | Sequence[AssetPath]) -> list[AssetPath]:
 
 @dataclass(frozen=True, eq=False)
 class _FileBuild:
-    """The arguments of `build_file`, checked."""
+    """The checked arguments of `build_file`."""
 
     paths: Sequence[AssetPath]
     bundle_path: Path
@@ -129,7 +128,7 @@ class _FileBuild:
     progress: Progress
     devices: Sequence[Device]
     unusable: Literal["drop", "refuse"]
-    num_bytes: int  # memory of the host
+    num_bytes: int  # host memory
     executor: Executor | None
     codec: str
     quality: Quality
@@ -140,11 +139,11 @@ class _FileBuild:
         return levels_path(self.bundle_path)
 
     def leaves_of(self, asset: Gaussians | None) -> AbstractContextManager[Leaves]:
-        """The leaves of an asset in memory, or in its files."""
+        """Return the leaves of an asset in memory, or in its files."""
         if asset is not None:
             return nullcontext(MemoryLeaves(asset, self.config, self.unusable, self.devices[0]))
         most_in_memory = MOST_GAUSSIANS
-        if self.executor is not None:  # its workers cannot read the memory of this process
+        if self.executor is not None:  # other processes cannot read the memory of this one
             most_in_memory = 0
         return leaves_on_disk(
             self.paths,
@@ -159,17 +158,18 @@ class _FileBuild:
         )
 
     def run(self, source: AbstractContextManager[Leaves], *, resume: bool) -> tuple[Bundle, bool]:
-        """Keep or build the bundle; returns it, and whether it was built."""
+        """Keep or build the bundle; return it, and whether it was built."""
         with source as leaves:
-            if resume and self._is_finished(leaves):
-                with suppress(RuntimeError):  # another build has begun to write there
+            config = leaves.settings(self.config)
+            if resume and self._is_finished(leaves, config):
+                with suppress(RuntimeError):  # another build is writing there
                     discard_levels(self.levels_path)
                 return Bundle.open(self.bundle_path), False
             self._check_memory(leaves)
             bundle = build_into(
                 self.levels_path,
                 leaves,
-                self.config,
+                config,
                 self.seed,
                 self.devices,
                 self.progress,
@@ -193,23 +193,23 @@ class _FileBuild:
             f"got {in_mib(self.num_bytes)}; give more, or build with the quality draft",
         )
 
-    def _is_finished(self, leaves: Leaves) -> bool:
-        """Whether the bundle exists, was made of these leaves with these settings, and
-        was not converted to another codec since."""
-        settings = made_with(leaves, self.config, self.seed, self.codec, self.up)
+    def _is_finished(self, leaves: Leaves, config: BuildConfig) -> bool:
+        """Return whether the bundle exists, was built from these leaves with these
+        settings, and has not been converted to another codec."""
+        settings = made_with(leaves, config, self.seed, self.codec, self.up)
         refinement = refinement_of(self.quality, leaves.num_gaussians, settings["seed"])
         try:
             bundle = Bundle.open(self.bundle_path)
             if refinement is not None:
                 settings = refinement.settings_of(bundle, settings)
             return bundle.config == settings and bundle.codec == self.codec
-        except (ValueError, OSError):  # missing, damaged, or of another version: build it
+        except (ValueError, OSError):  # missing, damaged, or of another version: build it again
             return False
 
 
 @contextmanager
 def _naming_asset(path: AssetPath) -> Iterator[None]:
-    """Begin the messages of errors of an asset with the name of its file."""
+    """Prefix errors about an asset with the name of its file."""
     try:
         yield
     except ValueError as error:
@@ -220,9 +220,9 @@ def _naming_asset(path: AssetPath) -> Iterator[None]:
 
 
 def levels_path(bundle_path: str | os.PathLike[str]) -> Path:
-    """The file in which `build_file` makes the bundle, and from which an interrupted
-    build continues."""
+    """Return the file in which `build_file` builds the bundle, and from which an
+    interrupted build continues."""
     path = Path(bundle_path)
-    if path.is_symlink():  # the file is beside the target of the link, which it will replace
+    if path.is_symlink():  # the file is beside the link's target, which it will replace
         path = Path(os.path.realpath(path))
     return path.with_name(path.name + ".partial")

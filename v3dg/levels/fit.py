@@ -1,5 +1,5 @@
-"""The core's fit: its settings, and running it while Ctrl-C and the display of progress
-keep working."""
+"""The fits of the core: their settings, and how they run while Ctrl-C and the progress
+display keep working."""
 
 import _thread
 import threading
@@ -16,7 +16,7 @@ _T = TypeVar("_T")
 
 
 def fit_config(config: BuildConfig, seed: int, level: int) -> _core.FitConfig:
-    """The settings of the core's fit for the groups of a level."""
+    """Return the settings of the core's fit for the groups of a level."""
     return _core.FitConfig(
         steps=config.steps_at(level),
         views_per_step=config.views_per_step,
@@ -48,8 +48,8 @@ def run_fit(
     device: Device,
     show: Callable[[_core.FitProgress], None],
 ) -> _T:
-    """Run `fit` on a thread of its own, `show` its progress meanwhile, and return its
-    result."""
+    """Run `fit` on a separate thread, call `show` with its progress meanwhile, and
+    return its result."""
     state = _core.FitProgress()
     result: list[_T] = []
     run = _device.with_this_stream(lambda: result.append(fit(state)), device)
@@ -57,7 +57,7 @@ def run_fit(
     has_ended = threading.Event()
 
     def work(token: _Token) -> None:
-        del token  # the frame of the thread still holds it
+        del token  # the frame of the thread still refers to it
         try:
             run()
         except BaseException as error:
@@ -65,9 +65,9 @@ def run_fit(
         finally:
             has_ended.set()
 
-    # Not threading.Thread: if the thread ends before its first line because memory is
-    # short, start() waits for ever; and after Ctrl-C during join(), Python 3.11 can
-    # take a running thread for finished.
+    # threading.Thread is not used: start() would wait forever if the thread ends before
+    # its first line for lack of memory; and after Ctrl-C during join(), Python 3.11 may
+    # treat a running thread as finished.
     tokens = [_Token()]
     running_token = weakref.ref(tokens[0])
     try:
@@ -82,10 +82,10 @@ def run_fit(
     if failure:
         raise failure[0]
     if not has_ended.is_set():
-        raise MemoryError("a thread that had started ended at once")
+        raise MemoryError("a new thread ended at once, for lack of memory")
     show(state)
     return result[0]
 
 
 class _Token:
-    """Is destroyed together with the thread that holds it."""
+    """An object that is destroyed together with the thread that holds it."""

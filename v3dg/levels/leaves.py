@@ -17,6 +17,7 @@ from v3dg._json import JsonObject
 from v3dg._numbers import check, one_of, value_text, whole_number
 from v3dg.bundle.codec import Codec
 from v3dg.cameras import Axis
+from v3dg.formats._declared import declared_of
 from v3dg.gaussians import Gaussians, gaussian_bytes
 from v3dg.levels.config import BuildConfig
 from v3dg.levels.digest import digest_of
@@ -34,15 +35,25 @@ class Leaves(ABC):
     dropped: dict[str, int]
     digest: str
     resident_bytes: int  # memory of the host that they need as long as they are read
+    up: Axis | None  # what is up, if the file of the asset declares it
+    antialiased: bool | None  # as in `Gaussians`
+
+    def settings(self, config: BuildConfig) -> BuildConfig:
+        """The settings with which they are built; an AssetWarning says where these
+        contradict the asset."""
+        contradiction = config.contradiction(antialiased=self.antialiased)
+        if contradiction:
+            warnings.warn(f"asset: {contradiction}", cleaning.AssetWarning, stacklevel=3)
+        return config.of_asset(antialiased=self.antialiased)
 
     @abstractmethod
     def read(self, first: int, last: int) -> Gaussians:
-        """Leaves `first` to `last`, in arrays of their own."""
+        """Return leaves `first` to `last`, in newly allocated arrays."""
 
 
 class MemoryLeaves(Leaves):
-    """The leaves of an asset in memory, on any device; the first `read` splits them, on
-    `device`."""
+    """The leaves of an asset in memory, on any device. The first call of `read` splits
+    them, on `device`."""
 
     def __init__(
         self,
@@ -50,6 +61,7 @@ class MemoryLeaves(Leaves):
         config: BuildConfig,
         unusable: Unusable = "drop",
         device: Device = _device.CPU,
+        up: Axis | None = None,
     ) -> None:
         is_single = str(asset.means.dtype).endswith("32")
         check("asset", is_single, "float32 arrays, got float64; convert them first")
@@ -65,6 +77,8 @@ class MemoryLeaves(Leaves):
             dropped=tally.counts,
             digest=digest_of(host),
             resident_bytes=len(asset) * (gaussian_bytes(asset.sh_degree) + 4),
+            up=up or declared_of(asset).up,
+            antialiased=asset.antialiased,
         )
         self._asset = _device.place(asset, _device.of(asset.means))  # without gradients
         self._config = config
@@ -73,7 +87,7 @@ class MemoryLeaves(Leaves):
         self._lock = threading.Lock()
 
     def read(self, first: int, last: int) -> Gaussians:
-        """Leaves `first` to `last`, on the device of the asset."""
+        """Return leaves `first` to `last`, on the device of the asset."""
         with self._lock:
             if self._order is None:
                 means = _device.place_rows(self._asset.means, self._drawable, self._device)
@@ -89,7 +103,7 @@ class MemoryLeaves(Leaves):
 def made_with(
     leaves: Leaves, config: BuildConfig, seed: int, codec: str, up: Axis | None
 ) -> JsonObject:
-    """The config of a bundle: the asset and the settings that it was made with."""
+    """Return the config of a bundle: the asset and the settings it is built from."""
     seed = whole_number(seed, "seed")
     check("seed", 0 <= seed < 2**58, f"0 to 2^58 - 1, got {value_text(seed)}")
     result: JsonObject = {
@@ -101,13 +115,14 @@ def made_with(
     }
     if codec != Codec.name:
         result["codec"] = codec
+    up = up or leaves.up
     if up is not None:
         result["up"] = up
     return result
 
 
 class Tally:
-    """Counts of the gaussians of an asset, which is examined one part after another."""
+    """Counts the gaussians of an asset, which is examined in parts."""
 
     def __init__(self) -> None:
         self.num_gaussians = 0
@@ -116,7 +131,7 @@ class Tally:
         self._counts: Counter[str] = Counter()
 
     def add(self, part: Gaussians) -> npt.NDArray[np.bool_]:
-        """Count the gaussians of a part; (N,) whether each can be drawn."""
+        """Count the gaussians of a part; return (N,) whether each can be drawn."""
         findings = cleaning.examine(part)
         self.num_gaussians += len(part)
         self.num_drawable += int(findings.drawable.sum())
@@ -129,8 +144,8 @@ class Tally:
         return {kind: self._counts[kind] for kind in cleaning.KINDS if kind in self._counts}
 
     def check(self, unusable: Unusable) -> None:
-        """Refuse an asset that cannot be built, and warn of gaussians that are left
-        out."""
+        """Raise ValueError for an asset that cannot be built, and warn about gaussians
+        that are left out."""
         text = cleaning.summary(
             self.num_gaussians - self.num_drawable, self.num_gaussians, self.counts
         )

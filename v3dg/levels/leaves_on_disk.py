@@ -1,9 +1,9 @@
-"""The leaves of an asset in files, one or many, that need not fit in memory.
+"""The leaves of an asset in one or many files, which need not fit in memory.
 
 An asset that does not fit in memory is read twice, in blocks. The first pass writes its
 means to scratch files, where they are split (`external_split`) down to *buckets*: nodes
 that are small enough to be sorted when they are read. The second pass writes every
-gaussian to its bucket. docs/results.md counts the bytes.
+gaussian to its bucket. docs/results.md has the amounts of data.
 """
 
 import math
@@ -25,8 +25,9 @@ from v3dg._numbers import check
 from v3dg._progress import Bar, Progress
 from v3dg._urls import shown
 from v3dg.bundle.codec import Codec
+from v3dg.cameras import Axis
 from v3dg.formats._reading import AssetFile
-from v3dg.gaussians import Gaussians, gaussian_bytes, put
+from v3dg.gaussians import Gaussians, common, gaussian_bytes, put
 from v3dg.io import open_asset
 from v3dg.levels import external_split
 from v3dg.levels.config import BuildConfig
@@ -39,9 +40,10 @@ from v3dg.levels.scratch import RowFile, scratch_folder
 MOST_GAUSSIANS = 1 << 32
 """An asset must have fewer gaussians than this."""
 
-_MOST_IN_BUCKET = 1 << 18  # a quarter of a unit of a build, so that few unneeded gaussians are read
-_MOST_IN_BLOCK_BYTES = 1 << 28  # a larger block is not faster: its rows are read in random order
-_SENT_AT_ONCE = 1 << 12  # gaussians that a thread writes to a bucket at a time
+_MOST_IN_BUCKET = 1 << 18  # a quarter of a build unit, so that few unneeded gaussians are read
+# Larger blocks are not faster, because their rows are read in random order.
+_MOST_IN_BLOCK_BYTES = 1 << 28
+_SENT_AT_ONCE = 1 << 12  # gaussians that a thread writes to a bucket together
 _OVERHEAD_BYTES = 24 << 20
 _CHANGED = "a file that does not change while it is read, got another content; build again"
 _NAMES = ("points", "spare", "order", "rows")
@@ -51,8 +53,8 @@ _Blocks = Iterator[tuple[int, Gaussians]]
 
 @dataclass(eq=False)
 class DiskLeaves(Leaves):
-    """Leaves in a scratch folder, while that exists; can be pickled, and read by
-    several threads at once."""
+    """Leaves in a scratch folder, valid while the folder exists. They can be pickled,
+    and read by several threads at once."""
 
     path: Path
     bucket_offset: npt.NDArray[np.int64]
@@ -91,19 +93,17 @@ def leaves_on_disk(
     progress: Progress = False,
     most_in_memory: int = MOST_GAUSSIANS,
 ) -> Iterator[Leaves]:
-    """The leaves of the asset that consists of the gaussians of some files, within
-    `memory` bytes.
+    """Return the leaves of the asset that consists of the gaussians in some files,
+    using at most `memory` bytes.
 
     Their order is that of the median split of all of them and does not depend on the
-    memory. `reserved` says how much of it other work needs, from the number of
+    memory. `reserved` returns the memory that other work needs, given the number of
     gaussians and the SH degree. An asset of more than `most_in_memory` gaussians is
-    sorted on disk even if it fits in memory. The scratch folder is made only if it is
+    sorted on disk even if it fits in memory. The scratch folder is created only if
     needed, and removed at the end.
     """
-    files = map(open_asset, paths)  # lazily, so that few files are open at once
-    tiles = [
-        _Tile(file.path, file.num_gaussians, file.sh_degree, file.whole_bytes) for file in files
-    ]
+    files = map(open_asset, paths)  # lazy, so that few files are open at once
+    tiles = list(map(_Tile.of, files))
     count = sum(tile.num_gaussians for tile in tiles)
     check("asset", count < MOST_GAUSSIANS, f"fewer than 2^32 gaussians, got {count:,}")
     degree = max(tile.sh_degree for tile in tiles)
@@ -111,27 +111,29 @@ def leaves_on_disk(
     folder = Path(folder)
     fits = count <= min(sizes.in_memory, most_in_memory)
     scratch: AbstractContextManager[None] = nullcontext()
-    # A folder that a killed build left is removed in any case.
+    # A folder that a killed build has left is removed in any case.
     if not fits or os.path.lexists(folder):
         scratch = scratch_folder(folder, _NAMES)
     if fits:
         progress = False
     with scratch, Bar(2 * count, "reading", progress) as bar:
         if fits:
-            buffer = Codec(degree).empty(count)
+            antialiased = _antialiased(tiles)
+            buffer = Codec(degree).empty(count).trained(antialiased=antialiased)
             for _ in _blocks(tiles, buffer, bar):
                 pass
             bar.close()
-            leaves = MemoryLeaves(buffer, config, unusable, device)
+            leaves: Leaves = MemoryLeaves(buffer, config, unusable, device, tiles[0].up)
             del buffer
-            yield leaves
         else:
             _check_disk(folder, scratch_bytes(count, degree))
-            yield _sort_on_disk(tiles, folder, sizes, config, unusable, bar)
+            leaves = _sort_on_disk(tiles, folder, sizes, config, unusable, bar)
+            bar.close()
+        yield leaves
 
 
 def _check_disk(folder: Path, num_bytes: int) -> None:
-    """Refuse, with OSError, a folder whose disk has less than `num_bytes` free."""
+    """Raise OSError if the disk of a folder has less than `num_bytes` free."""
     free = shutil.disk_usage(folder).free
     if free < num_bytes:
         raise OSError(
@@ -147,6 +149,19 @@ class _Tile(NamedTuple):
     num_gaussians: int
     sh_degree: int
     whole_bytes: int
+    up: Axis | None
+    antialiased: bool | None
+
+    @staticmethod
+    def of(file: AssetFile) -> "_Tile":
+        return _Tile(
+            file.path,
+            file.num_gaussians,
+            file.sh_degree,
+            file.whole_bytes,
+            file.declared.up,
+            file.declared.antialiased,
+        )
 
     def open(self) -> AssetFile:
         file = open_asset(self.path)
@@ -155,9 +170,15 @@ class _Tile(NamedTuple):
         return file
 
 
+def _antialiased(tiles: Sequence[_Tile]) -> bool | None:
+    """Whether the gaussians of all files were trained with antialiasing; None if that
+    is not known, or not the same for all."""
+    return common([tile.antialiased for tile in tiles])
+
+
 class _Sizes(NamedTuple):
-    """Maximum number of gaussians: in memory at once, in a block, in a node that is
-    split, in a bucket."""
+    """The maximum number of gaussians: in memory at once, in a block, in a node that is
+    split, and in a bucket."""
 
     in_memory: int
     in_block: int
@@ -166,7 +187,8 @@ class _Sizes(NamedTuple):
 
     @staticmethod
     def of(memory: int, reserved: int, degree: int, tiles: Sequence[_Tile]) -> "_Sizes":
-        """The sizes for `memory` bytes; ValueError if they are too few."""
+        """Return the sizes for `memory` bytes; raise ValueError if the memory is too
+        small."""
         gaussian = gaussian_bytes(degree)
         # A piece of a block is decoded in double precision, in addition to the block.
         overhead = _OVERHEAD_BYTES + 8 * PIECE * gaussian
@@ -190,25 +212,25 @@ class _Sizes(NamedTuple):
         )
 
     def blocks(self, tiles: Sequence[_Tile], bar: Bar) -> "_Blocks":
-        """The asset in blocks of this size."""
+        """Return the asset in blocks of this size."""
         degree = max(tile.sh_degree for tile in tiles)
         return _blocks(tiles, Codec(degree).empty(self.in_block), bar)
 
 
 def _bytes_in_bucket(degree: int) -> int:
-    """Memory for each gaussian of a bucket that is sorted: two copies of it, and the
-    split."""
+    """Return the memory per gaussian of a bucket that is being sorted: two copies of
+    the gaussian, and the split."""
     return 2 * gaussian_bytes(degree) + external_split.FITTING_BYTES
 
 
 def scratch_bytes(count: int, degree: int) -> int:
-    """An upper bound of the size on disk of the scratch for `count` gaussians."""
+    """Return an upper bound of the scratch files' size for `count` gaussians."""
     return count * (4 + max(gaussian_bytes(degree), 2 * 16))
 
 
 def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Bar) -> _Blocks:
-    """The asset in blocks that fill the buffer, each with its first row; one is valid
-    until the next."""
+    """Yield the asset in blocks that fill the buffer, each with its first row. A block
+    is valid until the next one."""
     first = 0
     filled = 0
     for tile in tiles:
@@ -224,7 +246,7 @@ def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Bar) -> _Blocks:
                 yield first, buffer
                 first += filled
                 filled = 0
-        del file  # a file that was read whole is freed before the next one is opened
+        del file  # free a completely read file before the next one is opened
     if filled:
         yield first, buffer.subset(slice(0, filled))
 
@@ -260,15 +282,13 @@ def _sort_on_disk(
             bucket_depth = min(depth, _core.num_halvings(count, sizes.in_bucket))
             files = (point_file, spare_file)
             external_split.split(files, count, bucket_depth, sizes.in_node, order_file)
-        points.unlink()
-        spare.unlink()
+        _remove(points, spare)
         offset = halved(np.array([count]), bucket_depth)
         ends = _ends_in_buckets(order_file, offset, sizes.in_block, tally.num_gaussians)
         with RowFile(rows, gaussian_bytes(degree) // 4, np.float32, must_be_new=True) as row_file:
             second_digest = _write_rows(sizes.blocks(tiles, bar), order_file, ends, row_file)
     order.unlink()
     check(_name_of(tiles), second_digest == digest, _CHANGED)
-    bar.close()
     return DiskLeaves(
         num_gaussians=count,
         asset_gaussians=tally.num_gaussians,
@@ -276,27 +296,34 @@ def _sort_on_disk(
         dropped=tally.counts,
         digest=digest,
         resident_bytes=int(np.diff(offset).max()) * _bytes_in_bucket(degree),
+        up=tiles[0].up,
+        antialiased=_antialiased(tiles),
         path=rows.absolute(),
         bucket_offset=offset,
         bucket_depth=depth - bucket_depth,
     )
 
 
+def _remove(*paths: Path) -> None:
+    for path in paths:
+        path.unlink()
+
+
 def _new_words(path: Path, width: int) -> external_split.WordFile:
-    """A new file of rows of words."""
+    """Return a new file of rows of 32-bit integers."""
     return RowFile(path, width, np.uint32, must_be_new=True)
 
 
 def _name_of(tiles: Sequence[_Tile]) -> str:
-    """The name of the asset in messages."""
+    """Return the name of the asset for messages."""
     if len(tiles) == 1:
         return shown(tiles[0].path)
     return f"one of {len(tiles)} files"
 
 
 def _write_points(blocks: _Blocks, points: external_split.WordFile, tally: Tally) -> str:
-    """The first pass: write the means of the drawable gaussians, with their rows in the
-    asset; the digest."""
+    """Run the first pass: write the means of the drawable gaussians with their rows in
+    the asset; return the digest."""
     hashes: list[bytes] = []
     with new_pool() as pool:
         for first, block in blocks:
@@ -317,8 +344,8 @@ def _write_rows(
     ends: npt.NDArray[np.int64],
     rows: RowFile[np.float32],
 ) -> str:
-    """The second pass: write every gaussian to its bucket, in the order of the asset;
-    the digest."""
+    """Run the second pass: write every gaussian to its bucket, in the order of the
+    asset; return the digest."""
     hashes: list[bytes] = []
     with new_pool() as pool:
         for number, (first, block) in enumerate(blocks):
@@ -335,7 +362,7 @@ def _write_rows(
                     index = (
                         order.read(start, min(start + _SENT_AT_ONCE, end)).astype(np.int64) - first
                     )
-                    # Unlike an index in brackets, take() releases the GIL.
+                    # take() releases the GIL, unlike indexing with brackets.
                     rows.write(
                         start,
                         np.concatenate([array.take(index, axis=0) for array in arrays], axis=1),
@@ -351,8 +378,8 @@ def _ends_in_buckets(
     block: int,
     asset_gaussians: int,
 ) -> npt.NDArray[np.int64]:
-    """(B, blocks + 1) places in the order: the start of each bucket, then its end in
-    each block."""
+    """Return (B, blocks + 1) positions in the order: the start of each bucket, then its
+    end in each block."""
     counts = np.zeros((len(offset) - 1, 1 - (-asset_gaussians // block)), np.int64)
     for bucket, (begin, end) in enumerate(
         zip(offset[:-1].tolist(), offset[1:].tolist(), strict=True)

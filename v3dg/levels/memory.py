@@ -1,5 +1,4 @@
-"""The memory of the host that a build may use, and the number of units that fit into
-it."""
+"""The host memory that a build may use, and the number of units that fit into it."""
 
 import os
 import re
@@ -15,20 +14,21 @@ from v3dg.levels.leaves import Leaves
 from v3dg.levels.whole import UNIT_LEAVES
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
-# Memory that each leaf of a unit needs until the levels are written: a number of bytes
-# that does not depend on the SH degree, and copies of the gaussian. A unit of 1,048,576
-# leaves took 380 bytes a leaf at SH degree 0, where a gaussian has 56 bytes, and 870 at
+# Memory per leaf of a unit until the levels are written: a number of bytes that does
+# not depend on the SH degree, and copies of the gaussian. A unit of 1,048,576 leaves
+# took 380 bytes per leaf at SH degree 0, where a gaussian has 56 bytes, and 870 at
 # degree 3, where it has 236.
 _LEAF_BYTES = 320
 _LEAF_COPIES = 2.5
 
 
 def in_bytes(memory: int | str | None) -> int:
-    """An amount of memory: bytes, or text like "8GiB"; None is half of what is free."""
+    """Return an amount of memory in bytes, given bytes or text like "8GiB"; half of the
+    free memory for None."""
     if memory is None:
         return free_bytes() // 2
     is_amount = isinstance(memory, str | int | float | np.number) and not isinstance(memory, bool)
-    # Python may refuse to print a very long number.
+    # Python may refuse to print a very long integer.
     is_long = isinstance(memory, int) and memory.bit_length() > 128
     text = ""
     if is_amount and not is_long:
@@ -40,8 +40,8 @@ def in_bytes(memory: int | str | None) -> int:
 
 
 def pool_bytes(memory: int | str | None) -> int | Literal["auto"] | None:
-    """The memory of a renderer's pool: bytes, "auto", or None; ValueError for anything
-    else."""
+    """Return the memory of a renderer's pool: bytes, "auto", or None; raise ValueError
+    for other values."""
     if memory is None:
         return None
     if isinstance(memory, str) and memory == "auto":
@@ -50,32 +50,32 @@ def pool_bytes(memory: int | str | None) -> int | Literal["auto"] | None:
 
 
 def most_units(memory: int, leaves: Leaves) -> int:
-    """Units that may be in memory at once, beside the leaves; at least one."""
+    """Return how many units may be in memory besides the leaves; at least one."""
     return max(
         1, (memory - leaves.resident_bytes) // unit_bytes(leaves.num_gaussians, leaves.sh_degree)
     )
 
 
 def unit_bytes(num_gaussians: int, sh_degree: int) -> int:
-    """Memory that a unit of an asset needs, in bytes."""
+    """Return the memory that a unit of an asset needs, in bytes."""
     return int(
         min(num_gaussians, UNIT_LEAVES) * (_LEAF_BYTES + _LEAF_COPIES * gaussian_bytes(sh_degree))
     )
 
 
 def in_mib(num_bytes: int) -> str:
-    """A number of bytes as text for messages, rounded up."""
+    """Return a number of bytes as text for messages, rounded up."""
     return f"{-(-num_bytes >> 20):,} MiB"
 
 
 def free_bytes() -> int:
-    """Free memory, in bytes: of the system, or of the container of the process if that
-    has less."""
+    """Return the free memory in bytes: of the system, or of the container of the
+    process if that has less."""
     free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     with suppress(OSError, ValueError, AttributeError, TypeError):
         text = Path("/proc/meminfo").read_text(encoding="ascii")
         free = int(re.search(r"MemAvailable:\s*(\d+)", text)[1]) << 10  # type: ignore[index]
-    with suppress(OSError, ValueError):  # "max" is no number
+    with suppress(OSError, ValueError):  # "max" is not a number
         group = Path("/sys/fs/cgroup")
         limit = int((group / "memory.max").read_text())
         used = int((group / "memory.current").read_text())

@@ -1,5 +1,5 @@
-"""The shape of every level, from counts alone: what a group is made of is known before
-anything is built."""
+"""The shape of every level. It follows from counts alone, so the members of each group
+are known before anything is built."""
 
 import itertools
 import math
@@ -18,17 +18,17 @@ Offsets = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class LevelPlan:
-    """One level, or a run of its groups: C clusters made by G groups, each of as many
-    clusters.
+    """One level, or a run of its groups: C clusters made by G groups, the same number
+    by each group.
 
-    At level 0 every cluster is a group of its own.
+    At level 0 every cluster counts as a group.
     """
 
-    first_group: int  # its number in the level of the whole asset
-    offset: Offsets  # (C + 1,) gaussians of each cluster
-    group_offset: Offsets  # (G + 1,) gaussians that each group is simplified to
-    leaf_offset: Offsets  # (G + 1,) gaussians of level 0 under each group
-    weight: npt.NDArray[np.float32]  # (G,) of the footprint
+    first_group: int  # index in the level of the whole asset
+    offset: Offsets  # (C + 1,) boundaries of the clusters' gaussians
+    group_offset: Offsets  # (G + 1,) boundaries of the gaussians that groups are simplified to
+    leaf_offset: Offsets  # (G + 1,) boundaries of the gaussians of level 0 under the groups
+    weight: npt.NDArray[np.float32]  # (G,) weight of the footprint
 
     @property
     def num_clusters(self) -> int:
@@ -43,7 +43,7 @@ class LevelPlan:
         return int(self.offset[-1])
 
     def groups(self, first: int, last: int) -> "LevelPlan":
-        """A run of the groups, their gaussians counted from 0."""
+        """Return a run of the groups, with their gaussians counted from 0."""
         clusters_made = self.num_clusters // self.num_groups
         offset = self.offset[first * clusters_made : last * clusters_made + 1]
         group_offset = self.group_offset[first : last + 1]
@@ -59,17 +59,17 @@ class LevelPlan:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The levels of a whole asset, or those of a subtree of it.
+    """The levels of a whole asset, or of a subtree of it.
 
-    All counts of clusters and groups are powers of two, so groups nest evenly: those
-    under a run of groups are a run of whole groups of every level below.
+    All counts of clusters and groups are powers of two, so groups nest evenly: below a
+    run of groups, every level has a run of whole groups.
     """
 
     levels: tuple[LevelPlan, ...]
 
     @staticmethod
     def of(num_gaussians: int, config: BuildConfig) -> "Plan":
-        """The plan of an asset of `num_gaussians`."""
+        """Return the plan of an asset of `num_gaussians`."""
         depth = _core.num_halvings(num_gaussians, config.cluster_size)
         offset = halved(np.array([num_gaussians]), depth)
         level_0 = LevelPlan(
@@ -85,7 +85,7 @@ class Plan:
         return Plan(tuple(levels))
 
     def subtree(self, level: int, first_group: int, last_group: int) -> "Plan":
-        """The levels under a run of groups of one level, and that level."""
+        """Return the levels below a run of groups of one level, and that level."""
         levels = []
         for lower in self.levels[: level + 1]:
             ratio = lower.num_groups // self.levels[level].num_groups
@@ -93,8 +93,8 @@ class Plan:
         return Plan(tuple(levels))
 
     def units(self, most_leaves: int) -> "list[Plan]":
-        """Cut the plan into parts that share no page, each above at most `most_leaves`
-        where possible."""
+        """Divide the plan into parts that share no page, each with at most
+        `most_leaves` leaves if possible."""
         num_units = (
             1 << max(0, math.ceil(self.levels[0].num_gaussians / most_leaves) - 1).bit_length()
         )
@@ -115,7 +115,7 @@ class Plan:
     def first_page(self) -> list[int]:
         """The first page of each level, then the number of pages.
 
-        A group's page is the page of the clusters that it replaces.
+        The page of a group has the clusters that the group replaces.
         """
         return list(itertools.accumulate(self._num_pages, initial=0))
 
@@ -133,10 +133,10 @@ class Plan:
 
 
 def _next_shape(lower: LevelPlan, config: BuildConfig) -> tuple[int, int] | None:
-    """The number of groups that a level's clusters form, and of the clusters that each
-    group makes.
+    """Return the number of groups that a level's clusters form, and the number of
+    clusters that each group makes.
 
-    None after the last level.
+    The result is None after the last level.
     """
     num_groups = max(1, lower.num_clusters // config.group_size)
     clusters_made = max(1, lower.num_clusters // num_groups // 2)
@@ -161,10 +161,10 @@ def _level_above(lower: LevelPlan, num_groups: int, clusters_made: int) -> Level
 
 
 def halved(sizes: npt.NDArray[np.int64], depth: int) -> Offsets:
-    """The first element of each part, and the end, after splitting nodes in two `depth`
-    times.
+    """Return the first element of each part, and the end, after splitting nodes in two
+    `depth` times.
 
-    The halves have the sizes that the median split gives them.
+    The halves have the sizes of the median split.
     """
     for _ in range(depth):
         sizes = np.stack([(sizes + 1) // 2, sizes // 2], axis=1).ravel()

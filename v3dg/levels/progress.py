@@ -9,12 +9,12 @@ from v3dg.levels.simplify import Show
 
 
 class Stopped(Exception):
-    """Another thread of the build has failed."""
+    """Raised because another thread of the build has failed."""
 
 
 class Bar(_progress.Bar):
-    """One bar over all levels. It advances by fitted gaussians, because the time is
-    proportional to them."""
+    """One bar for all levels. It advances by fitted gaussians, because the time is
+    proportional to their number."""
 
     def __init__(self, plan: Plan, initial: int, progress: Progress) -> None:
         total = sum(level.num_gaussians for level in plan.levels[1:])
@@ -26,11 +26,11 @@ class Bar(_progress.Bar):
         self._is_stopped = False
 
     def stop(self) -> None:
-        """Have every thread that shows progress raise `Stopped` from now on."""
+        """Make every thread that shows progress raise `Stopped` from now on."""
         self._is_stopped = True
 
     def show_of(self, part: int) -> Show:
-        """The progress callback of the fits of a part."""
+        """Return the progress callback for the fits of a part."""
 
         def show(
             levels: range, num_groups: int, num_gaussians: int, state: _core.FitProgress
@@ -47,7 +47,7 @@ class Bar(_progress.Bar):
         return show
 
     def add(self, part: int, level: int, num_gaussians: int) -> None:
-        """Count a level that another process made."""
+        """Count a level that another process has built."""
         if level > 0:
             self._update((part, level), num_gaussians)
 

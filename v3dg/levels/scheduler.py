@@ -1,11 +1,11 @@
-"""Whether the dask scheduler behind an executor still answers, so that no build waits
-for it without end.
+"""Checks that the dask scheduler behind an executor still answers, so that no build
+waits for it forever.
 
-A dask client with an open connection sends messages and waits for results: it does not
-notice that a scheduler has stopped, for example because its machine hangs. So the
-scheduler is sent a small request again and again while units are built. Only its
-silence ends a build: units may take as long as they need, and the scheduler itself
-notices workers that die.
+A dask client with an open connection sends messages and waits for results. It does not
+notice that a scheduler has stopped, for example because its machine hangs. So a small
+request is sent to the scheduler repeatedly while units are built. Only a silent
+scheduler ends a build: units may take as long as they need, and the scheduler itself
+detects workers that die.
 """
 
 import asyncio
@@ -19,16 +19,15 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# A working scheduler may be busy for a long time with the graphs of other clients,
-# which its only thread processes.
+# A working scheduler has a single thread, which may be busy for a long time with the
+# graphs of other clients.
 _MOST_SILENCE_S = 120.0
-_TICK_S = 5.0  # between two requests
+_TICK_S = 5.0  # time between two requests
 _ADVICE = "check it; finished units are kept, and a resumed build continues from them"
 
 
 class SchedulerError(RuntimeError):
-    """A scheduler does not answer any more, or has dropped the units that it was
-    given."""
+    """Raised if a scheduler does not answer, or has dropped its units."""
 
 
 class Watch:
@@ -45,15 +44,15 @@ class Watch:
         self._silent_s = 0.0
 
     def note_answer(self) -> None:
-        """Note that a result has arrived, which counts as an answer."""
+        """Note the arrival of a result, which counts as an answer."""
         self._silent_s = 0.0
 
     def tick(self) -> None:
-        """Note that another tick has passed; SchedulerError after too many without an
+        """Note that a tick has passed; raise SchedulerError after too many without an
         answer.
 
-        Ticks are counted and no clock is read: a process that was itself stopped for a
-        while received nothing, and must not conclude anything from that.
+        It counts ticks and does not read a clock, because a process that was itself
+        stopped for a while has received nothing in that time.
         """
         self._silent_s += _TICK_S
         if self._question is not None and self._question.done():
@@ -72,20 +71,20 @@ async def _ask(client: "Client") -> None:
 
 
 def watch_over(executor: Executor) -> Watch | None:
-    """A watch over the scheduler whose workers an executor has; None for executors of
-    other kinds."""
+    """Return a watch over the scheduler of an executor's workers; None for other kinds
+    of executors."""
     module = sys.modules.get("distributed.cfexecutor")
     if module is None or not isinstance(executor, module.ClientExecutor):
         return None
-    client = executor._client  # dask gives the client no public name
+    client = executor._client  # dask has no public name for the client
     if client.scheduler is None:
         return None
     return Watch(client)
 
 
 def completed(futures: Collection[Future[T]], watch: Watch | None) -> Iterator[Future[T]]:
-    """Futures in the order in which they end; SchedulerError where the scheduler drops
-    them or is silent."""
+    """Yield futures in the order in which they end; raise SchedulerError if the
+    scheduler drops them or is silent."""
     waiting = set(futures)
     timeout = None
     if watch is not None:

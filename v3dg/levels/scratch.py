@@ -1,4 +1,4 @@
-"""Scratch: a folder of files of rows, which is removed when the work is done."""
+"""Scratch folders: files of rows that are removed when the work is done."""
 
 import errno
 import fcntl
@@ -13,14 +13,13 @@ import numpy.typing as npt
 
 from v3dg import _files
 
-_MARK = "v3dg-scratch"  # a file that marks the folder as ours
+_MARK = "v3dg-scratch"  # a file that marks the folder as created here
 
 _Scalar = TypeVar("_Scalar", np.float32, np.uint32)
 
 
 class RowFile(AbstractContextManager["RowFile[_Scalar]"], Generic[_Scalar]):
-    """A file of rows of one width, float32 or uint32, in the byte order of the
-    machine."""
+    """A file of rows of one width, float32 or uint32, in the machine's byte order."""
 
     def __init__(
         self, path: Path, width: int, dtype: type[_Scalar], *, must_be_new: bool = False
@@ -38,7 +37,7 @@ class RowFile(AbstractContextManager["RowFile[_Scalar]"], Generic[_Scalar]):
         os.close(self._descriptor)
 
     def read(self, first: int, last: int) -> npt.NDArray[_Scalar]:
-        """Rows `first` to `last`, (M, width); (M,) where the width is 1."""
+        """Return rows `first` to `last`, (M, width), or (M,) if the width is 1."""
         shape: tuple[int, ...] = (last - first,)
         if self._width != 1:
             shape = (last - first, self._width)
@@ -50,7 +49,7 @@ class RowFile(AbstractContextManager["RowFile[_Scalar]"], Generic[_Scalar]):
         return rows
 
     def blocks(self, first: int, last: int, size: int) -> Iterator[npt.NDArray[_Scalar]]:
-        """Rows `first` to `last`, at most `size` at a time."""
+        """Yield rows `first` to `last`, at most `size` at a time."""
         for start in range(first, last, size):
             yield self.read(start, min(start + size, last))
 
@@ -63,9 +62,9 @@ class RowFile(AbstractContextManager["RowFile[_Scalar]"], Generic[_Scalar]):
 
 @contextmanager
 def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
-    """Make an empty folder for files of these names, and remove it at the end.
+    """Create an empty folder for files with these names, and remove it at the end.
 
-    Files of these names that a killed run left are removed.
+    Files with these names that a killed run has left are removed.
     """
     folder.mkdir(mode=0o700, exist_ok=True)
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -81,8 +80,8 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
                 f"{folder}: expected scratch files of a build, got {foreign_names[0]!a}; move it "
                 "elsewhere"
             )
-        # The mark comes before any other file and goes after the last: without it none
-        # of them is ours.
+        # The mark is written before all other files and removed after them: without it
+        # none of them was created here.
         os.close(
             os.open(folder / _MARK, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
         )
@@ -99,8 +98,8 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
 
 
 def lock(descriptor: int, path: str | os.PathLike[str], work: str = "build") -> None:
-    """Lock an open file or folder against others that do the same work, until it is
-    closed."""
+    """Lock an open file or folder against other processes that do the same work, until
+    it is closed."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -108,8 +107,8 @@ def lock(descriptor: int, path: str | os.PathLike[str], work: str = "build") -> 
             f"{os.fspath(path)}: another {work} is using it; wait for it, or write to another place"
         ) from None
     except OSError as error:
-        # Some network file systems have no locks; users must not start two builds of
-        # one output there.
+        # Some network file systems have no locks; users must not start two builds with
+        # the same output there.
         if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
             raise
 

@@ -1,5 +1,5 @@
-"""The unit of work: from the leaves of an asset or of a subtree of it to the levels
-above them."""
+"""The unit of work: it makes the levels above the leaves of an asset or of a subtree of
+it."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +15,8 @@ from v3dg.levels.config import BuildConfig
 from v3dg.levels.fit import fit_config, run_fit
 from v3dg.levels.plan import LevelPlan, Offsets, Plan
 
-# Groups whose start is computed at once. Ctrl-C waits meanwhile, for about a second.
+# Number of groups that are initialised together. Ctrl-C has to wait for them, about a
+# second.
 _GROUPS_AT_ONCE = 256
 
 Show = Callable[[range, int, int, _core.FitProgress], None]
@@ -24,12 +25,12 @@ Show = Callable[[range, int, int, _core.FitProgress], None]
 
 @dataclass(frozen=True, eq=False)
 class LevelTables:
-    """The measured values of a level, on the host; everything else follows from the
+    """The measured values of a level, on the host; all other values follow from the
     plan."""
 
-    box: npt.NDArray[np.float32]  # (C, 2, 3), bounds of the drawn clusters
+    box: npt.NDArray[np.float32]  # (C, 2, 3), boxes around the drawn clusters
     ball: npt.NDArray[np.float32]  # (G, 4), nested, for selection
-    # (G, 4), as small as is known, framed by the views of the fit
+    # (G, 4), as small as possible, framed by the views of the fit
     fit_ball: npt.NDArray[np.float32]
     error: npt.NDArray[np.float32]  # (G, 2), residual of the fits
 
@@ -44,12 +45,12 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class LevelBuilder:
-    """Makes the levels of a plan: of a whole asset, or of any subtree of it.
+    """Makes the levels of a plan for a whole asset or for any subtree of it.
 
     The result for a group depends only on the leaves under it, the config, the seed,
-    its level and its number in the level. So on the CPU the same groups get the same
-    bits, whatever the plan. On CUDA, how many groups are fitted at once can change how
-    a group is spread over the GPU, and thereby the last bits.
+    its level and its index in the level. So on the CPU the same groups get the same
+    bits in every plan. On CUDA, the number of groups that are fitted together can
+    change how a group is spread over the GPU, and thereby the last bits.
     """
 
     plan: Plan
@@ -63,8 +64,8 @@ class LevelBuilder:
         finished: Iterable[Level] = (),
         show: Show = lambda levels, num_groups, num_gaussians, state: None,
     ) -> Iterator[Level]:
-        """Yield all levels, one after another: the leaves first, as level 0; some may
-        be `finished`."""
+        """Yield all levels in ascending order, beginning with the leaves as level 0;
+        some may be `finished`."""
         plan = self.plan.levels[0]
         leaves = self.codec.rounded(leaves, plan.offset)
         ball = _device.to_host(_core.bound_spheres(_spheres(leaves), plan.leaf_offset))
@@ -99,7 +100,7 @@ class LevelBuilder:
             first_needed = min(last, self.config.target_of(last + 1))
             for number in [number for number in lower_levels if number < first_needed]:
                 del lower_levels[number]
-            while levels:  # a level that was yielded is not kept alive
+            while levels:  # do not keep a level alive that was yielded
                 yield levels.pop(0)
 
     def _simplify(
@@ -126,7 +127,7 @@ class LevelBuilder:
                 fit_config(config, self.seed, numbers[0]),
                 _target(lower_levels, targets, config),
                 _ranges(target_offsets, target_sizes),
-                gaussians.rows,  # the fit replaces them by its result
+                gaussians.rows,  # the fit overwrites them by its result
                 _ranges([plan.group_offset for plan in plans], np.diff(first_row)),
                 np.concatenate(fit_balls),
                 np.concatenate([_streams(*level) for level in zip(numbers, plans, strict=True)]),
@@ -145,8 +146,8 @@ class LevelBuilder:
         return levels
 
     def _starts(self, gaussians: Gaussians, numbers: range) -> Gaussians:
-        """The starts of the groups of some levels, each level halved from the one below
-        it."""
+        """Return the initial gaussians of the groups of some levels, each level halved
+        from the one below it."""
         starts: list[Gaussians] = []
         for number in numbers:
             plan = self.plan.levels[number]
@@ -158,14 +159,14 @@ class LevelBuilder:
 
 
 def _streams(number: int, plan: LevelPlan) -> npt.NDArray[np.int64]:
-    """(G,) streams of random numbers: every group of the asset has one of its own."""
+    """Return (G,) seeds of random numbers: every group of the asset has its own."""
     return (number << 40) + np.arange(
         plan.first_group, plan.first_group + plan.num_groups, dtype=np.int64
     )
 
 
 def _joined(parts: Sequence[Gaussians]) -> Gaussians:
-    """The gaussians of all parts, without a copy where there is only one."""
+    """Return the gaussians of all parts, without a copy if there is only one part."""
     if len(parts) == 1:
         return parts[0]
     return Gaussians.concatenate(parts)
@@ -179,7 +180,7 @@ def _level(
     fit_ball: npt.NDArray[np.float32],
     error: npt.NDArray[np.float32],
 ) -> Level:
-    """A level of fitted groups, each split into its clusters."""
+    """Return a level of fitted groups, each split into its clusters."""
     clusters_made = plan.num_clusters // plan.num_groups
     if clusters_made > 1:
         order, _ = _core.median_split(
@@ -194,8 +195,8 @@ def _level(
 def _view(
     target: Level, plan: Plan, number: int, config: BuildConfig
 ) -> tuple[Offsets, npt.NDArray[np.float32]]:
-    """The targets of a level's groups: (G + 1,) offsets of their gaussians; (G, 4)
-    balls that the views show."""
+    """Return the targets of a level's groups: (G + 1,) offsets of their gaussians, and
+    (G, 4) balls that the views show."""
     source = config.target_of(number)
     leaf_offset = plan.levels[number].leaf_offset
     if source == 0:
@@ -208,7 +209,7 @@ def _view(
 
 
 def _children(plan: Plan, lower: int, number: int) -> Offsets:
-    """(G + 1,) offsets: the groups of level `lower` that are under each group of level
+    """Return (G + 1,) offsets of the groups of level `lower` under each group of level
     `number`."""
     num_groups = plan.levels[number].num_groups
     return np.arange(num_groups + 1, dtype=np.int64) * (plan.levels[lower].num_groups // num_groups)
@@ -223,12 +224,12 @@ def _spheres(gaussians: Gaussians) -> Array:
 def _target(
     lower_levels: Mapping[int, Level], numbers: range, config: BuildConfig
 ) -> _core.FitTarget:
-    """The gaussians that groups are fitted to, drawn as they are drawn when they are
-    selected.
+    """Return the gaussians that groups are fitted to, with the appearance that they
+    have when they are selected.
 
-    The filter of the asset is left out: it spreads gaussians without reducing their
-    opacity, the more the smaller they are shown, and coarser levels would learn to be
-    too thick.
+    The filter of the asset is left out: it widens gaussians without reducing their
+    opacity, the more the smaller they are shown, so coarser levels would become too
+    thick.
     """
     rows = _joined([lower_levels[number].gaussians for number in numbers]).rows
     if numbers[0] == 0:
@@ -239,8 +240,8 @@ def _target(
 def _start(
     gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: BuildConfig
 ) -> Gaussians:
-    """The start of the fit of groups: their gaussians halved, from `offset` to
-    `out_offset`."""
+    """Return the initial gaussians of groups: their gaussians from `offset`, reduced to
+    the numbers of `out_offset`."""
     if _device.of(gaussians.means).is_cuda:
         return _halved(gaussians, offset, out_offset, config)
     result = empty(int(out_offset[-1]), gaussians.sh_degree)
@@ -265,8 +266,8 @@ def _halved(
 
 
 def _ranges(offsets: Sequence[Offsets], counts: Sequence[int] | Offsets) -> npt.NDArray[np.int64]:
-    """(S, 2) first element and end of each segment of arrays of `counts` elements that
-    are concatenated."""
+    """Return (S, 2) first element and end of each segment of arrays of `counts`
+    elements that are concatenated."""
     first = np.cumsum([0, *counts])
     moved = [offset + start for offset, start in zip(offsets, first[:-1], strict=True)]
     return np.concatenate([np.stack([offset[:-1], offset[1:]], axis=1) for offset in moved])

@@ -1,5 +1,5 @@
-"""Measures whether an asset is smooth: its gaussians are as wide as they are far apart,
-so that no filter is needed."""
+"""Measures whether an asset is smooth: its gaussians are about as wide as the distances
+between them, so that no filter is needed."""
 
 from dataclasses import replace
 
@@ -12,12 +12,12 @@ from v3dg.levels.leaves import Leaves
 from v3dg.levels.plan import Plan
 from v3dg.levels.simplify import LevelBuilder
 
-# Groups of level 1 that are fitted with this filter and without one.
+# Number of groups of level 1 that are fitted with this filter and without a filter.
 _GROUPS = 32
 _FILTER_PX2 = 0.05
-# Leaves of a group: larger ones would take too long.
+# Largest number of leaves in such a group; larger groups would take too long.
 _MOST_LEAVES = 1 << 15
-# An asset needs the filter if its loss without it is larger by this factor
+# An asset needs the filter if its loss without the filter is larger by this factor
 # (docs/levels.md).
 _NEEDED = 1.4
 
@@ -25,7 +25,7 @@ _NEEDED = 1.4
 def measured_config(
     config: BuildConfig, plan: Plan, leaves: Leaves, seed: int, codec: Codec, device: Device
 ) -> BuildConfig:
-    """The config that levels are built with: smooth="measured" becomes "yes" if the
+    """Return the config that levels are built with: "measured" becomes "yes" if the
     asset is smooth."""
     smooth = replace(config, smooth="yes", filter_px2=0.0)
     if config.smooth == "yes":
@@ -41,8 +41,8 @@ def measured_config(
     first_leaves = level_1.leaf_offset[stride // 2 : -1 : stride].tolist()
     parts = [_device.place(leaves.read(first, first + size), device) for first in first_leaves]
     sample = Gaussians.concatenate(parts)
-    # The sample has as many groups as were read, each of two clusters, whatever the
-    # groups of the build have.
+    # The sample consists of the groups that were read. Each has two clusters, whatever
+    # the group size of the build is.
     sample_config = replace(
         config,
         init="merge",

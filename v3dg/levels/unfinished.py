@@ -1,9 +1,9 @@
 """The unfinished bundle, from which an interrupted build continues.
 
-It is the file of the bundle, with the finished pages at their places. The journal
-begins at the end of the finished file: a record for each finished level of each part,
-with its tables and the hashes of its pages. The first bytes, a header of length 0 and
-the digest of the asset and the settings, distinguish it from a bundle.
+It is the file of the bundle, with the finished pages at their final positions. The
+journal begins behind the end of the finished file: a record for each finished level of
+each part, with its tables and the hashes of its pages. The first bytes distinguish it
+from a bundle: a header of length 0, and the digest of the asset and the settings.
 """
 
 import json
@@ -34,7 +34,7 @@ from v3dg.levels.plan import LevelPlan
 from v3dg.levels.scratch import lock
 from v3dg.levels.simplify import Level, LevelTables
 
-# Precedes a level: its part, its number, the hash of the following arrays.
+# Each level begins with its part, its number, and the hash of the arrays that follow.
 _RECORD = struct.Struct("<II16s")
 _MAGIC = bytes(8) + b"unfinished v3dg 1\n"
 
@@ -44,10 +44,10 @@ class FinishedLevel:
     """A level of a part whose pages are written."""
 
     tables: LevelTables
-    hashes: npt.NDArray[np.uint8]  # (n, 16) of the pages
+    hashes: npt.NDArray[np.uint8]  # (n, 16) hashes of the pages
 
     def read(self, pages: "PageFile | MemoryStore", run: PageRun) -> Level:
-        """The level, from its pages."""
+        """Return the level, read from its pages."""
         return Level(pages.read(run, self.hashes), self.tables)
 
 
@@ -61,28 +61,28 @@ Refine = Callable[[Bundle], Bundle]
 
 @dataclass(frozen=True)
 class PageFile:
-    """The pages of an unfinished bundle, for every process on every machine that can
-    open its file."""
+    """The pages of an unfinished bundle, for every process on any machine that can open
+    its file."""
 
     path: Path
     head: bytes
     codec: Codec
 
     def write(self, run: PageRun, gaussians: Gaussians) -> npt.NDArray[np.uint8]:
-        """Write the gaussians of a run of pages, on any device; (n, 16) their
+        """Write the gaussians of a run of pages, on any device; return (n, 16) their
         hashes."""
         with self._opened(os.O_RDWR) as descriptor:
             return write_pages(descriptor, run, self.codec, gaussians)
 
     def read(self, run: PageRun, hashes: npt.NDArray[np.uint8]) -> Gaussians:
-        """The gaussians of a run of pages that have these hashes."""
+        """Return the gaussians of a run of pages that have these hashes."""
         with self._opened(os.O_RDONLY) as descriptor:
             return read_pages(self.path, descriptor, run, self.codec, hashes)
 
     @contextmanager
     def _opened(self, flags: int) -> Iterator[int]:
-        """Open the file again, so that writes of other machines are seen, and they see
-        those of this one."""
+        """Open the file again, so that this machine sees the writes of others and they
+        see its writes."""
         with _files.naming_errors(self.path):
             descriptor = os.open(self.path, flags | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
             try:
@@ -94,8 +94,8 @@ class PageFile:
 
 
 class Unfinished:
-    """A bundle that is being built, in a file that replaces `bundle_path` at the end,
-    or stays where it is if that is None.
+    """A bundle in progress. Its file replaces `bundle_path` at the end, or stays in
+    place if that is None.
 
     A truncated record is ignored; a damaged record or page is an error. The file is
     locked while a build uses it, and removed after a build that finished only the
@@ -138,7 +138,7 @@ class Unfinished:
         return self
 
     def _continue(self, descriptor: int, magic: bytes) -> None:
-        """Read the levels that an interrupted build of the same bundle finished, or
+        """Read the levels that an interrupted build of the same bundle has finished, or
         begin an empty file."""
         head = os.pread(descriptor, len(self._plan.header), 0)
         if head == self._plan.header:
@@ -201,13 +201,13 @@ class Unfinished:
             if page_hash(arrays) != digest:
                 raise ValueError("a level is damaged")
             level = FinishedLevel(tables, hashes)
-            level.read(self.pages, run)  # checks the hashes of its pages
+            level.read(self.pages, run)  # this checks the hashes of its pages
             self.levels[part, number] = level
             self._end = end
 
     def save(self, part: int, number: int, level: FinishedLevel) -> None:
-        """Append a level to the journal; a record that a full disk truncates is ignored
-        later."""
+        """Append a level to the journal; a record that is truncated by a full disk is
+        ignored later."""
         arrays = [*vars(level.tables).values(), level.hashes]
         record = _RECORD.pack(part, number, page_hash(arrays))
         with self._lock, _files.naming_errors(self._path):
@@ -221,22 +221,23 @@ class Unfinished:
             self._end = end
 
     def finish(self, clusters: Clusters, groups: Groups, hashes: npt.NDArray[np.uint8]) -> None:
-        """Complete the bundle. After a kill at any moment the file is whole, or a build
-        can continue it."""
+        """Complete the bundle. If the process is killed at any moment, the file is
+        either complete or can be continued by another build."""
         descriptor = self._file.fileno()
         with _files.naming_errors(self._path):
             self._plan.write_tables(descriptor, clusters, groups, hashes)
-            os.fsync(descriptor)  # the header must not reach the disk before everything else
+            os.fsync(descriptor)  # the header must reach the disk after everything else
             try:
                 self._plan.write_header(descriptor)
             except OSError:
-                os.pwrite(descriptor, self.pages.head, 0)  # needs no space, for it replaces bytes
+                # Needs no disk space, because it overwrites bytes.
+                os.pwrite(descriptor, self.pages.head, 0)
                 raise
             self.is_whole = True
             os.ftruncate(descriptor, self._plan.num_bytes)
 
     def bundle(self, refine: Refine | None = None) -> Bundle:
-        """The whole bundle, moved to its final path.
+        """Return the complete bundle, moved to its final path.
 
         A refined one is written there; until then this file has the levels as they are
         built, and a build that is killed refines them again. Without a final path this
@@ -254,8 +255,8 @@ class Unfinished:
 
 
 class MemoryStore:
-    """The finished levels of a build in memory, and their pages: like `Unfinished` and
-    `PageFile` in one."""
+    """The finished levels of a build and their pages, in memory. It has the interfaces
+    of `Unfinished` and of `PageFile`."""
 
     is_whole = False
 
@@ -290,16 +291,17 @@ class MemoryStore:
 
 
 def described(device: Device) -> tuple[str, str]:
-    """The kind of a device and the version of v3dg, on which the last bits of a build
-    depend."""
+    """Return the kind of a device and the version of v3dg, on which the last bits of a
+    build depend."""
     return _device.describe(device), __version__
 
 
 def discard_levels(resume_path: str | os.PathLike[str]) -> None:
-    """Remove the levels that an interrupted build left at this path, if there are any.
+    """Remove the levels that an interrupted build has left at this path, if there are
+    any.
 
     Raises:
-        ValueError: The file is something else; it stays.
+        ValueError: The file is of another kind; it is not removed.
         RuntimeError: A build is using it.
         OSError: It cannot be removed.
     """
@@ -313,7 +315,7 @@ def discard_levels(resume_path: str | os.PathLike[str]) -> None:
 
 
 def _is_bundle(path: str | os.PathLike[str]) -> bool:
-    """Whether a build was killed after the bundle was complete and before it was
+    """Return whether a build was killed after the bundle was complete and before it was
     moved."""
     try:
         Bundle.open(path)
@@ -323,19 +325,20 @@ def _is_bundle(path: str | os.PathLike[str]) -> bool:
 
 
 def _open_locked(path: str | os.PathLike[str]) -> FileIO:
-    """Open or create a file to read and write, locked against other builds until it is
-    closed."""
-    # O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
+    """Open or create a file for reading and writing, locked against other builds until
+    it is closed."""
+    # With O_NONBLOCK, opening a pipe does not wait for a writer; regular files ignore
+    # it.
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
     while True:
         check(path, not os.path.islink(path), "a file of levels, got a link; remove it")
-        # The file gets the permissions of the bundle when it replaces that.
+        # The file has the permissions of the bundle that it will replace.
         file = FileIO(path, "r+", opener=lambda name, _: os.open(name, flags, 0o600))
         try:
             status = os.fstat(file.fileno())
             check(path, stat.S_ISREG(status.st_mode), "a file of levels, got a device or a pipe")
             lock(file.fileno(), path)
-            # The build that had the lock before may have removed the file.
+            # The previous owner of the lock may have removed the file.
             with suppress(FileNotFoundError):
                 if os.path.samestat(status, os.lstat(path)):
                     return file

@@ -1,4 +1,5 @@
-"""The build of a whole asset: its units on an executor, then the levels above them."""
+"""The build of a whole asset: an executor builds its units, then the levels above them
+are built here."""
 
 import os
 import socket
@@ -34,22 +35,22 @@ from v3dg.levels.simplify import Level, LevelBuilder, LevelTables, Show
 from v3dg.levels.smooth import measured_config
 from v3dg.levels.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
 
-# Leaves of a unit: enough to keep a GPU busy, in little memory. The last bits of a
-# bundle depend on this number.
+# The number of leaves in a unit. It keeps a GPU busy and needs little memory. The last
+# bits of a bundle depend on it.
 UNIT_LEAVES = 1 << 20
-# Factor by which the balls of level 1 grow if a smooth asset is too large to be
-# measured: level 1 is then selected at half the size (docs/levels.md).
+# The factor by which the balls of level 1 grow if a smooth asset is too large to be
+# measured. Level 1 is then selected at half the size (docs/levels.md).
 _UNMEASURED = 2.0
-# Units that a GPU works on at once, so that it is not idle during the smallest levels
-# of one.
+# The number of units that a GPU processes at once, so that it is not idle during the
+# smallest levels of one.
 _UNITS_ON_GPU = 4
 
 _Levels = dict[int, FinishedLevel]
 
 
 def devices_for(device: str | Device, asset: Gaussians | None = None) -> list[Device]:
-    """The devices of a build: for "auto" and "cuda", the asset's or the current one and
-    all others of its kind."""
+    """Return the devices of a build. For "auto" and "cuda": the asset's or the current
+    device, and all others of its kind."""
     first = _device.resolve(device)
     if not first.is_cuda or str(device) not in ("auto", "cuda"):
         return [first]
@@ -74,7 +75,7 @@ def build_into(
     up: Axis | None = None,
 ) -> Bundle:
     """Build all levels of an asset, in memory or in a file that replaces `bundle_path`;
-    as `build_bundle`."""
+    see `build_bundle`."""
     plan = Plan.of(leaves.num_gaussians, config)
     config.check_views(
         max((np.diff(level.group_offset).max() for level in plan.levels[1:]), default=1)
@@ -116,7 +117,7 @@ def _opened(
 
 
 def _parts(plan: Plan, units: Sequence[Plan], file: BundlePlan) -> list[Part]:
-    """The parts of the units, and last the part above them."""
+    """Return the parts of the units and, last, the part above them."""
 
     def runs(number: int, count: int) -> list[PageRun]:
         first, last = plan.first_page[number : number + 2]
@@ -147,7 +148,7 @@ class _Build:
 
     @property
     def num_low(self) -> int:
-        """Levels of the units."""
+        """The number of levels in the units."""
         return len(self.units[0].levels)
 
     def all_levels(
@@ -157,7 +158,7 @@ class _Build:
         most_units: int | None,
         executor: Executor | None,
     ) -> tuple[list[LevelTables], npt.NDArray[np.uint8]]:
-        """Build all levels; their tables, and the hashes of all pages."""
+        """Build all levels; return their tables, and the hashes of all pages."""
         if executor is None:
             self._build_on_threads(leaves, devices, most_units)
         else:
@@ -172,7 +173,8 @@ class _Build:
         if runs:
             first = self.config.target_of(self.num_low)
         lower_levels: dict[int, Level] = {}
-        for n in range(first, self.num_low):  # targets and starts of the levels above
+        # These are the targets and initial gaussians of the levels above.
+        for n in range(first, self.num_low):
             gaussians = _device.place(self._level(n).gaussians, devices[0])
             lower_levels[n] = Level(gaussians, finished[n].tables)
         builder = LevelBuilder(self.plan, self.config, self.seed, self.file.codec)
@@ -187,8 +189,8 @@ class _Build:
         )
 
     def grown(self, tables: Sequence[LevelTables], device: Device) -> list[LevelTables]:
-        """The tables with larger balls; the growth of level 1 is measured if the asset
-        is one unit."""
+        """Return the tables with larger balls; the growth of level 1 is measured if the
+        asset is one unit."""
         ball = tables[1].ball
         level_1 = self.plan.levels[1]
         growth = np.full(len(ball), _UNMEASURED, np.float32)
@@ -200,8 +202,7 @@ class _Build:
                 level_1.leaf_offset,
                 level_1.group_offset,
                 ball,
-                self.config.asset_filter_px2,
-                self.config.asset_antialiased,
+                *self.config.asset_look,
                 self.config.filter_px2,
             )
         balls = _core.grown_balls([table.ball for table in tables], growth)
@@ -246,7 +247,7 @@ class _Build:
 
         def submit(unit: int) -> Future[_Levels]:
             task = self._task(unit, leaves)
-            if isinstance(leaves, MemoryLeaves):  # those of the unit go along
+            if isinstance(leaves, MemoryLeaves):  # the leaves of the unit are sent with the task
                 task = replace(task, leaves=task.leaves().numpy)
             return executor.submit(build_in_worker, task, expected_device, nonce)
 
@@ -297,7 +298,7 @@ class _Build:
         return UnitTask(read, builder, runs, finished, self.store.pages)
 
     def _joined(self, number: int) -> FinishedLevel:
-        """A level of all units."""
+        """Return a level of all units together."""
         parts = [self.store.levels[unit, number] for unit in range(len(self.units))]
         columns = zip(*(vars(part.tables).values() for part in parts), strict=True)
         tables = LevelTables(*map(np.concatenate, columns))
@@ -306,13 +307,13 @@ class _Build:
 
 @dataclass(frozen=True, eq=False)
 class UnitTask:
-    """All that the work on a unit needs; it can be pickled where `leaves` and `pages`
-    can."""
+    """Everything that the work on a unit needs. It can be pickled if `leaves` and
+    `pages` can."""
 
     leaves: Callable[[], Gaussians]
     builder: LevelBuilder
     runs: Sequence[PageRun]  # pages of its levels
-    finished: Mapping[int, FinishedLevel]  # levels that are built already
+    finished: Mapping[int, FinishedLevel]  # levels that are already built
     pages: PageFile | MemoryStore
 
     def levels(self, device: Device, show: Show) -> Iterator[tuple[int, FinishedLevel]]:
@@ -330,7 +331,7 @@ class UnitTask:
             if number not in self.finished:
                 hashes = self.pages.write(self.runs[number], level.gaussians)
                 yield number, FinishedLevel(level.tables, hashes)
-            del level  # frees its memory while the next one is made
+            del level  # frees its memory while the next one is built
 
 
 class WorkerDevice(NamedTuple):
@@ -345,7 +346,7 @@ class WorkerDevice(NamedTuple):
 
 
 def build_in_worker(task: UnitTask, expected_device: WorkerDevice, _: bytes) -> _Levels:
-    """Build a unit in a worker of an executor, on a device like the expected one.
+    """Build a unit in a worker of an executor, on a device that must be as expected.
 
     The last argument differs in each build, because dask returns a cached result for
     the same arguments.

@@ -2,11 +2,11 @@
 
 `api.py` has `v3dg.render`, `renderer.py` has `v3dg.Renderer`. Both draw with a frame:
 of an asset (`asset_frame.py`), of a scene whose gaussians are all resident
-(`scene_frame.py`), or of a pool (`pool_frame.py`); `frame.py` says what a frame can do
-and chooses one. `request.py` has what is asked for.
+(`scene_frame.py`), or of a pool (`pool_frame.py`). `frame.py` defines the interface of
+frames and chooses one. `request.py` defines the requests.
 """
 
-from v3dg.render.api import render
+from v3dg.render.api import first_camera, render
 from v3dg.render.frame import Frame, FrameSource, frame_of
 from v3dg.render.pool_frame import PoolFrame
 from v3dg.render.renderer import Renderer
@@ -27,6 +27,7 @@ __all__ = [
     "Look",
     "PoolFrame",
     "Renderer",
+    "first_camera",
     "frame_of",
     "render",
     "shade_of",

@@ -1,18 +1,21 @@
-"""`v3dg.render`: single pictures, each settled."""
+"""`v3dg.render`: single pictures, each with all pages that it needs."""
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast, get_args, overload
 
 from v3dg import _device
 from v3dg._device import Device
-from v3dg._numbers import one_of
-from v3dg.cameras import Camera, StereoCamera, check_camera, for_each
+from v3dg._numbers import check, one_of, vector, whole
+from v3dg.cameras import AXES, Axis, Camera, StereoCamera, VectorLike, check_camera, for_each
 from v3dg.false_color import ColorBy
+from v3dg.framing import frame_subject
 from v3dg.gaussians import Gaussians
 from v3dg.image import RenderedImage
 from v3dg.levels.memory import pool_bytes
-from v3dg.opening import File, opened
+from v3dg.opening import File, open_with_cameras, opened
 from v3dg.pool import PoolSlot
 from v3dg.render.frame import FrameSource, frame_of
 from v3dg.render.picture import Picture
@@ -20,6 +23,7 @@ from v3dg.render.request import BLACK, CutRequest, FrameRequest, shade_of
 from v3dg.residency import residency
 from v3dg.scene import Subject
 from v3dg.select import CutOptions, Selection
+from v3dg.upright import direction_of, up_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,7 +43,7 @@ class _Options(CutOptions, total=False):
 
 @overload
 def render(
-    subject: Subject | File, camera: Camera, **options: Unpack[_Options]
+    subject: Subject | File, camera: Camera | None = None, **options: Unpack[_Options]
 ) -> RenderedImage: ...
 @overload
 def render(
@@ -51,7 +55,7 @@ def render(
 ) -> list[RenderedImage]: ...
 def render(
     subject: Subject | File,
-    camera: Camera | StereoCamera | Sequence[Camera],
+    camera: Camera | StereoCamera | Sequence[Camera] | None = None,
     *,
     tolerance: float | None = None,
     budget: int | None = None,
@@ -67,50 +71,57 @@ def render(
 ) -> RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 
-    Clusters whose gaussians each stand for at most `tolerance` px² are drawn in place
-    of finer ones; level 0 with the asset's own filter, coarser levels with the filter
-    they were made for (V3DG, section 3.4; our metric is in docs/levels.md). An asset is
-    drawn whole, without a filter.
+    Clusters whose gaussians each cover at most `tolerance` px² replace finer ones.
+    Level 0 is drawn with the asset's own filter, coarser levels with the filter that
+    they were made for (V3DG, section 3.4; docs/levels.md defines the metric). An asset
+    is drawn completely and without a filter. One that was trained with antialiasing
+    (`Gaussians.antialiased`) is drawn as it was trained, with 0.3 px² and compensated
+    opacities.
 
     Args:
-        subject: What to draw, in world space; or the file of it, which is then opened
-            anew by every call.
+        subject: What to draw, in world space; or its file, which every call opens
+            again.
         camera: Pinhole camera. With several, each has its own cut and its own picture,
-            as if drawn alone. The eyes of a stereo camera share one cut, and one frame:
-            two pictures, whose statistics are those of both together but for the
-            gaussians that were selected.
+            as if drawn alone. The two eyes of a stereo camera share one cut and one
+            frame. Their two pictures have common statistics, which are sums, except for
+            the number of selected gaussians. None means the first camera of a scene's
+            file, else the camera of `first_camera`.
         tolerance: As in `v3dg.select`; so are `budget` and `min_level`.
-        fade: As in `v3dg.select`; weights multiply opacities. Give `v3dg.DEFAULT_FADE`
+        fade: As in `v3dg.select`; weights multiply opacities. Use `v3dg.DEFAULT_FADE`
             for a film.
-        cut: Draw what was selected before from this scene, whatever the camera: a cut
-            to walk around. Takes the place of `tolerance`, `budget`, `min_level` and
-            `fade`.
-        color_by: "level" or "cluster" colours gaussians by their own, "residency" where
-            pages are missing.
+        cut: A cut that was selected earlier from this scene, which is drawn for any
+            camera, so that it can be inspected from all sides. Replaces `tolerance`,
+            `budget`, `min_level` and `fade`.
+        color_by: "level" or "cluster" colours gaussians by their level or cluster,
+            "residency" shows where pages are missing.
         background: Three numbers.
-        min_transmittance: A pixel stops behind the gaussian that lets no more than this
-            share of light through, 0 to 0.99, and gives that light to what it has
-            blended: no channel is off by more than this times the difference to what
-            lies behind. None is 0.001 for scenes and bundles, and draws assets as
-            `v3dg.rasterize` does.
+        min_transmittance: A pixel stops behind the gaussian that leaves this
+            transmittance or less, 0 to 0.99, and distributes the rest over the
+            gaussians that it has blended. So the error of a channel is at most this
+            fraction of the difference to what lies behind. None means 0.001 for scenes
+            and bundles; assets are then drawn as by `v3dg.rasterize`.
         depth: Draw the expected depth, too.
-        device: "cpu" draws NumPy arrays; "cuda", or a certain one as "cuda:1", draws
-            torch tensors there, on the stream that is torch's current one, and keeps on
-            the device what the next picture of the same scene or bundle needs. Use a
-            `Renderer` to say how long. "auto" is "cuda" where that works.
+        device: "cpu" draws NumPy arrays. "cuda", or one device such as "cuda:1", draws
+            torch tensors there on torch's current stream, and keeps on the device what
+            the next picture of the same scene or bundle needs; a `Renderer` controls
+            how long. "auto" means "cuda" if it works.
         memory: As in `Renderer`; each picture is settled.
 
     Raises:
-        ValueError: An argument is not as above, or the coarsest cut has more gaussians
-            than the budget; on CUDA that is raised where the picture is looked at.
-        RuntimeError: `device` is "cuda" and something is missing for it.
+        ValueError: An argument is invalid, or the coarsest cut has more gaussians than
+            the budget; on CUDA the latter is raised when the picture is used.
+        RuntimeError: `device` is "cuda", and something that CUDA needs is missing.
     """
     chosen_device = _device.resolve(device)
-    opened_subject = opened(subject)
+    if camera is None:
+        opened_subject, camera = _with_first_camera(subject)
+    else:
+        opened_subject = opened(subject)
     one_of(color_by, "color_by", get_args(ColorBy))
     frame = _still_frame(opened_subject, color_by, chosen_device, pool_bytes(memory))
     cut_request = CutRequest(tolerance, budget, min_level, fade)
-    shade = shade_of(background, min_transmittance, isinstance(opened_subject, Gaussians), depth)
+    is_asset = isinstance(opened_subject, Gaussians)
+    shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=depth)
 
     def picture(view: Camera | StereoCamera) -> Picture:
         check_camera(view)
@@ -123,13 +134,61 @@ def render(
     )
 
 
+def first_camera(
+    subject: Subject | File,
+    width: int = 800,
+    height: int = 800,
+    *,
+    up: Axis | VectorLike | None = None,
+) -> Camera:
+    """Return the camera that first shows a subject, the same as in the viewer and of
+    `v3dg render`: all of an object, from its front and a little above; the middle of a
+    room, from inside.
+
+    The field of view is 45 degrees across the shorter side, 65 degrees inside.
+
+    Args:
+        subject: A scene, a bundle or an asset, or the file of it.
+        width, height: Size of the picture in px.
+        up: The axis or direction that is up; None uses the axis of
+            `v3dg.upright.up_of`.
+
+    Raises:
+        ValueError: An argument is not as above.
+    """
+    width = whole(width, "width", "a positive whole number", 1)
+    height = whole(height, "height", "a positive whole number", 1)
+    content: Subject = opened(subject)
+    if up is None:
+        up = up_of(content)[0]
+    if isinstance(up, str):
+        one_of(up, "up", AXES)
+        up = direction_of(up)
+    direction = vector(up, "up")
+    check("up", direction.any(), "a direction, got (0, 0, 0)")
+    return frame_subject(content).camera(direction, width, height)
+
+
+def _with_first_camera(subject: Subject | File) -> tuple[Subject, Camera]:
+    """Return a subject and the camera that it is drawn with by default: the first one
+    of its file, else a first view of it."""
+    if not isinstance(subject, str | os.PathLike):
+        return subject, first_camera(subject)
+    path = Path(subject)
+    content, cameras = open_with_cameras(path)
+    if cameras:
+        return content, next(iter(cameras.values()))
+    return content, first_camera(content, up=up_of(content)[0])
+
+
 def _still_frame(
     subject: Subject, color_by: ColorBy, device: Device, memory: int | Literal["auto"] | None
 ) -> FrameSource:
-    """The frame that stills of a subject are drawn with, which is kept with a scene or
-    a bundle.
+    """Return the frame for single pictures of a subject, which is stored with a scene
+    or a bundle.
 
-    All colours share a pool. Of pools of a given size, only the last one is kept.
+    All colours share a pool. If the size of the pool is given, only the last pool is
+    kept.
     """
     if isinstance(subject, Gaussians):
         return frame_of(subject, color_by, device, memory, PoolSlot())

@@ -1,5 +1,5 @@
-"""The frame of an asset, which is drawn whole: it has no levels to choose from, and no
-pages."""
+"""The frame of an asset, which is drawn completely: it has no levels to choose from,
+and no pages."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from v3dg._device import Device
 from v3dg._numbers import check
 from v3dg.cameras import Camera, StereoCamera
 from v3dg.false_color import ColorBy
+from v3dg.gaussians import TRAINED_FILTER_PX2
 from v3dg.image import RenderedImage, Stats
 from v3dg.render.picture import Picture, stats_of
 from v3dg.render.request import CutRequest, FrameRequest
@@ -21,11 +22,12 @@ if TYPE_CHECKING:
 
 
 class AssetFrame:
-    """Draws one asset on one device. It keeps the asset's arrays there.
+    """Draws one asset on one device, where it keeps the asset's arrays. An asset that
+    was trained with antialiasing is drawn as it was trained.
 
     Attributes:
-        device: Where it draws.
-        memory: None, for it draws from no pool.
+        device: The device that draws.
+        memory: None, because it has no pool.
     """
 
     def __init__(self, asset: Gaussians, color_by: ColorBy, device: Device) -> None:
@@ -33,10 +35,17 @@ class AssetFrame:
         check("color_by", color_by == "appearance", expected)
         self.device = device
         self.memory: int | None = None
-        self._core = _core.AssetFrame(_core.Model(_device.place(asset, device).rows))
+        filter_px2 = 0.0
+        if asset.antialiased:
+            filter_px2 = TRAINED_FILTER_PX2
+        self._core = _core.AssetFrame(
+            _core.Model(_device.place(asset, device).rows),
+            filter_px2=filter_px2,
+            antialiased=bool(asset.antialiased),
+        )
 
     def chosen(self, subject: Subject) -> AssetFrame:
-        """This frame."""
+        """Return this frame."""
         return self
 
     def draw(
@@ -46,8 +55,7 @@ class AssetFrame:
         steps: _core.BudgetSteps | None = None,
         stop: _core.Stop | None = None,
     ) -> Picture:
-        """Draw the asset; ValueError where something is asked for that only levels
-        have."""
+        """Draw the asset; raise ValueError if the request needs levels."""
         is_selected = request.selection is None
         check("cut", is_selected, "a scene or a bundle to choose from, got an asset")
         check_request(request.cut)
@@ -62,7 +70,7 @@ class AssetFrame:
     def settle(
         self, subject: Subject, camera: Camera | StereoCamera, cut: CutRequest, timeout: float
     ) -> None:
-        """Return at once, for all of an asset is resident."""
+        """Return at once, because all of an asset is resident."""
 
     def _draw_eye(
         self, camera: Camera, shade: _core.Shade, stop: _core.Stop | None
@@ -78,8 +86,8 @@ class AssetFrame:
 
 
 def check_request(request: CutRequest) -> None:
-    """Refuse what an asset cannot have; a tolerance and a fade are accepted and change
-    nothing."""
+    """Raise ValueError for a request that needs levels; a tolerance and a fade are
+    accepted without effect."""
     if request.is_plain:
         _check_known(*request)
     else:

@@ -1,5 +1,5 @@
-"""Frames: what pictures of one subject are drawn with on one device, and which of them
-a subject gets."""
+"""Frames: the buffers for pictures of one subject on one device, and the choice of a
+frame for a subject."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 
 class Frame(Protocol):
-    """Buffers that pictures of one subject are drawn with; it does not keep a scene or
-    a bundle alive."""
+    """The buffers for pictures of one subject. A frame does not keep a scene or a
+    bundle alive."""
 
     def draw(
         self,
@@ -37,44 +37,44 @@ class Frame(Protocol):
         steps: _core.BudgetSteps | None = None,
         stop: _core.Stop | None = None,
     ) -> Picture:
-        """Draw what is resident; of a stereo camera, a picture for each eye.
+        """Draw what is resident; for a stereo camera, one picture per eye.
 
         Args:
-            steps: The pacing of pictures that follow each other; None for a single one.
+            steps: Pacing state of a sequence of pictures; None for a single one.
             stop: Ends a picture early on the CPU.
         """
 
     def draw_settled(self, subject: Subject, request: FrameRequest) -> Picture:
-        """Draw a picture that misses nothing, whatever other threads draw."""
+        """Draw a picture that misses no page, regardless of what other threads draw."""
 
     def settle(
         self, subject: Subject, camera: Camera | StereoCamera, cut: CutRequest, timeout: float
     ) -> None:
-        """Wait until what a view needs is resident."""
+        """Wait until everything that a view needs is resident."""
 
 
 class FrameSource(Protocol):
-    """Has the frame of a subject on one device, which may become another one when the
+    """Provides the frame of a subject on one device. The frame can change when the
     subject grows."""
 
     device: Device
 
     @property
     def memory(self) -> int | None:
-        """Bytes of the pool that it draws from; None where all is resident."""
+        """Bytes of the pool that it draws from; None if everything is resident."""
 
     def chosen(self, subject: Subject) -> Frame:
-        """The frame that the subject is drawn with now."""
+        """Return the frame that currently draws the subject."""
 
 
 class AutoFrame:
-    """Draws with all gaussians resident where they fit, else from a pool.
+    """Draws with all gaussians resident if they fit, else from a pool.
 
-    Which of the two is decided when it is made, and again when bundles are added; once
-    it has a pool it keeps that.
+    The choice is made on construction, and again when bundles are added; a pool is
+    never given up.
 
     Attributes:
-        device: Where it draws.
+        device: The device that draws.
     """
 
     def __init__(self, color_by: ColorBy, device: Device, slot: PoolSlot) -> None:
@@ -90,12 +90,13 @@ class AutoFrame:
         return self._frame.memory
 
     def chosen(self, subject: Subject) -> SceneFrame | PoolFrame:
-        """The frame that the subject is drawn with now."""
+        """Return the frame that currently draws the subject."""
         with residency.turn(self.device):
-            resident = residency.scene(subject, self.device, self._resident)
-            self._resident = resident
-            if self._references is not resident.references:
-                self._choose(resident)
+            if self._resident is None or not self._resident.is_of(subject):
+                resident = residency.scene(subject, self.device)
+                self._resident = resident
+                if self._references is not resident.references:
+                    self._choose(resident)
             return self._frame
 
     def _choose(self, resident: ResidentScene) -> None:
@@ -117,26 +118,30 @@ def frame_of(
     memory: int | Literal["auto"] | None,
     slot: PoolSlot,
 ) -> FrameSource:
-    """A new frame for pictures of a subject.
+    """Return a new frame for pictures of a subject.
 
     Args:
         memory: Bytes of a pool; "auto" and None as in `v3dg.Renderer`.
-        slot: Where its pool is kept, if it gets one.
+        slot: Where its pool is stored, if it gets one.
 
     Raises:
-        ValueError: `color_by` or `memory` is not as in `v3dg.Renderer`.
+        ValueError: `color_by` or `memory` is invalid; see `v3dg.Renderer`.
     """
     one_of(color_by, "color_by", get_args(ColorBy))
     if isinstance(subject, Gaussians):
         is_without = memory is None or memory == "auto"
-        check("memory", is_without, f"None for an asset, without pages, got {memory}; leave it out")
+        check(
+            "memory",
+            is_without,
+            f"None for an asset, which has no pages, got {memory}; leave it out",
+        )
         return AssetFrame(subject, color_by, device)
     frame: SceneFrame | PoolFrame | AutoFrame
     if memory is None:
         frame = SceneFrame(color_by, device)
     elif memory != "auto":
         frame = PoolFrame(color_by, device, memory, slot)
-    elif device.is_cuda and color_by != "appearance":  # A pool on a GPU has no other colours.
+    elif device.is_cuda and color_by != "appearance":  # a pool on a GPU supports no other colours
         frame = SceneFrame(color_by, device)
     else:
         frame = AutoFrame(color_by, device, slot)

@@ -1,4 +1,4 @@
-"""Pictures that may still be under way, and what they cost."""
+"""Pictures that may still be in progress, and their statistics."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from v3dg import _core
 from v3dg.cameras import Camera, StereoCamera
 from v3dg.image import RenderedImage, Stats
 
-# Of a camera; or of the eyes of a stereo camera, left first.
+# One picture for a camera; for a stereo camera one per eye, left first.
 Picture: TypeAlias = RenderedImage | tuple[RenderedImage, RenderedImage]
 
 
 def picture_of(
     drawing: _core.Drawing, camera: Camera | StereoCamera, finish: Callable[[], Stats]
 ) -> Picture:
-    """The picture that a drawing makes; `finish` waits for it and returns what it
-    cost."""
+    """Return the picture of a drawing; `finish` waits for the picture and returns its
+    statistics."""
     left = RenderedImage(drawing, finish)
     if isinstance(camera, Camera):
         return left
@@ -25,8 +25,7 @@ def picture_of(
 
 
 def stats_of(stats: _core.FrameStats, tolerance: float) -> Stats:
-    """What a picture cost, as users see it, with the tolerance that its cut was chosen
-    with."""
+    """Return the statistics of a picture for users, with the tolerance of its cut."""
     return Stats(
         stats.gaussians,
         stats.in_frustum,

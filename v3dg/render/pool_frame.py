@@ -1,5 +1,5 @@
-"""The frame of a pool: of a scene's gaussians, those are resident that views need and
-that have room."""
+"""The frame of a pool: only those of a scene's gaussians are resident that views need
+and that fit."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class PoolFrame:
         self._core = _core.SceneFrame(device.number)
         self._pool: Pool | None = None
         self._references: tuple[weakref.ref[Bundle], ...] | None = None
-        self._resident: ResidentScene | None = None  # as it was last drawn
-        self._has_settled = False  # and drawn nothing since
+        self._resident: ResidentScene | None = None  # the scene as it was last drawn
+        self._has_settled = False  # whether nothing was drawn since `settle`
 
     @property
     def core(self) -> _core.PagePool:
@@ -58,14 +58,14 @@ class PoolFrame:
         return self._pool.core
 
     def take(self, resident: ResidentScene) -> Pool:
-        """The pool of the scene's bundles."""
+        """Return the pool of the scene's bundles."""
         pool = self._pool
-        if pool is not None and self._references is resident.references:  # as in most pictures
+        if pool is not None and self._references is resident.references:  # true for most pictures
             return pool
         with residency.lock:
             bundles = resident.bundles
             tables = [residency.table(bundle) for bundle in bundles]
-            pool = None  # both references end, because the memory of the pool may be needed
+            pool = None  # both references must end, because the memory of the pool may be needed
             self._pool = None
             pool = self._slot.pool(bundles, tables, self.device, self._num_bytes)
             self._pool = pool
@@ -73,7 +73,7 @@ class PoolFrame:
             return pool
 
     def chosen(self, subject: Subject) -> PoolFrame:
-        """This frame."""
+        """Return this frame."""
         return self
 
     def draw(
@@ -83,7 +83,7 @@ class PoolFrame:
         steps: _core.BudgetSteps | None = None,
         stop: _core.Stop | None = None,
     ) -> Picture:
-        """Draw what is resident of a cut, after bringing in pages that are ready."""
+        """Draw the resident part of a cut, after bringing in pages that are ready."""
         _refuse_given_cut(request)
         with residency.turn(self.device):
             resident = residency.scene(subject, self.device, self._resident)
@@ -93,13 +93,13 @@ class PoolFrame:
         if not self.device.is_cuda:
             _finish(picture)
         elif self._has_settled:
-            # This may draw again, from pages that other views put in place of its own.
+            # If this draws again, the pages of other views may have replaced its own.
             _finish(picture)
         self._has_settled = False
         return picture
 
     def draw_settled(self, subject: Subject, request: FrameRequest) -> Picture:
-        """Settle and draw in one step, between which no other thread's view gets at the
+        """Settle and draw in one step, in which no other thread's view uses the
         pool."""
         _refuse_given_cut(request)
         camera = request.camera.core
@@ -125,8 +125,8 @@ class PoolFrame:
         timeout: float = _STILL_TIMEOUT_SECONDS,
         seconds: float = math.inf,
     ) -> None:
-        """Bring in what a view needs, or what of it comes in within `seconds`; errors
-        as of `Pool.settle`."""
+        """Bring in the pages that a view needs, or those that arrive within `seconds`;
+        raises the errors of `Pool.settle`."""
         real(timeout, "timeout", "seconds, at least 0", 0)
         rule = cut.rule
         with residency.turn(self.device):
@@ -137,7 +137,7 @@ class PoolFrame:
         self._has_settled = True
 
     def pick(self, subject: Subject, pixel: _core.Camera, rule: _core.Rule) -> _core.Pick | None:
-        """What a pixel shows most of; only on the CPU."""
+        """Return the gaussian with the largest weight in a pixel; only on the CPU."""
         resident = residency.scene(subject, self.device)
         pool = self.take(resident)
         request = _core.FrameRequest(pixel, rule, look=_core.Look(aside=True))
@@ -181,12 +181,14 @@ class PoolFrame:
 
 
 def _finish(picture: Picture) -> None:
-    """Wait for a picture, and raise what went wrong."""
+    """Wait for a picture, and raise its error if it has one."""
     if isinstance(picture, tuple):
         picture = picture[0]
     picture.stats  # noqa: B018
 
 
 def _refuse_given_cut(request: FrameRequest) -> None:
-    is_selected = request.selection is None
-    check("cut", is_selected, "none for a pool, which has its own, got one; give memory=None")
+    if request.selection is not None:
+        raise ValueError(
+            "cut: a renderer with a pool selects its own cut; leave it out, or give memory=None"
+        )

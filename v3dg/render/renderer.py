@@ -1,4 +1,4 @@
-"""`v3dg.Renderer`: pictures of one subject that follow each other."""
+"""`v3dg.Renderer`: sequences of pictures of one subject."""
 
 from __future__ import annotations
 
@@ -34,38 +34,38 @@ class _Options(CutOptions, total=False):
 
 
 class Renderer:
-    """Draws one scene, bundle or asset on one device, with buffers of its own.
+    """Draws one scene, bundle or asset on one device, with its own buffers.
 
-    On a CUDA device, enqueuing a picture on torch's current stream there waits for
-    nothing, so pictures can be drawn ahead, and captured in a CUDA graph: draw once
-    what the graph will meet, so that it is all on the device, then capture `render`;
-    what was not drawn before is a RuntimeError. Keep the renderer as long as the graph,
-    and capture again when the scene has changed. A picture that is under way when its
-    scene is changed is finished first.
+    On a CUDA device, pictures are enqueued on torch's current stream without waiting.
+    So pictures can be drawn ahead, and captured in a CUDA graph: draw everything once
+    that the graph will draw, so that it is on the device, then capture `render`;
+    anything that was not drawn before raises RuntimeError. Keep the renderer as long as
+    the graph, and capture again after changes of the scene. When a scene changes,
+    pictures in progress are finished first.
 
-    With a budget and a fade, pictures are taken to follow each other: the tolerance
-    goes in steps to the one at which a part of the budget is free, never below that of
-    `render`, so that slow motion is steady; at rest it is there after eight pictures
-    (docs/fades.md). Without a fade, pictures are those of `render`.
+    With a budget and a fade, pictures count as a sequence: the tolerance moves in steps
+    to the value at which a part of the budget is free, never below that of `render`, so
+    that slow motion is steady; at rest it arrives after eight pictures (docs/fades.md).
+    Without a fade, pictures are those of `render`.
 
-    With a pool, only a part of the bundles is resident, so that they may be far larger
-    than memory: pages come in from the files as views need them, read by other threads.
-    A picture waits for none of them: where one is missing, the coarser clusters above
-    it are drawn; with a fade, pages fade in. Use `settle` for a picture that misses
-    nothing. If a view needs more than there is room for, the tolerance is raised until
-    it fits.
+    With a pool, only a part of the bundles is resident, so the bundles may be far
+    larger than memory. Other threads read pages from the files as views need them. A
+    picture does not wait for pages: where one is missing, the coarser clusters above it
+    are drawn; with a fade, pages fade in. Use `settle` for a picture that misses no
+    page. If a view needs more pages than fit, the tolerance is raised until they fit.
 
     Args:
         subject: As in `v3dg.render`.
         color_by: As in `v3dg.render`; with a pool on a CUDA device, "appearance".
-        device: As in `v3dg.render`. The renderer stays on it, whichever device is
-            torch's current one later.
-        memory: Of a pool for gaussians on the device: bytes, or text like "2GB". All
-            are resident if None. "auto" is None where all fit into what is free, less a
-            quarter of that or 1 GiB; else half of it.
+        device: As in `v3dg.render`. The renderer keeps using this device if torch's
+            current device changes.
+        memory: Size of a pool for gaussians on the device: bytes, or text like "2GB".
+            None keeps all gaussians resident. "auto" means None if all of them fit into
+            the free memory, less a quarter of that or 1 GiB; otherwise it means half of
+            the free memory.
 
     Raises:
-        RuntimeError: Something is missing for the device.
+        RuntimeError: The device is not available.
         ValueError: `memory` has no room for the coarsest level, or the coarsest page of
             a file is damaged.
     """
@@ -86,7 +86,7 @@ class Renderer:
 
     @property
     def memory(self) -> int | None:
-        """Bytes of the pool that it draws from; None where all is resident."""
+        """Bytes of the pool that it draws from; None if everything is resident."""
         return self._frame.memory
 
     def __repr__(self) -> str:
@@ -97,13 +97,13 @@ class Renderer:
 
     @property
     def subject(self) -> Subject:
-        """What it draws."""
+        """The subject that it draws."""
         return self._subject
 
     @property
     def pool_frame(self) -> PoolFrame | None:
-        """What it draws with where not all is resident; else None. Not part of the
-        public interface."""
+        """The frame of its pool; None without a pool. Not part of the public
+        interface."""
         frame = self._frame.chosen(self._subject)
         if isinstance(frame, PoolFrame):
             return frame
@@ -128,10 +128,11 @@ class Renderer:
         min_transmittance: float | None = None,
         depth: bool = False,
     ) -> RenderedImage | tuple[RenderedImage, RenderedImage]:
-        """Draw as `v3dg.render` does, of what is resident."""
+        """Draw as `v3dg.render` does, using what is resident."""
         check_camera(camera)
         subject = self._subject
-        shade = shade_of(background, min_transmittance, isinstance(subject, Gaussians), depth)
+        is_asset = isinstance(subject, Gaussians)
+        shade = shade_of(background, min_transmittance, is_asset=is_asset, depth=depth)
         cut_request = CutRequest(tolerance, budget, min_level, fade)
         request = FrameRequest(camera, cut_request, shade, cut)
         return self._frame.chosen(subject).draw(subject, request, self._steps)
@@ -146,20 +147,22 @@ class Renderer:
         fade: float | None = None,
         timeout: float = 30.0,
     ) -> None:
-        """Wait until what a view needs is resident, so that its picture misses nothing.
+        """Wait until everything that a view needs is resident, so that its picture
+        misses no page.
 
-        The picture is then the same, bit for bit, as if all were resident; or as it is
-        at the tolerance that it says, where there is not enough room. That holds for
-        the next picture, which is waited for, too, on a CUDA device. Returns at once
-        where all is resident. Threads that share a renderer may take each other's pages
-        between the two calls; `v3dg.render` settles and draws in one step.
+        The next picture is then the same, bit for bit, as if everything were resident.
+        If there is not enough room, it is the picture at the tolerance that it reports.
+        On a CUDA device, drawing it waits, too. Returns at once if everything is
+        resident. Threads that share a renderer may evict each other's
+        pages between the two calls; `v3dg.render` settles and draws in one step.
 
         Args:
-            timeout: Seconds after which it gives up if not a single page came in.
+            timeout: Seconds without an arriving page after which it raises
+                TimeoutError.
 
         Raises:
             ValueError: A page is damaged; the message says which.
-            OSError: A page cannot be read. A TimeoutError if the disk does not answer.
+            OSError: A page cannot be read. TimeoutError if the disk does not answer.
         """
         real(timeout, "timeout", "seconds, at least 0", 0)
         cut = CutRequest(tolerance, budget, min_level, fade)

@@ -1,5 +1,5 @@
-"""What is asked for: the cut of a picture and what its pixels show, as values that go
-from API to core."""
+"""Requests: the cut of a picture and what its pixels show, as values that pass from the
+API to the core."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     from v3dg.false_color import ColorBy
     from v3dg.select import Selection
 
-# Of pictures with levels, whose own error is far larger; docs/cuda.md has what it
-# saves.
+# The default for pictures with levels, whose own error is far larger; docs/cuda.md
+# states how much time it saves.
 DEFAULT_MIN_TRANSMITTANCE = 1e-3
 BLACK = (0.0, 0.0, 0.0)
 _PLAIN_TYPES = frozenset({float, int, type(None)})
 
 
 class CutRequest(NamedTuple):
-    """Which cut of a view is wanted, as users say it; the arguments are those of
+    """The cut of a view, in terms of the API; the fields are arguments of
     `v3dg.select`."""
 
     tolerance: float | None = None
@@ -41,14 +41,14 @@ class CutRequest(NamedTuple):
 
     @property
     def is_plain(self) -> bool:
-        """Whether all values are Python's own numbers, by which results can be
-        remembered."""
+        """Whether all values are Python's own numbers, so that results can be cached by
+        them."""
         return _PLAIN_TYPES.issuperset(map(type, self))
 
     @property
     def rule(self) -> _core.Rule:
-        """The request as the core takes it; ValueError where a number is not as
-        `v3dg.select` has it."""
+        """The rule for the core; ValueError if a number is not valid for
+        `v3dg.select`."""
         if self.is_plain:
             return _known_rule(*self)
         return _rule(*self)
@@ -60,23 +60,24 @@ def _rule(
     return rule_of(tolerance, budget, min_level, fade=fade)
 
 
-# Pictures that follow each other mostly ask for the same. By type as well as by value,
-# because True, which is refused, equals 1.
+# Consecutive pictures mostly have equal requests. The cache distinguishes types,
+# because True, which is rejected, equals 1.
 _known_rule = lru_cache(64, typed=True)(_rule)
 
 
 @dataclass(frozen=True)
 class Look:
-    """What a picture of a pool shows in place of the frame's own colours, and of which
-    cut; anything but "appearance" is for the CPU alone.
+    """What a picture of a pool shows instead of the frame's own colours, and the cut
+    that it shows; anything but "appearance" works only on the CPU.
 
     Attributes:
-        shows: Colours as in `v3dg.render`; "error" shows the share of the tolerance
-            that metrics take, as grey, and "count" the number of gaussians that a pixel
-            is blended of, in place of depth.
-        chooser: The camera whose cut is drawn; None for the camera of the picture.
-        aside: Draw what was resident for the last picture, and neither bring pages in
-            nor ask for any.
+        shows: Colours as in `v3dg.render`; "error" shows metrics as fractions of the
+            tolerance, in grey; "count" replaces depth by the number of gaussians that a
+            pixel blends.
+        chooser: The camera that the cut is selected for; None for the camera of the
+            picture.
+        aside: Draw the pages that were resident for the last picture, and neither bring
+            pages in nor request any.
     """
 
     shows: ColorBy | Literal["error", "count"] = "appearance"
@@ -85,12 +86,13 @@ class Look:
 
     @property
     def is_plain(self) -> bool:
-        """Whether it shows the gaussians themselves, of the cut for who looks."""
+        """Whether it shows the gaussians themselves, with the cut for the camera of the
+        picture."""
         return self.shows == "appearance" and self.chooser is None and not self.aside
 
     def core(self, bundles: Sequence[Bundle]) -> _core.Look | None:
-        """The look for the compiled operations, of pictures of these bundles; None
-        where it is that of the gaussians themselves."""
+        """Return the look for the compiled operations, for pictures of these bundles;
+        None if it shows the gaussians themselves."""
         if self.is_plain:
             return None
         chooser = None
@@ -99,8 +101,8 @@ class Look:
         return _core.Look(self.shows, self.palettes(bundles), chooser, self.aside)
 
     def palettes(self, bundles: Sequence[Bundle]) -> list[NDArray[np.float32]]:
-        """The colours of each bundle's clusters; none where the bundles have no colours
-        of their own."""
+        """Return the colours of each bundle's clusters; empty if gaussians have their
+        own colours."""
         if self.shows not in ("level", "cluster"):
             return []
         palettes = []
@@ -112,14 +114,14 @@ class Look:
 
 
 class FrameRequest(NamedTuple):
-    """One picture that is asked of a frame.
+    """The request for one picture.
 
     Attributes:
-        camera: Who looks; the two eyes of a stereo camera share a cut.
-        cut: Which cut is selected.
-        shade: What is behind gaussians, and when a pixel stops.
-        selection: A cut that was selected before, to be drawn in place of `cut`.
-        look: What it shows; None for the frame's own colours.
+        camera: The camera of the picture; the two eyes of a stereo camera share a cut.
+        cut: The cut to select.
+        shade: The background, and the transmittance at which pixels stop.
+        selection: A cut that was selected earlier, which is drawn instead of `cut`.
+        look: What the picture shows; None for the frame's own colours.
     """
 
     camera: Camera | StereoCamera
@@ -130,21 +132,21 @@ class FrameRequest(NamedTuple):
 
 
 def shade_of(
-    background: Sequence[float], min_transmittance: float | None, is_asset: bool, depth: bool
+    background: Sequence[float], min_transmittance: float | None, *, is_asset: bool, depth: bool
 ) -> _core.Shade:
-    """The shade of a picture as the core takes it; the arguments are those of
+    """Return the shade of a picture for the core; the arguments are those of
     `v3dg.render`.
 
-    A transmittance below 0 makes pixels stop where `v3dg.rasterize` has them stop,
-    which is the default of assets.
+    A negative transmittance makes pixels stop as in `v3dg.rasterize`, which is the
+    default for assets.
     """
     if background is BLACK and min_transmittance is None:
-        return _known_shade(is_asset, bool(depth))
-    return _shade(background, min_transmittance, is_asset, bool(depth))
+        return _known_shade(is_asset=is_asset, depth=bool(depth))
+    return _shade(background, min_transmittance, is_asset=is_asset, depth=bool(depth))
 
 
 def _shade(
-    background: Sequence[float], min_transmittance: float | None, is_asset: bool, depth: bool
+    background: Sequence[float], min_transmittance: float | None, *, is_asset: bool, depth: bool
 ) -> _core.Shade:
     if min_transmittance is not None:
         stop = real(min_transmittance, "min_transmittance", "a share of light, 0 to 0.99", 0, 0.99)
@@ -159,6 +161,7 @@ def _shade(
 
 
 @lru_cache(4)
-def _known_shade(is_asset: bool, depth: bool) -> _core.Shade:
-    """The shade of pictures that say nothing of it, which most do."""
-    return _shade(BLACK, None, is_asset, depth)
+def _known_shade(*, is_asset: bool, depth: bool) -> _core.Shade:
+    """Return the shade of a picture with default arguments, which most pictures
+    have."""
+    return _shade(BLACK, None, is_asset=is_asset, depth=depth)

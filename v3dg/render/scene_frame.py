@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 
 class SceneFrame:
-    """Draws a scene or a bundle on one device, all of whose gaussians it has there.
+    """Draws a scene or a bundle on one device, where all its gaussians are resident.
 
     It does not keep the subject alive.
 
     Attributes:
-        device: Where it draws.
-        memory: None, for it draws from no pool.
-        num_bundles: How many of the scene's bundles have their gaussians there. A scene
-            only adds bundles.
+        device: The device that draws.
+        memory: None, because it has no pool.
+        num_bundles: Number of the scene's bundles whose gaussians are on the device. A
+            scene never removes bundles.
     """
 
     def __init__(self, color_by: ColorBy, device: Device) -> None:
@@ -43,11 +43,11 @@ class SceneFrame:
         self.core = _core.SceneFrame(device.number)
         self._color_by = color_by
         self._references: tuple[weakref.ref[Bundle], ...] | None = None
-        self._resident: ResidentScene | None = None  # as it was last drawn
+        self._resident: ResidentScene | None = None  # the scene as it was last drawn
 
     def take(self, resident: ResidentScene) -> None:
-        """Have the gaussians of the scene's bundles on the device."""
-        if self._references is resident.references:  # as in most pictures
+        """Put the gaussians of the scene's bundles on the device."""
+        if self._references is resident.references:  # true for most pictures
             return
         with residency.lock:
             bundles = resident.bundles
@@ -57,7 +57,7 @@ class SceneFrame:
             self._references = resident.references
 
     def chosen(self, subject: Subject) -> SceneFrame:
-        """This frame."""
+        """Return this frame."""
         return self
 
     def draw(
@@ -67,7 +67,7 @@ class SceneFrame:
         steps: _core.BudgetSteps | None = None,
         stop: _core.Stop | None = None,
     ) -> Picture:
-        """Draw the cut that is asked for."""
+        """Draw the requested cut."""
         camera, cut, shade, selection, _ = request
         if selection is not None:
             if isinstance(camera, StereoCamera):
@@ -102,7 +102,7 @@ class SceneFrame:
     def settle(
         self, subject: Subject, camera: Camera | StereoCamera, cut: CutRequest, timeout: float
     ) -> None:
-        """Return at once, for all is resident."""
+        """Return at once, because everything is resident."""
 
     def _draw_given(
         self,
@@ -112,7 +112,7 @@ class SceneFrame:
         eye: Camera,
         stop: _core.Stop | None,
     ) -> RenderedImage:
-        """Draw a cut that was selected before."""
+        """Draw a cut that was selected earlier."""
         with residency.turn(self.device):
             resident = residency.scene(subject, self.device, self._resident)
             self._resident = resident
@@ -146,11 +146,11 @@ class SceneFrame:
 def _check_cut(
     cut: Selection, subject: Subject, resident: ResidentScene, request: CutRequest
 ) -> None:
-    """Refuse a cut that is not of this scene as it is, and whatever else is asked
-    for."""
+    """Raise ValueError for a cut that is not of the current scene, and for other
+    arguments besides a cut."""
     check_type("cut", cut, Selection, "a Selection of v3dg.select")
     for name, value in request._asdict().items():
-        check(name, not value, f"nothing beside a cut, which has been chosen, got {value}")
+        check(name, not value, f"no value besides a cut, got {value}")
     is_from_bundle = isinstance(subject, Bundle) and cut.scene.bundles == (subject,)
     check(
         "cut",

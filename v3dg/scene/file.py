@@ -2,11 +2,12 @@
 cameras."""
 
 import copy
+import itertools
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -14,27 +15,43 @@ from v3dg._json import Node, read_json, write_json
 from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, check, check_type, refuse
 from v3dg._urls import beside, is_url
 from v3dg.bundle import Bundle
-from v3dg.cameras import DEFAULT_FOV_X, Camera, check_cameras
+from v3dg.cameras import DEFAULT_FOV_X, Axis, Camera, check_cameras
 from v3dg.io import SUFFIXES
+from v3dg.rotations import normalised, product, similarity_of
 from v3dg.scene import Scene
+from v3dg.scene.scene import turn_of
 
 FORMAT = "v3dg-scene"
 VERSION = 1
 
+_Subject = TypeVar("_Subject", Bundle, Scene)
+
+
+# Bounds on nested scenes: each file of a chain may place the next one many times.
+_MOST_DEPTH = 16
+_MOST_INSTANCES = 1 << 24
+
 
 class _Instance(NamedTuple):
-    """The arguments of `Scene.add`, in their order."""
+    """A placed bundle or scene: the columns of `Scene.add`.
 
-    bundle: Bundle
+    `node` is the place of a nested scene in its file; bundles, which may be many, have
+    None.
+    """
+
+    subject: Bundle | Scene
     position: list[float]
     quaternion: list[float]
     scale: float
     importance: float
+    opacity: float
+    tint: list[float]
+    node: Node | None
 
 
 def is_scene(path: Path) -> bool:
-    """Whether a file has the name of a scene: JSON, but not the `meta.json` of an asset
-    in SOG."""
+    """Return whether a file has the name of a scene: JSON, but not the `meta.json` of
+    an asset in SOG."""
     name = beside(path).name
     return name.endswith(".json") and not name.endswith(SUFFIXES)
 
@@ -58,13 +75,66 @@ def read_scene(
     path = Path(path)
     if bundles is not None:
         check_type("bundles", bundles, Mapping, "bundles by their paths")
-    root = read_json(path)
-    opened = dict(bundles or {})
-    if root.has("layouts"):
-        return _read_layouts(root, path.parent, opened)
-    if root.has("asset") and not root.has("format"):
-        return _read_flat_layout(root, path.parent, opened)
-    return _read_scene(root, path.parent, opened)
+    return _Files().read(path, dict(bundles or {}))
+
+
+class _Files:
+    """The files of a scene and of those that it nests: each is read once."""
+
+    def __init__(self) -> None:
+        self._scenes: dict[str, Scene] = {}
+        self._bundles: dict[str, Bundle] = {}
+        self._chain: list[str] = []
+
+    def read(self, path: Path, opened: dict[str, Bundle]) -> tuple[Scene, dict[str, Camera]]:
+        """Return a scene and its cameras; bundles that are already open are used
+        again."""
+        root = read_json(path)
+        self._chain.append(os.path.realpath(path))
+        if root.has("layouts"):
+            result = _read_layouts(root, path.parent, opened)
+        elif root.has("asset") and not root.has("format"):
+            result = _read_flat_layout(root, path.parent, opened)
+        else:
+            result = _read_scene(root, path.parent, opened, self)
+        self._chain.pop()
+        return result
+
+    def nested(self, node: Node, folder: Path) -> Scene:
+        """Return the scene in a file that another one names."""
+        path = folder / node.text()
+        real_path = os.path.realpath(path)
+        if real_path in self._chain:
+            names = [*map(os.path.basename, self._chain), path.name]
+            raise node.problem(
+                f"expected scenes that do not contain themselves, got {' > '.join(names)}"
+            )
+        if len(self._chain) >= _MOST_DEPTH:
+            raise node.problem(f"expected at most {_MOST_DEPTH} scenes inside each other, got more")
+        if not path.is_file():
+            raise FileNotFoundError(str(node.problem(f"expected a scene at {path}, got none")))
+        if not is_scene(path):
+            raise node.error("a file name ending in .json, not meta.json")
+        if real_path not in self._scenes:
+            self._scenes[real_path] = self.read(path, {})[0]
+        return self._scenes[real_path]
+
+    def open_bundles(
+        self, nodes: Mapping[str, Node], folder: Path, opened: dict[str, Bundle]
+    ) -> dict[str, Bundle]:
+        """Return bundles by name, including those that an earlier file has opened."""
+        real_paths = {
+            node.text(): os.path.realpath(folder / node.text()) for node in nodes.values()
+        }
+        for text, real_path in real_paths.items():
+            if real_path in self._bundles:
+                opened.setdefault(text, self._bundles[real_path])
+        _open_bundles(
+            {node.text(): (node, [node.text()]) for node in nodes.values()}, folder, opened
+        )
+        for text, real_path in real_paths.items():
+            self._bundles.setdefault(real_path, opened[text])
+        return {name: opened[node.text()] for name, node in nodes.items()}
 
 
 def write_scene(
@@ -123,8 +193,8 @@ def _camera_as_json(name: str, camera: Camera) -> dict[str, object]:
 
 
 def _paths_of_bundles(scene: Scene, folder: str) -> list[str]:
-    """The files that the bundles were opened from, relative to a folder; ValueError for
-    those without one."""
+    """Return the files that the bundles were opened from, relative to a folder;
+    ValueError for a bundle without a file."""
     paths = []
     for number, bundle in enumerate(scene.bundles):
         if not bundle.path or is_url(bundle.path):
@@ -135,7 +205,7 @@ def _paths_of_bundles(scene: Scene, folder: str) -> list[str]:
 
 
 def _instances_as_json(scene: Scene, names: list[str]) -> list[dict[str, object]]:
-    """The instances of a scene, whose bundles have these names."""
+    """Return the instances of a scene as JSON; `names` are those of its bundles."""
     bundles = scene.instance_bundle.tolist()
     positions = scene.positions.tolist()
     quaternions = scene.quaternions.tolist()
@@ -148,34 +218,126 @@ def _instances_as_json(scene: Scene, names: list[str]) -> list[dict[str, object]
     ]
     for number in np.flatnonzero(scene.importance != 1).tolist():
         instances[number]["importance"] = scene.importance[number].item()
+    for number in np.flatnonzero(scene.opacity != 1).tolist():
+        instances[number]["opacity"] = scene.opacity[number].item()
+    for number in np.flatnonzero((scene.tint != 1).any(axis=1)).tolist():
+        instances[number]["tint"] = scene.tint[number].tolist()
     return instances
 
 
 def _read_scene(
-    root: Node, folder: Path, opened: dict[str, Bundle]
+    root: Node, folder: Path, opened: dict[str, Bundle], files: _Files
 ) -> tuple[Scene, dict[str, Camera]]:
-    top = root.fields(("format", "version", "bundles", "instances"), ("cameras", "up"))
+    required = ["format", "version", "instances"]
+    if not root.has("scenes"):
+        required.insert(2, "bundles")
+    top = root.fields(tuple(required), ("cameras", "up", "bundles", "scenes"))
     if top["format"].value != FORMAT:
         raise top["format"].error(f'"{FORMAT}"')
     if top["version"].value != VERSION or isinstance(top["version"].value, bool):
         raise top["version"].error(f"{VERSION}, which is what this build reads")
-    nodes = top["bundles"].some_fields(())
-    _open_bundles({node.text(): (node, [node.text()]) for node in nodes.values()}, folder, opened)
-    bundles = {name: opened[node.text()] for name, node in nodes.items()}
-    instances = []
-    for node in top["instances"].items():
-        fields = node.fields(("bundle", "position"), ("quaternion", "scale", "importance"))
-        if fields["bundle"].text() not in bundles:
-            raise fields["bundle"].error("a name from bundles")
-        instances.append(_instance(bundles[fields["bundle"].text()], fields))
-    cameras: dict[str, Camera] = {}
-    if "cameras" in top:
-        cameras = _read_cameras(top["cameras"])
-    scene = _scene_of(instances)
+    scene = Scene()
     if "up" in top:
         up = top["up"].text()
         root.attempt(lambda: setattr(scene, "up", up))
+    subjects = _subjects_of(top, folder, opened, files)
+    _add_all(scene, (_instance_of(node, subjects, scene) for node in top["instances"].items()))
+    cameras: dict[str, Camera] = {}
+    if "cameras" in top:
+        cameras = _read_cameras(top["cameras"])
     return scene, cameras
+
+
+class _Subjects(NamedTuple):
+    """What a scene places, by name."""
+
+    bundles: dict[str, Bundle]
+    scenes: dict[str, Scene]
+
+
+def _subjects_of(
+    top: Mapping[str, Node], folder: Path, opened: dict[str, Bundle], files: _Files
+) -> _Subjects:
+    bundle_nodes: dict[str, Node] = {}
+    scene_nodes: dict[str, Node] = {}
+    if "bundles" in top:
+        bundle_nodes = top["bundles"].some_fields(())
+    if "scenes" in top:
+        scene_nodes = top["scenes"].some_fields(())
+    return _Subjects(
+        bundles=files.open_bundles(bundle_nodes, folder, opened),
+        scenes={name: files.nested(node, folder) for name, node in scene_nodes.items()},
+    )
+
+
+_POSE = ("position", "quaternion", "scale")
+
+
+def _instance_of(node: Node, subjects: _Subjects, scene: Scene) -> _Instance:
+    """Return an instance of a scene file; if it names an axis that is up, its scene
+    takes that axis."""
+    optional = ("bundle", "scene", *_POSE, "matrix", "up", "importance", "opacity", "tint")
+    fields = node.fields((), optional)
+    if ("bundle" in fields) == ("scene" in fields):
+        raise node.error("either the field bundle or the field scene")
+    if "matrix" not in fields:
+        node.field("position")
+    elif any(name in fields for name in _POSE):
+        raise node.problem("expected either matrix, or position, quaternion and scale, got both")
+    subject: Bundle | Scene
+    if "bundle" in fields:
+        subject = _named(fields["bundle"], subjects.bundles, "bundles")
+    else:
+        subject = _named(fields["scene"], subjects.scenes, "scenes")
+    instance = _instance(node, subject, fields)
+    if "up" not in fields:
+        return instance
+    up = fields["up"].text()
+    turn = node.attempt(lambda: turn_of(subject, cast(Axis, up)))
+    if scene.up not in (None, up):
+        raise fields["up"].error(f"{scene.up}, which is up in this scene")
+    scene.up = cast(Axis, up)
+    quaternion = product(normalised(np.array(instance.quaternion)), turn)
+    return instance._replace(quaternion=quaternion.tolist())
+
+
+def _named(node: Node, subjects: Mapping[str, _Subject], kind: str) -> _Subject:
+    name = node.text()
+    if name not in subjects:
+        raise node.error(f"a name from {kind}")
+    return subjects[name]
+
+
+def _add_all(scene: Scene, instances: Iterable[_Instance]) -> None:
+    """Add instances, whose ids are their numbers in the file unless scenes are nested;
+    neighbouring bundles are added at once."""
+    for is_nested, run in itertools.groupby(instances, lambda i: isinstance(i.subject, Scene)):
+        if not is_nested:
+            _add_bundles(scene, list(run))
+            continue
+        for instance in run:
+            inner = cast(Scene, instance.subject)
+            assert instance.node is not None
+            if len(scene) + len(inner) > _MOST_INSTANCES:
+                expected = f"at most {_MOST_INSTANCES:,} instances with those of nested scenes"
+                raise instance.node.problem(f"expected {expected}, got more")
+            scene.add_scene(
+                inner,
+                instance.position,
+                instance.quaternion,
+                instance.scale,
+                instance.importance,
+                opacity=instance.opacity,
+                tint=instance.tint,
+            )
+
+
+def _add_bundles(scene: Scene, instances: Sequence[_Instance]) -> None:
+    if not instances:
+        return
+    columns = zip(*instances, strict=True)
+    subjects, positions, quaternions, scales, importance, opacity, tint, _ = columns
+    scene.add(subjects, positions, quaternions, scales, importance, opacity=opacity, tint=tint)
 
 
 def _read_cameras(nodes: Node) -> dict[str, Camera]:
@@ -190,18 +352,54 @@ def _read_cameras(nodes: Node) -> dict[str, Camera]:
     return cameras
 
 
-def _instance(bundle: Bundle, fields: Mapping[str, Node]) -> _Instance:
-    position = fields["position"].vector(3)
+def _instance(node: Node, subject: Bundle | Scene, fields: Mapping[str, Node]) -> _Instance:
+    position = [0.0, 0.0, 0.0]
     quaternion = [1.0, 0.0, 0.0, 0.0]
     scale = 1.0
     importance = 1.0
+    opacity = 1.0
+    tint = [1.0, 1.0, 1.0]
+    if "matrix" in fields:
+        position, quaternion, scale = _pose_of(fields["matrix"])
+    if "position" in fields:
+        position = fields["position"].vector(3)
     if "quaternion" in fields:
         quaternion = _quaternion(fields["quaternion"])
     if "scale" in fields:
         scale = fields["scale"].positive()
     if "importance" in fields:
         importance = _importance(fields["importance"])
-    return _Instance(bundle, position, quaternion, scale, importance)
+    if "opacity" in fields:
+        opacity = _opacity(fields["opacity"])
+    if "tint" in fields:
+        tint = _tint(fields["tint"])
+    place: Node | None = None
+    if isinstance(subject, Scene):
+        place = node
+    return _Instance(subject, position, quaternion, scale, importance, opacity, tint, place)
+
+
+def _pose_of(node: Node) -> tuple[list[float], list[float], float]:
+    rows = node.matrix(4, 4)
+    try:
+        pose = similarity_of(rows)
+    except ValueError as error:
+        raise node.problem(str(error).removeprefix("matrix: ")) from error
+    return pose.positions[0].tolist(), pose.quaternions[0].tolist(), float(pose.scales[0])
+
+
+def _opacity(node: Node) -> float:
+    opacity = node.number()
+    if not 0 <= opacity <= 1:
+        raise node.error("a number of 0 to 1")
+    return opacity
+
+
+def _tint(node: Node) -> list[float]:
+    tint = node.vector(3)
+    if min(tint) < 0 or max(tint) > MOST_FLOAT:
+        raise node.error("3 numbers of 0 or more that a float32 can hold")
+    return tint
 
 
 def _quaternion(node: Node) -> list[float]:
@@ -219,10 +417,9 @@ def _importance(node: Node) -> float:
 
 
 def _scene_of(instances: list[_Instance]) -> Scene:
-    """A scene of the instances, whose ids are their numbers in the file."""
+    """Return a scene of the instances, whose ids are their numbers in the file."""
     scene = Scene()
-    if instances:
-        scene.add(*zip(*instances, strict=True))
+    _add_all(scene, instances)
     return scene
 
 
@@ -286,7 +483,7 @@ def _read_layouts(
                 "quaternion": pose["quaternions"],
                 "scale": pose["scale"],
             }
-            instances.append(_instance(opened[name], fields))
+            instances.append(_instance(instance, opened[name], fields))
     keys = ("camera_name", "camera_width", "camera_height", "camera_angle_x", "camera_angle_y")
     return _scene_of(instances), _read_blender_cameras(top["cameras"].items(), keys)
 
@@ -300,15 +497,15 @@ def _read_flat_layout(
     _open_bundles({asset: (top["asset"], [os.path.splitext(asset)[0] + ".v3dg"])}, folder, opened)
     required = ("position", "quaternion", "scale")
     instances = [
-        _instance(opened[asset], node.fields(required)) for node in top["instances"].items()
+        _instance(node, opened[asset], node.fields(required)) for node in top["instances"].items()
     ]
     keys = ("name", "width", "height", "fov_x", "fov_y")
     return _scene_of(instances), _read_blender_cameras(top["cameras"].items(), keys)
 
 
 def _read_blender_cameras(nodes: Iterable[Node], keys: tuple[str, ...]) -> dict[str, Camera]:
-    """Cameras in Blender's convention by name; if names repeat, each is prefixed with
-    its number."""
+    """Return cameras in Blender's convention by name; if names repeat, each is prefixed
+    with its number."""
     names = []
     cameras = []
     for node in nodes:

@@ -1,5 +1,6 @@
 """Scenes: bundles placed many times by similarity transforms."""
 
+import copy
 import os
 import threading
 from collections.abc import Mapping, Sequence
@@ -9,11 +10,23 @@ import numpy as np
 import numpy.typing as npt
 
 from v3dg import _device
-from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, Floats, check, check_type, floats, one_of
+from v3dg._numbers import Floats, check, check_type, one_of, positive, vector
 from v3dg.bundle import Bundle
 from v3dg.cameras import AXES, Axis, Camera
 from v3dg.gaussians import Array, Gaussians
-from v3dg.rotations import normalised, rotation_from_quaternion
+from v3dg.rotations import normalised, product, rotation_from_quaternion, turn_between
+from v3dg.scene.columns import (
+    Columns,
+    column,
+    columns_of,
+    composed,
+    joined,
+    on_device_of,
+    parts_of,
+    replaced,
+    turned,
+    up_of_bundle,
+)
 
 # Held during every change of a scene. Also held during fork(), so that it is never
 # locked in the child.
@@ -29,6 +42,8 @@ class _State(NamedTuple):
     bundles: tuple[Bundle, ...]
     bundle: npt.NDArray[np.int32]
     importance: npt.NDArray[np.float32]
+    opacity: npt.NDArray[np.float32]
+    tint: npt.NDArray[np.float32]
     positions: Array  # poses are NumPy arrays, or tensors on a CUDA device
     quaternions: Array
     scales: Array
@@ -56,6 +71,8 @@ class Scene:
             bundles=(),
             bundle=np.zeros(0, np.int32),
             importance=np.zeros(0, np.float32),
+            opacity=np.zeros(0, np.float32),
+            tint=np.zeros((0, 3), np.float32),
             positions=np.zeros((0, 3)),
             quaternions=np.zeros((0, 4)),
             scales=np.zeros(0),
@@ -97,42 +114,109 @@ class Scene:
     def add(
         self,
         bundle: Bundle | str | os.PathLike[str] | Sequence[Bundle],
-        positions: Array | npt.ArrayLike = (0.0, 0.0, 0.0),
+        positions: Array | npt.ArrayLike | None = None,
         quaternions: Array | npt.ArrayLike | None = None,
         scales: Array | npt.ArrayLike | None = None,
         importance: npt.ArrayLike = 1.0,
+        *,
+        matrix: Array | npt.ArrayLike | None = None,
+        up: Axis | None = None,
+        opacity: npt.ArrayLike = 1.0,
+        tint: npt.ArrayLike = (1.0, 1.0, 1.0),
     ) -> range:
         """Place a bundle I times and return the ids of the new instances.
 
         Args:
             bundle: One for all, also by its file, or a sequence of I.
-            positions: (I, 3), or (3,) for one instance; world units.
+            positions: (I, 3), or (3,) for one instance; world units; the origin if
+                None.
             quaternions: (I, 4) or (4,) w x y z of any length but zero; no rotation if
                 None.
             scales: (I,) or one number for all, > 0; 1 if None.
             importance: (I,) or one number for all, > 0. An instance of importance 4 is
                 drawn as if the tolerance were a quarter.
+            matrix: (I, 4, 4) or (4, 4), in place of positions, quaternions and scales:
+                the transform of column vectors, which may turn, move and scale alike
+                along all axes.
+            up: The axis that is up in the scene. What is up in the bundle (as its file
+                says, else -y, as in trained assets) is turned to it before the pose
+                applies. It becomes the scene's `up` if that is None.
+            opacity: (I,) or one number for all, 0 to 1: factor of the opacities of the
+                gaussians. An instance of opacity 0 is not drawn and costs nothing.
+            tint: (I, 3) or (3,) for all, >= 0: factors of red, green and blue, once the
+                colours are known and clamped at 0.
 
         Raises:
             TypeError: ``bundle`` is not a bundle.
-            ValueError: A shape or a value is not as above.
+            ValueError: A shape or a value is not as above, the matrix is no similarity
+                (it shears, mirrors or stretches), or ``up`` is not the scene's.
         """
         bundles = _bundles_of(bundle)
-        points: Array = positions
-        if not getattr(points, "is_cuda", False):
-            points = floats(points, "positions")
-        if len(points.shape) == 1:
-            points = points[None]
-        shape = tuple(points.shape)
-        check("positions", shape[1:] == (3,), f"shape (I, 3), got {shape}")
-        count = shape[0]
+        if matrix is not None:
+            positions, quaternions, scales = parts_of(matrix, positions, quaternions, scales)
+        rows = columns_of(positions, quaternions, scales, importance, opacity, tint)
+        count = len(rows.importance)
         if isinstance(bundle, list | tuple):
             check("bundle", len(bundles) == count, f"one for all or {count}, got {len(bundles)}")
-        position_rows = _rows(points, "positions", count)
-        quaternion_rows = _rows(quaternions, "quaternions", count)
-        scale_rows = _rows(scales, "scales", count)
-        importance_rows = _rows(importance, "importance", count)
+        if up is not None:
+            rows = rows._replace(quaternions=turned(rows.quaternions, bundles, up))
+        return self._append(bundles, rows, up)
+
+    def add_scene(
+        self,
+        scene: "Scene",
+        position: npt.ArrayLike | None = None,
+        quaternion: npt.ArrayLike | None = None,
+        scale: float | None = None,
+        importance: float = 1.0,
+        *,
+        matrix: npt.ArrayLike | None = None,
+        up: Axis | None = None,
+        opacity: float = 1.0,
+        tint: npt.ArrayLike = (1.0, 1.0, 1.0),
+    ) -> range:
+        """Place all instances of another scene as a whole and return their ids here.
+
+        Poses are composed; importance, opacity and tint are multiplied. Later changes
+        of the other scene have no effect. The arguments are those of `add` for one
+        instance; a scene whose `up` is None has z up.
+
+        Raises:
+            TypeError: ``scene`` is no scene.
+            ValueError: As in `add`.
+        """
+        check_type("scene", scene, Scene, "a Scene")
+        if position is not None:
+            position = vector(position, "position")
+        if quaternion is not None:
+            quaternion = vector(quaternion, "quaternion", (4,))
+        if scale is not None:
+            scale = positive(scale, "scale")
+        parts: tuple[Array, Array, Array] = (position, quaternion, scale)
+        if matrix is not None:
+            parts = parts_of(matrix, *parts)
+        outer = columns_of(*parts, importance, opacity, tint)
+        check("position", len(outer.importance) == 1, f"one, got {len(outer.importance)}")
+        inner = copy.copy(scene)  # other threads may change the original meanwhile
+        if up is not None:
+            turned_quaternions = product(outer.quaternions, turn_of(inner, up))
+            outer = outer._replace(quaternions=turned_quaternions)
+        columns = Columns(
+            positions=inner.positions,
+            quaternions=inner.quaternions,
+            scales=inner.scales,
+            importance=inner.importance,
+            opacity=inner.opacity,
+            tint=inner.tint,
+        )
+        bundles = [inner.bundles[number] for number in inner.instance_bundle]
+        return self._append(bundles, composed(outer, columns), up)
+
+    def _append(self, bundles: Sequence[Bundle], rows: Columns, up: Axis | None) -> range:
+        """Append instances of one bundle, or of one for each; returns their ids."""
+        count = len(rows.importance)
         with _lock:
+            self._take_up(up)
             state = self._state
             distinct = dict.fromkeys((*state.bundles, *bundles))
             number_of = {item: number for number, item in enumerate(distinct)}
@@ -141,10 +225,12 @@ class Scene:
             state = state._replace(
                 bundles=tuple(number_of),
                 bundle=np.concatenate([state.bundle, np.broadcast_to(numbers, count)]),
-                positions=_joined(state.positions, position_rows),
-                quaternions=_joined(state.quaternions, quaternion_rows),
-                scales=_joined(state.scales, scale_rows),
-                importance=_joined(state.importance, importance_rows),
+                positions=joined(state.positions, rows.positions),
+                quaternions=joined(state.quaternions, rows.quaternions),
+                scales=joined(state.scales, rows.scales),
+                importance=joined(state.importance, rows.importance),
+                opacity=joined(state.opacity, rows.opacity),
+                tint=joined(state.tint, rows.tint),
             )
             self._publish(state, changes=1)
         return range(first, first + count)
@@ -159,9 +245,11 @@ class Scene:
             state = state._replace(
                 bundle=state.bundle[is_left],
                 importance=state.importance[is_left],
-                positions=state.positions[_on_device_of(state.positions, is_left)],
-                quaternions=state.quaternions[_on_device_of(state.quaternions, is_left)],
-                scales=state.scales[_on_device_of(state.scales, is_left)],
+                opacity=state.opacity[is_left],
+                tint=state.tint[is_left],
+                positions=state.positions[on_device_of(state.positions, is_left)],
+                quaternions=state.quaternions[on_device_of(state.quaternions, is_left)],
+                scales=state.scales[on_device_of(state.scales, is_left)],
             )
             self._publish(state, changes=1, removals=int(not is_left.all()))
 
@@ -172,6 +260,8 @@ class Scene:
         positions: Array | npt.ArrayLike | None = None,
         quaternions: Array | npt.ArrayLike | None = None,
         scales: Array | npt.ArrayLike | None = None,
+        matrix: Array | npt.ArrayLike | None = None,
+        up: Axis | None = None,
     ) -> None:
         """Give instances new poses; a part that is None does not change.
 
@@ -180,21 +270,32 @@ class Scene:
             positions: (M, 3).
             quaternions: (M, 4) or (4,) for all of them.
             scales: (M,) or one number for all of them.
+            matrix: (M, 4, 4), or (4, 4) for one instance, in place of the three above.
+            up: As in `add`, with new quaternions or matrices: what is up in the bundles
+                is turned to this axis before the new rotation applies.
 
         Raises:
             IndexError: There is no such instance.
             ValueError: A shape or a value is not as in `add`.
         """
+        if matrix is not None:
+            positions, quaternions, scales = parts_of(matrix, positions, quaternions, scales)
+        if up is not None:
+            check("up", quaternions is not None, "quaternions or a matrix beside up, got neither")
         parts = {"positions": positions, "quaternions": quaternions, "scales": scales}
         with _lock:
             rows = self._ids(ids)
+            self._take_up(up)
             state = self._state
             for name, part in parts.items():
                 if part is None:
                     continue
-                values = _rows(part, name, len(rows))
+                values = column(part, name, len(rows))
+                if up is not None and name == "quaternions":
+                    bundles = [state.bundles[number] for number in state.bundle[rows]]
+                    values = turned(values, bundles, up)
                 if ids is not None:
-                    values = _replaced(getattr(state, name), rows, values)
+                    values = replaced(getattr(state, name), rows, values)
                 state = state._replace(**{name: values})
             self._publish(state, moves=1)
 
@@ -203,11 +304,31 @@ class Scene:
     ) -> None:
         """Give instances another importance, as in `add`; all of them if ``ids`` is
         None."""
+        self._set("importance", importance, ids)
+
+    def set_opacity(self, opacity: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None) -> None:
+        """Give instances another opacity, as in `add`; all of them if ``ids`` is
+        None."""
+        self._set("opacity", opacity, ids)
+
+    def set_tint(self, tint: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None) -> None:
+        """Give instances another tint, as in `add`; all of them if ``ids`` is None."""
+        self._set("tint", tint, ids)
+
+    def _set(self, name: str, values: npt.ArrayLike, ids: Array | npt.ArrayLike | None) -> None:
         with _lock:
             rows = self._ids(ids)
-            values = _rows(importance, "importance", len(rows))
-            state = self._state._replace(importance=_replaced(self.importance, rows, values))
-            self._publish(state, changes=1)
+            changed = replaced(getattr(self._state, name), rows, column(values, name, len(rows)))
+            self._publish(self._state._replace(**{name: changed}), changes=1)
+
+    def _take_up(self, up: Axis | None) -> None:
+        """Set the axis that is up, or refuse one that is not the scene's; the lock must
+        be held."""
+        if up is None:
+            return
+        is_same = self._up in (None, up)
+        check("up", is_same, f"{self._up}, which is up in this scene, got {up}")
+        self._up = up
 
     def _publish(self, state: _State, changes: int = 0, moves: int = 0, removals: int = 0) -> None:
         """Replace the state in one step and count the revision up; the lock must be
@@ -254,6 +375,25 @@ class Scene:
         return self._state.importance
 
     @property
+    def opacity(self) -> npt.NDArray[np.float32]:
+        """(I,) float32, 0 to 1; read-only."""
+        return self._state.opacity
+
+    @property
+    def tint(self) -> npt.NDArray[np.float32]:
+        """(I, 3) float32; read-only."""
+        return self._state.tint
+
+    @property
+    def factors(self) -> npt.NDArray[np.float32] | None:
+        """(I, 4) float32, factors of red, green, blue and opacity; None if all
+        are 1."""
+        state = self._state
+        if (state.opacity == 1).all() and (state.tint == 1).all():
+            return None
+        return np.concatenate([state.tint, state.opacity[:, None]], axis=1)
+
+    @property
     def positions(self) -> Floats:
         """(I, 3) float64, world units; a copy if they are on a device. Use `move` to
         change them."""
@@ -288,7 +428,7 @@ class Scene:
         return state.positions, state.quaternions, state.scales
 
     def _ids(self, ids: Array | None) -> npt.NDArray[np.int64]:
-        """Checked ids of instances; those of all instances for None."""
+        """Return checked ids of instances; for None, those of all instances."""
         count = len(self)
         if ids is None:
             return np.arange(count)
@@ -313,19 +453,22 @@ class Scene:
         return f"Scene({instances} of {num_bundles} bundle{'s' * (num_bundles != 1)})"
 
 
+def turn_of(subject: Scene | Bundle, up: Axis) -> Floats:
+    """Return the quaternion (4,) w x y z that turns the axis that is up in a scene or a
+    bundle to another one; ValueError if there is no such axis."""
+    one_of(up, "up", AXES)
+    if isinstance(subject, Bundle):
+        return turn_between(up_of_bundle(subject), up)
+    return turn_between(subject.up or "z", up)
+
+
 Subject: TypeAlias = Scene | Bundle | Gaussians
 """A value that can be drawn."""
 
-_ROW = {"positions": (3,), "quaternions": (4,), "scales": (), "importance": ()}
-_DEFAULTS: dict[str, Array] = {"quaternions": (1.0, 0.0, 0.0, 0.0), "scales": 1.0}
-_POSITIVE = {
-    "scales": (5e-324, np.inf, "positive numbers"),
-    "importance": (LEAST_FLOAT, MOST_FLOAT, "positive numbers that a float32 can hold"),
-}
-
 
 def _bundles_of(bundle: Bundle | str | os.PathLike[str] | Sequence[Bundle]) -> list[Bundle]:
-    """The bundles of a list or a tuple, or a single one, which may be a file."""
+    """Return the bundles of a list or a tuple, or a single bundle; each may be given by
+    its file."""
     if isinstance(bundle, str | os.PathLike):
         return [Bundle.open(bundle)]
     bundles: list[Bundle] = []
@@ -339,83 +482,7 @@ def _bundles_of(bundle: Bundle | str | os.PathLike[str] | Sequence[Bundle]) -> l
 
 
 def _read_only(state: _State) -> _State:
-    for column in state:
-        if isinstance(column, np.ndarray):
-            column.flags.writeable = False
+    for value in state:
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
     return state
-
-
-def _rows(values: Array | None, name: str, count: int) -> Array:
-    """A contiguous (count, ...) copy of a column, or of its default for None; one row
-    stands for all, except of positions."""
-    column: Array = values
-    if values is None:
-        column = _DEFAULTS.get(name)
-    row = _ROW[name]
-    is_on_device = getattr(column, "is_cuda", False) and name != "importance"
-    if is_on_device:
-        import torch
-
-        array = column.detach().to(torch.float64, copy=True)
-    else:
-        array = floats(column, name)
-    if name != "positions" and tuple(array.shape) == row:
-        if is_on_device:
-            array = array.expand(count, *row)
-        else:
-            array = np.broadcast_to(array, (count, *row))
-    shape = tuple(array.shape)
-    check(name, shape == (count, *row), f"shape {(count, *row)}, got {shape}")
-    if is_on_device:
-        return array.contiguous()
-    if name in _POSITIVE:
-        low, high, expected = _POSITIVE[name]
-        wrong = (array < low) | (array > high)
-        if wrong.any():
-            raise ValueError(f"{name}: expected {expected}, got {array[wrong][0]:g}")
-    if name == "quaternions":
-        largest = np.abs(array).max(axis=1, keepdims=True)
-        check("quaternions", largest.all(), "a rotation, got a quaternion of zeros")
-        array = array / largest  # so that squares neither overflow nor underflow
-        array /= np.linalg.norm(array, axis=1, keepdims=True)
-    if name == "importance":
-        return np.ascontiguousarray(array, np.float32)
-    return np.ascontiguousarray(array, np.float64)
-
-
-def _on_device_of(array: Array, values: Array) -> Array:
-    """The values as a tensor on the device of ``array``; unchanged if that is a NumPy
-    array."""
-    if isinstance(array, np.ndarray):
-        return values
-    import torch
-
-    if isinstance(values, np.ndarray):
-        values = np.array(values)  # a copy, because torch warns of arrays that are read-only
-    return torch.as_tensor(values, device=array.device)
-
-
-def _on_one_device(first: Array, second: Array) -> tuple[Array, Array]:
-    """Both arrays on the device of either that is a tensor; on the host if neither
-    is."""
-    target = first
-    if isinstance(first, np.ndarray):
-        target = second
-    return _on_device_of(target, first), _on_device_of(target, second)
-
-
-def _joined(first: Array, second: Array) -> Array:
-    """The concatenation, on the device of either."""
-    first, second = _on_one_device(first, second)
-    return _device.library_of(first).concatenate([first, second])
-
-
-def _replaced(values: Array, rows: npt.NDArray[np.int64], row_values: Array) -> Array:
-    """A copy with other values in some rows."""
-    values, row_values = _on_one_device(values, row_values)
-    if isinstance(values, np.ndarray):
-        values = values.copy()
-    else:
-        values = values.clone()
-    values[_on_device_of(values, rows)] = row_values
-    return values

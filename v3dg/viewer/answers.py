@@ -1,7 +1,8 @@
-"""What the viewer says to a page: JSON of these kinds; bytes follow `Picture` and
-`File`.
+"""Messages from the viewer to a page: JSON of these kinds; binary data follows
+`Picture` and `File`.
 
-`tests/support/page_protocol.py` makes the page's types of this module and `messages`.
+`tests/support/page_protocol.py` generates the page's types from this module and
+`messages`.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ class FileCamera(msgspec.Struct):
     """A camera of the file.
 
     Attributes:
-        photograph: Whether the picture that it took is there.
+        photograph: Whether the photograph of this camera is available.
     """
 
     name: str
@@ -32,11 +33,11 @@ class FileCamera(msgspec.Struct):
 
 
 class Limits(msgspec.Struct):
-    """The smallest and the largest values that the viewer takes.
+    """The limits of values that the viewer accepts.
 
     Attributes:
-        picture_px: The longer side of a picture, at most.
-        path_seconds: The length of a path, at most.
+        picture_px: Largest length of a picture's longer side.
+        path_seconds: Largest duration of a path.
     """
 
     tolerance: tuple[float, float]
@@ -50,47 +51,62 @@ class Hello(msgspec.Struct, tag="hello"):
     """The first message of a connection.
 
     Attributes:
-        version: Version of the viewer; a page of another one loads itself anew.
+        version: Version of the viewer; a page of another version reloads itself.
         up: The direction that is up, in the world.
-        asks_up: Whether `up` is only assumed, so that the page asks.
-        home: A view of all of the scene.
-        settings: What a tab begins with.
-        defaults: What a setting is that nobody has asked for.
+        asks_up: Whether `up` is only assumed, so that the page asks the user.
+        settings: The initial settings of a tab.
+        defaults: The default of each setting.
     """
 
     version: str
     up: Vector
     asks_up: bool
-    home: View
     settings: Settings
     defaults: Settings
     limits: Limits
     cameras: list[FileCamera]
 
 
-class Scene(msgspec.Struct, tag="scene"):
-    """What the tab shows from now on.
+class Home(msgspec.Struct):
+    """The first view of a tab in a window of a certain aspect.
 
     Attributes:
-        center, radius: A ball that holds nearly all of it, world units.
+        focus: The point that orbits go around.
+    """
+
+    view: View
+    focus: Vector
+
+
+class Scene(msgspec.Struct, tag="scene"):
+    """The subject that the tab shows from now on.
+
+    Attributes:
+        center, radius: A ball that contains nearly all of it, world units.
         near: Distance of the near plane, world units.
-        instances: How many there are.
-        has_files: Whether all its bundles are files, so that it can be saved.
+        homes: First views, from narrow windows to wide ones.
+        instances: Number of instances.
+        has_files: Whether all its bundles are in files, so that the scene can be saved.
+        writes_files: Whether the server writes new assets, beside the file that is
+            shown; otherwise the browser saves them.
         level_colors: Colour of each level.
         ramp: Colours from the smallest value to the largest.
-        most_counted: Gaussians in a pixel that get the last colour of the ramp.
-        modes: What can be shown.
-        shows_cuts: Whether cuts can be frozen, split and picked from.
-        missing_colors: Colours of gaussians of whose pages none, one, two and three
-            levels are missing.
+        most_counted: Number of gaussians in a pixel that gets the last colour of the
+            ramp.
+        modes: The available display modes.
+        shows_cuts: Whether freezing, splitting and picking are available.
+        missing_colors: Colours of gaussians whose pages miss no, one, two and three
+            levels.
     """
 
     name: str
     center: Vector
     radius: float
     near: float
+    homes: list[Home]
     instances: int
     has_files: bool
+    writes_files: bool
     level_colors: list[Color]
     ramp: list[Color]
     most_counted: int
@@ -100,12 +116,11 @@ class Scene(msgspec.Struct, tag="scene"):
 
 
 class Figures(msgspec.Struct):
-    """What a picture cost.
+    """The statistics of a picture.
 
     Attributes:
         gaussians_selected, gaussians_in_frustum, tolerance, select_ms, draw_ms, levels,
-        missing: As in `v3dg.Stats`.
-        memory_bytes: Memory that the viewer's process holds.
+        missing: See `v3dg.Stats`. memory_bytes: Memory of the viewer's process.
     """
 
     gaussians_selected: int
@@ -122,14 +137,14 @@ class Picture(msgspec.Struct, tag="picture"):
     """A picture, as the bytes of a JPEG.
 
     Attributes:
-        final: Whether no other picture follows for the same request.
+        final: Whether this is the last picture for its request.
         number: Number of the request.
         size: Width and height, px.
-        view: From where it is seen.
-        range: The values of the darkest and the brightest colour, where colours are
+        view: The viewpoint of the picture.
+        range: The values of the darkest and the brightest colour, if colours represent
             values.
-        distance: How deep what is in its middle mostly is, world units; null where
-            nothing is, or not known.
+        distance: Median depth around the middle, world units; null if nothing is there,
+            or if it is unknown.
     """
 
     final: bool
@@ -143,25 +158,25 @@ class Picture(msgspec.Struct, tag="picture"):
 
 
 class Failed(msgspec.Struct, tag="failed"):
-    """Says why the picture that was asked for is not drawn."""
+    """Says why the requested picture is not drawn."""
 
     text: str
 
 
 class Notice(msgspec.Struct, tag="notice"):
-    """Something for a person to read, once."""
+    """A message for the user, shown once."""
 
     text: str
 
 
 class Progress(msgspec.Struct, tag="progress"):
-    """How far the film that is saved is, 0 to 1."""
+    """Progress of the film that is being saved, 0 to 1."""
 
     share: float
 
 
 class Done(msgspec.Struct, tag="done"):
-    """The work that the page asked for has ended."""
+    """The work that the page requested has ended."""
 
 
 class File(msgspec.Struct, tag="file"):
@@ -171,7 +186,7 @@ class File(msgspec.Struct, tag="file"):
 
 
 class Pose(msgspec.Struct):
-    """Where an instance is."""
+    """The pose of an instance."""
 
     position: Vector
     quaternion: Quaternion
@@ -184,7 +199,7 @@ class Picked(msgspec.Struct, tag="picked"):
     Attributes:
         box: Lower and upper corner of its bundle, in the bundle's own coordinates.
         bundle: Name of the bundle's file; empty if the bundle is not in a file.
-        point: The place that was picked, in the world.
+        point: The picked point, in the world.
     """
 
     instance: int | UnsetType = UNSET
@@ -195,7 +210,7 @@ class Picked(msgspec.Struct, tag="picked"):
 
 
 class Play(msgspec.Struct, tag="play"):
-    """The views of a path, to be flown along."""
+    """The views of a path, for playback."""
 
     fps: int
     views: list[View]
@@ -207,8 +222,8 @@ Answer: TypeAlias = (
 
 
 def encode(answer: Answer, data: bytes = b"") -> str | bytes:
-    """Return a message as text; with bytes, as the length of the text in four bytes
-    (little-endian), the text, and the bytes."""
+    """Return a message as text; with binary data, as the length of the text in four
+    bytes (little-endian), the text, and the data."""
     text = msgspec.json.encode(answer)
     if not data:
         return text.decode()

@@ -1,5 +1,4 @@
-"""The work of a tab that takes long, such as saving files, and the thread that does
-it."""
+"""The long work of a tab, such as saving files, and the thread that does it."""
 
 import contextlib
 import os
@@ -15,15 +14,15 @@ from v3dg.viewer.answers import Answer, Done, File, Notice
 
 
 def bundle_names(scene: Scene) -> list[str]:
-    """Return the paths of the scene's bundles, which must be files, from the folder
-    that contains all of them."""
+    """Return the paths of the scene's bundles, which must be files, relative to the
+    folder that contains all of them."""
     paths = [os.path.abspath(bundle.path or "") for bundle in scene.bundles]
     folder = os.path.commonpath([os.path.dirname(path) for path in paths] or ["/"])
     return [os.path.relpath(path, folder) for path in paths]
 
 
 class Tell(Protocol):
-    """Sends a message to the page, with bytes that belong to it."""
+    """Sends a message to the page, optionally with binary data."""
 
     def __call__(self, answer: Answer, data: bytes = b"") -> None: ...
 
@@ -45,9 +44,10 @@ class Exporter:
         self._stop = _core.Stop()
 
     def begin(self, work: Callable[[_core.Stop], None]) -> None:
-        """Start work, unless other work is under way: a notice says so.
+        """Start work, unless other work is in progress; then a notice says so.
 
-        The work ends soon after its argument is requested; its errors become notices.
+        The work must end soon after a stop is requested from its argument; its errors
+        become notices.
         """
         with self._lock:
             if self._is_closed:
@@ -72,19 +72,19 @@ class Exporter:
             self._tell(answer)
 
     def save(self, name: str, write: Callable[[Path], object]) -> None:
-        """Write a file, and have the browser save it."""
+        """Write a file, and make the browser save it."""
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, name)
             write(path)
             self._tell(File(name), path.read_bytes())
 
     def stop(self) -> None:
-        """Ask the work under way to end."""
+        """Ask the current work to end."""
         self._stop.request()
 
     def close(self, seconds: float) -> bool:
-        """Stop for good; returns whether the thread has ended, waiting so long for
-        it."""
+        """Stop permanently; wait at most this long and return whether the thread has
+        ended."""
         with self._lock:
             self._is_closed = True
         self.stop()

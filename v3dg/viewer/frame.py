@@ -1,5 +1,7 @@
-"""One picture of the viewer: a scene, a view and settings become pixels and figures."""
+"""One picture of the viewer: a scene, a view and settings become pixels and
+statistics."""
 
+import functools
 import threading
 import time
 from dataclasses import dataclass, replace
@@ -12,9 +14,10 @@ from v3dg import _core, _device
 from v3dg._device import CPU, Device
 from v3dg._numbers import Floats
 from v3dg._urls import beside, cleaned, shown
-from v3dg.cameras import Camera
+from v3dg.cameras import Camera, VectorLike
 from v3dg.cleaning import ball_of_most
 from v3dg.false_color import ColorBy
+from v3dg.framing import Framing, frame_subject
 from v3dg.gaussians import Gaussians
 from v3dg.image import RenderedImage, Stats
 from v3dg.levels import BuildConfig, build_bundle
@@ -35,29 +38,33 @@ Shows: TypeAlias = Literal[
     "appearance", "level", "cluster", "error", "residency", "depth", "alpha", "count", "difference"
 ]
 
-# Gaussians in a pixel that get the brightest colour.
+# Number of gaussians in a pixel that gets the brightest colour.
 MOST_COUNTED = 256
 _MODES_OF_POOLS_ON_CUDA: tuple[Shows, ...] = ("appearance", "depth", "alpha")
-# At most so many gaussians are all drawn while the camera moves, too.
+# Up to this number, all gaussians are drawn even while the camera moves.
 _FEW_GAUSSIANS = 500_000
+# Height of the picture for which a first view is framed; only its aspect counts.
+_FIRST_PIXELS = 1000
 _SHADE = shade_of((0.0, 0.0, 0.0), None, is_asset=False, depth=True)
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a picture shows, and how finely.
+    """The content and quality of a picture.
 
     Attributes:
-        shows: The colours, those of a level or a cluster, the error, which is the
-            screen area that a gaussian of a coarser cluster stands for, expected depth,
-            alpha, how many gaussians a pixel is blended of, or the difference to the
+        shows: The gaussians' colours; the colours of levels or clusters; the error,
+            which is the screen area per gaussian of a coarser cluster; expected depth;
+            alpha; the number of gaussians blended in a pixel; or the difference to the
             picture of all gaussians.
-        tolerance, budget, min_level, fade: As in `v3dg.render`, but that a tolerance is
-            always given.
-        gain: What a difference is multiplied by.
-        split: Share of the width, from the left, that shows all gaussians; 0 for none.
-        frozen: The view that the cut is chosen for; None for the one that is looked
-            from.
+        tolerance, budget, min_level, fade: As in `v3dg.render`, but a tolerance is
+            always set.
+        gain: Factor of differences.
+        split: Fraction of the width, from the left, that shows all gaussians; 0 for
+            none.
+        frozen: The view that the cut is selected for; None for the view of the picture.
+        background: Red, green and blue, 0 to 1, behind colours of gaussians; the other
+            modes are drawn on black.
     """
 
     shows: Shows = "appearance"
@@ -68,6 +75,7 @@ class Settings:
     gain: float = 5.0
     split: float = 0.0
     frozen: View | None = None
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -76,14 +84,14 @@ class Frame:
 
     Attributes:
         pixels: (H, W, 3).
-        figures: What it cost; times are those of the whole picture, all else is the
-            cut's.
+        figures: Its statistics; times are those of the whole picture, everything else
+            is of the cut.
         shows: As in its settings.
-        value_range: The values of the darkest and the brightest colour, where colours
-            are values.
-        view: From where it is seen.
-        distance: How deep what is in its middle mostly is, world units; None where
-            nothing is, or not known.
+        value_range: The values of the darkest and the brightest colour, if colours
+            represent values.
+        view: The viewpoint of the picture.
+        distance: Median depth around the middle, world units; None if nothing is there,
+            or if it is unknown.
     """
 
     pixels: Pixels
@@ -102,8 +110,8 @@ class _Job(NamedTuple):
     """How a picture is drawn.
 
     Attributes:
-        chooser: The camera that the cut is selected for; None for the one that the
-            picture is seen from.
+        chooser: The camera that the cut is selected for; None for the camera of the
+            picture.
         edge: The column at which the picture is split, px.
     """
 
@@ -121,8 +129,8 @@ class _Planes(NamedTuple):
     Attributes:
         color: (H, W, 3).
         alpha: (H, W).
-        depth: (H, W), or how many gaussians each pixel is blended of.
-        gaussians_in_frustum: Those of the whole picture.
+        depth: (H, W), or the number of gaussians blended in each pixel.
+        gaussians_in_frustum: Number in the whole picture.
     """
 
     color: _Float32
@@ -132,13 +140,13 @@ class _Planes(NamedTuple):
 
 
 class _Drawn(NamedTuple):
-    """What a picture is painted from.
+    """The input of painting a picture.
 
     Attributes:
-        color, alpha, depth: As in `_Planes`, of the part to the right of the split.
-        whole: Colours of all gaussians, from the left edge on, to compare with; None if
+        color, alpha, depth: As in `_Planes`, for the part to the right of the split.
+        whole: Colours of all gaussians, from the left edge on, for comparison; None if
             nothing is compared.
-        figures: What drawing cost.
+        figures: The statistics of drawing.
     """
 
     color: _Float32
@@ -149,7 +157,7 @@ class _Drawn(NamedTuple):
 
 
 class _Painting(NamedTuple):
-    """The colours to the right of the split; the other two are as in `Frame`."""
+    """The colours to the right of the split; the other two fields are as in `Frame`."""
 
     colors: _Float32
     value_range: tuple[float, float] | None
@@ -157,7 +165,7 @@ class _Painting(NamedTuple):
 
 
 class Stopped(Exception):
-    """A picture was given up because another one is wanted."""
+    """A picture was abandoned because another one was requested."""
 
 
 class SceneView:
@@ -166,16 +174,17 @@ class SceneView:
     Args:
         subject: A scene, a bundle, or an asset, which is split into clusters but gets
             no coarser levels.
-        device: Where to draw: "cpu", "cuda", or "auto", which is CUDA where that works.
-        memory: As in `v3dg.Renderer`. With a pool, one picture is drawn at a time, and
-            what is compared with is the finest that it has room for, of the cut's
-            camera; on CUDA nothing is.
+        device: The device that draws: "cpu", "cuda", or "auto", which is CUDA if it
+            works.
+        memory: As in `v3dg.Renderer`. With a pool, one picture is drawn at a time.
+            Comparisons are then with the finest cut that fits into the pool, for the
+            cut's camera; on CUDA there are no comparisons.
 
     Attributes:
         scene: The subject as a scene.
-        near: As in `v3dg.Camera`, to suit the scene's size.
-        center, radius: A ball that holds nearly all of it, world units.
-        pool: What draws where not all is resident, or None.
+        near: As in `v3dg.Camera`, chosen by the scene's size.
+        center, radius: A ball that contains nearly all of it, world units.
+        pool: Draws if not everything is resident; otherwise None.
     """
 
     def __init__(
@@ -200,14 +209,26 @@ class SceneView:
         ]
         self.num_gaussians = int(np.array(sizes, np.int64)[self.scene.instance_bundle].sum())
 
+    @functools.cached_property
+    def framing(self) -> Framing:
+        """The framing of the scene, which determines its first views."""
+        return frame_subject(self.scene)
+
+    def first_view(self, up: VectorLike, aspect: float) -> tuple[View, Floats]:
+        """Return the view that a tab begins with, and the (3,) point that orbits go
+        around."""
+        height = _FIRST_PIXELS
+        camera = self.framing.camera(up, max(round(aspect * height), 1), height)
+        return replace(View.of_camera(camera), aspect=aspect), self.framing.focus(camera)
+
     @property
     def draws_all_while_moving(self) -> bool:
-        """Whether all gaussians are few enough to be drawn in every picture."""
+        """Whether there are so few gaussians that every picture draws all of them."""
         return self.device.is_cuda or self.num_gaussians <= _FEW_GAUSSIANS
 
     def explain(self, error: Exception) -> str:
-        """Return an error's line, in which bundles go by names, not paths: the tab may
-        be somebody else's."""
+        """Return the line about an error. It contains names of bundles, not their
+        paths, because the tab may belong to another user."""
         text = " ".join(str(error).split())
         for path in (bundle.path for bundle in self.scene.bundles):
             if path:
@@ -217,7 +238,7 @@ class SceneView:
 
     @property
     def modes(self) -> tuple[Shows, ...]:
-        """What can be shown."""
+        """The available display modes."""
         if self.pool is not None and self.device.is_cuda:
             return _MODES_OF_POOLS_ON_CUDA
         return tuple(
@@ -226,8 +247,8 @@ class SceneView:
 
     @property
     def shows_cuts(self) -> bool:
-        """Whether cuts can be frozen, split and picked from: a pool on CUDA draws its
-        own as they are."""
+        """Whether freezing, splitting and picking are available. A pool on CUDA only
+        draws its own cut."""
         return self.pool is None or not self.device.is_cuda
 
     def frame(
@@ -239,10 +260,10 @@ class SceneView:
         steps: _core.BudgetSteps | None = None,
         patience: float = 0.0,
     ) -> Frame:
-        """Draw a picture of ``size`` (width, height) px; with ``steps``, one that
-        follows others.
+        """Draw a picture of ``size`` (width, height) px; with ``steps``, the next one
+        of a sequence.
 
-        It waits so many seconds for pages that a pool lacks.
+        It waits up to this many seconds for pages that a pool lacks.
 
         Raises:
             Stopped: ``stop`` was requested; it is raised soon after.
@@ -250,7 +271,7 @@ class SceneView:
                 is damaged.
         """
         _check(stop)
-        if self.pool is not None and self.device.is_cuda:  # the settings of a link may ask for more
+        if self.pool is not None and self.device.is_cuda:  # the settings of a link may request more
             shows = settings.shows
             if shows not in self.modes:
                 shows = "appearance"
@@ -283,8 +304,8 @@ class SceneView:
     def pick(
         self, view: View, size: tuple[int, int], x: int, y: int, settings: Settings
     ) -> Pick | None:
-        """Return what a pixel of a picture shows most of, of what is resident where
-        there is a pool."""
+        """Return the gaussian with the largest weight in a pixel of a picture, from
+        what is resident if there is a pool."""
         camera = view.camera(*size, self.near)
         with self._drawing:
             return pick(
@@ -299,10 +320,10 @@ class SceneView:
             )
 
     def _draw_pool(self, job: _Job, pool: Renderer, patience: float) -> _Drawn:
-        """Draw from a pool, and what is compared with: the finest cut that the pool has
-        room for.
+        """Draw from a pool, and draw the picture to compare with: the finest cut that
+        fits into the pool.
 
-        Both are drawn from the pages of the finer cut.
+        Both pictures are drawn from the pages of the finer cut.
         """
         settings = job.settings
         pool_frame = pool.pool_frame
@@ -327,7 +348,8 @@ class SceneView:
 
         whole: _Float32 | None = None
         if compares:
-            whole = draw(finest, Look(chooser=job.chooser), None).color
+            finest_image = draw(finest, Look(chooser=job.chooser), None)
+            whole = _on_background(finest_image.color, finest_image.alpha, settings)
         look = Look(_look_of(settings.shows), job.chooser, aside=compares)
         image = draw(request, look, job.steps)
         first = min(job.edge, job.camera.width - 1)
@@ -345,7 +367,7 @@ class SceneView:
         )
 
     def _draw_resident(self, job: _Job) -> _Drawn:
-        """Draw where all gaussians are resident, and all of them to compare with."""
+        """Draw if all gaussians are resident, and draw all of them for comparison."""
         camera = job.camera
         settings = job.settings
         budget = settings.budget
@@ -361,7 +383,8 @@ class SceneView:
         if end_of_whole > 0:
             finest = select(self.scene, camera, tolerance=0.0, device=self.device)
             window = (0, 0, end_of_whole, camera.height)
-            whole = self._draw(finest, camera, window, "appearance", job.stop).color
+            finest_planes = self._draw(finest, camera, window, "appearance", job.stop)
+            whole = _on_background(finest_planes.color, finest_planes.alpha, settings)
         level = cut.per_pair(lambda clusters: clusters.level)
         size = cut.per_pair(lambda clusters: np.diff(clusters.offset))
         figures = Stats(
@@ -377,8 +400,8 @@ class SceneView:
     def _draw(
         self, cut: Selection, camera: Camera, window: Window, shows: Shows, stop: _core.Stop | None
     ) -> _Planes:
-        """Draw a window of the picture of a cut on the device, or on the CPU what only
-        that draws."""
+        """Draw a window of a cut's picture on the device, or on the CPU if only the CPU
+        supports it."""
         if not self.device.is_cuda or shows in ("count", "error"):
             return self._draw_on_cpu(cut, camera, window, shows, stop)
         image = render(
@@ -403,7 +426,7 @@ class SceneView:
     ) -> _Planes:
         frame = _core.SceneFrame(CPU.number)
         resident = residency.scene(self.scene, CPU)
-        cut.check(resident.revision)  # the scene still has the instances of the cut
+        cut.check(resident.revision)  # raises unless the scene still has the instances of the cut
         residency.set_models(frame, resident.bundles, CPU, _color_by(shows))
         request = _core.FrameRequest(
             camera.core.window(*window),
@@ -419,15 +442,15 @@ class SceneView:
 
 
 def _color_by(shows: Shows) -> ColorBy:
-    """The colours that gaussians are drawn with, from which `_paint` makes those of the
-    other modes."""
+    """Return the colours that gaussians are drawn with, from which `_paint` computes
+    the other modes."""
     if shows in ("level", "cluster", "residency"):
         return shows
     return "appearance"
 
 
 def _look_of(shows: Shows) -> ColorBy | Literal["error", "count"]:
-    """What `Look` calls a mode."""
+    """Return the name of a mode in `Look`."""
     if shows in ("error", "count"):
         return shows
     return _color_by(shows)
@@ -455,14 +478,24 @@ def _paint(drawn: _Drawn, settings: Settings) -> _Painting:
         return _Painting(colors, (float(far), float(near)), distance)
     if shows == "difference":
         assert drawn.whole is not None
-        difference = np.abs(drawn.color - drawn.whole[:, -alpha.shape[1] :])
+        colors = _on_background(drawn.color, alpha, settings)
+        difference = np.abs(colors - drawn.whole[:, -alpha.shape[1] :])
         return _Painting(np.minimum(settings.gain * difference, np.float32(1)), None, distance)
-    return _Painting(drawn.color, None, distance)
+    return _Painting(_on_background(drawn.color, alpha, settings), None, distance)
+
+
+def _on_background(color: _Float32, alpha: _Float32, settings: Settings) -> _Float32:
+    """Return (H, W, 3) premultiplied colours over the background."""
+    colors = np.asarray(_device.to_host(color))
+    if not any(settings.background):
+        return colors
+    uncovered = 1 - np.asarray(_device.to_host(alpha))[..., None]
+    return np.asarray(colors + uncovered * np.asarray(settings.background, np.float32))
 
 
 def _distance_in_middle(alpha: _Float32, depth: _Float32) -> float | None:
-    """The median depth of the covered pixels around the middle; None if there are
-    none."""
+    """Return the median depth of the covered pixels around the middle; None if there
+    are none."""
     middle = tuple(slice(side * 3 // 8, side * 5 // 8 + 1) for side in alpha.shape)
     covered = depth[middle][alpha[middle] > 0.5]
     if not covered.size:
@@ -471,8 +504,8 @@ def _distance_in_middle(alpha: _Float32, depth: _Float32) -> float | None:
 
 
 def _depth_range(alpha: _Float32, depth: _Float32) -> tuple[float, float]:
-    """The depths of the nearest and the farthest colour; percentiles, which few far
-    gaussians do not move."""
+    """Return the depths of the nearest and the farthest colour; they are percentiles,
+    so that few distant gaussians have no influence."""
     covered = depth[alpha > 0.5]
     if not covered.size:
         return 0.0, 1.0
@@ -486,8 +519,8 @@ def _check(stop: _core.Stop | None) -> None:
 
 
 def _bounds(scene: Scene) -> tuple[npt.NDArray[np.floating], float]:
-    """Centre and radius of a ball around nearly all of the scene: trained assets have a
-    few far outliers."""
+    """Return the centre and radius of a ball around nearly all of the scene: trained
+    assets have a few distant outliers."""
     corners: list[Floats] = [np.zeros((0, 3))]
     for number, bundle in enumerate(scene.bundles):
         is_of_bundle = scene.instance_bundle == number

@@ -1,11 +1,11 @@
-"""Who may talk to the viewer's server, judged by what a request says about where it
-comes from.
+"""Decides who may connect to the viewer's server, from the origin that a request
+states.
 
-Any web page can have its visitor's browser connect to this machine. The browser then
-says which name it looked up (Host), whose page asks (Origin, which the pictures,
-scripts and links of a page leave out) and how that page is related to the server
-(Sec-Fetch-Site, which browsers leave out where the server is another machine and the
-connection is not encrypted). No page can change any of them.
+Any web page can make its visitor's browser connect to this machine. The browser then
+sends the name that it looked up (Host), the page that sends the request (Origin, which
+is absent for pictures, scripts and links of a page) and the relation of that page to
+the server (Sec-Fetch-Site, which browsers omit if the server is another machine and the
+connection is not encrypted). No page can change any of these headers.
 """
 
 import errno
@@ -18,13 +18,13 @@ import socket
 from websockets.http11 import Request
 
 _MOST_PORTS = 1000
-# A name or an address, and perhaps a port, as browsers write them: without a user, in
-# lower case.
+# A name or an address, optionally with a port, as browsers write it: without a user
+# name, in lower case.
 _HOST = re.compile(
     r"(?:\[(?P<address>[0-9a-f:.]+(?:%[a-z0-9._~-]+)?)\]|(?P<name>[a-z0-9._-]+))(?::[0-9]{0,5})?"
 )
-# Sec-Fetch-Site of the viewer's own page, and of an address that a person typed or
-# opened from a bookmark.
+# Values of Sec-Fetch-Site for the viewer's own page, and for an address that was typed
+# or opened from a bookmark.
 _OWN_SITES = ("same-origin", "none")
 # Paths of the page, which links of other sites may open.
 _PAGE_PATHS = ("/", "/index.html")
@@ -34,14 +34,14 @@ class Gate:
     """Decides which requests to the server at one address of this machine are answered.
 
     Args:
-        host: Address to listen at; ``"0.0.0.0"`` for all that this machine has.
-        port: Port to listen at; if it is taken, the next free one.
+        host: Address to listen at; ``"0.0.0.0"`` means all addresses of this machine.
+        port: Port to listen at; if it is taken, the next free one is used.
 
     Attributes:
         socket: The socket that listens.
-        port: The port that was free.
+        port: The port that is used.
         url: The address for a browser. If other machines can connect, it contains a
-            secret, without which requests are refused.
+            secret; requests without the secret are refused.
         is_secret: Whether the address contains a secret.
 
     Raises:
@@ -53,8 +53,8 @@ class Gate:
         self.port = int(self.socket.getsockname()[1])
         address = ipaddress.ip_address(self.socket.getsockname()[0].partition("%")[0])
         self._names = {"localhost", host.lower(), str(address)}
-        # The names of a machine that listens at all addresses are not known: there only
-        # the token decides.
+        # The names of a machine that listens at all addresses are unknown, so only the
+        # token decides.
         self._has_any_name = address.is_unspecified
         self._token = ""
         if not address.is_loopback:
@@ -70,8 +70,8 @@ class Gate:
             self.url += f"/{self._token}/"
 
     def refusal(self, request: Request) -> str | None:
-        """Return why a request is refused, or None; the token is removed from the path
-        of a request that is not."""
+        """Return why a request is refused, or None. The token is removed from the path
+        of an accepted request."""
         headers = request.headers
         texts = (request.path, *(value for _, value in headers.raw_items()))
         if not all(text.isascii() for text in texts):
@@ -94,9 +94,9 @@ class Gate:
         return None
 
     def _knows(self, host: str) -> bool:
-        """Whether a Host is a loopback address or the host that was asked for.
+        """Return whether a Host is a loopback address or the requested host.
 
-        The owner of any other name can make it point to this machine.
+        The owner of any other name could make it point to this machine.
         """
         match = _HOST.fullmatch(host)
         if match is None:
@@ -111,8 +111,8 @@ class Gate:
 
 
 def _opens_the_page(request: Request) -> bool:
-    """Whether a request comes from a tab in which a link to the page was opened; a
-    frame has another destination."""
+    """Return whether a request comes from a tab in which a link to the page was opened;
+    frames have another destination."""
     headers = request.headers
     is_navigation = headers.get_all("Sec-Fetch-Mode") == ["navigate"]
     is_tab = headers.get_all("Sec-Fetch-Dest") == ["document"]

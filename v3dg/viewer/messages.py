@@ -1,7 +1,8 @@
-"""What a page may say to the viewer: JSON of these kinds, with numbers in bounds, and
-nothing else.
+"""Messages from a page to the viewer: JSON of these kinds, with bounded numbers;
+anything else is rejected.
 
-`tests/support/page_protocol.py` makes the page's types of this module and `answers`.
+`tests/support/page_protocol.py` generates the page's types from this module and
+`answers`.
 """
 
 import math
@@ -11,16 +12,17 @@ import msgspec
 
 from v3dg.cameras import Axis
 from v3dg.viewer.answers import Limits
+from v3dg.viewer.edits import check_new_name
 from v3dg.viewer.frame import Settings, Shows
 from v3dg.viewer.pacing import Request, scaled
 from v3dg.viewer.path import CameraPath
 from v3dg.viewer.view import View
 
-# The longer side of a picture, however large a window the page claims to have.
+# The longer side of a picture, regardless of the window size that the page claims.
 MOST_PIXELS = 4096
-# The largest message; the page sends files that were dropped onto it in pieces.
+# The largest message; the page sends dropped files in pieces.
 MOST_BYTES = 1 << 20
-# The length of a path: all its views are made before it is stopped or saved.
+# The duration of a path: all its views are made before it can be stopped or saved.
 MOST_PATH_SECONDS = 600.0
 MOST_TOLERANCE = 1e6
 MOST_GAUSSIANS = 1 << 40
@@ -33,7 +35,7 @@ LIMITS = Limits(
     path_seconds=MOST_PATH_SECONDS,
 )
 
-# Bounds keep out what is not a number, too.
+# Bounds also exclude NaN.
 _Number = Annotated[float, msgspec.Meta(ge=-1e15, le=1e15)]
 _Vector = tuple[_Number, _Number, _Number]
 _Quaternion = tuple[_Number, _Number, _Number, _Number]
@@ -59,7 +61,7 @@ class _View(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _Settings(msgspec.Struct, forbid_unknown_fields=True):
-    """What a picture shows, and how finely."""
+    """The content and quality of a picture."""
 
     shows: Shows = _DEFAULTS.shows
     tolerance: Annotated[float, msgspec.Meta(ge=0, le=MOST_TOLERANCE)] = _DEFAULTS.tolerance
@@ -69,6 +71,7 @@ class _Settings(msgspec.Struct, forbid_unknown_fields=True):
     gain: Annotated[float, msgspec.Meta(ge=1, le=MOST_GAIN)] = _DEFAULTS.gain
     split: _Share = _DEFAULTS.split
     frozen: _View | None = None
+    background: tuple[_Share, _Share, _Share] = _DEFAULTS.background
 
     def settings(self) -> Settings:
         frozen: View | None = None
@@ -83,15 +86,16 @@ class _Settings(msgspec.Struct, forbid_unknown_fields=True):
             gain=self.gain,
             split=self.split,
             frozen=frozen,
+            background=self.background,
         )
 
 
 class Look(msgspec.Struct, tag="look", forbid_unknown_fields=True):
-    """Asks for a picture, in place of what was asked for before.
+    """Requests a picture; replaces the previous request.
 
     Attributes:
         size: Width and height of the picture, px.
-        number: By which the page knows the pictures that answer.
+        number: Identifies the pictures that answer this request.
     """
 
     view: _View
@@ -100,17 +104,17 @@ class Look(msgspec.Struct, tag="look", forbid_unknown_fields=True):
     number: Annotated[int, msgspec.Meta(ge=0, le=1 << 53)] = 0
 
     def request(self) -> Request:
-        """Return what is to be drawn, in a size that can be drawn."""
+        """Return the picture to draw, with a size that can be drawn."""
         size = scaled(self.size, min(1.0, MOST_PIXELS / max(self.size)))
         return Request(self.view.view(), size, self.settings.settings(), self.number)
 
 
 class Pick(msgspec.Struct, tag="pick", forbid_unknown_fields=True):
-    """Asks what is at a place of the picture, or where an instance is.
+    """Asks what is at a point of the picture, or where an instance is.
 
     Attributes:
-        at: The place, in shares of width and height from the upper left corner.
-        instance: The instance to tell about, whatever is at the place.
+        at: The point, as fractions of width and height from the upper left corner.
+        instance: The instance to describe, whatever is at the point.
     """
 
     look: Look
@@ -119,7 +123,7 @@ class Pick(msgspec.Struct, tag="pick", forbid_unknown_fields=True):
 
 
 class Move(msgspec.Struct, tag="move", forbid_unknown_fields=True):
-    """Gives an instance a pose."""
+    """Sets the pose of an instance."""
 
     instance: Annotated[int, msgspec.Meta(ge=0)]
     position: _Vector
@@ -131,13 +135,13 @@ class Move(msgspec.Struct, tag="move", forbid_unknown_fields=True):
 
 
 class Save(msgspec.Struct, tag="save", forbid_unknown_fields=True):
-    """Asks for a file; or, to play it, for the views of a path.
+    """Requests a file; or the views of a path, to play it.
 
     Attributes:
         what: The file: a picture, a film of the path, its cameras, or the scene.
-        look: What is shown, and in which size.
-        up: The axis that is up, which a scene's file says; null for another direction.
-        path: Views, each with the seconds from the one before.
+        look: The content and size.
+        up: The axis that is up, for a scene's file; null for other directions.
+        path: Views, each with the seconds since the one before.
     """
 
     output: Literal["picture", "film", "cameras", "scene", "play"] = msgspec.field(name="what")
@@ -154,12 +158,31 @@ class Save(msgspec.Struct, tag="save", forbid_unknown_fields=True):
         return CameraPath([(seconds, stop.view()) for seconds, stop in self.path])
 
 
+class Crop(msgspec.Struct, tag="crop", forbid_unknown_fields=True):
+    """Asks for a new asset, of the gaussians of a bundle whose centres lie in a box, or
+    of all others.
+
+    Attributes:
+        instance: One that shows the bundle.
+        box: Lower and upper corner, in the bundle's own coordinates.
+        name: Name of the file, whose end is the format.
+    """
+
+    instance: Annotated[int, msgspec.Meta(ge=0)]
+    box: tuple[_Vector, _Vector]
+    keep: Literal["inside", "outside"]
+    name: _Name
+
+    def __post_init__(self) -> None:
+        check_new_name(self.name)
+
+
 class Stop(msgspec.Struct, tag="stop", forbid_unknown_fields=True):
-    """Ends the work that `Save` began."""
+    """Ends the work that `Save` started."""
 
 
 class Open(msgspec.Struct, tag="open", forbid_unknown_fields=True):
-    """Says that a file follows as bytes, which is then shown.
+    """Announces a file that follows as binary data and is then shown.
 
     Attributes:
         size: Number of bytes.
@@ -169,7 +192,7 @@ class Open(msgspec.Struct, tag="open", forbid_unknown_fields=True):
     size: Annotated[int, msgspec.Meta(ge=1, le=1 << 38)]
 
 
-Message = Look | Pick | Move | Save | Stop | Open
+Message = Look | Pick | Move | Save | Crop | Stop | Open
 read_message = msgspec.json.Decoder(Message).decode
 
 

@@ -1,5 +1,5 @@
-"""Decides how large to draw, and when: small while the camera moves, larger step by
-step once it rests."""
+"""Decides how large to draw, and when: small while the camera moves, then step by step
+larger."""
 
 import contextlib
 import math
@@ -16,26 +16,26 @@ from v3dg.viewer.view import View
 
 Size = tuple[int, int]
 
-# Time for one picture while the camera moves; a drag then has an answer in less than
-# twice that.
+# The time for one picture while the camera moves; a drag then has an answer in less
+# than twice that.
 TARGET_MS = 60.0
-# A larger picture is begun when nothing has changed for so long.
+# A larger picture is begun when nothing has changed for this long.
 REST_SECONDS = 0.15
-# A picture at rest waits so long for pages; another one follows while some are
+# A picture at rest waits this long for pages; another one follows while some are
 # missing.
 PAGES_SECONDS = 0.1
-# A draft that has taken so long is given up when something else is asked for.
+# A draft that has taken this long is abandoned when another picture is requested.
 PATIENCE_SECONDS = 4e-3 * TARGET_MS
-# The smallest draft, as a share of the full width; below that the cut gets coarser, by
-# at most this factor of the tolerance.
+# The size of the smallest draft, as a fraction of the full width; below it the cut gets
+# coarser, by at most this factor of the tolerance.
 _SMALLEST = 1 / 4
 _COARSEST = 64.0
-# Sizes come in steps, so that they do not change from picture to picture.
+# Sizes are rounded to steps, so that they do not change from picture to picture.
 _STEPS_AN_OCTAVE = 4
 
 
 class Draft(NamedTuple):
-    """How to draw while the camera moves.
+    """The quality of pictures while the camera moves.
 
     Attributes:
         size: Width and height, px.
@@ -47,11 +47,12 @@ class Draft(NamedTuple):
 
 
 class Pacer:
-    """Chooses how to draw a picture in time, from how long earlier ones took.
+    """Chooses the size and tolerance of a draft that meets the target time, from the
+    times of earlier ones.
 
-    Time is assumed to be proportional to work, which is pixels divided by the factor of
-    the tolerance, and is measured with each picture. Where that does not hold, the
-    choice still converges to the one that takes the target.
+    The model is that time is proportional to work, which is pixels divided by the
+    factor of the tolerance; each picture updates the measured speed. If the model is
+    wrong, the choice still converges to the target time.
     """
 
     def __init__(self, target_ms: float = TARGET_MS) -> None:
@@ -61,20 +62,20 @@ class Pacer:
     def draft(self, full: Size) -> Draft:
         """Return how to draw a draft of a picture of size ``full``.
 
-        Its size has about the same aspect and is not larger; the first one is a quarter
-        as wide.
+        Its aspect is about the same and its size not larger; the first draft has a
+        quarter of the width.
         """
         whole = math.prod(full)
         share = (self._target_ms * self._work_per_ms or whole / 16) / whole
-        # The small term keeps rounding from refusing a step that fits.
+        # The small term prevents rounding from excluding a step that fits.
         scale = 2 ** (math.floor(_STEPS_AN_OCTAVE * math.log2(share) / 2 + 1e-6) / _STEPS_AN_OCTAVE)
         coarser = min(max((_SMALLEST / scale) ** 2, 1.0), _COARSEST)
         return Draft(scaled(full, min(max(scale, _SMALLEST), 1.0)), coarser)
 
     def drew(self, draft: Draft, milliseconds: float) -> None:
-        """Take note of how long a picture took."""
+        """Note how long a picture took."""
         speed = math.prod(draft.size) / draft.coarser / max(milliseconds, 0.1)
-        # A lower speed counts at once, a higher one only if it lasts.
+        # A lower speed counts at once, a higher one only if it persists.
         share = 1.0
         if speed > self._work_per_ms > 0:
             share = 0.3
@@ -93,11 +94,11 @@ def scaled(full: Size, scale: float) -> Size:
 
 def finer_sizes(drawn: Size, full: Size) -> list[Size]:
     """Return the sizes to draw after ``drawn``, each twice the one before, up to
-    ``full``; empty if that is drawn already."""
+    ``full``; empty if that is already drawn."""
     sizes = []
     width = drawn[0]
     while width < full[0]:
-        # A last step of less than a factor of 1.5 is not worth a picture of its own.
+        # A last step of less than a factor of 1.5 is not worth another picture.
         if 3 * width >= full[0]:
             sizes.append(full)
             break
@@ -107,11 +108,11 @@ def finer_sizes(drawn: Size, full: Size) -> list[Size]:
 
 
 class Request(NamedTuple):
-    """What a tab wants to see.
+    """The picture that a tab requests.
 
     Attributes:
         size: Width and height of the full picture, px.
-        number: By which the tab knows the pictures that answer.
+        number: Identifies the pictures that answer this request.
     """
 
     view: View
@@ -121,25 +122,24 @@ class Request(NamedTuple):
 
 
 class SendFrame(Protocol):
-    """Sends a picture to the page; ``is_final`` says that no other follows for the
-    request of that number."""
+    """Sends a picture to the page; ``is_final`` marks the last picture for the request
+    of that number."""
 
     def __call__(self, frame: Frame, number: int, *, is_final: bool) -> None: ...
 
 
 class RenderLoop:
-    """Draws what one tab asked for last, in a thread of its own, as often and as large
-    as time allows.
+    """Draws the last request of one tab, in its own thread, as often and as large as
+    time allows.
 
-    A request is answered by a small picture; after a rest larger ones follow, up to the
-    full size. A new request ends a larger picture at once. It ends a small one that has
-    taken too long, after which the next one is smaller; the smallest is always
-    finished, so that something is seen.
+    A request is answered by a small picture; at rest larger ones follow, up to the full
+    size. A new request ends a larger picture at once. It also ends a small picture that
+    has taken too long, after which the next one is smaller; the smallest one is always
+    finished, so that something is shown.
 
     Args:
         send: Called with each picture in the loop's thread.
-        fail: Called with the error of what could not be drawn or sent, in the loop's
-            thread.
+        fail: Called in the loop's thread with an error of drawing or sending.
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class RenderLoop:
         self._thread.start()
 
     def ask(self, request: Request) -> None:
-        """Ask for a picture; it replaces the request before."""
+        """Request a picture; replaces the previous request."""
         with self._changed:
             self._request = request
             if time.monotonic() >= self._patience_ends:
@@ -171,7 +171,7 @@ class RenderLoop:
             self._changed.notify()
 
     def close(self, seconds: float) -> bool:
-        """Draw nothing more; waits for the thread at most so long, and returns whether
+        """Draw nothing more; wait at most this long for the thread, and return whether
         it has ended."""
         with self._changed:
             self._is_closed = True
@@ -193,7 +193,7 @@ class RenderLoop:
             except Stopped:
                 pass
             except Exception as error:
-                # The loop goes on, and the tab shows the reason.
+                # The loop continues, and the tab shows the reason.
                 with contextlib.suppress(Exception):
                     self._fail(error)
 
@@ -254,7 +254,7 @@ class RenderLoop:
 
     def _draw_until_settled(self, request: Request, tolerance: float) -> None:
         """Draw pictures until the tolerance, which approaches that of the budget in
-        steps, stays the same."""
+        steps, is constant."""
         is_settled = False
         while not is_settled:
             stop = self._begin(0.0)
@@ -266,8 +266,7 @@ class RenderLoop:
             tolerance = frame.figures.tolerance
 
     def _while_moving(self, settings: Settings, draft: Draft) -> Settings:
-        """Return the settings without what there is no time for while the camera
-        moves."""
+        """Return the settings without what takes too long while the camera moves."""
         draws_all = self._scene_view.draws_all_while_moving
         if not draws_all and (settings.split > 0 or settings.shows == "difference"):
             settings = replace(settings, shows="appearance", split=0.0)
@@ -280,10 +279,10 @@ class RenderLoop:
         return self._is_closed or self._request is not None
 
     def _begin(self, patience: float) -> _core.Stop:
-        """Return what stops the next picture.
+        """Return the flag that stops the next picture.
 
-        A new request stops it at once if it comes ``patience`` seconds from now or
-        later.
+        A new request stops the picture at once if it arrives ``patience`` seconds from
+        now or later.
         """
         with self._changed:
             self._stop = _core.Stop()

@@ -28,15 +28,15 @@ class CameraPath:
 
     @property
     def times(self) -> Floats:
-        """(K,) seconds of each view from the first."""
+        """(K,) seconds of each view since the first."""
         return np.cumsum([0.0, *(seconds for seconds, _ in self.stops[1:])])
 
     def views_at(self, seconds: Floats) -> list[View]:
         """Return views on a smooth curve through all stops, at times since the first.
 
-        Positions, rotations and fields of view follow cubic Hermite curves whose slopes
-        are those of Catmull-Rom for uneven times; rotations are normalised. Earlier
-        times give the first view, later ones the last.
+        Positions, rotations and fields of view follow cubic Hermite curves with the
+        slopes of Catmull-Rom splines for non-uniform times; rotations are normalised.
+        Earlier times give the first view, later ones the last.
 
         Raises:
             ValueError: The path is empty.
@@ -64,8 +64,8 @@ class CameraPath:
         return [View(tuple(row[:4]), tuple(row[4:7]), row[7], row[8]) for row in curve.tolist()]
 
     def film(self, fps: int) -> list[View]:
-        """Return the views of a film: the first, the last, and between them ``fps`` a
-        second."""
+        """Return the views of a film: the first, the last, and ``fps`` per second in
+        between."""
         seconds = self.times[-1]
         return self.views_at(np.linspace(0.0, seconds, max(round(seconds * fps), 1) + 1))
 
@@ -78,9 +78,9 @@ class CameraPath:
 
 
 def _rows(views: list[View]) -> Floats:
-    """(K, 9): quaternion, position, field of view, aspect.
+    """Return (K, 9): quaternion, position, field of view, aspect.
 
-    Each quaternion has the sign with which it is nearest to the one before.
+    The sign of each quaternion is chosen closest to the one before.
     """
     rows = np.array(
         [(*view.wxyz, *view.position, view.fov_y, view.aspect) for view in views], np.float64

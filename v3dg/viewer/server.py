@@ -1,5 +1,5 @@
-"""The viewer's web server: serves the page, and gives every browser tab a connection of
-its own."""
+"""The viewer's web server: it serves the page, and connects every browser tab
+separately."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import contextlib
 import http
 import io
 import logging
-import math
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -20,11 +19,12 @@ import numpy as np
 from PIL import Image
 
 from v3dg import _extras
+from v3dg._numbers import check, color
 from v3dg._version import __version__
 from v3dg.cameras import Camera, VectorLike, check_cameras
 from v3dg.select import DEFAULT_TOLERANCE
 from v3dg.viewer.frame import SceneView, Settings
-from v3dg.viewer.view import View, look_at
+from v3dg.viewer.view import View
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
@@ -33,25 +33,25 @@ if TYPE_CHECKING:
     from v3dg.viewer.answers import Hello
     from v3dg.viewer.tab import Tab
 
-_FOV_Y = math.radians(45)
-# Threads that are still at work after so long are not waited for.
+# The end of the server does not wait longer than this for threads.
 _CLOSE_SECONDS = 1.0
-# The longer side of photographs at most, by the folder in which the page asks for them.
+# The largest longer side of photographs, by the folder in which the page requests them.
 _PHOTOGRAPH_PIXELS = {"photograph": 1600, "thumbnail": 240}
-# Errors of a connection are its client's fault: they are logged, and not printed in the
-# terminal.
+# Errors of a connection are caused by its client: they are logged, and not printed in
+# the terminal.
 _LOG = logging.getLogger(__name__)
 _LOG.addHandler(logging.NullHandler())
-# Media types of the files that are served; other files of the page's folder are not.
+# Media types of the files that are served; other files in the page's folder are not
+# served.
 _MEDIA_TYPES = {
     ".html": "text/html",
     ".css": "text/css",
     ".js": "text/javascript",
     ".svg": "image/svg+xml",
 }
-# Headers of every answer, of refusals and errors too. No other page can frame this one;
-# it runs only its own files and talks to no other server. Other pages cannot show what
-# is served, nor get hold of the window.
+# Headers of every answer, including refusals and errors. No other page can frame this
+# page; it runs only its own files and talks to no other server. Other pages cannot show
+# what is served, nor get access to the window.
 _HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -72,19 +72,21 @@ class Site:
     Args:
         name: Title of the tabs, and name of the files that they save.
         cameras: Named cameras to jump to.
-        photographs: Files of the pictures that cameras took, by the cameras' names.
+        photographs: Files of the cameras' photographs, by the cameras' names.
         host, port: As for `Gate`.
-        tolerance, budget: Settings that a tab begins with.
+        tolerance, budget, background: Initial settings of a tab.
         up: (3,) direction in the world that is up.
-        asks_up: Whether ``up`` is only assumed, so that the page asks.
+        asks_up: Whether ``up`` is only assumed, so that the page asks the user.
+        edits_folder: Folder that pages may write new assets to, never over a file that
+            exists; if None, or if other machines can connect, browsers save them.
 
     Attributes:
-        port, url, is_secret: As of `Gate`.
+        port, url, is_secret: See `Gate`.
 
     Raises:
         ImportError: The extra is not installed.
         TypeError: ``cameras`` is not a mapping of names to cameras.
-        ValueError: As of `Gate`.
+        ValueError: See `Gate`.
     """
 
     def __init__(
@@ -98,25 +100,25 @@ class Site:
         port: int = 8080,
         tolerance: float = DEFAULT_TOLERANCE,
         budget: int | None = None,
+        background: Sequence[float] = (0.0, 0.0, 0.0),
         up: VectorLike = (0.0, 0.0, 1.0),
         asks_up: bool = False,
+        edits_folder: Path | None = None,
     ) -> None:
-        for module in ("msgspec", "websockets.asyncio.server"):
-            _extras.load(module)
+        _load_extras()
         from v3dg.viewer.gate import Gate
-        from v3dg.viewer.tab import Tab
 
-        self._make_tab = Tab
         self._scene_view = scene_view
         self._name = name
         cameras = cameras or {}
         check_cameras(cameras)
         self._photographs = [dict(photographs or {}).get(camera) for camera in cameras]
+        shade = _checked_color(background)
+        settings = Settings(tolerance=tolerance, budget=budget, background=shade)
         self._greeting = _greeting(
-            scene_view,
             cameras,
             self._photographs,
-            settings=Settings(tolerance=tolerance, budget=budget),
+            settings=settings,
             up=up,
             asks_up=asks_up,
         )
@@ -126,7 +128,15 @@ class Site:
         self.port = self._gate.port
         self.url = self._gate.url
         self.is_secret = self._gate.is_secret
+        self._edits_folder = self._allowed_folder(edits_folder)
         self._start()
+
+    def _allowed_folder(self, folder: Path | None) -> Path | None:
+        """Return the folder that pages may write to; None if other machines can
+        connect."""
+        if folder is None or self.is_secret:
+            return None
+        return Path(folder).absolute()
 
     def _start(self) -> None:
         """Start the server's thread, and wait until it accepts connections."""
@@ -140,9 +150,9 @@ class Site:
         is_serving.wait()
 
     def close(self) -> bool:
-        """End all tabs and the server in about two seconds; returns whether all their
-        threads have ended."""
-        with contextlib.suppress(RuntimeError):  # the loop is closed already
+        """End all tabs and the server within about two seconds; return whether all
+        their threads have ended."""
+        with contextlib.suppress(RuntimeError):  # the loop is already closed
             self._loop.call_soon_threadsafe(self._closing.set)
         self._thread.join(3 * _CLOSE_SECONDS)
         return not self._thread.is_alive() and not self._tabs
@@ -161,9 +171,9 @@ class Site:
             sock=self._gate.socket,
             logger=_LOG,
             max_size=MOST_BYTES,
-            compression=None,  # pictures are compressed already
-            close_timeout=0.5,  # the end does not wait for a client that does not answer
-            server_header=None,  # clients are not told versions
+            compression=None,  # pictures are already compressed
+            close_timeout=0.5,  # an unresponsive client must not delay the end
+            server_header=None,  # clients need not know versions
             process_request=self._answer,
             process_response=_add_headers,
         )
@@ -173,13 +183,14 @@ class Site:
         await asyncio.to_thread(self._end_tabs)
 
     def _end_tabs(self) -> None:
-        """End the threads of all tabs, also of those whose connection is closed."""
+        """End the threads of all tabs, including those whose connection is closed."""
         end = time.monotonic() + _CLOSE_SECONDS
         self._tabs = {tab for tab in self._tabs if not tab.close(max(end - time.monotonic(), 0.0))}
 
     async def _talk(self, connection: ServerConnection) -> None:
         """Serve one tab while it is open."""
         from v3dg.viewer.answers import encode
+        from v3dg.viewer.tab import Tab
 
         def send(data: str | bytes) -> None:
             coroutine = connection.send(data)
@@ -197,13 +208,13 @@ class Site:
                 if open_tab.scene_view is scene_view:
                     open_tab.ask_again()
 
-        tab = self._make_tab(self._scene_view, self._name, send, moved)
+        tab = Tab(self._scene_view, self._name, send, moved, self._greeting.up, self._edits_folder)
         self._tabs.add(tab)
         try:
             await connection.send(encode(self._greeting))
             await connection.send(encode(tab.describe_scene()))
             async for data in connection:
-                # A wrong message is ignored, whatever is wrong with it.
+                # An invalid message is ignored, for whatever reason.
                 with contextlib.suppress(Exception):
                     tab.take(data)
         finally:
@@ -211,7 +222,8 @@ class Site:
                 self._tabs.discard(tab)
 
     async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Answer a request for a file of the page; None if it opens a connection."""
+        """Return the answer to a request for a file of the page; None for a request
+        that opens a connection."""
         refusal = self._gate.refusal(request)
         if refusal is not None:
             return connection.respond(http.HTTPStatus.FORBIDDEN, refusal)
@@ -235,8 +247,8 @@ class Site:
         return response
 
     def _photograph(self, place: str, side: int) -> bytes | None:
-        """Return the photograph of the camera of that number as JPEG; None if there is
-        none that can be read."""
+        """Return the photograph of the camera with that number as JPEG; None if there
+        is none, or if it cannot be read."""
         try:
             if not place.isdecimal():
                 return None
@@ -248,12 +260,23 @@ class Site:
                 file = io.BytesIO()
                 picture.convert("RGB").save(file, "jpeg", quality=85)
                 return file.getvalue()
-        except Exception:  # Pillow raises errors of many kinds for damaged files
+        except Exception:  # for damaged files, Pillow raises errors of many kinds
             return None
 
 
+def _checked_color(values: Sequence[float]) -> tuple[float, float, float]:
+    red, green, blue = color(values, "background")
+    fits = all(0 <= part <= 1 for part in (red, green, blue))
+    check("background", fits, f"three numbers from 0 to 1, got {(red, green, blue)}")
+    return red, green, blue
+
+
+def _load_extras() -> None:
+    for module in ("msgspec", "websockets.asyncio.server"):
+        _extras.load(module)
+
+
 def _greeting(
-    scene_view: SceneView,
     cameras: Mapping[str, Camera],
     photographs: Sequence[Path | None],
     *,
@@ -273,7 +296,6 @@ def _greeting(
         version=__version__,
         up=(x, y, z),
         asks_up=asks_up,
-        home=start_view(scene_view, up),
         settings=settings,
         defaults=Settings(),
         limits=LIMITS,
@@ -292,20 +314,10 @@ def _read_page() -> dict[str, bytes]:
 
 
 def _add_headers(_connection: ServerConnection, _request: Request, response: Response) -> None:
-    """Give an answer the headers that all answers have."""
+    """Add the headers that all answers have."""
     response.headers.update(_HEADERS)
 
 
 def start_view(scene_view: SceneView, up: VectorLike, aspect: float = 16 / 9) -> View:
-    """Return the view that a tab begins with: all of the scene, from a little above."""
-    axis = np.asarray(up, np.float64)
-    axis = axis / np.linalg.norm(axis)
-    # The world's axis after the one that is nearest to `up`, so that the two are not
-    # parallel.
-    aside = np.roll(np.eye(3)[int(np.abs(axis).argmax())], 1)
-    aside = aside - (aside @ axis) * axis
-    direction = math.cos(0.45) * aside / np.linalg.norm(aside) + math.sin(0.45) * axis
-    distance = 0.95 * scene_view.radius / math.sin(_FOV_Y / 2)
-    return look_at(
-        scene_view.center + distance * direction, scene_view.center, axis, _FOV_Y, aspect
-    )
+    """Return the initial view of a tab: that of `v3dg.first_camera`."""
+    return scene_view.first_view(up, aspect)[0]

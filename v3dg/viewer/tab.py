@@ -1,4 +1,4 @@
-"""A browser tab: does what its page asks for, and tells the page what came of it."""
+"""A browser tab: it does what its page requests, and sends the results to the page."""
 
 import contextlib
 import copy
@@ -23,25 +23,30 @@ from v3dg import _core
 from v3dg._urls import beside
 from v3dg.bundle import Bundle
 from v3dg.camera_file import write_cameras
-from v3dg.cameras import Camera
+from v3dg.cameras import Camera, VectorLike
+from v3dg.editing import crop_box
 from v3dg.gaussians import Gaussians
-from v3dg.io import read_asset
+from v3dg.io import read_asset, subject_name, write_asset
 from v3dg.pictures import to_8bit
 from v3dg.scene.file import write_scene
 from v3dg.video import write_video
 from v3dg.viewer import answers, messages
+from v3dg.viewer.edits import write_new_asset
 from v3dg.viewer.exports import Exporter, bundle_names
 from v3dg.viewer.frame import MOST_COUNTED, Frame, Pixels, SceneView
 from v3dg.viewer.pacing import RenderLoop
 
+# Width over height of windows for which first views are framed.
+_HOME_ASPECTS = (0.4, 0.5, 0.6, 0.75, 1.0, 4 / 3, 16 / 9, 2.4)
 # Qualities of JPEG.
 _DRAFT_QUALITY = 75
 _FINAL_QUALITY = 94
-# Pillow's numbers for JPEG whose colours have half the resolution, and the whole one.
+# Pillow's codes for JPEG with colours of half the resolution, and of full resolution.
 _HALF_COLORS = 2
 _WHOLE_COLORS = 0
 _FPS = 30
-# Share of a pixel's colour from which a click means a gaussian: less is hardly seen.
+# The least weight in a pixel for a gaussian to be picked by a click; less is hardly
+# visible.
 _LEAST_WEIGHT = 0.05
 _SECONDS_BETWEEN_PROGRESS = 0.2
 
@@ -54,18 +59,28 @@ class Tab:
     Args:
         scene_view: The scene that is shown until a file is dropped onto the page.
         name: Name of the files that the page saves.
-        send: Sends text or bytes to the page; waits until they are away, but not in the
-            server's thread.
+        send: Sends text or binary data to the page; waits until they are sent, except
+            in the server's thread.
         moved: Called with a scene view after one of its instances was moved.
+        edits_folder: Folder that new assets are written to; None has the browser save
+            them, which it also does for a file that was dropped.
     """
 
     def __init__(
-        self, scene_view: SceneView, name: str, send: _Send, moved: Callable[[SceneView], None]
+        self,
+        scene_view: SceneView,
+        name: str,
+        send: _Send,
+        moved: Callable[[SceneView], None],
+        up: VectorLike = (0.0, 0.0, 1.0),
+        edits_folder: Path | None = None,
     ) -> None:
         self.scene_view = scene_view
+        self._up = up
         self._name = name
         self._send = send
         self._moved = moved
+        self._edits_folder = edits_folder
         self._exporter = Exporter(self._tell, lambda error: self.scene_view.explain(error))
         self._loop = RenderLoop(scene_view, self._show, self._fail)
         self._look: messages.Look | None = None
@@ -75,7 +90,7 @@ class Tab:
         self._missing_bytes = 0
 
     def close(self, seconds: float) -> bool:
-        """Stop drawing and saving; waits for each thread at most so long, and returns
+        """Stop drawing and saving; wait at most this long for each thread, and return
         whether all have ended."""
         has_ended = all([self._loop.close(seconds), self._exporter.close(seconds)])
         if has_ended and self._folder is not None:
@@ -83,15 +98,15 @@ class Tab:
         return has_ended
 
     def ask_again(self) -> None:
-        """Draw again, because what is shown has changed."""
+        """Draw again, because the subject has changed."""
         if self._look is not None:
             self._loop.ask(self._look.request())
 
     def take(self, data: str | bytes) -> None:
-        """Do what a message of the page says.
+        """Execute a message of the page.
 
         Raises:
-            ValueError: It is none of `messages`.
+            ValueError: The message is not one of `messages`.
         """
         if isinstance(data, bytes):
             self._take_bytes(data)
@@ -107,13 +122,15 @@ class Tab:
                 self._move(message)
             case messages.Save():
                 self._exporter.begin(functools.partial(self._save, message))
+            case messages.Crop():
+                self._exporter.begin(lambda _: self._crop(message))
             case messages.Stop():
                 self._exporter.stop()
             case messages.Open():
                 self._begin_file(message)
 
     def describe_scene(self) -> answers.Scene:
-        """Return what the page has to know of what it shows."""
+        """Return what the page needs to know about the subject."""
         scene_view = self.scene_view
         bundles = scene_view.scene.bundles
         num_missing = np.arange(4)
@@ -122,7 +139,9 @@ class Tab:
             center=_vector(scene_view.center),
             radius=scene_view.radius,
             near=scene_view.near,
+            homes=self._homes(),
             instances=len(scene_view.scene),
+            writes_files=self._edits_folder is not None,
             has_files=self._folder is None and all(bundle.path for bundle in bundles),
             level_colors=_colors(_core.level_colors(scene_view.num_levels)),
             ramp=_colors(_core.ramp(np.linspace(0, 1, 7))),
@@ -131,6 +150,14 @@ class Tab:
             shows_cuts=scene_view.shows_cuts,
             missing_colors=_colors(_core.missing_colors(4.0**num_missing)),
         )
+
+    def _homes(self) -> list[answers.Home]:
+        """Return the first views for windows from narrow to wide."""
+        homes = []
+        for aspect in _HOME_ASPECTS:
+            view, focus = self.scene_view.first_view(self._up, aspect)
+            homes.append(answers.Home(view, _vector(focus)))
+        return homes
 
     def _tell(self, answer: answers.Answer, data: bytes = b"") -> None:
         self._send(answers.encode(answer, data))
@@ -181,8 +208,8 @@ class Tab:
         self._moved(self.scene_view)
 
     def _begin_picking(self, message: messages.Pick) -> None:
-        """Answer in a thread of its own, unless an earlier question is not answered
-        yet."""
+        """Answer in a separate thread, unless an earlier question is still
+        unanswered."""
         if self._picking.acquire(blocking=False):
             threading.Thread(
                 target=self._pick, args=(message,), name="v3dg pick", daemon=True
@@ -198,7 +225,7 @@ class Tab:
             self._picking.release()
 
     def _find(self, message: messages.Pick) -> answers.Picked:
-        """Return the instance that a page asks about, or that is at a place of its
+        """Return the instance that a page asks about, or that is at a point of its
         picture."""
         if message.instance is not None:
             return self._describe_instance(message.instance)
@@ -217,9 +244,7 @@ class Tab:
 
     def _describe_instance(self, number: int) -> answers.Picked:
         scene = self.scene_view.scene
-        if number >= len(scene):
-            raise ValueError(f"instance: expected 0 to {len(scene) - 1}, got {number}")
-        bundle = scene.bundles[scene.instance_bundle[number]]
+        bundle = scene.bundles[scene.instance_bundle[self._checked_instance(number)]]
         boxes = bundle.clusters.box[: bundle.level_range(0).stop]
         w, x, y, z = scene.quaternions[number].tolist()
         pose = answers.Pose(
@@ -284,8 +309,8 @@ class Tab:
         self._exporter.save("transforms.json", lambda file: write_cameras(file, cameras))
 
     def _save_scene(self, message: messages.Save) -> None:
-        """Save the instances as they are now, the axis that is up, and the cameras of
-        the path."""
+        """Save the current instances, the axis that is up, and the cameras of the
+        path."""
         width, height = message.look.request().size
         path = message.camera_path()
         cameras: dict[str, Camera] = {}
@@ -298,9 +323,32 @@ class Tab:
             f"{self._name}.json", lambda file: write_scene(file, scene, names, cameras)
         )
 
+    def _crop(self, message: messages.Crop) -> None:
+        """Save a part of level 0 of a bundle as a new asset."""
+        scene = self.scene_view.scene
+        bundle = scene.bundles[scene.instance_bundle[self._checked_instance(message.instance)]]
+        whole = bundle.level_gaussians(0)
+        part = crop_box(whole, *message.box, keep=message.keep)
+        name = message.name
+        counts = f"{len(part):,} of {len(whole):,} gaussians"
+        if not len(part):
+            raise ValueError(f"box: nothing is left of {len(whole):,} gaussians; change the box")
+        if self._edits_folder is None:
+            self._exporter.save(name, lambda file: write_asset(file, part))
+            self._tell(answers.Notice(f"{name} has {counts}."))
+            return
+        write_new_asset(self._edits_folder, name, part)
+        self._tell(answers.Notice(f"{name} was written beside what is shown: {counts}."))
+
+    def _checked_instance(self, number: int) -> int:
+        count = len(self.scene_view.scene)
+        if number >= count:
+            raise ValueError(f"instance: expected 0 to {count - 1}, got {number}")
+        return number
+
     def _begin_file(self, message: messages.Open) -> None:
-        """Create the file that the next bytes are written to, in a folder that is
-        removed with the tab."""
+        """Create the file for the binary data that follows, in a folder that is removed
+        with the tab."""
         self._folder = self._folder or tempfile.TemporaryDirectory(prefix="v3dg_")
         if self._dropped is not None:
             self._dropped.close()
@@ -326,12 +374,13 @@ class Tab:
                 subject = Bundle.open(path)
             else:
                 subject = read_asset(path)
-        except (OSError, ValueError) as error:  # no page is told the folders of this machine
+        except (OSError, ValueError) as error:  # no page may learn the folders of this machine
             raise ValueError(str(error).replace(f"{path.parent}{os.sep}", "")) from None
         scene_view = SceneView(subject, device=self.scene_view.device)
         old_loop = self._loop
         self.scene_view = scene_view
-        self._name = path.stem
+        self._name = subject_name(path)
+        self._edits_folder = None
         self._loop = RenderLoop(scene_view, self._show, self._fail)
         old_loop.close(0.0)
         self._tell(self.describe_scene())
@@ -347,8 +396,7 @@ def _colors(colors: npt.NDArray[np.float32]) -> list[answers.Color]:
 
 
 def _resident_bytes(statm_path: str = "/proc/self/statm") -> int:
-    """Return the memory that this process holds; without /proc, the most that it has
-    held."""
+    """Return the memory of this process; without /proc, its maximum so far."""
     try:
         with open(statm_path, encoding="ascii") as file:
             return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")

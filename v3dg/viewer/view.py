@@ -1,4 +1,4 @@
-"""Views: cameras as a browser knows them, and the pinhole cameras that follow from
+"""Views: cameras in the terms of a browser, and the pinhole cameras that follow from
 them."""
 
 import math
@@ -16,7 +16,7 @@ class View:
 
     Attributes:
         wxyz: Rotation from camera (x right, y down, z forward) to world, a quaternion
-            of any length but zero.
+            of any nonzero length.
         position: Position of the eye, world units.
         fov_y: Vertical field of view in radians.
         aspect: Width over height.
@@ -29,8 +29,8 @@ class View:
 
     @classmethod
     def of_camera(cls, camera: Camera) -> "View":
-        """Return the view with a camera's pose and field of view; a principal point off
-        the middle is lost."""
+        """Return the view with a camera's pose and field of view; the position of the
+        principal point is ignored."""
         half_x = camera.width / 2 / camera.fx
         half_y = camera.height / 2 / camera.fy
         wxyz = quaternion_from_rotation(camera.viewmat[:3, :3].T)
@@ -52,6 +52,6 @@ class View:
 def look_at(
     eye: VectorLike, target: VectorLike, up: VectorLike, fov_y: float, aspect: float
 ) -> View:
-    """Return the view at ``eye`` with ``target`` in the middle and ``up`` upwards."""
+    """Return the view from ``eye`` with ``target`` in the middle and ``up`` upwards."""
     of_camera = View.of_camera(Camera.look_at(eye, target, up, width=1, height=1))
     return replace(of_camera, fov_y=fov_y, aspect=aspect)

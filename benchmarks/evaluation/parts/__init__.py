@@ -1,10 +1,10 @@
-"""The parts of the evaluation, a module each.
+"""The parts of the evaluation, one module each.
 
-A part has a TITLE, a sentence or two ABOUT what it asks, and three functions:
-run(evaluation) measures and returns what JSON can hold, or yields it again each time
-that it knows more; tables(result) gives that as Markdown; summary(result) says in a
-sentence or two where we win and where we do not. Where there is something to plot,
-plot(result, figure) draws it.
+A part has a TITLE, a sentence or two ABOUT its question, and three functions.
+run(evaluation) measures and returns JSON values, or yields them again whenever there
+are more. tables(result) returns them as Markdown. summary(result) says in a sentence or
+two where we win and where we do not. If there is something to plot, plot(result,
+figure) draws it.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ NAMES = (
     "views",
     "levels",
 )
-"""In order of importance, in which they are run."""
+"""The parts in order of importance, in which they are run."""
 
 
 def part(name: str) -> Any:
-    """The module of a part.
+    """Return the module of a part.
 
     Raises:
-        ValueError: There is no such part.
+        ValueError: The part does not exist.
     """
     if name not in NAMES:
         raise ValueError(f"parts: expected some of {', '.join(NAMES)}, got {name}")

@@ -1,4 +1,4 @@
-"""Rasterizer, split, selection and build alone: time, share of the machine's limit,
+"""Rasterizer, split, selection and build alone: time, fraction of the machine's limit,
 growth with size."""
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def copy_bandwidth(device: str) -> float:
-    """Bytes a second, read and written, of one large copy."""
+    """Return the bytes per second, read and written, of one large copy."""
     source = np.ones(_COPIED_BYTES, np.uint8)
     if device == "cpu":
         target = np.empty_like(source)
@@ -87,7 +87,7 @@ def rasterize_row(evaluation: Evaluation, count: int, bandwidth: float) -> Row:
         row |= gsplat_peer(evaluation, gaussians, camera, picture.color)
     elif evaluation.device == "cpu":
         row["psnr_to_float64"] = psnr_to_float64(gaussians, camera, picture.color)
-    renderer = Renderer(gaussians, device=evaluation.device)  # takes over the asset once
+    renderer = Renderer(gaussians, device=evaluation.device)  # converts the asset once
     timed = time_ms(
         lambda: renderer.render(camera).stats, evaluation.device, evaluation.settings.repeats
     )
@@ -161,8 +161,8 @@ def split_row(evaluation: Evaluation, count: int, bandwidth: float) -> Row:
 
 
 def select_row(evaluation: Evaluation, count: int) -> Row:
-    """A scene of so many gaussians, of instances of the asset, from where about half is
-    coarse."""
+    """Return the row for a scene of this many gaussians, at a distance where about half
+    are coarse."""
     bundle = evaluation.build().bundle
     instances = max(1, count // len(evaluation.asset))
     rng = np.random.default_rng(evaluation.seed)
@@ -206,9 +206,9 @@ def build_row(evaluation: Evaluation, count: int) -> Row:
     }
 
 
-# A process a number of threads: OpenMP reads it once. Prints milliseconds of a split
-# and of a frame. It looks for modules where this process does: the folder that it
-# starts in may hold a v3dg of its own.
+# One process per number of threads is needed, because OpenMP reads the number once. The
+# script prints milliseconds of a split and of a frame. It uses the module path of this
+# process, because the working folder may contain another v3dg.
 _SCRIPT = """
 import json, sys
 sys.path[:] = json.loads(sys.argv[1])

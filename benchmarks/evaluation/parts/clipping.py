@@ -1,4 +1,4 @@
-"""Against clipping: leaving out what is small on screen, as gsplat's `radius_clip`
+"""Comparison with clipping: omitting what is small on screen, as gsplat's `radius_clip`
 does, at equal counts."""
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def clipped(evaluation: Evaluation, view: View, count: int) -> tuple[float, int, Picture]:
-    """The clip that leaves at most so many of the full scene's gaussians in the
-    picture, and the picture."""
+    """Return the clip that leaves at most this many of the full scene's gaussians in
+    the picture, and the picture."""
     everything = select(evaluation.full_scene, view.camera, tolerance=0.0, device="cpu").gaussians(
         device=evaluation.device
     )

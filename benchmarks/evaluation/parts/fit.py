@@ -1,5 +1,5 @@
-"""Local splatting (table 1, upper half): what the fit of the levels gives, for its
-steps."""
+"""Local splatting (table 1, upper half): the benefit of fitting the levels, by number
+of steps."""
 
 from __future__ import annotations
 

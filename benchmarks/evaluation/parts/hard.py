@@ -1,4 +1,4 @@
-"""What is hard for level of detail: hair-thin lines, a sky of huge soft gaussians, a
+"""Hard cases for level of detail: hair-thin lines, a sky of huge soft gaussians, a
 dense tree."""
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ def cameras_around(evaluation: Evaluation, asset: Gaussians) -> dict[str, Camera
     direction = np.array([0.2, -0.8, 0.55])
 
     def camera(factor: float) -> Camera:
-        # As many px² a gaussian as from so far away, without the empty rest of the
-        # picture.
+        # The view has as many px² per gaussian as at the larger distance, without the
+        # empty rest of the picture.
         side = max(_LEAST_PX, round(evaluation.settings.panel / factor))
         eye = center + factor * distance * direction
         return Camera.look_at(
@@ -107,7 +107,8 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
                 if share in (None, _SHARES[-1]) or ours_count > wanted:
                     text = f"{ours_count / count:.0%}"
                     strip += [(f"ours, {text}", ours), (f"merged, {text}", theirs)]
-                # As coarse as it gets: the eye is inside the balls of what is left.
+                # This is the coarsest cut: the eye is inside the balls of the remaining
+                # groups.
                 if ours_count > wanted:
                     break
             strip[0] = f"{name}, {where}: truth", truth
@@ -123,7 +124,8 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def enlarged(picture: Picture, side: int) -> Picture:
-    """Each pixel as a square, so that the picture is about so large."""
+    """Return the picture with each pixel as a square, so that its size is approximately
+    this."""
     factor = max(1, side // picture.shape[0])
     return picture.repeat(factor, 0).repeat(factor, 1)
 

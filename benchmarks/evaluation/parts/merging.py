@@ -1,15 +1,16 @@
-"""Against levels that are only merged: pairs by their moments, and what other tools
-make of the same asset.
+"""Comparison with levels that are only merged: pairs by their moments, and the output
+of other tools for the same asset.
 
-Other tools run beforehand, on the asset that the evaluation is given; what they write
-is read from the folder of peers, as <asset>_<tool>_<percent>.ply:
+Other tools run beforehand, on the asset of the evaluation; their output is read from
+the folder of peers, as <asset>_<tool>_<percent>.ply:
 
     splat-transform -g cpu -w donut.ply -d 50% peers/donut_splat-transform_50.ply
     splat-transform -g cpu -w donut.ply --decimate-adaptive 50%
     peers/donut_adaptive_50.ply node benchmarks/studies/spark_levels.mjs donut.ply peers
     50 25 12.5 6.25 1
 
-and seconds.json there has what each took, {"splat-transform": {"50": 1.0}}.
+The file seconds.json in that folder has the time of each, {"splat-transform": {"50":
+1.0}}.
 """
 
 from __future__ import annotations
@@ -87,13 +88,13 @@ def peer_rows(evaluation: Evaluation) -> list[Row]:
 
 
 def view_camera(bundle: Bundle, view: int, footprint_px2: float | None) -> Camera:
-    """A camera around the asset: the large picture, or one in which its ball covers so
-    many px²."""
+    """Return a camera around the asset: with the large picture, or one in which the
+    asset's ball covers this many px²."""
     means = bundle.level_gaussians(0).means
     center = (means.min(axis=0) + means.max(axis=0)).astype(np.float64) / 2
     radius = float(np.linalg.norm(means - center, axis=1).max())
-    # Directions spread over the sphere between 50 degrees below and above the horizon,
-    # a spiral.
+    # Directions form a spiral on the sphere between 50 degrees below and above the
+    # horizon.
     z = 0.77 * (2 * (view + 0.5) / _VIEWS - 1)
     angle = math.pi * (3 - math.sqrt(5)) * view
     side = math.sqrt(1 - z * z)
@@ -110,8 +111,8 @@ def view_camera(bundle: Bundle, view: int, footprint_px2: float | None) -> Camer
 
 
 def footprint_of_cut(bundle: Bundle, count: int) -> float:
-    """Footprint of the asset's ball at which the default cut has so many gaussians,
-    averaged over views."""
+    """Return the footprint of the asset's ball at which the default cut has this many
+    gaussians, averaged over views."""
     scene = Scene.of(bundle)
     low, high = 1.0, 64.0 * count
     for _ in range(24):
@@ -130,8 +131,8 @@ def footprint_of_cut(bundle: Bundle, count: int) -> float:
 def compare(
     evaluation: Evaluation, bundle: Bundle, theirs: Any, footprint_px2: float | None
 ) -> Row:
-    """Means over the views of FLIP and PSNR, of all gaussians, theirs, and our cut with
-    at most as many."""
+    """Return means over the views of FLIP and PSNR, for all gaussians, theirs, and our
+    cut with at most as many."""
     scene = Scene.of(bundle)
     coarser = bundle.level_range(1)[0] if bundle.num_levels > 1 else 0
     own_filter = (
@@ -147,7 +148,8 @@ def compare(
             bundle, camera, tolerance=tolerance_for(scene, camera, len(theirs)), device="cpu"
         )
         counts.append(ours.stats.gaussians_selected)
-        # Theirs as the asset is drawn, or with our filter where that suits it better.
+        # Their levels are drawn like the asset, or with our filter if that suits them
+        # better.
         drawn = [
             to_8bit(rasterize(theirs, camera, filter_px2=px2, antialiased=compensated).color)
             for px2, compensated in ((0.0, False), own_filter)

@@ -1,5 +1,5 @@
-"""Steadiness: a zoom through the scene, and how much more a frame differs from the next
-than it has to."""
+"""Steadiness: a zoom through the scene, and how much more consecutive frames differ
+than necessary."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ _DRIFT_COLUMNS = (
 
 def tables(result: dict[str, Any]) -> str:
     zoom = markdown(_COLUMNS, result["rows"])
-    if "drift" not in result:  # it was recorded before there was one
+    if "drift" not in result:  # older recordings have no drift
         return zoom
     return "\n\n".join([zoom, _DRIFT, markdown(_DRIFT_COLUMNS, result["drift"])])
 

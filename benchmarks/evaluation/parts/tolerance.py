@@ -40,7 +40,8 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def gsplat_row(evaluation: Evaluation) -> Row:
-    """gsplat draws every gaussian of the scene, which it is given in the world."""
+    """Return the row of gsplat, which draws every gaussian of the scene, already in the
+    world."""
     import torch
 
     every_one = select(

@@ -1,5 +1,5 @@
-"""Tree or DAG (table 3): gaussians a cluster and clusters a group, 8,192 gaussians a
-group throughout."""
+"""Tree or DAG (table 3): gaussians per cluster and clusters per group, always with
+8,192 gaussians per group."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Original views (table 5): the close views for which an asset was trained; nothing may
-be lost there."""
+"""Original views (table 5): the close views that an asset was trained for; nothing may
+be lost in them."""
 
 from __future__ import annotations
 
@@ -113,5 +113,5 @@ def summary(result: dict[str, Any]) -> Summary:
 
 
 def _drop(row: Row) -> float:
-    """PSNR lost to the full asset, dB."""
+    """Return the PSNR lost against the full asset, dB."""
     return float(row["full_psnr"] - row["ours_psnr"])

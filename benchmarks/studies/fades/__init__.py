@@ -1,5 +1,5 @@
-"""Whether a fade between levels removes pops, and what an eye makes of it.
+"""Whether a fade between levels removes visible pops.
 
-`measure` flies bundles along slow paths, `scenes` looks at scenes in windows, and
-`video` asks ColorVideoVDP.
+`measure` moves along slow paths past bundles, `scenes` measures windows of scenes, and
+`video` uses ColorVideoVDP.
 """

@@ -1,9 +1,9 @@
-"""Does a fade between levels remove pops? Bundles on slow paths, beside the hard cut
-and all gaussians.
+"""Does a fade between levels remove pops? Bundles on slow paths, in comparison with the
+hard cut and all gaussians.
 
 The hard cut is drawn twice: at the same tolerance, and at the lower one at which it has
-as many gaussians as the fade. So is a cut that stays as it is in the middle of the
-path: what it flickers is no pop, and no fade can be steadier. docs/fades.md is about
+as many gaussians as the fade. A constant cut is also drawn, that of the middle of the
+path: its flicker is not popping, and no fade can be steadier. docs/fades.md discusses
 the result.
 """
 
@@ -27,7 +27,7 @@ from v3dg.cleaning import ball_of_most
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _HALVINGS = 24
 _FILLS = 2.0  # distance of the nearest camera, in radii of the ball of most gaussians
-_SPACING = 2.5  # of a field, in the same
+_SPACING = 2.5  # between copies in a field, in the same radii
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -83,8 +83,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def filtered(bundle: Bundle, filter_px2: float) -> Bundle:
-    """The bundle whose level 0 is drawn with a filter and compensated opacities, as
-    coarser levels are."""
+    """Return the bundle with a filter and compensated opacities at level 0, as coarser
+    levels have."""
     if filter_px2 == 0.0:
         return bundle
     clusters = bundle.clusters
@@ -98,8 +98,8 @@ def filtered(bundle: Bundle, filter_px2: float) -> Bundle:
 
 
 def field_of(bundle: Bundle, side: int, up: str) -> Scene:
-    """So many times so many of the bundle, each turned about its upright middle at
-    random; one stays."""
+    """Return a square field of copies of the bundle, each rotated about its vertical
+    axis at random; one is not rotated."""
     if side == 1:
         return Scene.of(bundle)
     center, radius = ball_of_most(bundle.level_gaussians(0).means)
@@ -116,14 +116,14 @@ def field_of(bundle: Bundle, side: int, up: str) -> Scene:
 
 
 def axes(up: str) -> tuple[Any, Any]:
-    """What is up, and an axis across."""
+    """Return the vertical axis, and one perpendicular to it."""
     axis = np.array(_AXES[up[-1]]) * (-1 if up[0] == "-" else 1)
     return axis, np.roll(axis, 1)
 
 
 def first_camera(bundle: Bundle, up: str, distance: float, size: int) -> tuple[Camera, Any]:
-    """From where the bundle fills a picture, or so many times as far away; and its
-    middle."""
+    """Return a camera at the distance where the bundle fills a picture, or a multiple
+    of it; and the bundle's middle."""
     center, radius = ball_of_most(bundle.level_gaussians(0).means)
     axis, aside = axes(up)
     direction = math.cos(0.45) * aside + math.sin(0.45) * axis
@@ -132,7 +132,7 @@ def first_camera(bundle: Bundle, up: str, distance: float, size: int) -> tuple[C
 
 
 class Stays:
-    """The hard cut of one camera, whatever the frame, drawn as a fade draws: with a
+    """The hard cut of one camera for all frames, drawn as a fade is drawn: with a
     filter at level 0."""
 
     def __init__(self, camera: Camera, tolerance: float) -> None:
@@ -149,8 +149,8 @@ class Stays:
 def measure(
     scene: Scene, path: CameraPath, options: Any, of: Row, *, along_motion: bool = True
 ) -> list[Row]:
-    """Rows of one path: all gaussians, the hard cut, fades, the hard cut with as many,
-    and one that stays."""
+    """Return the rows of one path: all gaussians, the hard cut, fades, the hard cut
+    with as many gaussians, and the constant cut."""
     tolerance = options.tolerance
     cuts: dict[str, Cut] = {"all": {"tolerance": 0.0}, "hard": {"tolerance": tolerance}}
     cuts |= {f"fade {fade:g}": {"tolerance": tolerance, "fade": fade} for fade in options.fades}
@@ -172,8 +172,8 @@ def _mean_count(scene: Scene, cameras: list[Camera], **how: Any) -> float:
 
 
 def _tolerance_of_count(scene: Scene, cameras: list[Camera], count: float, most: float) -> float:
-    """The least tolerance, up to one, at which the hard cut has at most so many
-    gaussians a frame."""
+    """Return the least tolerance, up to one, at which the hard cut has at most this
+    many gaussians per frame."""
     low, high = most / 4, most
     for _ in range(_HALVINGS):
         middle = math.sqrt(low * high)
@@ -185,10 +185,10 @@ def _tolerance_of_count(scene: Scene, cameras: list[Camera], count: float, most:
 
 
 def verdict(rows: list[Row], fade: float, keys: tuple[str, ...] = ("asset", "distance")) -> Row:
-    """What a fade comes to, for each start: ratios to the hard cut and to all
-    gaussians, of what is worst.
+    """Return the result of a fade for each start: ratios of the worst values to those
+    of the hard cut and of all gaussians.
 
-    Starts differ in the keys. The worst is that of drifts, if there are any.
+    Starts differ in the keys. The worst value is that of drifts, if there are any.
     """
     starts = sorted({tuple(row[key] for key in keys) for row in rows})
     found = []
@@ -231,7 +231,7 @@ def verdict(rows: list[Row], fade: float, keys: tuple[str, ...] = ("asset", "dis
 
 
 def line(row: Row) -> str:
-    """What a row says, in one line."""
+    """Return a row as one line."""
     start = f"{row['asset']:>10} {row['distance']:4g} " if "distance" in row else ""
     warped = (
         f"warped {row['warped_mean']:.3f} {row['warped_worst']:.3f}  "

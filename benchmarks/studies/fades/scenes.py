@@ -1,10 +1,10 @@
-"""Does a fade remove pops in scenes? Instances by the thousand, crowds of captured
-assets, rooms from within.
+"""Does a fade remove pops in scenes? Thousands of instances, crowds of captured assets,
+rooms from inside.
 
-A picture is looked at in windows of some pixels, each of which drifts towards and away
-from what is in its own middle: what moves slowly there hides nothing. All windows
-together are the picture. The cuts are those of `fades`.
-docs/notes/experiments/2026-11-23-fades-scenes-unfiltered.md is about the result.
+A picture is divided into windows of some pixels. Each window drifts towards and away
+from the object in its own middle, so slowly that nothing else hides a pop. All windows
+together form the picture. The cuts are those of `fades`.
+docs/notes/experiments/2026-11-23-fades-scenes-unfiltered.md discusses the result.
 
 A subject is one of
 
@@ -43,30 +43,30 @@ from v3dg import (
 from v3dg._device import to_host
 from v3dg.cleaning import ball_of_most
 
-_PITCH = 2.2  # of a crowd, in radii of the ball of most gaussians
+_PITCH = 2.2  # between members of a crowd, in radii of the ball of most gaussians
 _COVERED, _SEEN = (
     0.9,
     0.25,
-)  # alpha from which on a pixel is of something, and the least share of such pixels
+)  # alpha from which on a pixel shows an object, and the least fraction of such pixels
 
 
 @dataclass
 class Config:
     subjects: tyro.conf.Positional[tuple[str, ...]]
-    """See above."""
+    """See the module's docstring."""
     frames: int = 24
     picture: tuple[int, int] = (1920, 1080)
     window: tuple[int, int] = (320, 180)
     windows: int = 0
-    """Of each camera: those evenly apart among all that tile the picture and show
-    something; 0: all."""
+    """Windows per camera, evenly spaced among those that tile the picture and show an
+    object; 0: all."""
     side: int = 10
-    """Of crowds."""
+    """Number of members per side of a crowd."""
     fades: tuple[float, ...] = (DEFAULT_FADE,)
     tolerance: float = DEFAULT_TOLERANCE
     paths: tuple[str, ...] = ("drift in", "drift out")
     samples: int = SUPERSAMPLING
-    """Of the true pictures, a pixel's side."""
+    """Samples per side of a pixel of the true pictures."""
     level_0_filter: float = 0.0
     """px², with compensated opacities."""
     device: str = "cpu"
@@ -81,7 +81,7 @@ class Subject:
 
 
 def subject_of(text: str, config: Config) -> Subject:
-    """What a subject's name in the command stands for."""
+    """Return the subject that a name in the command means."""
     files, *names = text.split("@")
     path, _, camera_file = files.partition("+")
     if ".v3dg:" in files:
@@ -95,7 +95,7 @@ def subject_of(text: str, config: Config) -> Subject:
 
 
 def with_filter(scene: Scene, filter_px2: float) -> Scene:
-    """The scene whose level 0 is drawn with a filter."""
+    """Return the scene with a filter at level 0."""
     changed = Scene()
     for b, bundle in enumerate(scene.bundles):
         mine = scene.instance_bundle == b
@@ -105,8 +105,8 @@ def with_filter(scene: Scene, filter_px2: float) -> Scene:
 
 
 def crowd_of(members: list[str], side: int) -> Subject:
-    """A square of so many assets to a side, brought to one size and turned upright,
-    each as often as any."""
+    """Return a square crowd of assets, scaled to one size and turned upright, each
+    equally often."""
     random = np.random.default_rng(0)
     who = np.resize(np.arange(len(members)), side * side)
     random.shuffle(who)
@@ -140,7 +140,7 @@ def crowd_of(members: list[str], side: int) -> Subject:
 
 
 def _upright(up: str) -> Any:
-    """(3, 3) rotation that brings what is up to z."""
+    """Return the (3, 3) rotation from the asset's vertical axis to z."""
     axis, aside = axes(up)
     return np.stack([aside, np.cross(axis, aside), axis])
 
@@ -151,7 +151,7 @@ def _about_z(angle: float) -> Any:
 
 
 def _quaternion(turn: Any) -> Any:
-    """(4,) w x y z of a rotation: the eigenvector of its largest eigenvalue."""
+    """Return (4,) w x y z of a rotation: the eigenvector of the largest eigenvalue."""
     (a, b, c), (d, e, f), (g, h, i) = turn
     rows = [
         [a + e + i, h - f, c - g, d - b],
@@ -163,8 +163,8 @@ def _quaternion(turn: Any) -> Any:
 
 
 def windows_of(scene: Scene, camera: Camera, config: Config) -> Iterator[tuple[str, Camera, Any]]:
-    """Parts of a camera's picture, and what each looks at: names, cameras, and places
-    in the world."""
+    """Yield parts of a camera's picture, and the object of each: names, cameras, and
+    positions in the world."""
     camera = resized(camera, config.picture)
     width, height = config.window
     image = render(scene, resized(camera, (480, 270)), depth=True, device=config.device)
@@ -210,11 +210,11 @@ def main(config: Config) -> None:
                         rows += found
                         print(f"{subject.name} {camera_name} {window}, {of['away']} away")
                         print(*map(line, found), sep="\n", flush=True)
-                report(rows, config)  # so that a run that is cut off leaves what it has
+                report(rows, config)  # so that an interrupted run leaves its results
 
 
 def report(rows: list[Row], config: Config) -> None:
-    """Write what there is."""
+    """Write the results so far."""
     settings = {k: v for k, v in vars(config).items() if k not in ("subjects", "json", "device")}
     verdicts = [verdict(rows, fade, ("asset", "camera")) for fade in config.fades]
     write(config.json, {**settings, "rows": rows, "verdict": verdicts}, config.device)

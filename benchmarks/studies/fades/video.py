@@ -1,11 +1,11 @@
-"""What an eye makes of a slow drift: ColorVideoVDP of the hard cut and of a fade,
-beside all gaussians.
+"""The visibility of pops in a slow drift: ColorVideoVDP of the hard cut and of a fade,
+compared with all gaussians.
 
-Frames at 30 a second, as on a screen of 1920 x 1080 px, against two references: frames
-of 4 x 4 samples of all gaussians, from which a cut differs everywhere and always, and
-the same path drawn from the cut of its middle frame, from which it differs by what
-levels do while the camera moves. Needs the package `cvvdp`, and a GPU for large
-pictures; docs/fades.md is about the result.
+Frames at 30 per second, as on a screen of 1920 x 1080 px, are compared with two
+references: frames of all gaussians with 4 x 4 samples, from which a cut differs
+everywhere and always; and the same path drawn from the cut of its middle frame, from
+which it differs only by changes of levels while the camera moves. Needs the package
+`cvvdp`, and a GPU for large pictures; docs/fades.md discusses the result.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ def main(arguments: list[str] | None = None) -> int:
 def measure(
     scene: Scene, cameras: list[Camera], options: argparse.Namespace
 ) -> list[dict[str, Any]]:
-    """Rows of one path: just objectionable differences, 10 where there is none, and
-    gaussians a frame."""
+    """Return the rows of one path: just-objectionable differences, 10 if there are
+    none, and gaussians per frame."""
     import pycvvdp
 
     metric = pycvvdp.cvvdp(display_name=_DISPLAY, device=torch.device(options.device), quiet=True)
@@ -92,7 +92,7 @@ def measure(
             middle = cameras[len(cameras) // 2]
             cut = select(scene, middle, tolerance=tolerance, cull=False, device=options.device)
         for fade in [None, DEFAULT_FADE] if tolerance > 0 else [None]:
-            if cut is not None:  # drawn alike, so that it differs in what pops alone
+            if cut is not None:  # drawn in the same way, so that only pops differ
                 weights = None if fade is None else np.ones(len(cut), np.float32)
                 still = replace(cut, given_weights=weights)
                 references["frozen"] = video(renderer, cameras, 1, cut=still)[0]
@@ -110,8 +110,8 @@ def measure(
 
 
 def video(renderer: Renderer, cameras: list[Camera], samples: int, **cut: Any) -> tuple[Any, float]:
-    """(F, H, W, 3) bytes of the frames, each pixel the mean of so many samples squared;
-    gaussians a frame."""
+    """Return (F, H, W, 3) bytes of the frames, each pixel the mean of samples x
+    samples; and gaussians per frame."""
     frames, gaussians = [], 0
     for camera in cameras:
         image = renderer.render(camera.scaled(samples), **cut)

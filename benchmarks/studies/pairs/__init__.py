@@ -1,4 +1,4 @@
-"""Levels at equal counts and several sizes, beside those of other tools.
+"""Levels at equal counts and several sizes, in comparison with those of other tools.
 
-`measure` records errors of assets (`subject`), `report` makes the page of them.
+`measure` records errors of assets (`subject`), `report` makes a page from them.
 """

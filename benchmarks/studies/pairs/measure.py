@@ -1,37 +1,40 @@
-"""Levels at equal counts and several sizes: ours, merging alone, and what other tools
-and makers left.
+"""Levels at equal counts and several sizes: ours, merging alone, and levels of other
+tools and of the assets' authors.
 
     python -m benchmarks.studies.pairs measure ASSETS -o pairs --device cuda python -m
     benchmarks.studies.pairs report pairs/pairs.json -o docs/notes/pairs.md --plots
     docs/images
 
-ASSETS is a folder with assets.json: for each asset by its name a `file` that v3dg
-reads; `up` for an object, which is drawn from four sides, or for a scene `cameras`, a
-transforms.json, `views`, names of some of them, and `refined_from`, cameras of another
-file by which it is refined; and `published`, by their names the `file` and number of
-`gaussians` of the levels that its makers gave it. Levels of other tools are
-ASSETS/peers/NAME/TOOL_PERCENT.npz, which `subject.pack_level` makes of what
+ASSETS is a folder with assets.json. For each asset it has, by name: a `file` that v3dg
+reads; `up` for an object, which is drawn from four sides; or for a scene `cameras`, a
+transforms.json, `views`, names of some of them, and `refined_from`, a file of other
+cameras for its refinement; and `published`, by name the `file` and number of
+`gaussians` of its authors' levels. Levels of other tools are
+ASSETS/peers/NAME/TOOL_PERCENT.npz, which `subject.pack_level` makes from the output of
 
     splat-transform -g cpu -w NAME.ply -d 50% d_50.ply
     splat-transform -g cpu -w NAME.ply --decimate-adaptive 50% adaptive_50.ply
 
-wrote, or of any format that v3dg reads.
+or from any format that v3dg reads.
 
-A pair is a count and a size. The size at which a level is at home is 2 px² for each of
-its gaussians: of the footprint of the object's ball, or of a scene's picture, for as
-large a share of the level as is in it of the asset. Every level is drawn at `factors`
-times that, measured along a side. Ours and merging alone are the finest cut with at
-most as many gaussians as the other level has, drawn with the filter that the bundle
-asks for, and so are ours refined, with `--refine` and as many steps; others are drawn
-whole and plain. Of a scene those gaussians count whose means are in the picture, in
-each picture anew: others' levels have more of them in one place than in another, so
-there each of them is a pair alone. Cuts are of whole groups: where one has fewer than
-97 % of the count, its error and that of the next finer one are interpolated in the
-logarithm of the count. Where the eye is inside of groups, those are refined at any
-tolerance; a count below what is left is met with the least `min_level` that does. The
-truth is every gaussian at four by four samples a pixel. Of a picture wider than
-`widest` a window is compared, around a gaussian drawn at random from those that are
-large and opaque.
+A pair is a count and a size. A level has its native size at 2 px² for each of its
+gaussians: px² of the footprint of an object's ball, or of a scene's picture multiplied
+by the share of the asset's gaussians that are in it. Every level is drawn at `factors`
+times that size, measured along a side. "Ours" and "merging alone" are the finest cuts
+with at most as many gaussians as the other level, drawn with the filter that the bundle
+requires; with `--refine`, so is "refined". Other levels are drawn completely and
+without a filter.
+
+For a scene, only gaussians whose means are in the picture count, separately in each
+picture: others' levels distribute their gaussians unevenly, so each of these levels
+forms its own pair. Cuts consist of whole groups. If a cut has fewer than 97 % of the
+count, its error and that of the next finer cut are interpolated in the logarithm of the
+count. If the eye is inside of groups, these are refined at any tolerance; a smaller
+count is then met with the least `min_level` that suffices.
+
+The true picture has every gaussian at four by four samples per pixel. For a picture
+wider than `widest`, a window is compared, around a gaussian drawn at random with a
+preference for large and opaque ones.
 """
 
 from __future__ import annotations
@@ -63,10 +66,10 @@ Row = dict[str, Any]
 PERCENTS = (50.0, 25.0, 12.5, 6.25, 3.0, 1.5, 0.7)
 _OURS = ("ours", "refined", "merged")
 _SAMPLES = 4
-_FULL_ENOUGH = 0.97  # of a budget
+_FULL_ENOUGH = 0.97  # fraction of a budget
 _FINEST_PX2, _COARSEST_PX2 = 1e-9, 1e30
-_STEP = 2 ** (-1.5 / 2048)  # cuts of tolerances that lie closer count as neighbours
-_LEAST_PX = 8  # of a side: SSIM needs 6, and below that there is nothing to see
+_STEP = 2 ** (-1.5 / 2048)  # cuts whose tolerances are closer count as neighbours
+_LEAST_PX = 8  # px per side: SSIM needs 6, and smaller pictures show nothing
 
 
 @dataclass
@@ -85,27 +88,27 @@ class Measure:
         "merged",
         "peers",
     )
-    """What is measured; "all" is every gaussian at one sample a pixel."""
+    """Methods to measure; "all" draws every gaussian with one sample per pixel."""
     known: tuple[Path, ...] = ()
     """Recorded results, from which rows are taken that are not measured here."""
     percents: tuple[float, ...] = PERCENTS
-    """Counts, in percent of the asset's."""
+    """Counts of gaussians, in percent of the asset's count."""
     factors: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-    """Sizes, in those at which a level is at home."""
+    """Picture sizes, relative to the native size of each level."""
     widest: int = 512
     """px of a side of the pictures that are compared."""
     views: int = 4
     device: Literal["auto", "cpu", "cuda"] = "auto"
     build: v3dg.BuildConfig = field(default_factory=v3dg.BuildConfig)
-    """How ours are built; merging alone is the same without a step."""
+    """Settings of our levels; "merged" has the same settings, without fitting steps."""
     refine: int = 0
-    """Steps of "refined": ours, refined; without any it is left out."""
+    """Refinement steps of the method "refined"; with 0 steps it is left out."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What is drawn: gaussians whole, or a cut of a bundle; what they weigh in the
-    error of their method."""
+    """The subject of a picture: all gaussians, or a cut of a bundle; and the weight of
+    the picture in the error of its method."""
 
     method: str
     subject: v3dg.Gaussians | v3dg.Bundle
@@ -116,32 +119,32 @@ class Shown:
 
 @dataclass(frozen=True)
 class Level:
-    """Gaussians that stand for an asset, and who made them."""
+    """Gaussians that represent an asset, and their origin."""
 
     method: str
     gaussians: v3dg.Gaussians
     counts: list[int]
-    """Of gaussians that count, in each view."""
+    """Number of gaussians that count, in each view."""
 
 
 def errors(item: tuple[Row, Picture, Picture]) -> Row:
-    """FLIP, PSNR and SSIM of (what it is, truth, picture)."""
+    """Return FLIP, PSNR and SSIM of (description, truth, picture)."""
     return errors_of(item[1], item[2])
 
 
 @dataclass(frozen=True)
 class Target:
-    """A count that ours are to meet, and others' levels of it."""
+    """A count that our cuts have to meet, and others' levels with that count."""
 
     label: float | str
     count: int
     counts: list[int]
-    """Of gaussians that count, in each view."""
+    """Number of gaussians that count, in each view."""
     levels: list[Level]
 
 
 class Study:
-    """What is measured, where."""
+    """The measured pairs and methods."""
 
     def __init__(self, config: Measure) -> None:
         self._config = config
@@ -149,7 +152,7 @@ class Study:
         self.builds: dict[str, Row] = {}
 
     def rows(self, subject: Subject, judges: Judges) -> list[Row]:
-        """Means over the views of each method, count and size."""
+        """Return means over the views of each method, count and size."""
         views: dict[tuple[Any, ...], list[Row]] = {}
         for (about, _, _), found in judges.measured(self._drawn(subject), errors):
             key = tuple(
@@ -160,7 +163,7 @@ class Study:
         return [dict(zip(names, key, strict=True)) | weighted(rows) for key, rows in views.items()]
 
     def _drawn(self, subject: Subject) -> Iterator[tuple[Row, Picture, Picture]]:
-        """What is to be compared: what it is, the truth, the picture."""
+        """Yield the comparisons: description, truth, picture."""
         wanted_of_ours = set[str](self._config.methods) - (
             {"refined"} if self._config.refine == 0 else set()
         )
@@ -179,8 +182,8 @@ class Study:
                 yield from self._compared(subject, target, factor, bundles, sizes)
 
     def _targets(self, subject: Subject) -> list[Target]:
-        """Objects at each percent; of a scene each other level, which have different
-        counts in a picture."""
+        """Return the targets: for objects each percentage; for a scene each other
+        level, because their counts in a picture differ."""
         targets: dict[float | str, Target] = {}
         for percent in self._config.percents:
             counts = [round(count * percent / 100) for count in self._asset.counts]
@@ -211,7 +214,7 @@ class Study:
         return gaussians.torch("cuda") if self.device == "cuda" else gaussians
 
     def _built(self, subject: Subject, name: str, ours: v3dg.Bundle | None) -> v3dg.Bundle:
-        """What is refined is `ours`, or built for it."""
+        """Return the bundle to refine: `ours`, or one that is built for it."""
         config = replace(self._config.build, steps=0) if name == "merged" else self._config.build
         start = time.perf_counter()
         if name == "refined" and ours is not None:
@@ -268,8 +271,8 @@ class Study:
 
 
 def cluster_sizes(bundle: v3dg.Bundle, camera: v3dg.Camera | None = None) -> Any:
-    """(C,) gaussians of each cluster; with a camera, those whose means are in its
-    picture."""
+    """Return (C,) the gaussians of each cluster; with a camera, only those whose means
+    are in its picture."""
     offset = bundle.clusters.offset
     if camera is None:
         return np.diff(offset)
@@ -280,10 +283,10 @@ def cluster_sizes(bundle: v3dg.Bundle, camera: v3dg.Camera | None = None) -> Any
 def cuts_of(
     name: str, bundle: v3dg.Bundle, camera: v3dg.Camera, count: int, sizes: Any = None
 ) -> list[Shown]:
-    """The finest cut with at most so many gaussians, and the next finer one if it has
-    far fewer.
+    """Return the finest cut with at most this many gaussians, and the next finer one if
+    it has far fewer.
 
-    `sizes`: how many gaussians of each cluster count; all by default.
+    `sizes`: number of gaussians of each cluster that count; by default all.
     """
     scene = v3dg.Scene.of(bundle)
     sizes = cluster_sizes(bundle) if sizes is None else sizes
@@ -321,7 +324,7 @@ def cuts_of(
 
 
 def weighted(rows: list[Row]) -> Row:
-    """Means of what was measured, each row by its weight."""
+    """Return weighted means of the measurements."""
     means: Row = {}
     for name in ("gaussians", "tolerance", "flip", "psnr", "ssim"):
         known = [row for row in rows if row[name] is not None]
@@ -371,8 +374,8 @@ def by_key(rows: list[Row]) -> dict[tuple[Any, ...], Row]:
 def known_results(
     paths: tuple[Path, ...], settings: Row, changes: Row
 ) -> tuple[dict[tuple[Any, ...], Row], dict[str, Row], Row]:
-    """Rows and builds of recorded results, which must have been made alike, and all
-    changes."""
+    """Return rows and builds of recorded results, which must have the same settings,
+    and all changes."""
     rows: dict[tuple[Any, ...], Row] = {}
     builds: dict[str, Row] = {}
     for path in paths:

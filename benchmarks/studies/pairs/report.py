@@ -1,5 +1,5 @@
-"""The page of `pairs`: tables of our error by the best other tool's at equal counts,
-and plots."""
+"""The page of `pairs`: tables of our error relative to the best other tool's at equal
+counts, and plots."""
 
 from __future__ import annotations
 
@@ -33,10 +33,11 @@ _ABOUT = """# Levels at equal counts and several sizes
 
 Written by `python -m benchmarks.studies.pairs report` from recorded JSON, never by hand.
 
-A level is at home at 2 px² a gaussian: of the footprint of the object's ball, or of a scene's picture, for
-as large a share of them as is in it of the asset. (Groups of a bundle are fitted at 2 px² of their own
-balls, which overlap and lie behind each other: they are at home at a quarter to half the size that is called
-1 here.) Each level is drawn at several times that size, along a side, by the same renderer, and compared
+The native size of a level is 2 px² per gaussian. For an object, the area is the footprint of its ball. For a
+scene, it is the whole picture, and as large a share of the level's gaussians counts as of the asset's
+gaussians is in the picture. (Groups of a bundle are fitted at 2 px² per gaussian of their own balls, which
+overlap and hide each other, so their native size is a quarter to half of the size that is called 1 here.)
+Each level is drawn at several times that size, along a side, by the same renderer, and compared
 with every gaussian at 4 x 4 samples a pixel: FLIP (67 pixels per degree), PSNR and SSIM, means of {views}
 views, windows of at most {widest} px. *Ours* is the finest cut with at most as many gaussians as the other
 level has (of a scene, as many as it has in each picture), interpolated between two cuts where groups are too
@@ -60,8 +61,8 @@ class Report:
 
 
 def best_others(rows: Sequence[Row], which: str = "ours") -> list[Row]:
-    """One row for each pair of a count and a size that others have, too: which of ours,
-    the best other."""
+    """Return one row for each pair of a count and a size that others have, too: ours,
+    and the best other."""
     pairs: dict[tuple[Any, ...], dict[str, Row]] = {}
     for row in rows:
         pairs.setdefault((row["asset"], row["level"], row["factor"]), {})[row["method"]] = row
@@ -94,8 +95,8 @@ def _ratio(ours: float, theirs: float) -> float:
 
 
 def overview(rows: Sequence[Row], which: str = "ours") -> str:
-    """A line for each asset, and of all of them one, one from half the size on, and one
-    for each size."""
+    """Return a line for each asset, and for all assets: one in total, one from half the
+    size on, and one for each size."""
     pairs = best_others(rows, which)
     names = list(dict.fromkeys(row["asset"] for row in pairs))
     lines = [_line(name, [row for row in pairs if row["asset"] == name]) for name in names]
@@ -150,8 +151,8 @@ def _level(row: Row) -> str:
 
 
 def table(pairs: Sequence[Row]) -> str:
-    """Of one asset: counts down, sizes across, FLIP of ours and of the best other, and
-    their ratio."""
+    """Return the table of one asset: counts down, sizes across, FLIP of ours and of the
+    best other, and their ratio."""
     factors = sorted({row["factor"] for row in pairs})
     lines: dict[Any, Row] = {}
     for row in sorted(pairs, key=lambda row: -row["count"]):
@@ -171,8 +172,8 @@ def table(pairs: Sequence[Row]) -> str:
 
 
 def rows_of(recorded: Row) -> list[Row]:
-    """The rows of a result, which has them as written, or as lists beside the names of
-    their columns."""
+    """Return the rows of a result, which stores them as dicts, or as lists with
+    separate names of columns."""
     columns = recorded.get("columns")
     if columns is None:
         return list(recorded["rows"])
@@ -211,7 +212,7 @@ def report(options: Report) -> None:
 
 
 def plot(rows: Sequence[Row], path: Path) -> None:
-    """Count against FLIP, and below it PSNR, for each size: three sizes side by side,
+    """Plot count against FLIP, and PSNR below, for each size: three sizes side by side,
     as wide as a page."""
     import matplotlib
 
@@ -259,8 +260,8 @@ def plot(rows: Sequence[Row], path: Path) -> None:
 
 
 def _draw(panel: Any, rows: Sequence[Row], key: str) -> None:
-    """The points of each method, at one size, where others' levels of as many gaussians
-    are."""
+    """Plot one curve per method from rows of one picture size, at the counts of
+    gaussians at which another tool has a level."""
     counts = {
         row["level"]: row["gaussians"] for row in rows if row["method"] not in (*_OURS, "all")
     }

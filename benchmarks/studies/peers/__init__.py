@@ -1,5 +1,5 @@
-"""Our frames and gradients beside those of other rasterizers, in one run.
+"""Our frames and gradients in comparison with those of other rasterizers, in one run.
 
-`measure` records what everyone takes, `scenes` and `draw` say of what and how, and
-`report` makes the page of one or more results.
+`measure` records the measurements, `scenes` and `draw` define the scenes and renderers,
+and `report` makes a page of one or more results.
 """

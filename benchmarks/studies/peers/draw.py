@@ -1,8 +1,8 @@
-"""The renderers that `peers` compares: how each is given a scene, draws it, and is
-trained with.
+"""The renderers that `peers` compares: how each gets a scene, draws it, and is used in
+training.
 
-Each is driven as its authors' example or renderer drives it. What needs no camera is
-prepared before the time is taken, and so is what a camera needs of tensors.
+Each is used as in its authors' example or renderer. Everything that does not depend on
+a camera, and the tensors of a camera, are prepared before the time is measured.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from v3dg import _core
 from v3dg.cameras import Camera
 
 Draw: TypeAlias = Callable[[], Any]
-"""Draws a frame; what it returns is for the `picture` of its renderer."""
+"""Draws a frame; the `picture` of its renderer converts the result."""
 Prepare: TypeAlias = Callable[[Subject, float], Callable[[Camera], Draw]]
 Step: TypeAlias = "Callable[[Raw, Camera, float, Any], Trained]"
 
@@ -31,7 +31,7 @@ _MOST_SH = 16
 
 @dataclass(frozen=True)
 class Raw:
-    """Gaussians as optimisers hold them: logarithms of scales, logits of opacities."""
+    """Gaussians as optimisers store them: logarithms of scales, logits of opacities."""
 
     means: Any
     log_scales: Any
@@ -56,7 +56,7 @@ class Raw:
 
 @dataclass(frozen=True)
 class Trained:
-    """A training step that is ready to be taken."""
+    """A prepared training step."""
 
     forward: Draw
     step: Callable[[], tuple[Any, ...]]
@@ -67,36 +67,35 @@ class Trained:
 
 @dataclass(frozen=True)
 class Peer:
-    """A renderer, or one of the ways in which it can be used."""
+    """A renderer, or one of the ways to use it."""
 
     name: str
     prepare: Prepare
     picture: Callable[[Any], Any] = lambda frame: frame
-    """(H, W, 3) of what was drawn, on black; a float is 0 to 1."""
+    """Return (H, W, 3) of what was drawn, on black; floats are from 0 to 1."""
     train: Step | None = None
     keeps: Callable[[Subject, float], tuple[str, ...]] = lambda subject, filter_px2: INPUTS
-    """What of the subject's gaussians it draws from; of the rest it has copies of its
-    own."""
+    """The subject's gaussians that it draws from; it has copies of the others."""
     sh_degrees: tuple[int, ...] = (0, 1, 2, 3)
     differs: str = ""
-    """What it does otherwise than gsplat 1.5 does, as far as that shows in errors."""
+    """Differences to gsplat 1.5 that affect errors."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """What is measured in one process."""
+    """The measurements of one process."""
 
     name: str
-    """Also of the folder that is put in front of Python's path."""
+    """Also the folder that is put in front of Python's path."""
     module: str
-    """Without which there is nothing to measure."""
+    """The module without which nothing can be measured."""
     peers: tuple[Peer, ...]
     filter_px2: float | None = None
     """The only filter that was compiled in."""
 
 
 def differentiate(draw: Callable[[Raw, Camera, float], Any]) -> Step:
-    """Training with a function from gaussians to a picture (H, W, 3)."""
+    """Return the training step of a function from gaussians to a picture (H, W, 3)."""
 
     def train(raw: Raw, camera: Camera, filter_px2: float, weights: Any) -> Trained:
         import torch
@@ -119,8 +118,8 @@ def differentiate(draw: Callable[[Raw, Camera, float], Any]) -> Step:
 
 
 def v3dg_renderer(min_transmittance: float | None) -> Prepare:
-    """With None scenes and bundles stop where they do by default, and assets where
-    gsplat does."""
+    """Return the renderer of v3dg. If `min_transmittance` is None, pixels of scenes and
+    bundles stop at the default transmittance, and those of assets as in gsplat."""
 
     def prepare(subject: Subject, filter_px2: float) -> Callable[[Camera], Draw]:
         whole, device = subject.whole(filter_px2), subject.gaussians.means.device.type
@@ -143,8 +142,8 @@ def v3dg_renderer(min_transmittance: float | None) -> Prepare:
 
 
 def v3dg_keeps(subject: Subject, filter_px2: float) -> tuple[str, ...]:
-    """An asset is drawn from where it is, a scene and a bundle from what is
-    resident."""
+    """Return the inputs that are not copied: an asset is drawn from its arrays, a scene
+    and a bundle from resident data."""
     return INPUTS if subject.layout is None and filter_px2 == 0 else ()
 
 
@@ -177,7 +176,7 @@ def gsplat_training(packed: bool) -> Step:
 
 
 def higs(sh_compression: str) -> Prepare:
-    """gsplat's inference renderer, of its main branch after 1.5."""
+    """Return gsplat's inference renderer, from its main branch after 1.5."""
 
     def prepare(subject: Subject, filter_px2: float) -> Callable[[Camera], Draw]:
         from gsplat.experimental.render import GaussianInferenceRenderer
@@ -209,7 +208,7 @@ def higs(sh_compression: str) -> Prepare:
 
 
 def higs_picture(done: Any) -> Any:
-    """Without its transmittance."""
+    """Return the picture without its transmittance."""
     return done.frame[0, ..., :3]
 
 
@@ -217,7 +216,7 @@ def higs_picture(done: Any) -> Any:
 
 
 def fastergs_inputs(raw: Raw) -> tuple[Any, ...]:
-    """In the order in which its functions take them."""
+    """Return the inputs in the order of its functions' arguments."""
     rest = raw.sh[:, 1:].contiguous()
     return (
         raw.means,
@@ -342,18 +341,18 @@ def flashgs(subject: Subject, filter_px2: float) -> Callable[[Camera], Draw]:
     return of
 
 
-_FLASHGS_FAR = 100.0  # of its example; nothing is cut there
+_FLASHGS_FAR = 100.0  # from its example; nothing is that far
 
 
 def flashgs_picture(color: Any) -> Any:
-    """Its bytes are declared as signed."""
+    """Return the picture, whose bytes are declared as signed."""
     import torch
 
     return color.view(torch.uint8)
 
 
 def covariances(gaussians: v3dg.Gaussians) -> Any:
-    """(N, 6) upper triangles of the gaussians' covariances in the world."""
+    """Return (N, 6) upper triangles of the gaussians' covariances in the world."""
     import torch
 
     w, x, y, z = gaussians.quats.unbind(1)
@@ -384,8 +383,8 @@ def keeps(*names: str) -> Callable[[Subject, float], tuple[str, ...]]:
 
 
 def jobs() -> tuple[Job, ...]:
-    """What there is to measure, v3dg first and again at the end: a clock that has
-    changed shows."""
+    """Return the jobs, with v3dg first and again at the end, which shows whether the
+    clock has changed."""
     stop = "pixels of scenes and bundles stop behind what leaves a thousandth of the light"
     ours = (
         Peer(

@@ -1,25 +1,24 @@
-"""Our frames and gradients beside those of other rasterizers, in one run: times, memory
-and errors.
+"""Our frames and gradients in comparison with those of other rasterizers, in one run:
+times, memory and errors.
 
     python -m benchmarks.studies.peers --layout donutsea.json --asset donut.ply \\
         --captured ASSETS --names Fungi --modules PEERS -o peers.json
 
-Measured is what can be imported: gsplat 1.5, the inference renderer of its main branch
-("HiGS"), Faster-GS, FlashGS. PEERS has a folder for each that is put in front of
-Python's path: `gsplat`, `higs`, and, because the latter two have the filter compiled
-in, `fastergs_0`, `fastergs_0.3`, `flashgs_0` and `flashgs_0.3`. Every one is measured
-in a process of its own, so that one that fails leaves the others alone; what failed is
-in the result with what it said.
+It measures the renderers that can be imported: gsplat 1.5, the inference renderer of
+its main branch ("HiGS"), Faster-GS, FlashGS. PEERS has a folder for each that is put in
+front of Python's path: `gsplat`, `higs`, and, because the other two have the filter
+compiled in, `fastergs_0`, `fastergs_0.3`, `flashgs_0` and `flashgs_0.3`. Each is
+measured in a separate process, so that a failure does not affect the others; the result
+contains failures with their messages.
 
-ASSETS is a folder as `pairs` has it. Instances are drawn without a filter, assets and
-random gaussians with 0.3 px², as assets are trained, and, at the first size, without
-one. Times are of CUDA events around single calls that start on an idle device and end
-with it, so what Python costs is in them. Errors are to float64, in eight windows of
-each picture. Memory is what the process has on the device while it draws, without those
-inputs of which the renderer has a copy of its own. A training step starts from
-logarithms of scales and logits of opacities, as optimisers hold them, and its loss is a
-weighted sum of the picture's colours. Gradients of few gaussians are compared with
-float64's.
+ASSETS is a folder as for `pairs`. Instances are drawn without a filter, assets and
+random gaussians with 0.3 px², as in training, and, at the first size, without one.
+Times are of CUDA events around single calls from idle device to idle device, so
+Python's part is included. Errors are relative to float64, in eight windows of each
+picture. Memory is that of the process on the device while it draws, without inputs that
+the renderer has copied. A training step starts from logarithms of scales and logits of
+opacities, as in optimisers, and its loss is a weighted sum of the picture's colours.
+Gradients of few gaussians are compared with float64's.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ Row = dict[str, Any]
 
 _WARM_UPS = 3
 _LEAST_REPEATS, _MOST_REPEATS = 7, 51
-_SMALL = 20_000, 320, 180  # gaussians and picture of which gradients are compared with float64
+_SMALL = 20_000, 320, 180  # gaussians and picture size for the comparison of gradients with float64
 _TRUTHS = "truths"
 _OURS = "v3dg"
 
@@ -63,36 +62,36 @@ class Config:
     layout: Path | None = None
     """A layout of instances of that asset; without one, that part is left out."""
     cameras: tuple[int, ...] = (45, 50, 55, 59)
-    """Which cameras of the layout."""
+    """Indices of the layout's cameras."""
     captured: Path | None = None
     """A folder with assets.json; without one, that part is left out."""
     names: tuple[str, ...] = ()
-    """Assets of that folder."""
+    """Names of assets in that folder."""
     counts: tuple[int, ...] = (1_000_000, 4_000_000, 20_000_000)
-    """How many random gaussians."""
+    """Number of random gaussians."""
     sh_degree: int = 3
-    """Of the random gaussians."""
+    """SH degree of the random gaussians."""
     widths: tuple[int, ...] = (1920, 3840)
     """px; pictures are 16 : 9."""
     train_at_most: int = 4_000_000
-    """Gaussians of the scenes that are trained with."""
+    """Number of gaussians in the scenes of training."""
     modules: Path | None = None
-    """Folder with a folder for each of the peers."""
+    """Folder with a folder for each of the other renderers."""
     jobs: tuple[str, ...] = ()
-    """Which processes, by the names of their folders; all by default."""
+    """Names of the folders to run; all by default."""
     seconds: float = 0.4
-    """Time to spend on a row, within 7 to 51 repeats."""
+    """Seconds to spend on a row, within 7 to 51 repeats."""
     patience: float = 180.0
-    """Seconds after which a process is ended."""
+    """Seconds after which a process is terminated."""
     window: int = 128
-    """px of a side of the windows that are compared."""
+    """px per side of the windows that are compared."""
     device: Literal["cpu", "cuda"] = "cuda"
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
 
 
 def subjects(config: Config) -> Iterator[tuple[str, Callable[[], Subject]]]:
-    """Names of scenes, and what makes each; the largest last, for a pool keeps what was
-    taken once."""
+    """Yield names of scenes and their constructors; the largest comes last, because a
+    memory pool never shrinks."""
     device = config.device
     for name in config.names:
         yield name, partial(scenes.captured, config.captured or Path(), name, device)
@@ -104,7 +103,7 @@ def subjects(config: Config) -> Iterator[tuple[str, Callable[[], Subject]]]:
 
 
 def views(config: Config, subject: Subject, filter_px2: float) -> Iterator[tuple[Row, Camera]]:
-    """The pictures that are drawn with a filter: what they are, and their cameras."""
+    """Yield the pictures with a filter: their names and cameras."""
     widths = config.widths if filter_px2 == subject.filters_px2[0] else config.widths[:1]
     for width in widths:
         for name, camera in subject.cameras.items():
@@ -114,8 +113,8 @@ def views(config: Config, subject: Subject, filter_px2: float) -> Iterator[tuple
 
 
 class Book:
-    """Rows as they are measured, a line of JSON each, so that a process that ends
-    leaves what it had."""
+    """Writes each row when it is measured, as a line of JSON, so that a process that
+    ends early leaves its results."""
 
     def __init__(self, folder: Path, job: str) -> None:
         self._path, self._folder, self._job = folder / f"{job}.jsonl", folder, job
@@ -141,7 +140,7 @@ class Book:
 
 
 def work(config: Config, name: str, folder: Path) -> None:
-    """What a process does."""
+    """Do the work of one process."""
     book = Book(folder, name)
     job = next((job for job in jobs() if job.name == name), None)
     if config.modules is not None:
@@ -153,7 +152,7 @@ def work(config: Config, name: str, folder: Path) -> None:
         book.failure({}, error)
         return
     if config.device == "cuda":
-        with gpu.PeakMemory():  # the first one notes what an idle process has
+        with gpu.PeakMemory():  # the first one measures an idle process
             pass
     for scene, make in subjects(config):
         try:
@@ -177,7 +176,7 @@ def write_truths(config: Config, subject: Subject, book: Book) -> None:
 
 
 def measure(config: Config, job: Job, subject: Subject, book: Book) -> None:
-    """Frames of every view, and training steps of the first one."""
+    """Measure frames of every view, and training steps of the first one."""
     filters = [px2 for px2 in subject.filters_px2 if job.filter_px2 in (None, px2)]
     few = len(subject.gaussians) <= config.train_at_most
     for peer in job.peers:
@@ -215,7 +214,7 @@ def frames(config: Config, peer: Peer, subject: Subject, filter_px2: float, book
 
 
 def training(config: Config, peer: Peer, subject: Subject, filter_px2: float, book: Book) -> None:
-    """A step of the first view."""
+    """Measure a step of the first view."""
     import torch
 
     assert peer.train is not None
@@ -231,7 +230,7 @@ def training(config: Config, peer: Peer, subject: Subject, filter_px2: float, bo
 
 
 def measured(config: Config, draw: Draw, spare: float = 0.0) -> tuple[Row, Any]:
-    """Times of a call and the device's memory during it, and what it returned.
+    """Return times of a call and the device's memory during it, and its result.
 
     Args:
         spare: Gigabytes in use that the call does not need.
@@ -241,7 +240,7 @@ def measured(config: Config, draw: Draw, spare: float = 0.0) -> tuple[Row, Any]:
         with gpu.PeakMemory() as memory:
             for _ in range(_WARM_UPS):
                 draw()
-            times_ms(draw, config.device, 1)  # ends on an idle device
+            times_ms(draw, config.device, 1)  # ends with an idle device
         gigabytes = round(memory.gigabytes - spare, 2)
     first = statistics.median(times_ms(draw, config.device, 3))
     repeats = int(min(max(1e3 * config.seconds / max(first, 1e-3), _LEAST_REPEATS), _MOST_REPEATS))
@@ -259,7 +258,8 @@ def measured(config: Config, draw: Draw, spare: float = 0.0) -> tuple[Row, Any]:
 
 
 def errors_of(picture: Any, camera: Camera, path: Path, side: int) -> Row:
-    """How far the windows of a picture are from the truth, both clipped to [0, 1]."""
+    """Return the error of the windows of a picture against the truth, both clipped to
+    [0, 1]."""
     if not path.exists():
         return {}
     picture = picture.cpu().numpy() if hasattr(picture, "cpu") else np.asarray(picture)
@@ -280,7 +280,7 @@ def errors_of(picture: Any, camera: Camera, path: Path, side: int) -> Row:
 
 
 def compare_gradients(config: Config, job: Job, book: Book) -> None:
-    """Relative L2 distances of gradients to those of float64, of few gaussians in a
+    """Record relative L2 distances of gradients to float64, for few gaussians in a
     small picture."""
     trainable = [peer for peer in job.peers if peer.train and job.filter_px2 in (None, TRAINED_PX2)]
     if not trainable:
@@ -308,7 +308,7 @@ def compare_gradients(config: Config, job: Job, book: Book) -> None:
 
 
 def distances(values: dict[str, Any], truths: dict[str, Any]) -> dict[str, float]:
-    """Relative to the truths' lengths."""
+    """Return distances relative to the truths' norms."""
     found = {
         name: float((values[name] - truths[name]).norm() / truths[name].norm()) for name in ROWS
     }
@@ -316,7 +316,7 @@ def distances(values: dict[str, Any], truths: dict[str, Any]) -> dict[str, float
 
 
 def run(config: Config, name: str, folder: Path) -> list[Row]:
-    """The rows of one process, and that it failed if it did."""
+    """Return the rows of one process, and a failure if it failed."""
     book = Book(folder, name)
     process = multiprocessing.get_context("spawn").Process(target=work, args=(config, name, folder))
     process.start()
@@ -354,14 +354,14 @@ def result(config: Config, rows: list[Row]) -> Row:
 
 
 def version_of(config: Config, job: str) -> str | None:
-    """What the folder of a peer says in its file VERSION."""
+    """Return the content of the file VERSION in a renderer's folder."""
     path = (config.modules or Path()) / job / "VERSION"
     return path.read_text().strip() if config.modules and path.exists() else None
 
 
 def print_table(rows: list[Row]) -> None:
-    """Of each picture ours over the fastest peer, and everyone's times, PSNR to
-    float64, and memory."""
+    """Print, for each picture, our time relative to the fastest other renderer, and all
+    times, PSNR to float64, and memory."""
     pictures: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         key = tuple(row[name] for name in ("scene", "view", "width", "filter_px2"))

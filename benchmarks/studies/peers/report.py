@@ -1,9 +1,9 @@
-"""The page of `peers`: tables of everyone's times, errors and memory, from one or more
+"""The page of `peers`: tables of all times, errors and memory, from one or more
 recorded results.
 
     python -m benchmarks.studies.peers.report peers.json -o docs/notes/peers.md
 
-Ours is the quicker of `v3dg.Renderer` and `v3dg.rasterize` in the same row, where both
+"Ours" is the faster of `v3dg.Renderer` and `v3dg.rasterize` in the same row, if both
 were measured.
 """
 
@@ -39,19 +39,19 @@ pixels stop where everyone's do.
 @dataclass
 class Report:
     results: tyro.conf.Positional[tuple[Path, ...]]
-    """What `peers` has written; where two have a row, the later one counts."""
+    """Output files of `peers`; if two contain a row, the later one is used."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("peers.md")
 
 
 def family(row: Row) -> str:
-    """Whose row it is: ways to use one renderer are one."""
+    """Return the renderer of a row: the ways to use one renderer are combined."""
     if row["renderer"].startswith(_OURS):
         return _LIKE_GSPLAT if row["renderer"].endswith("1e-4") else _OURS
     return str(row["renderer"]).replace(" packed", "")
 
 
 def quickest(rows: list[Row], key: tuple[str, ...]) -> dict[tuple[Any, ...], dict[str, Row]]:
-    """Of each picture the quickest row of everyone."""
+    """Return the fastest row of every renderer for each picture."""
     found: dict[tuple[Any, ...], dict[str, Row]] = {}
     for row in rows:
         if row["job"].endswith("again"):
@@ -64,7 +64,7 @@ def quickest(rows: list[Row], key: tuple[str, ...]) -> dict[tuple[Any, ...], dic
 
 
 def ratio(everyone: dict[str, Row]) -> float | None:
-    """Ours over the fastest peer's."""
+    """Return our time relative to the fastest other renderer's."""
     peers = [row["ms"] for name, row in everyone.items() if not name.startswith(_OURS)]
     return everyone[_OURS]["ms"] / min(peers) if peers and _OURS in everyone else None
 
@@ -97,7 +97,8 @@ def frame_tables(rows: list[Row]) -> list[str]:
 
 
 def training_table(rows: list[Row], gradients: list[Row]) -> str:
-    """Each scene's steps, and how far everyone's gradients are from float64's."""
+    """Return the table of each scene's training steps, and the distances of all
+    gradients to float64's."""
     worst = {row["renderer"]: max(row["relative_l2"].values()) for row in gradients}
     table = []
     for everyone in quickest(rows, ("scene", "width")).values():
@@ -149,7 +150,7 @@ def page(results: list[Row]) -> str:
 
 
 def latest(rows: list[Row]) -> list[Row]:
-    """Rows of which no later one says the same."""
+    """Return the rows that are not replaced by a later one."""
     keys = ("job", "renderer", "scene", "view", "width", "filter_px2")
     return list({tuple(row[name] for name in keys): row for row in rows}.values())
 

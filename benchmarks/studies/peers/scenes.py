@@ -1,5 +1,5 @@
-"""What `peers` draws: scenes with their cameras, and what float64 says of windows of
-the pictures."""
+"""The scenes and cameras of `peers`, and the float64 truth of windows of the
+pictures."""
 
 from __future__ import annotations
 
@@ -24,36 +24,37 @@ TRAINED_PX2 = 0.3
 """The filter of the original 3DGS code, with which assets are trained."""
 
 TRAINED_WIDTH = 1920
-"""px of the pictures whose sizes random gaussians have."""
+"""Width in px of the pictures for which random gaussians have realistic sizes."""
 
-_ONE_LEVEL = 1 << 30  # clusters that a level needs for another one to be built
+_ONE_LEVEL = 1 << 30  # minimum of clusters for another level, so that only one level is built
 _MOST_IN_A_BUNDLE = 5_000_000
 _SIZE = {"width": TRAINED_WIDTH, "height": TRAINED_WIDTH * 9 // 16}
-_HIGH = 0.9  # of a scene's gaussians are below an eye that looks from above
-_DISTANCE = 2.0  # of the eye from the middle, in diagonals of what it is to see
-_SIGMAS, _MARGIN_PX = 3.34, 2.0  # farther away a gaussian of opacity 1 is below 1/255
+_HIGH = 0.9  # fraction of a scene's gaussians below an eye that looks from above
+_DISTANCE = 2.0  # distance of the eye from the middle, in diagonals of the visible part
+_SIGMAS, _MARGIN_PX = 3.34, 2.0  # a gaussian of opacity 1 is below 1/255 at this distance
 _CHUNK = 4_000_000
 
 
 @dataclass(frozen=True)
 class Subject:
-    """Gaussians on a device, as everyone gets them, and from where they are seen."""
+    """Gaussians on a device, as all renderers get them, and their cameras."""
 
     name: str
     gaussians: v3dg.Gaussians
     """torch tensors, float32, quaternions of length 1."""
     cameras: dict[str, Camera]
     filters_px2: tuple[float, ...]
-    """Variances of the filter with which they are drawn."""
+    """Variances of the filters."""
     layout: Path | None = None
     asset: v3dg.Gaussians | None = field(default=None, repr=False)
-    """What the instances of the layout are of."""
+    """The asset of the layout's instances."""
 
     def whole(self, filter_px2: float) -> v3dg.Scene | v3dg.Bundle | v3dg.Gaussians:
-        """What `v3dg.Renderer` draws the same picture of, at a tolerance of 0.
+        """Return the subject with which `v3dg.Renderer` draws the same picture, at a
+        tolerance of 0.
 
         Raises:
-            ValueError: More gaussians than are sorted into a bundle here.
+            ValueError: There are too many gaussians to be sorted into a bundle here.
         """
         if self.layout is not None and self.asset is not None:
             return _placed(self.layout, self.asset, filter_px2)[0]
@@ -67,7 +68,7 @@ class Subject:
 
 
 def one_level(asset: v3dg.Gaussians, filter_px2: float) -> v3dg.Bundle:
-    """All that an asset has, in a bundle without coarser levels."""
+    """Return all gaussians of an asset, in a bundle without coarser levels."""
     config = BuildConfig(min_clusters=_ONE_LEVEL, asset_filter_px2=filter_px2)
     return build_bundle(asset, config=config, progress=False, device="cpu")
 
@@ -79,8 +80,8 @@ def _placed(
 
 
 def at_size(camera: Camera, width: int, height: int) -> Camera:
-    """The same view on more or fewer pixels; another aspect ratio shows more or less
-    above and below."""
+    """Return the same view with more or fewer pixels; another aspect ratio changes the
+    vertical extent."""
     scale = width / camera.width
     K = camera.K * np.array([[scale], [scale], [1.0]])
     K[:2, 2] = width / 2, height / 2
@@ -88,13 +89,13 @@ def at_size(camera: Camera, width: int, height: int) -> Camera:
 
 
 def on_device(gaussians: v3dg.Gaussians, device: str) -> v3dg.Gaussians:
-    """As tensors with quaternions of length 1, which some renderers insist on."""
+    """Return tensors with quaternions of length 1, which some renderers require."""
     there = gaussians.torch(device)
     return replace(there, quats=there.quats / there.quats.norm(dim=1, keepdim=True))
 
 
 def instances(layout: Path, asset: Path | None, cameras: tuple[int, ...], device: str) -> Subject:
-    """A layout in full detail, without a filter, as its authors draw it."""
+    """Return a layout in full detail, without a filter, as its authors draw it."""
     what = make_asset() if asset is None else v3dg.read_asset(asset)
     scene, views = _placed(layout, what, 0.0)
     chosen = {name: views[name] for name in (list(views)[i] for i in cameras)}
@@ -103,7 +104,7 @@ def instances(layout: Path, asset: Path | None, cameras: tuple[int, ...], device
 
 
 def captured(folder: Path, name: str, device: str) -> Subject:
-    """An asset of a folder as `pairs` has it, at eye level and from above."""
+    """Return an asset of a folder as for `pairs`, at eye level and from above."""
     about = json.loads((folder / "assets.json").read_text())[name]
     asset = v3dg.read_asset(folder / about["file"])
     means = asset.means.astype(np.float64)
@@ -111,7 +112,8 @@ def captured(folder: Path, name: str, device: str) -> Subject:
         cameras = v3dg.read_cameras(folder / about["cameras"])
         eye_level = cameras[about.get("views", list(cameras))[0]]
         up = -eye_level.viewmat[1, :3]
-        # From under the ceiling, if there is one, to the middle of the floor.
+        # The eye is below the ceiling, if there is one, and looks at the middle of the
+        # floor.
         eye, target = (
             place + (height - place @ up) * up
             for place, height in zip(
@@ -135,8 +137,8 @@ def captured(folder: Path, name: str, device: str) -> Subject:
 
 
 def _from(means: Any, up: Any, slope: float) -> Camera:
-    """A camera that sees nine tenths of an object from a height of `slope` times its
-    distance."""
+    """Return a camera that sees nine tenths of an object from a height of `slope` times
+    its distance."""
     aside = np.cross(
         up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.7 * np.linalg.norm(up) else [0.0, 1.0, 0.0]
     )
@@ -148,14 +150,14 @@ def _from(means: Any, up: Any, slope: float) -> Camera:
 
 
 def random(count: int, sh_degree: int, device: str) -> Subject:
-    """Gaussians of the sizes that training leaves on 1920 x 1080 px."""
+    """Return gaussians with the sizes of training for 1920 x 1080 px."""
     camera = Camera.look_at((0, 0, 0), (0, 1, 0), **_SIZE)
     gaussians = on_device(like_trained(count, camera, device, sh_degree=sh_degree), device)
     return Subject(f"random {count / 1e6:g} M", gaussians, {"front": camera}, (TRAINED_PX2, 0.0))
 
 
 def windows(camera: Camera, side: int) -> list[tuple[int, int, int, int]]:
-    """Eight squares over the picture, (x0, y0, x1, y1) px."""
+    """Return eight squares over the picture, (x0, y0, x1, y1) px."""
     boxes = []
     for row in range(2):
         for column in range(4):
@@ -167,7 +169,8 @@ def windows(camera: Camera, side: int) -> list[tuple[int, int, int, int]]:
 
 
 def truths(subject: Subject, camera: Camera, filter_px2: float, side: int) -> list[Any]:
-    """What each window shows (h, w, 3), in float64; black behind it."""
+    """Return the content of each window (h, w, 3), in float64; the background is
+    black."""
     boxes = windows(camera, side)
     rows = _touching(subject.gaussians, camera, filter_px2, boxes).numpy()
     doubles = _core.Rows(*(getattr(rows, f.name).astype(np.float64) for f in fields(rows)))
@@ -182,8 +185,8 @@ def _touching(
     filter_px2: float,
     boxes: list[tuple[int, int, int, int]],
 ) -> v3dg.Gaussians:
-    """Those that may reach a window, and some that do not: the ball of the largest axis
-    decides."""
+    """Return the gaussians that may reach a window, and some that do not: the test uses
+    the ball of the largest axis."""
     import torch
 
     def tensor(array: Any) -> Any:
@@ -196,7 +199,7 @@ def _touching(
         view = gaussians.means[rows].double() @ to_view.T + origin
         depth = view[:, 2].clamp_min(camera.near)
         slope = view[:, :2] / depth[:, None]
-        # The Jacobian's norm, or more where it is clamped.
+        # The Jacobian's norm, or an upper bound if it is clamped.
         stretch = focal.max() / depth * (1 + slope.square().sum(1)).sqrt()
         sigma = ((stretch * gaussians.scales[rows].amax(1)) ** 2 + filter_px2).sqrt()
         reach = (_SIGMAS * sigma + _MARGIN_PX)[:, None]

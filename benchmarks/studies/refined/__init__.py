@@ -1,4 +1,4 @@
-"""Cuts of levels as they are built, and refined together.
+"""Cuts of levels before and after refinement.
 
-`measure` is of single assets, `worlds` of composed scenes.
+`measure` uses single assets, `worlds` composed scenes.
 """

@@ -1,4 +1,4 @@
-"""Cuts of levels as they are built, and refined together.
+"""Cuts of levels before and after refinement.
 
     python -m benchmarks.studies.refined --asset donut.ply --layout donutsea.json -o
     refined python -m benchmarks.studies.refined --asset donut.ply --picture refined.png
@@ -6,11 +6,11 @@
     transforms.json -o refined
 
 With a layout of instances, FLIP, PSNR and SSIM of the same cuts from some of its
-cameras, to all gaussians at 3 x 3 samples a pixel. With a picture, the asset, and a cut
-of a sixth of its gaussians three times as large as it is at home, built and refined.
-With eyes, cameras in a scene: errors of cuts of some shares of the gaussians in the
-frustum from these eyes, built, refined from all around, and refined from other cameras
-that stand beside them.
+cameras, against all gaussians at 3 x 3 samples per pixel. With a picture, the asset,
+and a cut with a sixth of its gaussians at three times its native size, before and after
+refinement. With eyes, which are cameras in a scene: errors of cuts with some fractions
+of the gaussians in the frustum, as built, refined from all around, and refined from
+other cameras beside the eyes.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def pictures(
 def seen_from(
     config: Config, bundles: dict[str, v3dg.Bundle], eyes: list[v3dg.Camera]
 ) -> Iterator[tuple[Row, Picture, Picture]]:
-    """Cuts from eyes in a scene."""
+    """Return errors of cuts from eyes in a scene."""
     for number, camera in enumerate(eyes):
         truth = draw_truth(bundles["built"], camera, config.device, _SAMPLES)
         everything = v3dg.select(bundles["built"], camera, tolerance=0, device="cpu").num_gaussians
@@ -84,13 +84,15 @@ def seen_from(
                 budget = {"budget": round(share * everything)} if share < 1 else {"tolerance": 0.0}
                 try:
                     image = v3dg.render(bundle, camera, device=config.device, **budget)
-                except ValueError:  # the eye is inside of groups, of which too much is left
+                # The eye is inside of groups, so even the coarsest cut has too many
+                # gaussians.
+                except ValueError:
                     continue
                 yield {"eye": number, "share": share, "levels": name}, truth, to_8bit(image.color)
 
 
 def sheet(config: Config, asset: v3dg.Gaussians, bundles: dict[str, v3dg.Bundle]) -> Picture:
-    """The asset, and its cuts."""
+    """Return the picture of the asset and its cuts."""
     budget = len(asset) // _PART
     side = _SIZE * math.ceil(math.sqrt(2 * budget))
     center = np.median(asset.means, axis=0)

@@ -1,15 +1,15 @@
-"""The composed worlds with levels as they are built, and refined together: what fewer
-gaussians are enough.
+"""The composed worlds before and after refinement: how few gaussians reach the same
+FLIP.
 
     python -m benchmarks.studies.refined.worlds --steps 10000 --persons 3 --device cuda
     -o refined_worlds python -m benchmarks.studies.refined.worlds --report
     refined_worlds.json
 
-Cuts of several tolerances, from cameras near to far, are compared with all gaussians at
-2 x 2 samples a pixel. The report has, for each camera and each FLIP that a cut of the
-levels as they are built has, how many gaussians are enough for it with refined levels,
-by how many are with those; and FLIP at the default tolerance by that of all gaussians
-at one sample.
+Cuts of several tolerances, from near to far cameras, are compared with all gaussians at
+2 x 2 samples per pixel. For each camera, and each FLIP of a cut of the unrefined
+levels, the report has the number of gaussians that reach this FLIP with refined levels,
+relative to the number without refinement; and FLIP at the default tolerance relative to
+that of all gaussians at one sample.
 """
 
 from __future__ import annotations
@@ -44,20 +44,21 @@ class Config:
     names: tuple[Literal["forest", "temples", "crowd"], ...] = ("forest", "temples", "crowd")
     scale: Literal["small", "full"] = "full"
     persons: int = 16
-    """Different ones in the crowd, each of which has to be refined."""
+    """Number of different persons in the crowd, each of which has to be refined."""
     cameras: tuple[int, ...] = (43, 47, 51, 55, 59)
-    """Of the world's, the fourth to the last of twenty from near to far."""
+    """Indices of the world's cameras: the fourth to the last of twenty from near to
+    far."""
     built: tuple[float, ...] = (3.0, 6.0, 9.4)
-    """Tolerances of cuts of the levels as they are built; all gaussians besides."""
+    """Tolerances of cuts of the unrefined levels; all gaussians are drawn, too."""
     refined: tuple[float, ...] = (3.0, 4.5, 6.0, 9.4, 13.0, 18.0)
-    """Tolerances of cuts of the refined ones."""
+    """Tolerances of cuts of the refined levels."""
     steps: int = 30_000
-    """Of the refinement; with 0 only levels as they are built are drawn."""
+    """Steps of the refinement; with 0 only unrefined levels are drawn."""
     build: v3dg.BuildConfig = field(default_factory=v3dg.BuildConfig)
-    """How the levels are built."""
+    """Settings of the builds."""
     device: Literal["cpu", "cuda"] = "cpu"
     report: Path | None = None
-    """Recorded results; nothing is measured then."""
+    """Recorded results to report; then nothing is measured."""
     output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
 
 
@@ -73,8 +74,8 @@ def make_asset(asset: worlds.Asset) -> v3dg.Gaussians:
 
 
 def pictures(config: Config, about: Row) -> Iterator[tuple[Row, Picture, Picture]]:
-    """What is drawn of each world, the truth and the picture; tells what it made in
-    `about`."""
+    """Yield the pictures of each world: description, truth and picture; writes build
+    data to `about`."""
     how: Row = {"device": config.device, "progress": False}
     for name in config.names:
         world, start = world_of(config, name), time.perf_counter()
@@ -109,7 +110,7 @@ def pictures(config: Config, about: Row) -> Iterator[tuple[Row, Picture, Picture
 
 
 def count_at(flip: float, rows: Sequence[Row]) -> float:
-    """The fewest gaussians of these cuts that have at most this FLIP, between two by
+    """Return the fewest gaussians of these cuts with at most this FLIP, interpolated in
     the logarithm."""
     fewest = math.inf
     finest_first = sorted(rows, key=lambda row: -row["gaussians"])
@@ -124,11 +125,11 @@ def count_at(flip: float, rows: Sequence[Row]) -> float:
 
 
 def share_at(tolerance: float, built: Sequence[Row], refined: Sequence[Row]) -> float | None:
-    """Gaussians with refined levels by those with levels as they are built, at the FLIP
+    """Return the gaussians with refined levels relative to those without, at the FLIP
     of one of these cuts.
 
-    None where the coarsest cut is nearer than that: then fewer than are known may be
-    enough. Where no refined cut is as near, nothing is gained.
+    The result is None if even the coarsest refined cut has a lower FLIP: then fewer
+    gaussians may suffice. If no refined cut reaches this FLIP, nothing is gained.
     """
     flip = next(row["flip"] for row in built if row["tolerance"] == tolerance)
     coarsest = max(built, key=lambda row: row["tolerance"])
@@ -146,7 +147,7 @@ def report(rows: Sequence[Row]) -> None:
         cameras = dict.fromkeys(row["camera"] for row in rows if row["world"] == world)
         sets = [(of(world, camera, "built"), of(world, camera, "refined")) for camera in cameras]
         print(world, *cameras)
-        # Without refined ones there is nothing to share.
+        # Without refined levels there is no ratio.
         kinds = range(1 + any(cuts[1] for cuts in sets))
         for tolerance in sorted(
             {row["tolerance"] for row in sets[0][0]} - {0.0} if len(kinds) > 1 else ()

@@ -1,10 +1,10 @@
-"""How long it takes from the name of files to the first, coarsest picture with a pool.
+"""The time from the names of files to the first, coarsest picture with a pool.
 
 Two kinds of 10 GB are made of one bundle: a set of copies, and one file with the
 clusters of as many copies side by side, whose tables are as large as those of a bundle
-of that size. Those stand where the first does. Processes of their own open them and
-draw, in turn with those of another checkout if there is one, with what the system keeps
-of the files dropped before (`cold`) or not.
+of that size. All copies are at the position of the first. Separate processes open them
+and draw, in alternation with those of another checkout if there is one, with the
+system's file cache dropped before (`cold`) or not.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from v3dg.bundle.codec import codec_of
 from v3dg.bundle.file import BundlePlan, write_pages
 from v3dg.bundle.pages import PageLayout
 
-PATHS = "V3DG_FIRST_PICTURE"  # names the variable that a child finds its files in
+PATHS = "V3DG_FIRST_PICTURE"  # the variable that contains the files for a child
 
 
 @dataclass
@@ -38,14 +38,14 @@ class Config:
     bundle: Path
     """A .v3dg file, which is copied."""
     folder: Path
-    """For the copies; those that are there are used again."""
+    """Folder for the copies; existing ones are used again."""
     copies: int = 103
     rounds: int = 3
     memory: str = "1GB"
     device: str = "cpu"
     size: tuple[int, int] = (640, 360)
     against: Path | None = None
-    """Another checkout, with its module built, that is measured, too."""
+    """Another checkout, with a built module, that is measured, too."""
     output: str | None = None
 
 
@@ -58,8 +58,8 @@ def write_set(config: Config) -> list[Path]:
 
 
 def write_joined(config: Config) -> Path:
-    """One bundle with the clusters of all copies: by level, and in each level copy by
-    copy."""
+    """Write one bundle with the clusters of all copies: by level, and in each level
+    copy by copy."""
     path = config.folder / f"joined_{config.copies}.v3dg"
     if path.exists():
         return path
@@ -92,7 +92,7 @@ def write_joined(config: Config) -> Path:
     file = one._file
     assert file is not None
     places, hashes = file.places, file.tables["pages.hash"]
-    parent_level = g.level  # of page g: all but the last
+    parent_level = g.level  # of page g, except for the last page
     with open(path, "wb", buffering=0) as out, open(config.bundle, "rb") as source:
         at, made_hashes = len(plan.header), []
         for level in range(1, one.num_levels):
@@ -112,7 +112,7 @@ def write_joined(config: Config) -> Path:
 
 
 def drop_cached(paths: list[Path]) -> None:
-    """Have the system forget what it keeps of the files, where it may be told."""
+    """Ask the system to drop the files from its cache, if it supports that."""
     for path in paths:
         descriptor = os.open(path, os.O_RDONLY)
         os.fsync(descriptor)
@@ -123,7 +123,7 @@ def drop_cached(paths: list[Path]) -> None:
 
 
 def open_and_draw(config: Config, paths: list[Path]) -> dict[str, Any]:
-    """What the parts took, ms. The module is imported before."""
+    """Return the milliseconds of each step. The module is imported before."""
     if config.device != "cpu":
         import torch
 

@@ -1,13 +1,13 @@
-"""What a pool of pages does to frames: flights and teleports over a field of many
+"""The effect of a page pool on frames: flights and teleports over a field of many
 different copies.
 
-Copies of a bundle are written with the colours of all gaussians changed a little, so
-that no two share a page, and stand in a grid. For pools of several sizes, as shares of
-what a view needs, with the files in the system's cache and without: how long frames
-take, how many bytes come in and how many pages are missing, and how far the picture is
-from the settled one; after a teleport, also how far both are from all gaussians at 4 x
-4 samples. The size of a pool is a choice here: whether all would fit is said by the row
-without a pool. On a GPU, rows say what the process has on it.
+Copies of a bundle are written with slightly different colours of all gaussians, so that
+no two share a page, and are placed in a grid. Pools have several sizes, as multiples of
+what a view needs, and the files are in the system's cache or not. It measures the time
+of frames, the bytes that come in, the number of missing pages, and the error against
+the settled picture; after a teleport also the errors of both against all gaussians at 4
+x 4 samples. The row without a pool shows whether everything would fit. On a GPU, rows
+contain the process's device memory.
 """
 
 from __future__ import annotations
@@ -38,28 +38,27 @@ class Config:
     bundle: Path
     """A .v3dg file, of which copies are made."""
     side: int = 3
-    """Of the grid of copies."""
+    """Number of copies per side of the grid."""
     size: tuple[int, int] = (640, 360)
     tolerance: float = 3.0
     frames: int = 120
-    """Of a flight across the field."""
+    """Frames of a flight across the field."""
     hz: float = 0.0
-    """Frames a second that flights and teleports are paced to; as many as there can be
-    if 0."""
+    """Frames per second of flights and teleports; 0 for as many as possible."""
     shares: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
-    """Slots of each pool, over those that the neediest view of the flight takes."""
+    """Slots of each pool, relative to the largest need of a view in the flight."""
     pools: tuple[str, ...] = ()
-    """Sizes of more pools, such as 2GB."""
+    """Sizes of further pools, such as 2GB."""
     device: str = "cpu"
     is_whole_drawn: bool = True
-    """Whether everything is drawn without a pool, too."""
+    """Whether everything is also drawn without a pool."""
     folder: Path | None = None
-    """Where the copies are kept."""
+    """Folder for the copies."""
     output: str | None = None
 
 
 def write_copies(config: Config, folder: Path) -> list[Path]:
-    """Bundles like the given one, each with colours of its own."""
+    """Write bundles like the given one, each with different colours."""
     paths = [folder / f"copy_{number}.v3dg" for number in range(config.side**2)]
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as processes:
         list(processes.map(write_copy, [config.bundle] * len(paths), range(len(paths)), paths))
@@ -93,7 +92,7 @@ class Field:
             self.scene.add(bundle, positions=place - middle, scales=scale)
 
     def camera(self, at: float) -> v3dg.Camera:
-        """From 0 at the near edge to 1 at the far one."""
+        """Return a camera; `at` is from 0 at the near edge to 1 at the far one."""
         width, height = self.config.size
         across, along = 0.5 * (self.config.side - 1), at * self.config.side - 0.8
         eye = (across + 0.3 * np.sin(6 * at), along, 0.6)
@@ -104,7 +103,7 @@ class Field:
         return [self.camera(at) for at in np.linspace(0, 0.8, self.config.frames)]
 
     def drop_cached_pages(self) -> None:
-        """Have the system forget what it keeps of the files, as far as it listens."""
+        """Ask the system to drop the files from its cache, if it supports that."""
         for path in self.paths:
             descriptor = os.open(path, os.O_RDONLY)
             os.fsync(descriptor)
@@ -112,7 +111,7 @@ class Field:
             os.close(descriptor)
 
     def memory(self, num_slots: int) -> int:
-        """Bytes of a pool with about so many slots."""
+        """Return the bytes of a pool with about this many slots."""
         bundles = self.scene.bundles
         degree = max(bundle.sh_degree for bundle in bundles)
         num_sh = 3 * (degree + 1) ** 2
@@ -136,8 +135,8 @@ class Field:
 def timed(
     config: Config, renderer: v3dg.Renderer, cameras: list[v3dg.Camera], kept: Collection[int] = ()
 ) -> list[dict[str, Any]]:
-    """Draw one picture after the other; what each took, and its stats. Some of the
-    pictures are kept."""
+    """Draw pictures one after the other; return the time and stats of each, and some of
+    the pictures."""
     frames, start = [], time.perf_counter()
     for number, camera in enumerate(cameras):
         if config.hz:
@@ -163,14 +162,14 @@ def summary(frames: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def errors(frames: list[dict[str, Any]], truth: dict[int, np.ndarray]) -> dict[str, Any]:
-    """PSNR of some pictures against the settled ones; equal pictures count as 100
-    dB."""
+    """Return the PSNR of some pictures against the settled ones; equal pictures count
+    as 100 dB."""
     values = [min(100.0, float(psnr(truth[number], frames[number]["picture"]))) for number in truth]
     return {"mean_psnr": float(np.mean(values)), "least_psnr": float(np.min(values))}
 
 
 def bytes_on_device(config: Config) -> int | None:
-    """What is taken of a GPU, which nobody else should use meanwhile."""
+    """Return the memory in use on a GPU, which nobody else should use meanwhile."""
     if config.device == "cpu":
         return None
     import torch
@@ -186,7 +185,8 @@ def pixels(image: v3dg.Image) -> np.ndarray:
 def teleport(
     config: Config, field: Field, memory: int, truth: np.ndarray, *, cold: bool
 ) -> dict[str, Any]:
-    """From one end of the field to the other: pictures until nothing is missing."""
+    """Teleport from one end of the field to the other, and draw pictures until nothing
+    is missing."""
     renderer = v3dg.Renderer(field.scene, device=config.device, memory=memory)
     renderer.settle(field.camera(0), tolerance=config.tolerance)
     renderer.render(field.camera(0), tolerance=config.tolerance).stats  # noqa: B018
@@ -209,7 +209,7 @@ def teleport(
         frame["psnr"] = min(100.0, float(psnr(settled, picture)))
         frame["psnr_to_truth"] = float(psnr(truth, picture))
     far = [number for number, frame in enumerate(curve, 1) if frame["psnr_to_truth"] < best - 0.5]
-    near = far[-1] if far else 0  # the first from which on all are within 0.5 dB
+    near = far[-1] if far else 0  # the first picture from which on all are within 0.5 dB
     return {
         "cold": cold,
         "frames_until_settled": len(curve),
@@ -238,7 +238,7 @@ def main(config: Config) -> None:
             truth[number] = pixels(roomy.render(cameras[number], tolerance=config.tolerance))
         del roomy
         result: dict[str, Any] = {
-            # Without folders.
+            # Paths are recorded without folders.
             "config": {k: str(getattr(v, "name", v)) for k, v in vars(config).items()},
             "gaussians": sum(bundle.num_gaussians for bundle in field.scene.bundles),
             "leaves": sum(

@@ -1,10 +1,10 @@
-"""What a process holds on the host while it flies over a field of copies, with pools
-and without.
+"""The host memory of a process that flies over a field of copies, with pools and
+without.
 
-The copies are those of `measure.py`. Each flight has a process of its own, in turn:
-how long frames take, the largest part of memory that the process had (RSS), and hashes
-of some settled pictures, which have to be the same for all. `--degree` gives the copies
-coefficients of spherical harmonics that the bundle lacks.
+The copies are those of `measure.py`. Each flight has a separate process, one after
+another. It measures the time of frames, the process's peak memory (RSS), and hashes of
+some settled pictures, which must be equal for all. `--degree` adds coefficients of
+spherical harmonics to the copies.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import v3dg
 from benchmarks.evaluation import record
 from benchmarks.studies.residency import measure as residency
 
-POOL = "V3DG_POOL_MEMORY"  # names the variable that a child finds its pool in
+POOL = "V3DG_POOL_MEMORY"  # the variable that contains the pool for a child
 MIB = 1 << 20
 
 
@@ -37,7 +37,7 @@ class Config:
     bundle: Path
     """A .v3dg file, of which copies are made."""
     folder: Path
-    """For the copies; those that are there are used again."""
+    """Folder for the copies; existing ones are used again."""
     side: int = 18
     degree: int = 3
     pools: tuple[str, ...] = ("none", "512MB")
@@ -50,7 +50,7 @@ class Config:
 
 
 def write_base(config: Config) -> Path:
-    """The bundle, quantised, with small coefficients up to the degree."""
+    """Write the bundle, quantised, with small coefficients up to the degree."""
     path = config.folder / "base.v3dg"
     if not path.exists():
         bundle = v3dg.Bundle.open(config.bundle)
@@ -76,7 +76,7 @@ def of_copies(config: Config) -> residency.Config:
 
 
 def memory_of_process() -> dict[str, float]:
-    """MiB that the process has, has of its own, and had at most."""
+    """Return MiB of the process: current, private, and peak."""
     text = Path("/proc/self/status").read_text(encoding="ascii")
     names = {"rss_mib": "VmRSS", "anonymous_mib": "RssAnon", "most_mib": "VmHWM"}
     found = {name: re.search(rf"{field}:\s*(\d+)", text) for name, field in names.items()}

@@ -1,8 +1,8 @@
-"""Pools that keep rows and pools that keep codes, of the same quantised bundles: frames
-of a flight by turns.
+"""Pools that keep rows in comparison with pools that keep codes, for the same quantised
+bundles: frames of a flight in alternation.
 
-A pool keeps rows where a bundle of the scene is float32. So one of the two scenes has a
-tiny one more, behind the camera.
+A pool keeps rows if a bundle of the scene is float32. So one of the two scenes has an
+additional tiny one, behind the camera.
 
     python -m benchmarks.studies.residency.pool_slots --bundle quantized.v3dg --side 13
     --size 1920 1080 --device cuda
@@ -26,7 +26,7 @@ ROUNDS = 3
 
 
 def with_rows(field: Field) -> v3dg.Scene:
-    """The scene of the field and a bundle in memory that no camera sees."""
+    """Return the scene of the field, and a bundle in memory that no camera sees."""
     scene = Field(field.config, field.paths).scene
     tiny = v3dg.build_bundle(make_donut(1000), config=v3dg.BuildConfig(steps=1), device="cpu")
     scene.add(tiny, positions=(0.0, -1e4, 0.0))

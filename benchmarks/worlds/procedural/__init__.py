@@ -1,8 +1,8 @@
 """Assets that need no download: 3DGS assets made from a seed.
 
-Gaussians are spread as training spreads them: flat ones that cover surfaces, needles
-along what is thin, a wide range of sizes and opacities, colour that depends on the view
-where something shines or light passes.
+Gaussians are distributed as after training: flat ones cover surfaces, needles follow
+thin parts, sizes and opacities vary widely, and colour depends on the view where
+something is glossy or translucent.
 """
 
 from benchmarks.worlds.procedural.donut import make_donut

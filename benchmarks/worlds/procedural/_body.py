@@ -1,8 +1,7 @@
-"""Bodies of round cones that are joined smoothly: the layers of a standing, dressed
-person.
+"""Bodies of smoothly joined round cones: the layers of a standing, dressed person.
 
-Lengths in metres for a person of middle height, who is scaled as a whole; x is to the
-person's left, the face looks along -y, the soles are at z = 0.
+Lengths are in metres for a person of average height, who is scaled as a whole; x is to
+the person's left, the face looks along -y, the soles are at z = 0.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ _SIDES = (-1.0, 1.0)
 
 @dataclass(frozen=True)
 class _Cone:
-    """Spheres of radius a at p to radius b at q, and all between them; ``flat``
-    squeezes it along y."""
+    """The hull of a sphere of radius a at p and one of radius b at q; ``flat``
+    compresses it along y."""
 
     p: Array
     q: Array
@@ -40,11 +39,11 @@ class Shape:
     """Round cones joined smoothly: a layer of the body or of its clothes."""
 
     cones: tuple[_Cone, ...]
-    blend: float  # how far joints are rounded, in metres
+    blend: float  # radius of the rounding at joints, in metres
 
     def distance(self, points: Array) -> tuple[Array, Array]:
-        """Signed distance, nearly, negative inside, and the direction in which it
-        grows, (n,) and (n,3)."""
+        """Return the approximate signed distance, negative inside, and its gradient,
+        (n,) and (n,3)."""
         total, gradient = np.zeros(len(points)), np.zeros((len(points), 3))
         for cone in self.cones:
             axis = cone.q - cone.p
@@ -61,14 +60,15 @@ class Shape:
         return -self.blend * np.log(total), unit(gradient)
 
     def spread(self, n: int, rng: np.random.Generator) -> tuple[Array, Array, float]:
-        """n points on the surface, nearly even, their normals, and the spacing."""
+        """Return n approximately even points on the surface, their normals, and the
+        spacing."""
         areas = np.array(
             [
                 np.pi * (c.a + c.b) * (np.linalg.norm(c.q - c.p) + c.a + c.b) * (1 + c.flat) / 2
                 for c in self.cones
             ]
         )
-        # More than enough, as what falls inside another cone is dropped.
+        # More points than needed, because those inside another cone are dropped.
         many = int(1.6 * n) + 64
         which = rng.choice(len(areas), many, p=areas / areas.sum())
         p, q = (np.stack([getattr(c, name) for c in self.cones])[which] for name in "pq")
@@ -105,7 +105,7 @@ class Shape:
 class Figure:
     """A person's layers."""
 
-    limbs: tuple[Shape, ...]  # each arm, and the legs where a skirt shows them
+    limbs: tuple[Shape, ...]  # each arm, and the legs if a skirt shows them
     face: Shape  # head and neck
     shirt: Shape
     trousers: Shape
@@ -119,23 +119,23 @@ class Figure:
 
 @dataclass(frozen=True)
 class _Build:
-    """What differs between people, besides their size."""
+    """The differences between people, besides their size."""
 
     woman: bool
-    stout: float  # 1: as wide as most
+    stout: float  # 1: average width
     shoulder: float  # half widths
     hip: float
     waist: float  # radii
     chest: float
     stride: float
-    raised: Array  # (2,) rad that the arms stand off
-    bent: Array  # (2,) rad that the elbows bend
+    raised: Array  # (2,) angles between arms and body, radians
+    bent: Array  # (2,) angles of the elbows, radians
     long_sleeves: bool
     skirt: bool
 
 
 def random_figure(rng: np.random.Generator) -> Figure:
-    """A person of random build, pose and kind of clothes."""
+    """Return a person with random build, pose and kind of clothes."""
     woman = bool(rng.random() < 0.5)
     size, stout = rng.normal(0.965 if woman else 1.03, 0.035), rng.normal(1.0, 0.09)
     build = _Build(
@@ -189,7 +189,7 @@ def random_figure(rng: np.random.Generator) -> Figure:
 
 
 def _joints(build: _Build, side: float) -> tuple[Array, Array, Array]:
-    """Hip, knee and ankle; one foot is before the other."""
+    """Return hip, knee and ankle; one foot is before the other."""
     hip = np.array([side * build.hip, 0.0, _HIPS - 0.04])
     knee = np.array([side * 0.095, -0.02 - 0.4 * side * build.stride, 0.50])
     return hip, knee, np.array([side * 0.105, 0.03 + side * build.stride, 0.09])
@@ -216,7 +216,7 @@ def _shoe(build: _Build, side: float) -> list[_Cone]:
 
 
 def _arm(build: _Build, which: int) -> tuple[list[_Cone], list[_Cone]]:
-    """An arm with its hand, and its sleeve."""
+    """Return an arm with its hand, and its sleeve."""
     side, raised, bent = _SIDES[which], build.raised[which], build.bent[which]
     shoulder = np.array([side * build.shoulder, 0.0, _NECK - 0.105])
     out = np.array([side * np.sin(raised), 0.03, -np.cos(raised)])
@@ -270,8 +270,8 @@ def _torso(build: _Build) -> list[_Cone]:
 
 
 def _face(head: Array) -> list[_Cone]:
-    """The skull first, then the face, the ears and the neck; places relative to the
-    head's centre."""
+    """Return the skull first, then the face, the ears and the neck; positions are
+    relative to the head's centre."""
 
     def cone(
         p: Sequence[float], q: Sequence[float], a: float, b: float, flat: float = 1.0

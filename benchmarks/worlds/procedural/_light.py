@@ -1,9 +1,9 @@
-"""Light for assets made of parts: one sun, a sky and the ground's bounce, kept as
+"""Light for assets made of parts: one sun, a sky and the ground's reflection, stored as
 spherical harmonics.
 
-Shadows come from the gaussians themselves. Seen from each of a few directions they are
-binned into a grid whose cells hold how much light they stop; sums along the direction
-tell how much arrives at each gaussian.
+Shadows are computed from the gaussians themselves. From each of a few directions they
+are binned into a grid whose cells hold how much light they block; sums along the
+direction give the light that arrives at each gaussian.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from benchmarks.worlds.procedural._parts import UP, Array, Part, quaternions, un
 from v3dg import _core
 from v3dg.gaussians import Gaussians
 
-SH_C0 = _core.sh_base0  # the constant basis function of spherical harmonics
-SH_C1 = 0.4886025119029199  # the factor of the linear ones
+SH_C0 = _core.sh_base0  # value of the constant basis function of spherical harmonics
+SH_C1 = 0.4886025119029199  # factor of the linear basis functions
 TO_SUN = np.array([0.42, -0.50, 0.76]) / np.linalg.norm([0.42, -0.50, 0.76])
 SUN = np.array([1.55, 1.42, 1.18])
 SKY = np.array([0.42, 0.52, 0.62])
-_CELLS = 1.2e6  # of the grid: fine enough for leaves' shadows, coarse enough to be quick
-_LOBE = 0.30  # width of a highlight; narrower would ring at degree 3
+_CELLS = 1.2e6  # cells of the grid: fine enough for leaves' shadows, coarse enough to be fast
+_LOBE = 0.30  # width of a highlight; a narrower one would cause ringing at degree 3
 
 
 def sh_basis(directions: Array, degree: int) -> Array:
@@ -56,20 +56,22 @@ def sh_basis(directions: Array, degree: int) -> Array:
 
 
 def display(linear: Array) -> Array:
-    """Linear light to display values, highlights rolled off."""
+    """Convert linear light to display values, with compressed highlights."""
     rolled = linear * (1 + linear / 6.0) / (1 + 0.55 * linear)
     return np.clip(rolled, 0, None) ** (1 / 2.2)
 
 
 def _arriving(part: Part, directions: Array, rng: np.random.Generator) -> Array:
-    """Share of the light from each of D directions that arrives at each gaussian,
-    (D,n)."""
-    # What a gaussian stops, seen from anywhere: its two longest axes make its shadow.
+    """Return the fraction of the light from each of D directions that arrives at each
+    gaussian, (D,n)."""
+    # The light that a gaussian blocks from any side: its two longest axes determine its
+    # shadow.
     stops = np.pi * part.scales[:, 0] * part.scales[:, 1] * part.opacities
     means = part.means.astype(np.float32)
     sides = np.ptp(means, axis=0).astype(np.float64)
     cell = max(float(np.prod(sides) / _CELLS) ** (1 / 3), float(sides.max()) / 256)
-    # Solid gaussians look from above their surface, else they would shade themselves.
+    # Solid gaussians are evaluated above their surface; otherwise they would shade
+    # themselves.
     lift = part.normals * (1.5 * (1 - part.translucency))[:, None] + rng.uniform(
         -0.4, 0.4, means.shape
     )
@@ -98,7 +100,7 @@ def _arriving(part: Part, directions: Array, rng: np.random.Generator) -> Array:
 
 
 def _sky_directions() -> Array:
-    """Six directions over the upper half, of which each brings as much."""
+    """Return six directions over the upper hemisphere that contribute equally."""
     azimuth = np.arange(5) * (2 * np.pi / 5) + 0.4
     height = np.where(np.arange(5) % 2, 0.45, 0.75)
     flat = np.sqrt(1 - height**2)
@@ -108,17 +110,16 @@ def _sky_directions() -> Array:
 
 
 def light(part: Part, degree: int, rng: np.random.Generator, *, even: float = 0.0) -> Array:
-    """Light gaussians that shade each other and express their colours as spherical
-    harmonics.
+    """Compute the light on gaussians that shade each other, and return their colours as
+    spherical harmonics.
 
     Args:
-        even: Share of the light that comes from all around, for assets that will lie
-            any way up.
+        even: Fraction of the light that comes from all around, for assets that will be
+            placed in any orientation.
 
     Returns:
-        (n, (degree+1)², 3). Beyond degree 0: highlights and the sky's mirror image on
-        what is glossy, light that shines through what is translucent, and a little
-        noise, as training leaves it.
+        (n, (degree+1)², 3). Beyond degree 0: highlights and sky reflections on glossy
+        parts, light through translucent parts, and a little noise, as after training.
     """
     n, thin = part.normals, part.translucency
     directions = _sky_directions()
@@ -141,9 +142,10 @@ def light(part: Part, degree: int, rng: np.random.Generator, *, even: float = 0.
     linear = part.albedo * lit
     colour = display(linear)
 
-    # The colour that an eye in direction v sees is a sum of lobes around directions;
-    # the lobe around r has the coefficients w_l Y_lm(r) of a smoothed point, scaled to
-    # rise 1 above its mean. Y is taken at the direction from the eye, which is -v.
+    # The colour that an eye in direction v sees is a sum of lobes around directions.
+    # The lobe around r has the coefficients w_l Y_lm(r) of a smoothed point, scaled
+    # such that its peak is 1 above its mean. Y is evaluated at the direction from the
+    # eye, which is -v.
     bands = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
     smooth = np.exp(-0.5 * _LOBE**2 * bands * (bands + 1))
 
@@ -178,8 +180,8 @@ def light(part: Part, degree: int, rng: np.random.Generator, *, even: float = 0.
 def gaussians_of(
     part: Part, degree: int, rng: np.random.Generator, *, even: float = 0.0
 ) -> Gaussians:
-    """Light a part and turn it into gaussians in random order: files of trained assets
-    have none either."""
+    """Light a part and return it as gaussians in random order, because files of trained
+    assets have no order either."""
     order = rng.permutation(len(part.means))
     sh = light(part, degree, rng, even=even)
     quats = quaternions(part.tangents, part.normals)

@@ -1,4 +1,4 @@
-"""Gaussians before lighting, and the shapes that assets are put together from."""
+"""Gaussians before lighting, and the shapes that assets are composed of."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ class Part:
     opacities: Array  # (n,)
     albedo: Array  # (n,3)
     gloss: Array  # (n,) strength of the highlight, 0: matt
-    translucency: Array  # (n,) share of the light that passes through, 0: solid
-    occlusion: Array  # (n,) share of the sky that is seen
+    translucency: Array  # (n,) fraction of the light that passes through, 0: solid
+    occlusion: Array  # (n,) visible fraction of the sky
 
     @staticmethod
     def concatenate(parts: Sequence[Part]) -> Part:
         return Part(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Part)))
 
     def first(self, n: int) -> Part:
-        """The first n gaussians, to make up a count."""
+        """Return the first n gaussians, to reach an exact count."""
         return Part(*(getattr(self, f.name)[:n] for f in fields(Part)))
 
     def moved(self, rotation: Array, translation: Array) -> Part:
@@ -50,7 +50,7 @@ def unit(v: Array) -> Array:
 
 
 def mix(a: Array | Sequence[float], b: Array | Sequence[float], weight: Array) -> Array:
-    """Colours from ``a`` (weight 0) to ``b`` (weight 1), one row per weight."""
+    """Return colours from ``a`` (weight 0) to ``b`` (weight 1), one row per weight."""
     w = weight[:, None]
     return np.asarray(a) * (1 - w) + np.asarray(b) * w
 
@@ -68,7 +68,8 @@ def rotation(axis: Array, angle: float) -> Array:
 
 
 class Noise:
-    """Smooth noise in [0,1] over space, from a periodic lattice of random values."""
+    """Smooth noise in [0,1] over space, interpolated from a periodic lattice of random
+    values."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._lattice = rng.random((32, 32, 32))
@@ -104,19 +105,19 @@ class Noise:
 
 @dataclass
 class Surface:
-    """n points spread evenly over a surface of revolution around z."""
+    """n points distributed evenly over a surface of revolution around z."""
 
     points: Array  # (n,3)
     normals: Array  # (n,3) outwards
     around: Array  # (n,3) unit tangent around the axis
-    along: Array  # (n,) 0 at the start of the profile, 1 at its end
+    along: Array  # (n,) from 0 at the start of the profile to 1 at its end
     angle: Array  # (n,)
-    spacing: float  # side of the square that one point has to cover
+    spacing: float  # side of the square that one point covers
 
 
 def revolve(profile: Callable[[Array], tuple[Array, Array]], n: int) -> Surface:
-    """Spread points in a golden-angle spiral, equal area each; ``profile`` maps [0,1]
-    to radius, height."""
+    """Distribute points in a golden-angle spiral with equal area each; ``profile`` maps
+    [0,1] to radius, height."""
     t = np.linspace(0, 1, 513)
     radius, height = profile(t)
     step = np.hypot(np.diff(radius), np.diff(height))
@@ -129,7 +130,7 @@ def revolve(profile: Callable[[Array], tuple[Array, Array]], n: int) -> Surface:
     angle = np.arange(n) * GOLDEN_ANGLE
     cos, sin = np.cos(angle), np.sin(angle)
     points = np.stack([r * cos, r * sin, z], -1)
-    # The profile runs from the top outwards and down, so its left-hand side is outside.
+    # The profile runs from the top outwards and down, so its left side is outside.
     normals = np.stack([-slope[:, 1] * cos, -slope[:, 1] * sin, slope[:, 0]], -1)
     around = np.stack([-sin, cos, np.zeros(n)], -1)
     return Surface(points, normals, around, along, angle, float(np.sqrt(area[-1] / max(n, 1))))
@@ -147,11 +148,12 @@ def strips(
     outline: Callable[[Array], Array],
     rng: np.random.Generator,
 ) -> tuple[Part, Array, Array]:
-    """K leaves of ``rows`` × ``columns`` gaussians: blades of grass, petals, leaflets.
+    """Return K leaves of ``rows`` × ``columns`` gaussians: blades of grass, petals,
+    leaflets.
 
-    A leaf starts at ``base``, runs ``along`` and bends away from ``up`` by ``bend``;
-    ``outline`` maps [0,1] to its half width relative to ``width``. Also returns where
-    each gaussian is: along its leaf in [0,1], across it in [-1,1].
+    A leaf starts at ``base``, extends ``along`` and bends away from ``up`` by ``bend``;
+    ``outline`` maps [0,1] to its half width relative to ``width``. Also returns the
+    position of each gaussian: along its leaf in [0,1], across it in [-1,1].
     """
     k = len(base)
     t = (np.arange(rows) + 0.5) / rows
@@ -163,7 +165,7 @@ def strips(
     along, up = unit(along), unit(up - along * np.sum(unit(along) * up, 1, keepdims=True))
     side = np.cross(up, along)
     drop = -bend[:, None] * length[:, None] * t * t
-    curl = 0.25 * half * (s * s)  # edges rise, as a gutter
+    curl = 0.25 * half * (s * s)  # edges rise as in a gutter
     means = (
         base[:, None]
         + along[:, None] * (length[:, None] * t)[..., None]
@@ -192,8 +194,8 @@ def strips(
 
 
 def quaternions(tangents: Array, normals: Array) -> Array:
-    """Rotations (w,x,y,z) that take x to the tangent and z to the normal, as near as
-    both can be had."""
+    """Return rotations (w,x,y,z) that map x to the tangent and z to the normal,
+    approximately if the two are not orthogonal."""
     z = unit(normals)
     x = tangents - z * np.sum(tangents * z, 1, keepdims=True)
     stray = np.linalg.norm(x, axis=1) < 1e-6
@@ -201,7 +203,7 @@ def quaternions(tangents: Array, normals: Array) -> Array:
     x = unit(x)
     y = np.cross(z, x)
     m = np.stack([x, y, z], -1)
-    # Four formulas, each well conditioned where its component is the largest.
+    # Each of the four formulas is well conditioned if its component is the largest.
     diagonal = np.stack([m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]], -1)
     squares = np.stack(
         [
@@ -227,21 +229,22 @@ def quaternions(tangents: Array, normals: Array) -> Array:
 
 
 def allot(weights: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Which of the weighted things each of n gaussians is for, in order, as evenly as
-    the weights allow."""
+    """Assign n gaussians to weighted items, in order, as evenly as the weights
+    allow."""
     ends = np.cumsum(weights)
     at = (np.arange(n) + rng.random(n)) / max(n, 1) * ends[-1]
     return np.asarray(np.minimum(np.searchsorted(ends, at, side="right"), len(weights) - 1))
 
 
 def leaf_outline(t: Array) -> Array:
-    """Half width along a leaf, at most 1: round at the foot, narrow at the tip."""
+    """Return the half width along a leaf, at most 1: round at the base, narrow at the
+    tip."""
     return np.sqrt(np.clip(t * (1.06 - t) * 3.6, 0.03, 1))
 
 
 @dataclass
 class Patch:
-    """n points spread evenly over a parametric surface."""
+    """n points distributed evenly over a parametric surface."""
 
     points: Array  # (n,3)
     normals: Array  # (n,3) unit, along the cross product of the derivatives by u and v
@@ -253,7 +256,7 @@ class Patch:
 
     @property
     def spacing(self) -> float:
-        """Side of the square that one point has to cover."""
+        """The side of the square that one point covers."""
         return float(np.sqrt(self.area / max(len(self.u), 1)))
 
 
@@ -261,7 +264,8 @@ SurfaceMap: TypeAlias = Callable[[Array, Array], Array]  # u, v (n,) in [0,1] to
 
 
 def surface_area(surface: SurfaceMap, cells: int = 64) -> float:
-    """Area of a parametric surface, from a grid of that many cells a side."""
+    """Return the area of a parametric surface, computed on a grid with this many cells
+    per side."""
     return float(_cell_areas(surface, cells).sum())
 
 
@@ -277,9 +281,9 @@ def _cell_areas(surface: SurfaceMap, cells: int) -> Array:
 def sample(
     surface: SurfaceMap, n: int, rng: np.random.Generator, cells: int = 64, *, closed: str = ""
 ) -> Patch:
-    """Spread n points over a parametric surface, equally many on equal areas.
+    """Distribute n points over a parametric surface, with equal numbers on equal areas.
 
-    ``closed`` names u or v where the surface has no border in that direction.
+    ``closed`` names u or v if the surface has no border in that direction.
     """
     areas = _cell_areas(surface, cells)
     cell = allot(areas, n, rng)
@@ -294,7 +298,7 @@ def sample(
     endless = np.full(n, np.inf)
     room_u = endless if "u" in closed else length_u * np.minimum(u, 1 - u)
     room_v = endless if "v" in closed else length_v * np.minimum(v, 1 - v) * sine
-    # Where the surface is skew, its side borders are met across the tangent, too.
+    # If the surface is skew, its side borders can also be reached across the tangent.
     room = np.stack([room_u, np.minimum(room_v, room_u * sine / np.maximum(cosine, 1e-9))], -1)
     return Patch(points, unit(np.cross(du, dv)), unit(du), u, v, room, float(areas.sum()))
 
@@ -314,27 +318,29 @@ def cover(
     bend: Array | float = np.inf,
     room: Array | None = None,
 ) -> Part:
-    """Flat gaussians that together cover a surface whose points lie ``spacing`` apart.
+    """Return flat gaussians that together cover a surface with points at distances of
+    ``spacing``.
 
-    Sizes, shapes and opacities are spread as measured on a trained asset
+    Sizes, shapes and opacities are distributed as measured on a trained asset
     (docs/worlds.md): the mean size is lognormal, the ratios of neighbouring axes are
     exponentials of gamma variates, logits of opacities are normal with deviation 2.3
-    about ``opacity``. The long axes lie in the surface in all directions, or with
-    ``aligned`` = 1 along the tangents. What would stick out is shortened, as training
-    does: by ``bend``, the surface's smallest radius of curvature (with ``aligned``,
-    that across the tangents), and by ``room`` (n,2), the distances to its borders along
-    and across the tangents; beside a border, long axes lie along it.
+    around ``opacity``. The long axes are in the surface in all directions or, with
+    ``aligned`` = 1, along the tangents. Axes that would stick out are shortened, as in
+    training: by ``bend``, the surface's smallest radius of curvature (with ``aligned``,
+    the one across the tangents), and by ``room`` (n,2), the distances to its borders
+    along and across the tangents; near a border, long axes are parallel to it.
     """
     n = len(points)
     spacing = np.broadcast_to(np.asarray(spacing, dtype=np.float64), n)
     middle_ratio = np.exp(0.4 * rng.gamma(3.0, size=n))
     thin_ratio = np.exp(0.5 * rng.gamma(3.0, size=n))
     size = 0.75 * spacing * np.exp(0.7 * rng.standard_normal(n))
-    # Large and solid, a little below the others: nothing shines through between those.
+    # These are large and solid, slightly below the others, so that nothing shines
+    # through the gaps.
     base = rng.random(n) < 0.12
     size[base] = 2.2 * spacing[base]
     middle_ratio[base] = np.minimum(middle_ratio[base], 2)
-    # The ends, two deviations out, then rise by less than the spacing.
+    # At two standard deviations, the ends then rise by less than the spacing.
     longest = np.sqrt(0.4 * bend * spacing)
     long, middle = size * np.sqrt(middle_ratio), np.minimum(size / np.sqrt(middle_ratio), longest)
     angle = rng.uniform(-np.pi / 2, np.pi / 2, n) * (1 - aligned) + 0.1 * rng.standard_normal(n)
@@ -342,7 +348,8 @@ def cover(
         beside = room.min(axis=1) < 2 * long
         lengthwise = room[:, 1] <= room[:, 0]
         angle = np.where(beside, np.where(lengthwise, 0.0, np.pi / 2), angle)
-        space = np.maximum(0.45 * room, 0.22 * spacing[:, None])  # two deviations reach the border
+        # Two standard deviations reach the border.
+        space = np.maximum(0.45 * room, 0.22 * spacing[:, None])
         free = np.where(beside, np.where(lengthwise, space[:, 0], space[:, 1]), np.inf)
         long = np.minimum(long, free)
         free = np.where(beside, np.where(lengthwise, space[:, 1], space[:, 0]), np.inf)

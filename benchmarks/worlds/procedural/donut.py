@@ -21,7 +21,7 @@ from benchmarks.worlds.procedural._parts import (
 from v3dg.gaussians import Gaussians
 
 RING = 0.068  # radius of the tube's axis
-TUBE = 0.040  # of the tube, icing included
+TUBE = 0.040  # radius of the tube, including icing
 _DOUGH = 0.037
 _SPRINKLES = 260
 _SPRINKLE_COLOURS = np.array(
@@ -40,8 +40,8 @@ _ICINGS = np.array(
 
 
 def _on_tube(around: Array, along: Array, radius: Array) -> Array:
-    """Points at angles ``around`` the donut's axis and ``along`` the tube's section, 0
-    outside, pi/2 up."""
+    """Return points at angles ``around`` the donut's axis and ``along`` the tube's
+    cross-section, 0 at the outside, pi/2 at the top."""
     r = RING + radius * np.cos(along)
     return np.stack([r * np.cos(around), r * np.sin(around), radius * np.sin(along)], -1)
 
@@ -51,14 +51,14 @@ def make_donut(num_gaussians: int = 45_624, *, seed: int = 0, sh_degree: int = 3
     colours.
 
     Args:
-        num_gaussians: How many gaussians, exactly; the default is what the V3DG paper's
-            donut has.
-        seed: The same seed gives the same gaussians. Every fourth has pink icing.
+        num_gaussians: Exact number of gaussians; the default is that of the V3DG
+            paper's donut.
+        seed: The same seed gives the same gaussians. Every fourth seed has pink icing.
         sh_degree: 0 to 3; the icing is glossy from 1 on, sharpest at 3.
 
     Returns:
-        NumPy gaussians; z is up, the origin in the middle of the hole, the donut is
-        0.22 across.
+        NumPy gaussians; z is up, the origin is in the middle of the hole, the diameter
+        is 0.22.
 
     Raises:
         ValueError: ``num_gaussians`` is below 1,000.
@@ -79,7 +79,8 @@ def make_donut(num_gaussians: int = 45_624, *, seed: int = 0, sh_degree: int = 3
         return np.asarray(sum(terms))
 
     def rim(around: Array) -> tuple[Array, Array]:
-        """Where along the section the icing ends, outside and in the hole."""
+        """Return the angles along the cross-section at which the icing ends, outside
+        and in the hole."""
         outer = 0.10 + waves(around, (0.10, 0.13, 0.14, 0.05), 0)
         inner = np.pi - 0.35 + waves(around, (0.12, 0.10, 0.10, 0.04), 4)
         return outer, inner
@@ -89,7 +90,7 @@ def make_donut(num_gaussians: int = 45_624, *, seed: int = 0, sh_degree: int = 3
         outer, inner = rim(around)
         rounded = np.clip(1 - (2 * v - 1) ** 2, 0, 1)
         thick = (TUBE - _DOUGH + 0.0005) * np.minimum(1.0, 3.2 * rounded) ** 0.5
-        # Thicker where it stopped running.
+        # The icing is thicker where it stopped flowing.
         beads = 1 + 0.25 * np.exp(-((rounded - 0.12) ** 2) / 0.01)
         return _on_tube(around, outer + v * (inner - outer), _DOUGH - 0.0005 + thick * beads)
 
@@ -97,7 +98,7 @@ def make_donut(num_gaussians: int = 45_624, *, seed: int = 0, sh_degree: int = 3
         around = 2 * np.pi * u
         outer, inner = rim(around)
         along = inner - 0.15 + v * (2 * np.pi - (inner - outer) + 0.3)
-        # The pale line where it floated.
+        # The pale line at the former oil surface.
         pinch = 1 - 0.02 * np.exp(-((np.cos(along) - 1) ** 2) / 0.02)
         return _on_tube(around, along, _DOUGH * pinch)
 
@@ -151,7 +152,8 @@ def make_donut(num_gaussians: int = 45_624, *, seed: int = 0, sh_degree: int = 3
 
 
 def _sprinkles(icing: SurfaceMap, n: int, rng: np.random.Generator) -> Part:
-    """Sugar capsules of n gaussians each, stuck to the icing in all directions."""
+    """Return sugar capsules of n gaussians each, which lie on the icing in all
+    directions."""
     seats = sample(lambda u, v: icing(u, 0.10 + 0.80 * v), _SPRINKLES, rng)
     turn = rng.uniform(0, 2 * np.pi, _SPRINKLES)
     axis = (

@@ -58,9 +58,9 @@ def make_person(num_gaussians: int = 343_274, *, seed: int = 0, sh_degree: int =
     """Make a standing person in shirt, trousers or skirt, and shoes.
 
     Args:
-        num_gaussians: How many gaussians, exactly; the default is the mean of the V3DG
+        num_gaussians: Exact number of gaussians; the default is the mean of the V3DG
             paper's persons.
-        seed: Another person: build, pose, skin, hair and clothes.
+        seed: Each seed gives another person: build, pose, skin, hair and clothes.
         sh_degree: 0 to 3.
 
     Returns:
@@ -107,7 +107,7 @@ def make_person(num_gaussians: int = 343_274, *, seed: int = 0, sh_degree: int =
 
 
 def _seen(figure: Figure, points: Array, *, behind: Sequence[Shape]) -> Array:
-    """Which points no other layer hides."""
+    """Return which points are not hidden by another layer."""
     free = np.ones(len(points), bool)
     for shape in behind:
         near = np.flatnonzero(
@@ -121,7 +121,7 @@ def _seen(figure: Figure, points: Array, *, behind: Sequence[Shape]) -> Array:
 def _enough(
     shape: Shape, n: int, figure: Figure, behind: Sequence[Shape], rng: np.random.Generator
 ) -> tuple[Array, Array, float]:
-    """n points of a layer that no other hides."""
+    """Return n points of a layer that no other layer hides."""
     probe, _, _ = shape.spread(600, rng)
     share = max(float(_seen(figure, probe, behind=behind).mean()), 0.05)
     points, normals, spacing = shape.spread(int(1.12 * n / share) + 50, rng)
@@ -161,7 +161,8 @@ def _skin(
 
 
 def _face(at: Array, tone: Array, hair: Array) -> Array:
-    """Eyes, brows, lips and cheeks painted at places relative to the head's centre."""
+    """Return the colours of eyes, brows, lips and cheeks at positions relative to the
+    head's centre."""
     front = at[:, 1] < -0.03
     x, z = np.abs(at[:, 0]), at[:, 2]
 
@@ -198,11 +199,11 @@ def _cloth(
     noise: Noise,
     rng: np.random.Generator,
 ) -> Part:
-    """Woven cloth with folds, in one colour, in stripes across or along, or in
+    """Return woven cloth with folds: plain, with stripes across or along, or with
     checks."""
     on_top = shape is figure.shirt
     points, normals, spacing = _enough(shape, n, figure, () if on_top else (figure.shirt,), rng)
-    # Cut at the hem, where the round cones end in balls.
+    # The cloth ends at the hem, where the round cones end in balls.
     kept = np.flatnonzero(points[:, 2] > (figure.shirt_hem if on_top else figure.trouser_hem))
     kept = np.concatenate([kept, rng.choice(kept, n - len(kept))])
     points, normals = points[kept], normals[kept]
@@ -258,14 +259,15 @@ def _shoes(figure: Figure, n: int, noise: Noise, rng: np.random.Generator) -> Pa
 
 
 def _hair(figure: Figure, n: int, hair: Array, noise: Noise, rng: np.random.Generator) -> Part:
-    """Strands of a few needles each that grow from the scalp and fall."""
+    """Return strands of a few needles each that grow from the scalp and fall."""
     length = float(rng.choice([0.030, 0.055, 0.20, 0.30]))
     rows = 4 if length < 0.1 else 10
     k = n // rows
     parting = rng.uniform(-0.03, 0.03)
     roots, normals, _ = figure.scalp.spread(4 * k, rng)
     at = roots - figure.head
-    # No hair on the face: the hairline runs from the forehead down before the ears.
+    # There is no hair on the face: the hairline runs from the forehead down in front of
+    # the ears.
     line = 0.060 - 1.15 * np.maximum(at[:, 1] + 0.06, 0) + 0.012 * (noise(roots, 60.0) - 0.5)
     grows = np.flatnonzero((at[:, 2] > line) & (at[:, 2] > -0.075))
     grows = grows[:k] if len(grows) >= k else rng.choice(grows, k)

@@ -28,8 +28,8 @@ from benchmarks.worlds.procedural._parts import (
 )
 from v3dg.gaussians import Gaussians
 
-# Lengths in metres. Columns stand on a rectangle of 6 x 11; x is across the front,
-# which looks along -y.
+# Lengths are in metres. Columns stand on a rectangle of 6 x 11; x is parallel to the
+# front, which faces -y.
 _COLUMNS_X, _COLUMNS_Y, _PITCH = 6, 11, 2.35
 _HALF_X, _HALF_Y = (_COLUMNS_X - 1) * _PITCH / 2, (_COLUMNS_Y - 1) * _PITCH / 2
 _STEP, _TREAD = 0.38, 0.42
@@ -56,8 +56,8 @@ class _Face:
 def _quad(
     a: Sequence[float], b: Sequence[float], c: Sequence[float], d: Sequence[float]
 ) -> SurfaceMap:
-    """The bilinear patch with corners a, b along u, and d, c opposite; it faces (b - a)
-    x (d - a)."""
+    """Return the bilinear patch with corners a, b along u, and d, c opposite; its
+    normal is (b - a) x (d - a)."""
     corners = (np.array(x, dtype=np.float64) for x in (a, b, c, d))
     p, q, r, s = corners
 
@@ -71,7 +71,8 @@ def _quad(
 def _box(
     low: Sequence[float], high: Sequence[float], material: str, sides: str = "xXyYzZ"
 ) -> list[_Face]:
-    """The named faces of a box: small letters at ``low``, capitals at ``high``."""
+    """Return the named faces of a box: small letters at ``low``, capitals at
+    ``high``."""
     (x, y, z), (X, Y, Z) = low, high
     corners = {
         "x": ((x, Y, z), (x, y, z), (x, y, Z), (x, Y, Z)),
@@ -92,8 +93,8 @@ def _flat(corners: Sequence[Sequence[float]], material: str) -> _Face:
 def _ring(
     half_x: float, half_y: float, width: float, bottom: float, top: float, material: str
 ) -> list[_Face]:
-    """A beam around a rectangle whose outer sides are at the half lengths, seen from
-    all sides."""
+    """Return a beam around a rectangle whose outer sides are at the half lengths,
+    visible from all sides."""
     outer = _box((-half_x, -half_y, bottom), (half_x, half_y, top), material, "xXyY")
     inside = (half_x - width, half_y - width)
     a, b = inside
@@ -116,7 +117,7 @@ def _ring(
 
 
 def _column(x: float, y: float) -> list[_Face]:
-    """A fluted shaft that narrows upwards, its cushion and its slab."""
+    """Return a fluted shaft that narrows upwards, its cushion and its slab."""
 
     def shaft(v: Array, u: Array) -> Array:
         angle = -2 * np.pi * u
@@ -143,8 +144,8 @@ def _column(x: float, y: float) -> list[_Face]:
 
 
 def _frieze() -> list[_Face]:
-    """Triglyphs, one over each column and one between two, and the plain slabs behind
-    them."""
+    """Return triglyphs, one over each column and one between two, and the plain slabs
+    behind them."""
     faces = _ring(_HALF_X + 0.50, _HALF_Y + 0.50, 1.0, _FRIEZE, _CORNICE, "metope")
     width, step = 0.50, 0.065
     for half, other, count, along in (
@@ -174,11 +175,12 @@ def _roof() -> list[_Face]:
     for sign in (-1.0, 1.0):
 
         def slope(u: Array, v: Array, sign: float = sign) -> Array:
-            """Rows of flat tiles with round ones over their joints."""
+            """Return rows of flat tiles with round ones over their joints."""
             across = (columns * u) % 1.0
             down = (rows * v) % 1.0
             hump = 0.085 * smoothstep(0.2, 0.0, np.minimum(across, 1 - across))
-            lift = hump + 0.05 * (down - smoothstep(0.85, 1.0, down))  # no row's end is upright
+            # The end of a row is not vertical.
+            lift = hump + 0.05 * (down - smoothstep(0.85, 1.0, down))
             y = sign * half_y * (1 - 2 * u)
             x = sign * half_x * v
             return np.stack([x, y, _RIDGE + (_EAVES - _RIDGE) * v + lift], -1)
@@ -289,7 +291,7 @@ def _faces() -> tuple[_Face, ...]:
     return (*faces, *_roof())
 
 
-# How many gaussians a material gets on equal areas, and whether they run along the
+# The density of gaussians on each material, and whether they are aligned with the
 # surface's first direction.
 _DENSITY = {
     "column": 1.3,
@@ -306,14 +308,14 @@ def make_temple(num_gaussians: int = 1_350_487, *, seed: int = 0, sh_degree: int
     """Make a Doric temple of 6 x 11 columns.
 
     Args:
-        num_gaussians: How many gaussians, exactly; the default is what the V3DG paper's
-            temple has. From about 50,000 on it looks like what it is.
-        seed: Weathers and overgrows it differently.
+        num_gaussians: Exact number of gaussians; the default is that of the V3DG
+            paper's temple. From about 50,000 on it is recognisable.
+        seed: Each seed gives different weathering and plants.
         sh_degree: 0 to 3.
 
     Returns:
-        NumPy gaussians; z is up, the ground is at z = 0, the origin below the middle;
-        lengths in metres: 15 x 27, 10 high.
+        NumPy gaussians; z is up, the ground is at z = 0, the origin is below the
+        middle; lengths in metres: 15 x 27, 10 high.
 
     Raises:
         ValueError: ``num_gaussians`` is below 5,000: there are about a thousand faces.
@@ -341,7 +343,7 @@ def make_temple(num_gaussians: int = 1_350_487, *, seed: int = 0, sh_degree: int
 def _stone(
     material: str, patches: list[tuple[Patch, float]], noise: Noise, rng: np.random.Generator
 ) -> Part:
-    """Gaussians that cover patches of one material, worn and coloured."""
+    """Return gaussians that cover patches of one material, worn and coloured."""
     points, normals, tangents, room = (
         np.concatenate([getattr(patch, name) for patch, _ in patches])
         for name in ("points", "normals", "tangents", "room")
@@ -389,8 +391,8 @@ def _material_colour(material: str, points: Array, noise: Noise) -> Array:
 
 
 def _joints(material: str, points: Array, normals: Array, noise: Noise) -> Array:
-    """How bright the joints are, and each stone: courses on walls, slabs on floors,
-    drums of columns."""
+    """Return the brightness of the joints, and that of each stone: courses on walls,
+    slabs on floors, drums of columns."""
     x, y, z = points.T
     if material == "column":
         return 1 - 0.55 * smoothstep(0.02, 0.005, _to_joint(z - _FLOOR, _SHAFT / 5))
@@ -409,7 +411,8 @@ def _joints(material: str, points: Array, normals: Array, noise: Noise) -> Array
 
 
 def _weathered(material: str, points: Array, normals: Array, colour: Array, noise: Noise) -> Array:
-    """Rain leaves dark streaks below ledges; lichen grows where it is flat."""
+    """Return colours with dark streaks of rain below ledges, and lichen on flat
+    parts."""
     if material == "wood":
         return colour
     streak = noise(points * [1.0, 1.0, 0.07] + 17, 2.4) * noise(points + 57, 0.6)
@@ -424,12 +427,12 @@ def _weathered(material: str, points: Array, normals: Array, colour: Array, nois
 
 
 def _to_joint(x: Array, length: float) -> Array:
-    """Distance to the nearest joint between blocks of one length."""
+    """Return the distance to the nearest joint between blocks of one length."""
     return np.asarray(np.abs(x / length - np.round(x / length)) * length)
 
 
 def _grass(n: int, rng: np.random.Generator) -> Part:
-    """Blades in the corners of the steps and around the foot."""
+    """Return blades of grass in the corners of the steps and around the base."""
     rows = 6
     k = max(n // rows, 1)
     step = rng.integers(0, 3, k)
@@ -441,7 +444,7 @@ def _grass(n: int, rng: np.random.Generator) -> Part:
         + (step == 0) * rng.exponential(0.12, k)
     )
     half = np.stack([_HALF_X + out, _HALF_Y + out], -1)
-    # Tufts: many blades about few places of the rectangle's rim.
+    # Tufts are many blades near a few points of the rectangle's edge.
     tuft = rng.random(max(k // 45, 1))
     place = (tuft[rng.integers(len(tuft), size=k)] + 0.0025 * rng.standard_normal(k)) % 1.0
     side, along = (4 * place).astype(int), 2 * ((4 * place) % 1.0) - 1
@@ -470,8 +473,8 @@ def _grass(n: int, rng: np.random.Generator) -> Part:
 
 
 def _ivy(n: int, noise: Noise, rng: np.random.Generator) -> Part:
-    """Leaves that climb from the ground up the columns of one corner and over the
-    beams."""
+    """Return leaves that climb from the ground up the columns of one corner and over
+    the beams."""
     rows, columns = 3, 2
     k = max(n // (rows * columns), 1)
     many = 6 * k

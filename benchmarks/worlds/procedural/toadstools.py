@@ -1,13 +1,12 @@
 """A 3DGS asset that needs no download: toadstools on a mossy tuft, and a meadow to
 place it in.
 
-The gaussians are spread as training spreads them: thin discs that cover surfaces,
-needles along blades of grass, a wide range of sizes and opacities, colour that depends
-on the view where something shines or lets light through. What is simulated is only as
-much light as makes a picture pleasant: one sun with soft shadows, a sky, some
-occlusion.
+The gaussians are distributed as after training: thin discs cover surfaces, needles
+follow blades of grass, sizes and opacities vary widely, and colour depends on the view
+where something is glossy or translucent. Light is simulated only as far as it makes a
+pleasant picture: one sun with soft shadows, a sky, some occlusion.
 
-Axes: z is up, the ground is near z = 0, the tuft's radius is about 1.
+z is up, the ground is near z = 0, the tuft's radius is about 1.
 """
 
 from __future__ import annotations
@@ -49,11 +48,12 @@ def _discs(
     opacity: float = 2.2,
     overlap: float = 0.75,
 ) -> Part:
-    """Thin discs that together cover a surface whose points lie ``spacing`` apart.
+    """Return thin discs that together cover a surface with points at distances of
+    ``spacing``.
 
     ``stretch`` lengthens them along their tangents at equal area; ``opacity`` is the
-    middle of a spread of logits, of which a sixth is much fainter, as training leaves
-    them.
+    middle of the distribution of logits, of which a sixth is much fainter, as after
+    training.
     """
     n = len(points)
     size = overlap * spacing * np.exp(0.22 * rng.standard_normal(n))
@@ -76,7 +76,7 @@ def _discs(
 
 
 def _ground_height(points: Array, noise: Noise) -> Array:
-    """Height of the tuft's soil above a point, a low mound that falls away at its
+    """Return the height of the tuft's soil at a point: a low mound that falls at its
     rim."""
     r = np.hypot(points[:, 0], points[:, 1])
     flat = np.stack([points[:, 0], points[:, 1], np.zeros(len(points))], -1)
@@ -84,9 +84,10 @@ def _ground_height(points: Array, noise: Noise) -> Array:
 
 
 def _ground(n: int, noise: Noise, rng: np.random.Generator) -> Part:
-    """Moss: a closed layer of discs and a fur of needles on it."""
+    """Return moss: a closed layer of discs with a fur of needles."""
     n_base = n // 3
-    disc = revolve(lambda t: (1.18 * t, np.zeros_like(t)), n_base)  # under the neighbours' rims too
+    # Extends under the neighbours' rims.
+    disc = revolve(lambda t: (1.18 * t, np.zeros_like(t)), n_base)
     points = disc.points.copy()
     points[:, 2] = _ground_height(points, noise)
     e = 1e-3
@@ -111,7 +112,7 @@ def _ground(n: int, noise: Noise, rng: np.random.Generator) -> Part:
     root = np.stack([r * np.cos(a), r * np.sin(a), np.zeros(n_fur)], -1)
     root[:, 2] = _ground_height(root, noise)
     grow = unit(UP + 0.75 * rng.standard_normal((n_fur, 3)))
-    # Moss grows in cushions: long in the middle of one, short where two meet.
+    # Moss grows in cushions: long in the middle of one, short between two.
     cushion = noise(root, 7.0, 2)
     size = 0.022 * np.sqrt(30000 / max(n_fur, 1)) ** 0.5 * (0.55 + 0.9 * cushion)
     height = rng.random(n_fur) * (0.01 + 0.08 * cushion**2)
@@ -137,7 +138,7 @@ def _ground(n: int, noise: Noise, rng: np.random.Generator) -> Part:
 
 @dataclass
 class _Toadstool:
-    """Where a toadstool stands and how it is grown. Lengths relative to the tuft's
+    """The position and shape of a toadstool. Lengths are relative to the tuft's
     radius."""
 
     foot: Array  # (3,)
@@ -145,11 +146,11 @@ class _Toadstool:
     height: float
     radius: float  # of the cap
     dome: float  # height of the cap relative to its radius
-    size: float  # share of the gaussians that toadstools get
+    size: float  # fraction of the toadstools' gaussians
 
     @property
     def cap(self) -> Array:
-        """Centre of the cap's rim."""
+        """The centre of the cap's rim."""
         centre: Array = self.foot + self.lean @ np.array([0, 0, self.height])
         return centre
 
@@ -159,11 +160,11 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
     offset = rng.uniform(0, 30, 3)
 
     def cap_profile(t: Array) -> tuple[Array, Array]:
-        a = t * 1.78  # rad: past the rim at pi/2, the edge turns in
+        a = t * 1.78  # radians: beyond the rim at pi/2, the edge turns inwards
         return radius * np.sin(a) ** 0.92, dome * np.cos(a) * np.where(a > np.pi / 2, 0.45, 1.0)
 
     def wobble(points: Array) -> Array:
-        """Irregular growth: the cap is not quite round and its rim waves."""
+        """Deform points irregularly: the cap is not exactly round and its rim waves."""
         a = np.arctan2(points[:, 1], points[:, 0])
         r = np.hypot(points[:, 0], points[:, 1]) / radius
         wave = (
@@ -191,10 +192,11 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
     skin = _discs(
         wobble(cap.points), cap.normals, meridian, cap.spacing, red, rng, stretch=1.5, gloss=1.0
     )
-    skin.scales[:, 0] *= 1 - 0.45 * smoothstep(0.85, 1.0, cap.along)  # a clean edge, not a fringe
+    # A clean edge without a fringe.
+    skin.scales[:, 0] *= 1 - 0.45 * smoothstep(0.85, 1.0, cap.along)
     parts = [skin]
 
-    # Warts: rests of the veil, large near the top, torn into crumbs near the rim.
+    # Warts are remains of the veil: large near the top, small crumbs near the rim.
     count = max(8, int(40 * min(1.0, n / 4000) ** 0.5))
     on_cap = revolve(lambda t: cap_profile(0.03 + 0.80 * t), count)
     spots = wobble(on_cap.points)
@@ -238,7 +240,7 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
             stretch=5.0,
         )
     )
-    parts[-1].scales[:, 0] *= 1 - 0.75 * gill.along**4  # none reaches out past the rim
+    parts[-1].scales[:, 0] *= 1 - 0.75 * gill.along**4  # none extends beyond the rim
     parts[-1].occlusion[:] = 0.45 + 0.30 * gill.along
 
     # Stem: a fibrous column with a bulb, rings of scales on it.
@@ -282,7 +284,7 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
     )
     parts.append(veil)
 
-    # The cap sits on the stem; everything leans together.
+    # The cap is on the stem; everything leans together.
     for i in range(len(parts) - 2):
         parts[i].means[:, 2] += height
     whole = Part.concatenate(parts)
@@ -290,7 +292,7 @@ def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator
 
 
 def _on_ground(n: int, noise: Noise, rng: np.random.Generator, low: float, high: float) -> Array:
-    """Random places on the ground between two radii."""
+    """Return random positions on the ground between two radii."""
     r = np.sqrt(rng.uniform(low**2, high**2, n))
     a = np.arange(n) * GOLDEN_ANGLE + rng.uniform(0, 2 * np.pi) + 0.5 * rng.standard_normal(n)
     points = np.stack([r * np.cos(a), r * np.sin(a), np.zeros(n)], -1)
@@ -491,8 +493,8 @@ def _pebbles(n: int, noise: Noise, rng: np.random.Generator) -> Part:
 
 
 def _shadow(points: Array, caps: Sequence[_Toadstool]) -> Array:
-    """Share of the sun that caps let through to each point: caps are ellipsoids with
-    soft edges."""
+    """Return the fraction of the sun that caps let through to each point: caps are
+    ellipsoids with soft edges."""
     light = np.ones(len(points))
     for shape in caps:
         axes = np.array([1, 1, shape.dome]) * shape.radius
@@ -504,7 +506,7 @@ def _shadow(points: Array, caps: Sequence[_Toadstool]) -> Array:
 
 
 def _under_caps(points: Array, caps: Sequence[_Toadstool]) -> Array:
-    """Share of the sky that caps leave free above each point."""
+    """Return the fraction of the sky that caps leave free above each point."""
     free = np.ones(len(points))
     for shape in caps:
         aside = np.hypot(*(points - shape.cap)[:, :2].T) / shape.radius
@@ -518,8 +520,8 @@ def _under_caps(points: Array, caps: Sequence[_Toadstool]) -> Array:
 
 
 def _lit(part: Part, caps: Sequence[_Toadstool]) -> Array:
-    """Light the gaussians and express their colour as spherical harmonics of degree 1,
-    (n,4,3)."""
+    """Compute the light on the gaussians; return their colours as spherical harmonics
+    of degree 1, (n,4,3)."""
     facing = part.normals @ TO_SUN
     thin = part.translucency
     sunlit = _shadow(part.means, caps)
@@ -533,9 +535,9 @@ def _lit(part: Part, caps: Sequence[_Toadstool]) -> Array:
     linear = part.albedo * (direct[:, None] * SUN + sky[:, None] * SKY + bounce)
     colour = display(linear)
 
-    # What depends on the view, linear in the direction v to the eye: the sky's mirror
-    # image is brighter the higher the mirrored direction 2 (n.v) n - v points; the
-    # sun's highlight leans towards the sun's mirrored direction; thin things glow when
+    # The view-dependent part is linear in the direction v to the eye: the sky's
+    # reflection is brighter the higher the reflected direction 2 (n.v) n - v points;
+    # the sun's highlight is towards the sun's reflected direction; thin parts glow if
     # the sun is behind them.
     n = part.normals
     shine = part.gloss[:, None]
@@ -564,9 +566,9 @@ def make_asset(num_gaussians: int = 60_000, *, seed: int = 0) -> Gaussians:
     """Make a tuft of moss with toadstools, grass, daisies, clover and pebbles.
 
     Args:
-        num_gaussians: How many gaussians, exactly; fewer means fewer blades and larger
-            gaussians. From about 10,000 on it looks like what it is. seed: The same
-            seed gives the same gaussians.
+        num_gaussians: Exact number of gaussians; with fewer, there are fewer blades and
+            larger gaussians. From about 10,000 on the asset is recognisable. seed: The
+            same seed gives the same gaussians.
 
     Returns:
         NumPy gaussians with SH degree 1; z is up, the ground's radius is about 1.
@@ -613,10 +615,10 @@ def make_asset(num_gaussians: int = 60_000, *, seed: int = 0) -> Gaussians:
 
 
 def place_field(count: int = 2000, *, seed: int = 0) -> tuple[Array, Array, Array]:
-    """Place tufts on a round hill, so close that moss covers it, each turned and sized
-    differently.
+    """Place tufts on a round hill, close enough that moss covers it, each with a
+    different rotation and size.
 
-    The first stands at the origin, upright. Toadstools of two tufts seldom meet.
+    The first tuft is at the origin, upright. Toadstools of two tufts rarely touch.
 
     Returns:
         Positions (count,3), quaternions (count,4) w,x,y,z and scales (count,), float64;

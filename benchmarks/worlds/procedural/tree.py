@@ -1,5 +1,5 @@
-"""Trees of eight kinds: a trunk that branches in levels, bark, and thin leaves that let
-light through."""
+"""Trees of eight kinds: a trunk that branches in levels, bark, and thin leaves that
+light passes through."""
 
 from __future__ import annotations
 
@@ -25,22 +25,23 @@ from benchmarks.worlds.procedural._parts import (
 from v3dg.gaussians import Gaussians
 
 _STEPS = 10  # segments of a branch
-_CLEARANCE = 0.3  # m: no branch comes nearer to the ground
+_CLEARANCE = 0.3  # m; branches do not come closer to the ground
 _LEAF_ROWS, _LEAF_COLUMNS = 3, 2
 
 
 @dataclass(frozen=True)
 class _Level:
-    """How branches of one level spring from those of the level below."""
+    """How branches of one level grow from those of the level below."""
 
-    children: int  # on each
-    start: float  # where along the parent the first springs, in [0,1]
-    # From the parent's direction, rad: at the first child and at the last.
+    children: int  # number on each branch
+    start: float  # position of the first child along the parent, in [0,1]
+    # Angle to the parent's direction, radians: of the first child and of the last.
     angle: tuple[float, float]
-    length: tuple[float, float]  # relative to the parent's: at the first child and at the last
+    # Relative to the parent's length: of the first child and of the last.
+    length: tuple[float, float]
     bulge: float  # how much longer children in the middle are
     wander: float  # how crooked
-    rise: float  # bends upwards, negative: droops
+    rise: float  # bends upwards; negative: droops
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,8 @@ class _Kind:
     levels: tuple[_Level, ...]
     bark: tuple[tuple[float, float, float], tuple[float, float, float]]
     leaf: tuple[float, float]  # length and half width, at the default count
-    leaves: tuple[tuple[float, float, float], ...]  # colours, between which a tree's leaves vary
+    # Two colours, between which a tree's leaves vary.
+    leaves: tuple[tuple[float, float, float], ...]
     hang: float = 0.3  # how much leaves hang
     needles: bool = False
     bands: float = 0.0  # dark stripes across the bark, as birches have
@@ -201,8 +203,8 @@ def _grow(
     level: _Level,
     rng: np.random.Generator,
 ) -> _Branches:
-    """Grow branches from ``base``, crookedly, tapering to a quarter of their first
-    radius."""
+    """Return crooked branches that grow from ``base`` and taper to a quarter of their
+    first radius."""
     points = np.empty((len(base), _STEPS + 1, 3))
     points[:, 0], heading = base, unit(direction)
     for step in range(_STEPS):
@@ -216,7 +218,7 @@ def _grow(
 
 
 def _at(branches: _Branches, which: NDArray[np.int64], t: Array) -> tuple[Array, Array, Array]:
-    """Points, directions and radii at ``t`` in [0,1] along branches."""
+    """Return points, directions and radii at ``t`` in [0,1] along branches."""
     place = np.clip(t, 0, 1 - 1e-9) * _STEPS
     i = place.astype(np.int64)
     f = (place - i)[:, None]
@@ -226,7 +228,7 @@ def _at(branches: _Branches, which: NDArray[np.int64], t: Array) -> tuple[Array,
 
 
 def _branch_out(parents: _Branches, level: _Level, rng: np.random.Generator) -> _Branches:
-    """Children of every branch, spiralling around it."""
+    """Return the children of every branch, in a spiral around it."""
     count, k = len(parents.lengths), level.children
     which = np.repeat(np.arange(count), k)
     share = np.tile((np.arange(k) + 0.5) / k, count) + rng.uniform(-0.4, 0.4, count * k) / k
@@ -259,11 +261,11 @@ def make_tree(
     """Make a tree: bark on branches of four levels, leaves or needles on the last.
 
     Args:
-        num_gaussians: How many gaussians, exactly; the default is the mean of the V3DG
-            paper's trees. Fewer means fewer and larger leaves.
+        num_gaussians: Exact number of gaussians; the default is the mean of the V3DG
+            paper's trees. With fewer, there are fewer and larger leaves.
         kind: One of ``TREE_KINDS``.
-        seed: Another tree of the same kind.
-        sh_degree: 0 to 3; from 1 on leaves glow where the sun is behind them.
+        seed: Each seed gives another tree of the same kind.
+        sh_degree: 0 to 3; from 1 on leaves glow if the sun is behind them.
 
     Returns:
         NumPy gaussians; z is up, the foot of the trunk is at the origin; lengths in
@@ -302,15 +304,16 @@ def make_tree(
 def _bark(
     levels: list[_Branches], n: int, shape: _Kind, noise: Noise, rng: np.random.Generator
 ) -> Part:
-    """n gaussians around all branches: flat ones on what is thick, needles along what
-    is thin."""
+    """Return n gaussians around all branches: flat ones on thick branches, needles
+    along thin ones."""
     start = np.concatenate([b.points[:, :-1].reshape(-1, 3) for b in levels])
     end = np.concatenate([b.points[:, 1:].reshape(-1, 3) for b in levels])
     r0 = np.concatenate([b.radii[:, :-1].ravel() for b in levels])
     r1 = np.concatenate([b.radii[:, 1:].ravel() for b in levels])
     length = np.linalg.norm(end - start, axis=1)
     area = 2 * np.pi * 0.5 * (r0 + r1) * length
-    # Thin branches get more than their area's share, else they would be too few to see.
+    # Thin branches get more than in proportion to their area; otherwise they would have
+    # too few to be visible.
     which = allot(area**0.78, n, rng)
     here = np.bincount(which, minlength=len(area))[which]
     t, angle = rng.random(n), rng.uniform(0, 2 * np.pi, n)
@@ -377,7 +380,7 @@ def _seats(
 
 
 def _leaf_colours(shape: _Kind, twigs: NDArray[np.int64], rng: np.random.Generator) -> Array:
-    """A colour for each leaf; leaves of one twig are alike."""
+    """Return a colour for each leaf; leaves of one twig are alike."""
     k = len(twigs)
     of_twig = rng.random(int(twigs.max(initial=0)) + 1)[twigs]
     x = np.clip(0.5 * of_twig + 0.5 * rng.random(k) + 0.10 * rng.standard_normal(k), 0, 1)

@@ -22,6 +22,7 @@ from fuzz.attacks import bombs, changes, damages
 from fuzz.attacks.good_files import good_files
 from fuzz.attacks.memory_use import Watch, limit_growth
 from fuzz.attacks.pool import Outcome
+from v3dg.cleaning import AssetWarning
 from v3dg.cli import main
 
 LIMIT_S = 60  # a hang
@@ -91,6 +92,7 @@ READERS = {
     "bundle": read_bundle,
     "scene": read_scene,
     "cameras": read_cameras,
+    "colmap": read_cameras,
     "picture": read_picture,
 }
 
@@ -283,6 +285,7 @@ def _tried(read, path):
     """What was read or None, the error's text, and what is wrong with that."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        warnings.simplefilter("ignore", AssetWarning)  # notes about what is not read
         try:
             return read(path), "", None
         except MemoryError as error:

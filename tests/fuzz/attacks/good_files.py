@@ -4,6 +4,7 @@ else lies beside it."""
 import dataclasses
 import io
 import json
+import struct
 import zipfile
 from pathlib import Path
 
@@ -12,8 +13,9 @@ import torch
 from PIL import Image
 
 import v3dg
+from gltf_files import file_of_every_part
 from random_bundle import random_bundle, random_gaussians
-from test_camera_file import CAPTURE
+from test_camera_file import CAPTURE, PATH
 from test_formats import FIXTURES, gsplat_tensors
 from test_ply import Element, ply_bytes, random_columns
 from v3dg.formats import sog
@@ -62,6 +64,18 @@ def _ply():
         face = Element("face", {"indices": [np.arange(3, dtype="u2")]})
         elements = [face, Element("vertex", columns)] if degree else [Element("vertex", columns)]
         yield Good("ply", {"a.ply": ply_bytes(elements, encoding)})
+        yield Good("ply", {"a.ply": ply_bytes([_of_another_trainer(degree)], encoding)})
+
+
+def _of_another_trainer(degree):
+    """Base colours, flat gaussians, filters and numbers of other types."""
+    columns = random_columns(5, degree)
+    for i, name in enumerate(("red", "green", "blue")):
+        del columns[f"f_dc_{i}"]
+        columns[name] = np.arange(5, dtype="u1")
+    del columns["scale_2"]
+    columns["filter_3D"] = np.full(5, 0.5, "f2")
+    return Element("vertex", columns | {"label": np.arange(5, dtype="i8")})
 
 
 def _formats(folder):
@@ -83,7 +97,15 @@ def _formats(folder):
         if kind in ("splat", "ksplat", "spz", "sog", "glb"):
             is_hashed = kind == "sog" or path.read_bytes()[:2] == b"\x1f\x8b"
             yield Good(kind, {f"a.{kind}": path.read_bytes()}, is_hashed=is_hashed)
+    file = file_of_every_part()
+    document = file.write(folder / "good.gltf", "a.bin").read_bytes()
+    yield Good("gltf", {"a.gltf": document, "a.bin": bytes(file.blob)})
     parts = sog.encode(random_gaussians(np.random.default_rng(1), 40, 1))
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, content in parts.items():
+            archive.writestr(f"folder/{name}", content)
+    yield Good("sog", {"a.sog": stream.getvalue()}, is_hashed=True)
     yield Good("sog_folder", {"meta.json": parts.pop("meta.json"), **parts})
     yield streamed(4)
 
@@ -124,6 +146,16 @@ def _checkpoints():
     stream = io.BytesIO()
     torch.save({"pipeline": values}, stream)
     yield Good("checkpoint", {"a.ckpt": stream.getvalue()}, is_hashed=True)
+    order = ("means", "sh0", "shN", "scales", "quats", "opacities")
+    captured = (1, *(tensors[name] for name in order), *[torch.zeros(2)] * 3, {}, 2.0)
+    stream = io.BytesIO()
+    torch.save((captured, 30000), stream)
+    yield Good("checkpoint", {"a.pth": stream.getvalue()}, is_hashed=True)
+    colors = {name: tensors[name] for name in ("means", "scales", "quats", "opacities")}
+    colors["colors"] = tensors["sh0"][:, 0]
+    settings = b"antialiased: true\nmodel_type: 2dgs\n"
+    files = {"a.pt": checkpoint_bytes(colors), "cfg.yml": settings}
+    yield Good("checkpoint", files)  # the settings are not hashed
 
 
 def _bundles(folder):
@@ -141,8 +173,32 @@ def _json(folder):
     documents = list(_documents())
     for document in documents[:3]:
         yield Good("scene", {"scene.json": document, **beside})
-    for document in (json.dumps(CAPTURE).encode(), *documents[3:]):
+    others = [json.dumps(document).encode() for document in (PATH, [CAMERA_OF_3DGS] * 2)]
+    for document in (json.dumps(CAPTURE).encode(), *documents[3:], *others):
         yield Good("cameras", {"transforms.json": document})
+    yield from _models_of_colmap()
+
+
+CAMERA_OF_3DGS = {
+    "id": 0,
+    "img_name": "a",
+    "width": 64,
+    "height": 48,
+    "position": [0, 0, -5],
+    "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "fy": 50,
+    "fx": 50,
+}
+
+
+def _models_of_colmap():
+    """Two images of one camera, binary and as text."""
+    lens = struct.pack("<QIiQQ4d", 1, 1, 1, 64, 48, 50, 50, 32, 24)
+    image = struct.pack("<7dI", 1, 0, 0, 0, 0, 0, 5, 1) + b"a b.jpg\0" + bytes(8)
+    images = struct.pack("<QI", 2, 1) + image + struct.pack("<I", 2) + image
+    yield Good("colmap", {"images.bin": images, "cameras.bin": lens})
+    text = b"# images\n1 1 0 0 0 0 0 5 1 a b.jpg\n\n2 1 0 0 0 0 0 5 1 c.jpg\n1 2 -1\n"
+    yield Good("colmap", {"images.txt": text, "cameras.txt": b"1 PINHOLE 64 48 50 50 32 24\n"})
 
 
 def _documents():

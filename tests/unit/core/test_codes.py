@@ -228,5 +228,5 @@ def test_pages_that_are_none_are_refused():
             _core.Codes(*arguments)
     broken = page.copy()
     broken.view(np.float32)[6 * codes.num_gaussians] = np.nan  # the first cluster's first mean
-    with pytest.raises(ValueError, match="cluster 0: expected ranges of finite numbers"):
+    with pytest.raises(ValueError, match="cluster 0: expected finite ranges"):
         _core.Codes(broken, one, offset, 1)

@@ -468,7 +468,7 @@ def test_what_is_fitted_has_to_be_like_its_target():
 def test_what_is_fitted_has_to_be_writable():
     start = copied(in_ball(15, 10))
     start.means.flags.writeable = False
-    with pytest.raises(ValueError, match="means: expected an array that can be written to"):
+    with pytest.raises(ValueError, match="means: expected a writable array"):
         fit_one_group(in_ball(15, 10), in_ball(15, 10), {"gaussians": start.rows})
 
 

@@ -8,6 +8,7 @@ import pytest
 
 import scenes
 from random_bundle import random_bundle
+from reference import sh
 from v3dg import _core
 from v3dg._device import CPU
 from v3dg.residency import residency
@@ -187,7 +188,7 @@ def test_instances_of_no_bundle_are_refused(bundle):
         "offset": np.zeros(1, np.int64),
     }
     rows = scenes.gaussians([[0, 0, 1]]).rows
-    with pytest.raises(ValueError, match=f"bundle: expected a bundle below 1, got {bundle}"):
+    with pytest.raises(ValueError, match=f"bundle: expected an index below 1, got {bundle}"):
         _core.gather(bundles=[rows], instances=instances, device=-1, **arguments)
 
 
@@ -323,7 +324,7 @@ def test_frame_refuses_a_scene_of_other_bundles():
             assert not frame.draw(*arguments).alpha.any()
             continue
         with pytest.raises(
-            ValueError, match="scene: expected one of the bundles that the frame has the"
+            ValueError, match="scene: expected a scene of the bundles whose gaussians the frame has"
         ):
             frame.draw(*arguments)
 
@@ -332,3 +333,19 @@ def test_background_has_three_numbers():
     for background in ([0, 0], [0, 0, 0, 0], None, "red"):
         with pytest.raises(TypeError, match="incompatible constructor arguments"):
             _core.Shade(background=background, min_transmittance=1e-3, with_depth=True)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_bases_are_those_of_the_reference(degree):
+    directions = np.random.default_rng(degree).normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    found = _core.sh_bases(degree, directions)
+    np.testing.assert_allclose(found, sh.basis(directions, degree), atol=1e-12)
+    assert _core.sh_bases(degree, np.zeros((0, 3))).shape == (0, (degree + 1) ** 2)
+
+
+def test_bases_of_what_is_no_direction_are_refused():
+    with pytest.raises(ValueError, match="degree: expected 0 to 3, got 4"):
+        _core.sh_bases(4, np.zeros((1, 3)))
+    with pytest.raises(ValueError, match="directions: expected"):
+        _core.sh_bases(1, np.zeros((1, 2)))

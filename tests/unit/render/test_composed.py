@@ -325,7 +325,7 @@ def test_cut_of_another_scene_is_refused(device):
     cut = select(scene, camera, device="cpu")
     with pytest.raises(ValueError, match="cut: expected a selection from this scene"):
         render(composed(rng), camera, cut=cut, device=device)
-    with pytest.raises(ValueError, match="budget: expected nothing beside a cut"):
+    with pytest.raises(ValueError, match="budget: expected no value besides a cut"):
         render(scene, camera, cut=cut, budget=10**6, device=device)
     everything = select(scene, camera, cull=False, device="cpu")
     scene.remove(len(scene) - 1)

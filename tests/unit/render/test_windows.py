@@ -31,7 +31,7 @@ def draw_window(scene, camera, window):
     residency.set_models(frame, scene.bundles, CPU, "appearance")
     request = _core.FrameRequest(
         camera.core.window(*window),
-        shade=shade_of((0.1, 0.2, 0.3), None, False, True),
+        shade=shade_of((0.1, 0.2, 0.3), None, is_asset=False, depth=True),
         cut=_core.GivenCut(selection.instance_ids, selection.cluster_ids),
     )
     drawing = frame.draw(residency.scene(scene, CPU).core, request)

@@ -162,7 +162,7 @@ def test_a_click_finds_what_is_resident(scene):
 
 def test_picks_of_a_renderer_without_a_pool_are_refused(scene):
     camera = VIEW.camera(*SIZE, 0.01)
-    with pytest.raises(ValueError, match="renderer: expected one with a pool on the CPU"):
+    with pytest.raises(ValueError, match="renderer: expected a renderer with a pool on the CPU"):
         pick(scene, camera, 1, 1, renderer=Renderer(scene, device="cpu", memory=None))
 
 

@@ -54,6 +54,7 @@ export class App {
   bookmarks = new Bookmarks(this);
   linkState = new LinkState(this);
   overlay = new Overlay(this);
+  crop = this.overlay.crop;
   movement = new Movement(this);
   pointers = new Pointers(this);
   panel = new Panel(this);
@@ -112,7 +113,8 @@ export class App {
         saveFile(message.name, bytes);
         break;
       case "picked":
-        this.instances.take(message);
+        if (this.crop.isWaiting) this.crop.take(message);
+        else this.instances.take(message);
         break;
       case "play":
         this.path.play(message);
@@ -142,6 +144,7 @@ export class App {
     }
     document.title = scene.name;
     this.instances.reset();
+    this.crop.reset();
     this.path.reset();
     this.requests.reset();
     this.bookmarks.load();
@@ -152,7 +155,7 @@ export class App {
 
   openFirst() {
     this.camera.put(this.places.home);
-    this.camera.focus = this.scene.center;
+    this.camera.focus = this.places.homeFocus;
     this.panel.build();
     const { hash } = location;
     this.toolbar.showQuestion(this.greeting.asks_up && !/[#&]up=/.test(hash));
@@ -191,6 +194,12 @@ export class App {
   change(settings) {
     Object.assign(this.look.settings, settings);
     this.sync();
+  }
+
+  /** Lets go of the box of a crop, or of the selected instance. */
+  letGo() {
+    if (this.crop.isOn) this.crop.end();
+    else this.instances.select(null);
   }
 
   /** @param {Mode} mode */

@@ -17,7 +17,7 @@ const COMMANDS = /** @type {Record<string, (app: App) => void>} */ ({
   KeyG: (app) => app.instances.setTool("move"),
   KeyR: (app) => app.instances.setTool("turn"),
   KeyT: (app) => app.instances.setTool("size"),
-  Escape: (app) => app.instances.select(null),
+  Escape: (app) => app.letGo(),
 });
 
 /**

@@ -95,6 +95,22 @@ export function addCheckbox(parent, label, { value, title }, act) {
 /**
  * @param {HTMLElement} parent
  * @param {string} label
+ * @param {{ value: string, title: string }} state The colour as #rrggbb.
+ * @param {(value: string) => void} act
+ * @returns {Control<string>}
+ */
+export function addColor(parent, label, { value, title }, act) {
+  const control = make("input", { type: "color", value });
+  control.addEventListener("input", () => act(control.value));
+  const set = (/** @type {string} */ color) => {
+    control.value = color;
+  };
+  return { element: addLabelled(parent, label, control, title), set };
+}
+
+/**
+ * @param {HTMLElement} parent
+ * @param {string} label
  * @param {{ options: string[][], value: string, title?: string }} state Options: keys with texts.
  * @param {(value: string) => void} act
  * @returns {Control<string>}

@@ -86,16 +86,7 @@ export class Handles {
   }
 
   drawBox() {
-    const corners = cornersOf(this.app.instances.selected);
-    /** @type {Line[]} */
-    const edges = [];
-    // The bits of a corner's index say at which end of each axis it is.
-    corners.forEach((corner, i) => {
-      for (const bit of [1, 2, 4]) {
-        if ((i & bit) === 0) edges.push([corner, corners[i | bit]]);
-      }
-    });
-    this.projection.stroke(BOX_COLOR, 1.5, edges);
+    this.projection.stroke(BOX_COLOR, 1.5, edgesOf(this.app.instances.selected));
   }
 
   drawRings() {
@@ -192,9 +183,27 @@ export class Handles {
 }
 
 /**
+ * The edges of an instance's box, in the world.
+ *
+ * @param {Pick<Picked, "pose" | "box">} placed
+ */
+export function edgesOf(placed) {
+  const corners = cornersOf(placed);
+  /** @type {Line[]} */
+  const edges = [];
+  // The bits of a corner's index say at which end of each axis it is.
+  corners.forEach((corner, i) => {
+    for (const bit of [1, 2, 4]) {
+      if ((i & bit) === 0) edges.push([corner, corners[i | bit]]);
+    }
+  });
+  return edges;
+}
+
+/**
  * The corners of an instance's box, in the world.
  *
- * @param {Picked} picked
+ * @param {Pick<Picked, "pose" | "box">} placed
  */
 function cornersOf({ pose, box }) {
   return Array.from({ length: 8 }, (_, i) => {

@@ -1,6 +1,7 @@
 // What the page's address says after `#`: where the camera is, and the settings.
 
 import * as M from "./math.js";
+import { colorOf, hexOf } from "./colors.js";
 import { AXES, MODES, SPEED_BOUNDS, isMode } from "./camera.js";
 
 /** @typedef {import("./app.js").App} App */
@@ -118,6 +119,7 @@ export class LinkState {
     settings.min_level = Math.round(level);
     settings.gain = values.number("gain", limits.gain) ?? defaults.gain;
     settings.fade = values.text("fade") === "0" ? null : defaults.fade;
+    settings.background = colorOf(values.text("background") ?? hexOf(defaults.background));
     settings.split = values.number("split", [0, 1]) ?? defaults.split;
     if (settings.split && !shows_cuts) {
       settings.split = 0;
@@ -201,6 +203,7 @@ function partsOf(settings) {
     gain: settings.gain,
     fade: settings.fade === null ? 0 : 1,
     split: settings.split,
+    background: hexOf(settings.background).slice(1),
   };
 }
 

@@ -1,6 +1,7 @@
-// What is drawn over the picture: frusta, the selected instance, and the axes.
+// What is drawn over the picture: frusta, the selected instance, the box of a crop, and the axes.
 
 import { Compass } from "./compass.js";
+import { Crop } from "./crop.js";
 import { element } from "./elements.js";
 import { Frusta } from "./frusta.js";
 import { Handles } from "./handles.js";
@@ -21,6 +22,7 @@ export class Overlay {
     this.projection = new Projection(app.camera, this.context);
     this.frusta = new Frusta(app, this.projection);
     this.handles = new Handles(app, this.projection);
+    this.crop = new Crop(app, this.projection);
     this.compass = new Compass(app.camera);
   }
 
@@ -42,7 +44,8 @@ export class Overlay {
     const { app, context, projection } = this;
     if (projection.width > LEAST_WIDTH_OF_COMPASS_PX) this.compass.draw();
     const { frozen } = app.look.settings;
-    const isEmpty = !frozen && !app.fileCameras.showsFrusta && !app.instances.selected;
+    const hasObject = app.instances.selected || this.crop.isOn;
+    const isEmpty = !frozen && !app.fileCameras.showsFrusta && !hasObject;
     // A transparent layer is not blended over the picture, which takes long without a GPU.
     this.canvas.style.opacity = isEmpty ? "0" : "1";
     if (isEmpty) return;
@@ -53,5 +56,6 @@ export class Overlay {
     if (frozen) this.frusta.drawFrozen(frozen);
     if (app.fileCameras.showsFrusta) this.frusta.draw();
     if (app.instances.selected) this.handles.draw();
+    if (this.crop.isOn) this.crop.draw();
   }
 }

@@ -3,6 +3,7 @@
 import { tableOf } from "./controls.js";
 import { element, make } from "./elements.js";
 import { figuresOf } from "./figures.js";
+import { CropFolder } from "./panel_crop.js";
 import { FileCamerasFolder, MovementFolder, PlacesFolder } from "./panel_camera.js";
 import { PictureFolder } from "./panel_picture.js";
 import { InstancesFolder, PathFolder } from "./panel_scene.js";
@@ -62,6 +63,7 @@ export class Panel {
       this.folders.push(new FileCamerasFolder(app, this.addFolder("Cameras of the file")));
     }
     this.folders.push(new InstancesFolder(app, this.addFolder("Instances")));
+    this.folders.push(new CropFolder(app, this.addFolder("Crop")));
     this.path = new PathFolder(app, this.addFolder("Path"));
     this.folders.push(this.path);
     const keys = KEYS.map(([key, meaning]) => [make("kbd", {}, key), meaning]);

@@ -1,6 +1,7 @@
 // The panel's folder "Picture": what is shown, and how finely.
 
-import { addButton, addCheckbox, addRow, addSelect, addSlider } from "./controls.js";
+import { colorOf, hexOf } from "./colors.js";
+import { addButton, addCheckbox, addColor, addRow, addSelect, addSlider } from "./controls.js";
 import { make } from "./elements.js";
 
 /** @typedef {import("./app.js").App} App */
@@ -47,6 +48,7 @@ export class PictureFolder {
     this.split = this.addSplit(levels);
     this.isFrozen = this.addFreeze(levels);
     this.resolution = this.addResolution(parent);
+    this.background = this.addBackground(parent);
     const save = () => app.path.save("picture");
     addButton(addRow(parent), "Save picture", save, "A .png of what is shown, in full");
   }
@@ -71,6 +73,16 @@ export class PictureFolder {
     this.isFrozen.set(settings.frozen !== null);
     this.isFrozen.element.hidden = !app.scene.shows_cuts;
     this.resolution.set(100 * app.look.resolution);
+    this.background.set(hexOf(settings.background));
+  }
+
+  /** @param {HTMLElement} parent */
+  addBackground(parent) {
+    const title = "What is seen where no gaussian is.";
+    const state = { value: hexOf(this.settings.background), title };
+    return addColor(parent, "Background", state, (color) => {
+      this.app.change({ background: colorOf(color) });
+    });
   }
 
   /**

@@ -45,13 +45,38 @@ export class Places {
   }
 
   /**
-   * A view of all of the scene, from a little above, whichever axis is up.
+   * The first view of the scene: all of an object, a room from inside.
    *
    * @returns {Pinhole}
    */
   get home() {
+    const { greeting, camera } = this.app;
+    const isUpAsSaid = M.dot(M.unit(greeting.up), M.unit(camera.up)) > SAME_DIRECTION;
+    return isUpAsSaid ? this.firstHome.view : this.homeFromAbove;
+  }
+
+  /** The point that orbits go around at first. */
+  get homeFocus() {
+    return this.home === this.firstHome.view ? this.firstHome.focus : this.app.scene.center;
+  }
+
+  /** The widest first view that fits into the window, else the narrowest one. */
+  get firstHome() {
+    const { homes } = this.app.scene;
+    const fitting = homes.filter(({ view }) => view.aspect <= this.app.look.aspect);
+    return fitting.at(-1) ?? homes[0];
+  }
+
+  /**
+   * A view of all of the scene, from a little above, for an axis that a person chose.
+   *
+   * @returns {Pinhole}
+   */
+  get homeFromAbove() {
     const { scene, camera, look } = this.app;
-    const forward = this.homeDirection;
+    const side = M.unit(M.cross(camera.up, M.axisAcross(camera.up)));
+    const level = M.mul(side, Math.cos(HOME_PITCH));
+    const forward = M.add(level, M.mul(camera.up, -Math.sin(HOME_PITCH)));
     // A window that is higher than wide shows less at its sides.
     const half = Math.atan(Math.tan(HOME_FOV_Y / 2) * Math.min(1, look.aspect));
     const distance = (0.95 * scene.radius) / Math.sin(half);
@@ -59,18 +84,8 @@ export class Places {
     return { wxyz: M.looking(forward, camera.up), position, fov_y: HOME_FOV_Y };
   }
 
-  /** @returns {Vector} */
-  get homeDirection() {
-    const { camera, greeting } = this.app;
-    const isUpAsTold = M.dot(M.unit(greeting.up), M.unit(camera.up)) > SAME_DIRECTION;
-    if (isUpAsTold) return M.rotate(greeting.home.wxyz, [0, 0, 1]);
-    const side = M.unit(M.cross(camera.up, M.axisAcross(camera.up)));
-    const level = M.mul(side, Math.cos(HOME_PITCH));
-    return M.add(level, M.mul(camera.up, -Math.sin(HOME_PITCH)));
-  }
-
   showAll() {
-    this.app.camera.flyTo(this.home, this.app.scene.center);
+    this.app.camera.flyTo(this.home, this.homeFocus);
     this.app.redraw();
   }
 

@@ -64,20 +64,22 @@ export class Pointers {
 
   /** @param {PointerEvent} event */
   press(event) {
-    const { instances, overlay } = this.app;
+    const { crop, instances, overlay } = this.app;
     const { button, pointerId, pointerType } = event;
     this.surface.focus({ preventScroll: true });
     this.surface.setPointerCapture(pointerId);
     const [x, y] = this.placeOf(event);
     this.places.set(pointerId, [x, y]);
     instances.grip = null;
+    crop.grip = null;
     if (this.places.size > 1) {
       this.start.hasMoved = true; // two fingers are no click
       return;
     }
     this.start = { x, y, time: performance.now(), hasMoved: false, button };
     const slack = pointerType === "touch" ? SLACK_OF_TOUCH : SLACK_OF_MOUSE;
-    if (button === 0) instances.grip = overlay.handles.gripAt(x, y, slack);
+    if (button !== 0 || crop.gripAt(x, y, slack)) return;
+    instances.grip = overlay.handles.gripAt(x, y, slack);
   }
 
   /** @param {PointerEvent} event */
@@ -91,6 +93,7 @@ export class Pointers {
     }
     if (Math.hypot(x - this.start.x, y - this.start.y) > CLICK_PX) this.start.hasMoved = true;
     if (this.places.size === 2) this.pinch(event.pointerId, before, [x, y]);
+    else if (app.crop.grip) app.crop.drag(x, y);
     else if (app.instances.grip) app.instances.setPose(app.overlay.handles.drag(x, y));
     else if (this.start.hasMoved) this.drag(x - before[0], y - before[1], event.shiftKey);
     else return; // it may be a click
@@ -147,6 +150,10 @@ export class Pointers {
   /** @param {PointerEvent} event */
   release(event) {
     if (!this.places.delete(event.pointerId)) return;
+    if (this.app.crop.grip) {
+      this.app.crop.letGo();
+      return;
+    }
     if (this.app.instances.grip) {
       this.app.instances.letGo();
       return;

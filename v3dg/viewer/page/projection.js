@@ -59,6 +59,17 @@ export class Projection {
   }
 
   /**
+   * The direction from the camera to a place of the picture, in the world, of any length.
+   *
+   * @param {Place} place
+   */
+  ray([x, y]) {
+    /** @type {Vector} */
+    const ahead = [(x - this.width / 2) / this.focal, (y - this.height / 2) / this.focal, 1];
+    return M.rotate(this.camera.wxyz, ahead);
+  }
+
+  /**
    * @param {string} color
    * @param {number} width Px.
    * @param {Line[]} lines

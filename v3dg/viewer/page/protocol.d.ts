@@ -13,24 +13,40 @@ export type Shows =
   | "count"
   | "difference";
 
-/** The work that the page asked for has ended. */
+/**
+ * Asks for a new asset, of the gaussians of a bundle whose centres lie in a box, or
+ * of all others.
+ *
+ * Attributes:
+ *     instance: One that shows the bundle.
+ *     box: Lower and upper corner, in the bundle's own coordinates.
+ *     name: Name of the file, whose end is the format.
+ */
+export interface Crop {
+  type: "crop";
+  instance: number;
+  box: [[number, number, number], [number, number, number]];
+  keep: "inside" | "outside";
+  name: string;
+}
+
+/** The work that the page requested has ended. */
 export interface Done {
   type: "done";
 }
 
-/** Says why the picture that was asked for is not drawn. */
+/** Says why the requested picture is not drawn. */
 export interface Failed {
   type: "failed";
   text: string;
 }
 
 /**
- * What a picture cost.
+ * The statistics of a picture.
  *
  * Attributes:
  *     gaussians_selected, gaussians_in_frustum, tolerance, select_ms, draw_ms, levels,
- *     missing: As in `v3dg.Stats`.
- *     memory_bytes: Memory that the viewer's process holds.
+ *     missing: See `v3dg.Stats`. memory_bytes: Memory of the viewer's process.
  */
 export interface Figures {
   gaussians_selected: number;
@@ -53,7 +69,7 @@ export interface File {
  * A camera of the file.
  *
  * Attributes:
- *     photograph: Whether the picture that it took is there.
+ *     photograph: Whether the photograph of this camera is available.
  */
 export interface FileCamera {
   name: string;
@@ -65,19 +81,17 @@ export interface FileCamera {
  * The first message of a connection.
  *
  * Attributes:
- *     version: Version of the viewer; a page of another one loads itself anew.
+ *     version: Version of the viewer; a page of another version reloads itself.
  *     up: The direction that is up, in the world.
- *     asks_up: Whether `up` is only assumed, so that the page asks.
- *     home: A view of all of the scene.
- *     settings: What a tab begins with.
- *     defaults: What a setting is that nobody has asked for.
+ *     asks_up: Whether `up` is only assumed, so that the page asks the user.
+ *     settings: The initial settings of a tab.
+ *     defaults: The default of each setting.
  */
 export interface Hello {
   type: "hello";
   version: string;
   up: [number, number, number];
   asks_up: boolean;
-  home: View;
   settings: Settings;
   defaults: Settings;
   limits: Limits;
@@ -85,11 +99,22 @@ export interface Hello {
 }
 
 /**
- * The smallest and the largest values that the viewer takes.
+ * What a tab first shows, in a window of a certain aspect.
  *
  * Attributes:
- *     picture_px: The longer side of a picture, at most.
- *     path_seconds: The length of a path, at most.
+ *     focus: The point that orbits go around.
+ */
+export interface Home {
+  view: View;
+  focus: [number, number, number];
+}
+
+/**
+ * The limits of values that the viewer accepts.
+ *
+ * Attributes:
+ *     picture_px: Largest length of a picture's longer side.
+ *     path_seconds: Largest duration of a path.
  */
 export interface Limits {
   tolerance: [number, number];
@@ -100,11 +125,11 @@ export interface Limits {
 }
 
 /**
- * Asks for a picture, in place of what was asked for before.
+ * Requests a picture; replaces the previous request.
  *
  * Attributes:
  *     size: Width and height of the picture, px.
- *     number: By which the page knows the pictures that answer.
+ *     number: Identifies the pictures that answer this request.
  */
 export interface Look {
   type: "look";
@@ -114,7 +139,7 @@ export interface Look {
   number?: number;
 }
 
-/** Gives an instance a pose. */
+/** Sets the pose of an instance. */
 export interface Move {
   type: "move";
   instance: number;
@@ -123,14 +148,14 @@ export interface Move {
   scale: number;
 }
 
-/** Something for a person to read, once. */
+/** A message for the user, shown once. */
 export interface Notice {
   type: "notice";
   text: string;
 }
 
 /**
- * Says that a file follows as bytes, which is then shown.
+ * Announces a file that follows as binary data and is then shown.
  *
  * Attributes:
  *     size: Number of bytes.
@@ -142,11 +167,11 @@ export interface Open {
 }
 
 /**
- * Asks what is at a place of the picture, or where an instance is.
+ * Asks what is at a point of the picture, or where an instance is.
  *
  * Attributes:
- *     at: The place, in shares of width and height from the upper left corner.
- *     instance: The instance to tell about, whatever is at the place.
+ *     at: The point, as fractions of width and height from the upper left corner.
+ *     instance: The instance to describe, whatever is at the point.
  */
 export interface Pick {
   type: "pick";
@@ -161,7 +186,7 @@ export interface Pick {
  * Attributes:
  *     box: Lower and upper corner of its bundle, in the bundle's own coordinates.
  *     bundle: Name of the bundle's file; empty if the bundle is not in a file.
- *     point: The place that was picked, in the world.
+ *     point: The picked point, in the world.
  */
 export interface Picked {
   type: "picked";
@@ -176,14 +201,14 @@ export interface Picked {
  * A picture, as the bytes of a JPEG.
  *
  * Attributes:
- *     final: Whether no other picture follows for the same request.
+ *     final: Whether this is the last picture for its request.
  *     number: Number of the request.
  *     size: Width and height, px.
- *     view: From where it is seen.
- *     range: The values of the darkest and the brightest colour, where colours are
+ *     view: The viewpoint of the picture.
+ *     range: The values of the darkest and the brightest colour, if colours represent
  *         values.
- *     distance: How deep what is in its middle mostly is, world units; null where
- *         nothing is, or not known.
+ *     distance: Median depth around the middle, world units; null if nothing is there,
+ *         or if it is unknown.
  */
 export interface Picture {
   type: "picture";
@@ -197,34 +222,34 @@ export interface Picture {
   figures: Figures;
 }
 
-/** The views of a path, to be flown along. */
+/** The views of a path, for playback. */
 export interface Play {
   type: "play";
   fps: number;
   views: View[];
 }
 
-/** Where an instance is. */
+/** The pose of an instance. */
 export interface Pose {
   position: [number, number, number];
   quaternion: [number, number, number, number];
   scale: number;
 }
 
-/** How far the film that is saved is, 0 to 1. */
+/** Progress of the film that is being saved, 0 to 1. */
 export interface Progress {
   type: "progress";
   share: number;
 }
 
 /**
- * Asks for a file; or, to play it, for the views of a path.
+ * Requests a file; or the views of a path, to play it.
  *
  * Attributes:
  *     what: The file: a picture, a film of the path, its cameras, or the scene.
- *     look: What is shown, and in which size.
- *     up: The axis that is up, which a scene's file says; null for another direction.
- *     path: Views, each with the seconds from the one before.
+ *     look: The content and size.
+ *     up: The axis that is up, for a scene's file; null for other directions.
+ *     path: Views, each with the seconds since the one before.
  */
 export interface Save {
   type: "save";
@@ -235,20 +260,24 @@ export interface Save {
 }
 
 /**
- * What the tab shows from now on.
+ * The subject that the tab shows from now on.
  *
  * Attributes:
- *     center, radius: A ball that holds nearly all of it, world units.
+ *     center, radius: A ball that contains nearly all of it, world units.
  *     near: Distance of the near plane, world units.
- *     instances: How many there are.
- *     has_files: Whether all its bundles are files, so that it can be saved.
+ *     homes: First views, from narrow windows to wide ones.
+ *     instances: Number of instances.
+ *     has_files: Whether all its bundles are in files, so that the scene can be saved.
+ *     writes_files: Whether the server writes new assets, beside the file that is
+ *         shown; otherwise the browser saves them.
  *     level_colors: Colour of each level.
  *     ramp: Colours from the smallest value to the largest.
- *     most_counted: Gaussians in a pixel that get the last colour of the ramp.
- *     modes: What can be shown.
- *     shows_cuts: Whether cuts can be frozen, split and picked from.
- *     missing_colors: Colours of gaussians of whose pages none, one, two and three
- *         levels are missing.
+ *     most_counted: Number of gaussians in a pixel that gets the last colour of the
+ *         ramp.
+ *     modes: The available display modes.
+ *     shows_cuts: Whether freezing, splitting and picking are available.
+ *     missing_colors: Colours of gaussians whose pages miss no, one, two and three
+ *         levels.
  */
 export interface Scene {
   type: "scene";
@@ -256,8 +285,10 @@ export interface Scene {
   center: [number, number, number];
   radius: number;
   near: number;
+  homes: Home[];
   instances: number;
   has_files: boolean;
+  writes_files: boolean;
   level_colors: [number, number, number][];
   ramp: [number, number, number][];
   most_counted: number;
@@ -267,19 +298,21 @@ export interface Scene {
 }
 
 /**
- * What a picture shows, and how finely.
+ * The content and quality of a picture.
  *
  * Attributes:
- *     shows: The colours, those of a level or a cluster, the error, which is the
- *         screen area that a gaussian of a coarser cluster stands for, expected depth,
- *         alpha, how many gaussians a pixel is blended of, or the difference to the
+ *     shows: The gaussians' colours; the colours of levels or clusters; the error,
+ *         which is the screen area per gaussian of a coarser cluster; expected depth;
+ *         alpha; the number of gaussians blended in a pixel; or the difference to the
  *         picture of all gaussians.
- *     tolerance, budget, min_level, fade: As in `v3dg.render`, but that a tolerance is
- *         always given.
- *     gain: What a difference is multiplied by.
- *     split: Share of the width, from the left, that shows all gaussians; 0 for none.
- *     frozen: The view that the cut is chosen for; None for the one that is looked
- *         from.
+ *     tolerance, budget, min_level, fade: As in `v3dg.render`, but a tolerance is
+ *         always set.
+ *     gain: Factor of differences.
+ *     split: Fraction of the width, from the left, that shows all gaussians; 0 for
+ *         none.
+ *     frozen: The view that the cut is selected for; None for the view of the picture.
+ *     background: Red, green and blue, 0 to 1, behind colours of gaussians; the other
+ *         modes are drawn on black.
  */
 export interface Settings {
   shows: Shows;
@@ -290,9 +323,10 @@ export interface Settings {
   gain: number;
   split: number;
   frozen: View | null;
+  background: [number, number, number];
 }
 
-/** Ends the work that `Save` began. */
+/** Ends the work that `Save` started. */
 export interface Stop {
   type: "stop";
 }
@@ -302,7 +336,7 @@ export interface Stop {
  *
  * Attributes:
  *     wxyz: Rotation from camera (x right, y down, z forward) to world, a quaternion
- *         of any length but zero.
+ *         of any nonzero length.
  *     position: Position of the eye, world units.
  *     fov_y: Vertical field of view in radians.
  *     aspect: Width over height.
@@ -315,7 +349,7 @@ export interface View {
 }
 
 /** What the page says. */
-export type FromPage = Look | Pick | Move | Save | Stop | Open;
+export type FromPage = Look | Pick | Move | Save | Crop | Stop | Open;
 
 /** What the viewer says. */
 export type FromViewer =

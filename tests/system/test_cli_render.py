@@ -1,0 +1,171 @@
+"""`v3dg render`: cameras without a file, backgrounds, films and panoramas."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import scenes_lod
+import v3dg
+from v3dg import cli
+from v3dg.cli._views import picture_paths
+from v3dg.io import subject_name
+
+SMALL = ("--size", "64", "48", "--quiet", "--device", "cpu")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("render")
+    blob = scenes_lod.blob(np.random.default_rng(0), 400, size=0.4)
+    v3dg.write_asset(folder / "blob.ply", blob)
+    return folder
+
+
+@pytest.fixture
+def render(folder, tmp_path, monkeypatch, capsys):
+    """Runs the command beside the asset; its pictures go to another folder."""
+    monkeypatch.chdir(folder)
+
+    def run(*options, output="out.png"):
+        path = tmp_path / "new" / output
+        arguments = ["render", "blob.ply", "-o", str(path), *SMALL, "--json", *map(str, options)]
+        code = cli.main(arguments)
+        captured = capsys.readouterr()
+        return code, captured.err or json.loads(captured.out), path
+
+    return run
+
+
+def pixels(path):
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def drawn(camera, **options):
+    return v3dg.render("blob.ply", camera, device="cpu", **options)
+
+
+def test_eye_and_target_place_the_camera(render):
+    code, _, path = render("--eye", 1, -2, 3, "--target", 0.1, 0, 0, "--fov", 60, "--up", "y")
+    assert code == 0
+    camera = v3dg.Camera.look_at(
+        (1, -2, 3), (0.1, 0, 0), (0, 1, 0), math.radians(60), width=64, height=48
+    )
+    drawn(camera).save(path.with_name("expected.png"))
+    np.testing.assert_array_equal(pixels(path), pixels(path.with_name("expected.png")))
+
+
+def test_an_eye_alone_looks_at_the_middle(render):
+    assert render("--eye", 0, 0, 9, "--up", "y")[0] == 0
+    _, _, path = render("--eye", 0, 0, 9, "--up", "y", "--fov", 20)
+    rows, columns = np.nonzero(pixels(path).max(axis=2) > 30)
+    # The middle of the box, which the rows of a blob are not around exactly.
+    assert abs(rows.mean() - 24) < 8
+    assert abs(columns.mean() - 32) < 8
+
+
+def test_a_link_of_the_viewer_places_the_camera(render):
+    link = "http://127.0.0.1:8080/#at=0.5,0,-3&turn=1,0,0,0&focus=0,0,0&fov=50&up=-y&show=level"
+    for text in (link, link.partition("#")[2], link.replace(",", "%2C")):
+        code, _, path = render("--at", text)
+        assert code == 0
+        focal = 24 / math.tan(math.radians(25))
+        K = [[focal, 0, 32], [0, focal, 24], [0, 0, 1]]
+        viewmat = np.eye(4)
+        viewmat[:3, 3] = (-0.5, 0, 3)
+        drawn(v3dg.Camera(viewmat, K, 64, 48)).save(path.with_name("expected.png"))
+        np.testing.assert_array_equal(pixels(path), pixels(path.with_name("expected.png")))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--at", "http://x/#up=z"), "link: expected an address that the viewer's page has"),
+        (("--at", "#at=1,2&turn=1,0,0,0"), "3 numbers in at=, got 1,2"),
+        (("--at", "#at=1,2,nan&turn=1,0,0,0"), "3 numbers in at=, got 1,2,nan"),
+        (("--at", "#at=1,2,3&turn=0,0,0,0"), "a rotation of length 1 in turn="),
+        (("--at", "#x", "--eye", 1, 2, 3), "--eye, --at: expected one of them"),
+        (("--target", 1, 2, 3), "--target: expected --eye beside it"),
+        (("--eye", 1, 2, 3, "--views", 3), "--views: expected views around the subject"),
+        (("--eye", 1, 2, 3, "--fov", 180), "--fov: expected 0.001 to 179"),
+        (("--background", "nocolor"), "--background: expected three numbers"),
+        (("--projection", "equirectangular"), "--size: expected twice the height as width"),
+    ],
+)
+def test_wrong_options_are_refused_before_anything_is_read(render, options, message):
+    code, error, path = render(*options)
+    assert code in (1, 2)
+    assert message in error
+    assert not path.exists()
+
+
+def test_a_transparent_picture_has_straight_alpha(render):
+    code, _, path = render("--background", "none")
+    assert code == 0
+    _, _, black = render(output="black.png")
+    _, _, white = render("--background", "white", output="white.png")
+    picture = pixels(path).astype(float)
+    assert picture.shape == (48, 64, 4)
+    alpha = picture[..., 3:] / 255
+    assert 0.2 < alpha.mean() < 0.9
+    np.testing.assert_allclose(alpha * picture[..., :3], pixels(black), atol=1.6)
+    over_white = alpha * picture[..., :3] + 255 * (1 - alpha)
+    np.testing.assert_allclose(over_white, pixels(white), atol=2.1)
+    assert "a .png for none" in render("--background", "none", output="a.jpg")[1]
+
+
+def test_views_become_a_film(render):
+    av = pytest.importorskip("av")
+    code, result, path = render("--views", 5, "--fps", 10, output="film.mp4")
+    assert code == 0, result
+    assert result["film"] == str(path)
+    with av.open(str(path)) as film:
+        stream = film.streams.video[0]
+        assert stream.average_rate == 10
+        assert sum(1 for _ in film.decode(stream)) == 5
+    assert "with even sides, got 63 x 48" in render("--size", 63, 48, output="odd.mp4")[1]
+
+
+def test_panorama_shows_all_directions(render):
+    options = ("--eye", 0, 0, 4, "--up", "y", "--size", 128, 64)
+    code, _, path = render(*options, "--projection", "equirectangular", "--background", "white")
+    assert code == 0
+    covered = (pixels(path) < 250).any(axis=2)
+    assert covered[32, 64]  # ahead
+    assert not covered[:, :32].any()
+    assert not covered[:10].any()
+
+
+def test_names_of_photographs_give_no_second_suffix(tmp_path):
+    paths = picture_paths(tmp_path / "x.png", ["a.png", "b.JPG", "c.d", "2/e.jpeg"])
+    assert [path.name for path in paths] == ["x_a.png", "x_b.png", "x_c.d.png", "x_2_e.png"]
+    same = picture_paths(tmp_path / "x.png", ["a.png", "a.jpg"])
+    assert [path.name for path in same] == ["x_0.png", "x_1.png"]
+
+
+@pytest.mark.parametrize(
+    ("path", "name"),
+    [
+        ("town/lod-meta.json", "town"),
+        ("town/meta.json", "town"),
+        ("https://host/town/lod-meta.json?key=1", "town"),
+        ("town/a.sog", "a"),
+        ("meta.v3dg", "meta"),
+    ],
+)
+def test_files_that_are_always_called_alike_are_named_after_their_folder(path, name):
+    assert subject_name(path) == name
+
+
+def test_info_says_the_first_view_that_render_draws(render, capsys):
+    _, _, path = render()
+    assert cli.main(["info", "blob.ply", "--json"]) == 0
+    view = json.loads(capsys.readouterr().out)["first_view"]
+    assert view["is_inside"] is False
+    eye = v3dg.first_camera("blob.ply").position
+    np.testing.assert_allclose(view["eye"], eye, rtol=1e-6)
+    drawn(v3dg.first_camera("blob.ply", 64, 48)).save(path.with_name("expected.png"))
+    np.testing.assert_array_equal(pixels(path), pixels(path.with_name("expected.png")))

@@ -1,0 +1,288 @@
+"""The cameras of COLMAP's models, from `cameras` and `images`, binary or text.
+
+Newer models have `rigs` and `frames`, too, of which the poses in `images` follow.
+Source: COLMAP's documentation, Output Format, and its table of camera models.
+"""
+
+import codecs
+import os
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Literal, NamedTuple, NoReturn
+
+import numpy as np
+
+from v3dg import _files
+from v3dg._numbers import Floats, check, refuse
+from v3dg.rotations import normalised, rotation_from_quaternion
+
+IMAGE_FILES = ("images.bin", "images.txt")
+LENS_FILES = ("cameras.bin", "cameras.txt")
+_USUAL_NAME_BYTES = 256
+_MAX_NAME_BYTES = 1 << 16
+_COUNT = struct.Struct("<Q")
+_LENS = struct.Struct("<IiQQ")  # id, model, width, height
+_IMAGE = struct.Struct("<I7dI")  # id, quaternion, translation, id of the lens
+_POINT_BYTES = 24  # x, y and the number of a point
+_IMAGE_WORDS = 9  # of a line of text, before the name
+
+
+class _Model(NamedTuple):
+    """A camera model.
+
+    Attributes:
+        num_focal: Focal lengths, which are the first parameters; the centre follows.
+        num_distortion: Parameters of the lens after these.
+        projection: Name of the projection if the distortion is 0.
+    """
+
+    name: str
+    num_focal: int
+    num_distortion: int
+    projection: Literal["pinhole", "fisheye", "sphere"]
+
+
+_MODELS = (
+    _Model("SIMPLE_PINHOLE", 1, 0, "pinhole"),
+    _Model("PINHOLE", 2, 0, "pinhole"),
+    _Model("SIMPLE_RADIAL", 1, 1, "pinhole"),
+    _Model("RADIAL", 1, 2, "pinhole"),
+    _Model("OPENCV", 2, 4, "pinhole"),
+    _Model("OPENCV_FISHEYE", 2, 4, "fisheye"),
+    _Model("FULL_OPENCV", 2, 8, "pinhole"),
+    _Model("FOV", 2, 1, "pinhole"),
+    _Model("SIMPLE_RADIAL_FISHEYE", 1, 1, "fisheye"),
+    _Model("RADIAL_FISHEYE", 1, 2, "fisheye"),
+    _Model("THIN_PRISM_FISHEYE", 2, 8, "fisheye"),
+    _Model("RAD_TAN_THIN_PRISM_FISHEYE", 2, 12, "fisheye"),
+    _Model("SIMPLE_DIVISION", 1, 1, "pinhole"),
+    _Model("DIVISION", 2, 1, "pinhole"),
+    _Model("SIMPLE_FISHEYE", 1, 0, "fisheye"),
+    _Model("FISHEYE", 2, 0, "fisheye"),
+    _Model("EUCM", 2, 2, "pinhole"),
+    _Model("EQUIRECTANGULAR", 0, 0, "sphere"),
+)
+_NUM_WIDTH_HEIGHT = 2  # the parameters of EQUIRECTANGULAR
+
+
+@dataclass(frozen=True)
+class Lens:
+    """An image's size and lens, which COLMAP calls a camera.
+
+    Attributes:
+        distortion: Parameters of the lens beside focal lengths and centre.
+    """
+
+    model: _Model
+    width: int
+    height: int
+    focal_lengths: tuple[float, ...]
+    center: tuple[float, ...]
+    distortion: tuple[float, ...]
+
+    @property
+    def is_distorted(self) -> bool:
+        if self.model.name == "EUCM":
+            return self.distortion[0] != 0  # its other parameter then has no effect
+        return any(self.distortion)
+
+
+@dataclass(frozen=True)
+class Image:
+    """A registered image: its name, its lens, and the (4, 4) matrix from world to
+    camera."""
+
+    name: str
+    lens: Lens
+    viewmat: Floats
+
+
+def read_model(images: Path) -> list[Image]:
+    """Read the images of a model in the order of their ids, by its `images.bin` or
+    `images.txt`, beside which the file of the cameras is.
+
+    Raises:
+        ValueError: The content is not valid; the message names the file.
+        OSError: A file cannot be read.
+    """
+    lens_file = images.with_name(f"cameras{images.suffix}")
+    with _opened(lens_file) as file:
+        lenses = dict(_LENS_READERS[images.suffix](lens_file, file))
+    entries: dict[int, Image] = {}
+    with _opened(images) as file:
+        for number, quaternion, translation, lens, name in _IMAGE_READERS[images.suffix](
+            images, file
+        ):
+            check(images, number not in entries, f"each image once, got {number} twice")
+            expected = f"image {number} with a camera of {lens_file.name}"
+            check(images, lens in lenses, f"{expected}, got {lens}")
+            entries[number] = Image(name, lenses[lens], _viewmat(quaternion, translation))
+    return [entries[number] for number in sorted(entries)]
+
+
+class _ImageEntry(NamedTuple):
+    number: int
+    quaternion: tuple[float, ...]
+    translation: tuple[float, ...]
+    lens: int
+    name: str
+
+
+def _opened(path: Path) -> IO[bytes]:
+    with _files.naming_errors(path):
+        return open(_files.open_regular(path), "rb")
+
+
+def _viewmat(quaternion: tuple[float, ...], translation: tuple[float, ...]) -> Floats:
+    viewmat = np.eye(4)
+    if any(quaternion):  # Camera refuses a matrix of zeros
+        viewmat[:3, :3] = rotation_from_quaternion(normalised(np.array(quaternion)))
+    else:
+        viewmat[:3, :3] = 0
+    viewmat[:3, 3] = translation
+    return viewmat
+
+
+def _lens(
+    path: Path, number: int, model: _Model, width: int, height: int, parameters: list[float]
+) -> Lens:
+    center = model.num_focal
+    distortion = center + 2 * (model.num_focal > 0)
+    expected = _num_parameters(model)
+    count = len(parameters)
+    check(path, count == expected, f"{expected} parameters of camera {number}, got {count}")
+    return Lens(
+        model,
+        width,
+        height,
+        focal_lengths=tuple(parameters[:center]),
+        center=tuple(parameters[center:distortion]),
+        distortion=tuple(parameters[distortion:]),
+    )
+
+
+def _num_parameters(model: _Model) -> int:
+    if model.num_focal == 0:
+        return _NUM_WIDTH_HEIGHT
+    return model.num_focal + 2 + model.num_distortion
+
+
+def _take(path: Path, file: IO[bytes], size: int) -> bytes:
+    content = file.read(size)
+    check(path, len(content) == size, f"{size} more bytes, got the end of the file")
+    return content
+
+
+def _count(path: Path, file: IO[bytes], least_bytes: int) -> int:
+    """Read a number of entries; ValueError if the file has too few bytes for them."""
+    (count,) = _COUNT.unpack(_take(path, file, _COUNT.size))
+    num_bytes = os.fstat(file.fileno()).st_size
+    check(path, count <= num_bytes // least_bytes, f"{count} entries, got {num_bytes} bytes")
+    return int(count)
+
+
+def _binary_lenses(path: Path, file: IO[bytes]) -> Iterator[tuple[int, Lens]]:
+    for _ in range(_count(path, file, _LENS.size)):
+        number, kind, width, height = _LENS.unpack(_take(path, file, _LENS.size))
+        is_known = 0 <= kind < len(_MODELS)
+        check(path, is_known, f"a known model of camera {number}, got number {kind}")
+        model = _MODELS[kind]
+        size = _num_parameters(model)
+        parameters = struct.unpack(f"<{size}d", _take(path, file, 8 * size))
+        yield number, _lens(path, number, model, width, height, list(parameters))
+
+
+def _binary_images(path: Path, file: IO[bytes]) -> Iterator[_ImageEntry]:
+    end = os.fstat(file.fileno()).st_size
+    for _ in range(_count(path, file, _IMAGE.size)):
+        number, *pose, lens = _IMAGE.unpack(_take(path, file, _IMAGE.size))
+        name = _binary_name(path, file)
+        num_points = _count(path, file, 1)
+        position = file.seek(_POINT_BYTES * num_points, os.SEEK_CUR)
+        expected = f"{num_points} points of image {number}"
+        check(path, position <= end, f"{expected}, got the end of the file")
+        yield _ImageEntry(number, tuple(pose[:4]), tuple(pose[4:]), lens, name)
+
+
+def _binary_name(path: Path, file: IO[bytes]) -> str:
+    """Read a name up to its final zero byte; the file's position is then after that
+    byte."""
+    start = file.tell()
+    for num_bytes in (_USUAL_NAME_BYTES, _MAX_NAME_BYTES):
+        file.seek(start)
+        content = file.read(num_bytes)
+        size = content.find(b"\0")
+        if size >= 0:
+            break
+    check(path, size >= 0, f"a name of at most {_MAX_NAME_BYTES} bytes, got a longer one")
+    file.seek(start + size + 1)
+    return _text(content[:size])
+
+
+def _text(content: bytes) -> str:
+    """Decode a name in UTF-8; bytes of another encoding become escapes."""
+    return content.decode("utf-8", errors="backslashreplace")
+
+
+def _bad_line(path: Path, number: int, expected: str, line: bytes) -> NoReturn:
+    refuse(path, f"{expected} in line {number}, got {_text(line[:60])!a}")
+
+
+def _numbered_lines(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
+    """Yield the lines of a text with their numbers, without a byte order mark."""
+    for number, line in enumerate(file, start=1):
+        if number == 1:
+            line = line.removeprefix(codecs.BOM_UTF8)
+        yield number, line
+
+
+def _text_lenses(path: Path, file: IO[bytes]) -> Iterator[tuple[int, Lens]]:
+    models = {model.name: model for model in _MODELS}
+    for number, line in _numbered_lines(file):
+        words = line.split()
+        if not words or words[0].startswith(b"#"):
+            continue
+        try:
+            identity, width, height = (int(words[i]) for i in (0, 2, 3))
+            parameters = [float(word) for word in words[4:]]
+        except (ValueError, IndexError):
+            _bad_line(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", line)
+        name = _text(words[1])
+        check(path, name in models, f"a known model of camera {identity}, got {name[:40]!a}")
+        yield identity, _lens(path, identity, models[name], width, height, parameters)
+
+
+def _text_images(path: Path, file: IO[bytes]) -> Iterator[_ImageEntry]:
+    lines = _numbered_lines(file)
+    for number, line in lines:
+        words = line.split(maxsplit=_IMAGE_WORDS)
+        if not words or words[0].startswith(b"#"):
+            continue
+        try:
+            identity = int(words[0])
+            pose = [float(word) for word in words[1:8]]
+            lens = int(words[8])
+        except (ValueError, IndexError):
+            _bad_line(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line)
+        name = b"".join(words[_IMAGE_WORDS:]).rstrip(b"\r\n")
+        _check_points(path, next(lines, (number + 1, b"")))
+        yield _ImageEntry(identity, tuple(pose[:4]), tuple(pose[4:]), lens, _text(name))
+
+
+def _check_points(path: Path, numbered: tuple[int, bytes]) -> None:
+    """Raise ValueError unless a line has the points of an image. It may be empty, but
+    where it is missing the next image would be taken for it."""
+    number, line = numbered
+    words = line.split()
+    try:
+        is_list = len(words) % 3 == 0 and all(float(word) == float(word) for word in words[-3:])
+    except ValueError:
+        is_list = False
+    if not is_list:
+        _bad_line(path, number, "the points of an image, or an empty line,", line)
+
+
+_LENS_READERS = {".bin": _binary_lenses, ".txt": _text_lenses}
+_IMAGE_READERS = {".bin": _binary_images, ".txt": _text_images}

@@ -1,0 +1,324 @@
+"""The gaussians of a glTF primitive: its attributes, or the `.spz` that replaces them,
+and what it declares.
+
+Source: KHR_gaussian_splatting, Ellipse Kernel (attributes) and Extending Mesh
+Primitives (properties); its drafts for other names. What follows from each is in
+docs/formats.md.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v3dg import _core
+from v3dg._json import Node
+from v3dg._numbers import Floats
+from v3dg.formats import spz
+from v3dg.formats._gltf_accessors import column, count_of, has_data, indices
+from v3dg.formats._gltf_document import Document, name_text
+from v3dg.formats._packing import SH_C0, assemble
+from v3dg.formats._reading import check, integer_of
+from v3dg.gaussians import Gaussians
+from v3dg.rotations import normalised
+
+NAME = "KHR_gaussian_splatting"
+SPZ = "KHR_gaussian_splatting_compression_spz_2"
+# A draft that is a primitive's own extension, beside those within NAME.
+_SPZ_ALONE = "KHR_spz_gaussian_splats_compression"
+_SPZ_WITHIN = (SPZ, "KHR_gaussian_splatting_compression_spz")
+READ_EXTENSIONS = frozenset({NAME, *_SPZ_WITHIN, _SPZ_ALONE, "KHR_mesh_quantization"})
+# Drafts had `_SCALE` in place of `KHR_gaussian_splatting:SCALE`, and so on.
+_PREFIXES = (f"{NAME}:", "_")
+
+_LINEAR = "lin_rec709_display"
+# The values of properties that are read as they are meant, with the default first.
+_PROPERTIES = {
+    "kernel": ("ellipse",),
+    "colorSpace": ("srgb_rec709_display", _LINEAR),
+    "projection": ("perspective",),
+    "sortingMethod": ("cameraDistance",),
+}
+_POINTS = 0
+_TRIANGLES = 4  # the mode of a primitive that names none
+# Directions in which colours of another transfer function are fitted: enough for 16
+# coefficients.
+_NUM_DIRECTIONS = 64
+_FITTED_AT_ONCE = 1 << 12  # gaussians, so that their colours stay in the cache
+
+
+def is_gaussians(primitive: Node) -> bool:
+    """Whether a primitive of a mesh has gaussians."""
+    if not primitive.has("extensions"):
+        return False
+    extensions = primitive.field("extensions")
+    return extensions.has(NAME) or extensions.has(_SPZ_ALONE)
+
+
+def coefficients(degree: int) -> list[str]:
+    """Attributes of spherical harmonics, in order, without a prefix."""
+    return [f"SH_DEGREE_{d}_COEF_{n}" for d in range(degree + 1) for n in range(2 * d + 1)]
+
+
+@dataclass(frozen=True)
+class _Packed:
+    """The `.spz` of a primitive, and what its header has."""
+
+    content: memoryview
+    header: spz.Header
+
+
+class Primitive:
+    """A primitive of gaussians, of which nothing but its size is read at first.
+
+    Attributes:
+        count: Number of gaussians.
+        num_rows: Number of vertices, of which indices may choose some.
+        degree: Degree of their spherical harmonics.
+        antialiased: As in `Declared`.
+        notes: As in `Declared`.
+    """
+
+    def __init__(self, document: Document, node: Node) -> None:
+        self._document = document
+        self._node = node
+        self._extension = Node({}, node.file, node.path)
+        if node.field("extensions").has(NAME):
+            self._extension = node.field("extensions").field(NAME)
+        self._packed = self._find_packed()
+        self._attributes = Node({}, node.file, f"{node.path}.attributes")
+        if self._packed is None or node.has("attributes"):
+            self._attributes = node.field("attributes")
+        self.antialiased = self._antialiased()
+        self.notes = self._notes()
+        self.num_rows, self.degree = self._size()
+        self.count = self.num_rows
+        if node.has("indices"):
+            self.count = count_of(document.item("accessors", node.field("indices")))
+
+    def read(self) -> Gaussians:
+        """The gaussians, in the space of the mesh."""
+        if self._packed is None:
+            gaussians = self._read_attributes()
+        else:
+            content = bytes(self._packed.content)
+            gaussians = spz.decode(self._document.path, content, self._document.claims)
+        if self._node.has("indices"):
+            accessor = self._document.item("accessors", self._node.field("indices"))
+            gaussians = gaussians.subset(indices(self._document, accessor, len(gaussians)))
+        if self._color_space == _LINEAR:
+            gaussians = _encoded(gaussians)
+        return gaussians
+
+    @property
+    def packed_bytes(self) -> int:
+        """Bytes of `.spz` that reading expands."""
+        if self._packed is None:
+            return 0
+        return len(self._packed.content)
+
+    @property
+    def _color_space(self) -> object:
+        if not self._extension.has("colorSpace"):
+            return None
+        return self._extension.field("colorSpace").value
+
+    def _find_packed(self) -> _Packed | None:
+        extensions = self._node.field("extensions")
+        holders = []
+        if self._extension.has("extensions"):
+            inner = self._extension.field("extensions")
+            holders = [inner.field(name) for name in _SPZ_WITHIN if inner.has(name)]
+        if extensions.has(_SPZ_ALONE):
+            holders.append(extensions.field(_SPZ_ALONE))
+        if not holders:
+            return None
+        content = self._document.view(holders[0].field("bufferView"))
+        start = content[: spz.MAX_START]
+        header = spz.header_of(self._document.path, start, self._document.claims)
+        return _Packed(content, header)
+
+    def _size(self) -> tuple[int, int]:
+        """Number of vertices, and the SH degree."""
+        position = None
+        if self._packed is None or self._attributes.has("POSITION"):
+            position = self._document.item("accessors", self._attributes.field("POSITION"))
+        if self._packed is None:
+            assert position is not None
+            self._check_plain()
+            return count_of(position), self._degree()
+        header = self._packed.header
+        if position is not None and count_of(position) != header.num_gaussians:
+            expected = f"{header.num_gaussians}, as the .spz has"
+            raise position.field("count").error(expected)
+        return header.num_gaussians, header.sh_degree
+
+    def _check_plain(self) -> None:
+        """Raise ValueError where numbers are left to an extension that is not read."""
+        holders = [holder for holder in (self._node, self._extension) if holder.has("extensions")]
+        names = [name for holder in holders for name in _unread(holder.field("extensions"))]
+        if not names:
+            return
+        for number in self._attributes.some_fields(()).values():
+            if not has_data(self._document.item("accessors", number)):
+                name = name_text(names[0])
+                raise number.problem(f"expected numbers, got those of {name}, which is not read")
+
+    def _degree(self) -> int:
+        """The SH degree, by the names of attributes."""
+        for degree in (3, 2, 1):
+            if self._find(f"SH_DEGREE_{degree}_COEF_0") is not None:
+                return degree
+        return 0
+
+    def _find(self, name: str) -> Node | None:
+        """The number of the accessor of an attribute, by its name or that of a
+        draft."""
+        for prefix in _PREFIXES:
+            if self._attributes.has(prefix + name):
+                return self._attributes.field(prefix + name)
+        return None
+
+    def _column(self, name: str, width: int) -> Callable[[slice], Floats]:
+        number = self._find(name)
+        if number is None:
+            number = self._attributes.field(_PREFIXES[0] + name)  # raises
+        accessor = self._document.item("accessors", number)
+        return column(self._document, accessor, self.num_rows, [width])
+
+    def _read_attributes(self) -> Gaussians:
+        document = self._document
+        position = document.item("accessors", self._attributes.field("POSITION"))
+        mean = column(document, position, self.num_rows, [3])
+        scale = self._column("SCALE", 3)
+        quat = self._column("ROTATION", 4)
+        color, opacity = self._color_and_opacity()
+        higher = [self._column(name, 3) for name in coefficients(self.degree)[1:]]
+
+        def decode(rows: slice) -> tuple[Floats, ...]:
+            widths = scale(rows)
+            advice = "drafts of the extension had their logs; write the file with a newer program"
+            check(document.path, not (widths < 0).any(), f"scales of 0 or more, got less; {advice}")
+            bands = [color(rows), *(coefficient(rows) for coefficient in higher)]
+            return (
+                mean(rows),
+                normalised(np.roll(quat(rows), 1, axis=1)),
+                widths,
+                opacity(rows),
+                np.stack(bands, axis=1),
+            )
+
+        return assemble(self.num_rows, self.degree, decode)
+
+    def _color_and_opacity(self) -> tuple[Callable[[slice], Floats], Callable[[slice], Floats]]:
+        """Columns of the coefficient of degree 0, (N, 3), and of the opacity, (N,).
+
+        Drafts have both as COLOR_0: half more than the basis times the coefficient.
+        """
+        name = "SH_DEGREE_0_COEF_0"
+        has_color = self._find(name) is not None
+        has_opacity = self._find("OPACITY") is not None
+        rgba: Callable[[slice], Floats] | None = None
+        if not (has_color and has_opacity) and self._attributes.has("COLOR_0"):
+            accessor = self._document.item("accessors", self._attributes.field("COLOR_0"))
+            widths = [4]
+            if has_opacity:
+                widths = [3, 4]
+            rgba = column(self._document, accessor, self.num_rows, widths)
+        if rgba is not None and not has_color:
+            drafted = rgba
+            color: Callable[[slice], Floats] = lambda rows: (drafted(rows)[:, :3] - 0.5) / SH_C0  # noqa: E731
+        else:
+            color = self._column(name, 3)
+        if rgba is not None and not has_opacity:
+            drafted_alpha = rgba
+            return color, lambda rows: drafted_alpha(rows)[:, 3]
+        scalar = self._column("OPACITY", 1)
+        return color, lambda rows: scalar(rows)[:, 0]
+
+    def _antialiased(self) -> bool | None:
+        """What the `.spz` says, or the extras that `v3dg.write_asset` writes."""
+        if self._packed is not None:
+            return self._packed.header.antialiased
+        if self._extension.has("extras"):
+            extras = self._extension.field("extras")
+            if extras.has("antialiased") and isinstance(extras.value["antialiased"], bool):
+                return bool(extras.value["antialiased"])
+        return None
+
+    def _notes(self) -> list[str]:
+        """What is declared and not done, a sentence each."""
+        notes = []
+        for name, node in self._extension.some_fields(()).items():
+            values = _PROPERTIES.get(name)
+            if values is not None and node.value not in values:
+                if not isinstance(node.value, str):
+                    raise node.error("a string")
+                value = name_text(node.value)
+                notes.append(f"{NAME} has {name} {value}, which is read as {values[0]}.")
+            elif values is None and name not in ("extensions", "extras"):
+                notes.append(f"{name_text(name)} of {NAME} is not read.")
+        if self._color_space == _LINEAR:
+            notes.append(
+                f"Colours are linear ({_LINEAR}); they are converted to sRGB, in which they are "
+                "then blended."
+            )
+        mode = _TRIANGLES
+        if self._node.has("mode"):
+            mode = integer_of(self._node.field("mode"), "0 to 6", 0, 6)
+        if mode != _POINTS:
+            notes.append(f"A primitive has the mode {mode}, and is read as points.")
+        if self._packed is None:
+            notes += self._attribute_notes()
+        else:
+            notes += spz.flag_notes(self._packed.header)
+        if self._node.has("targets"):
+            notes.append("Morph targets are not read.")
+        return notes
+
+    def _attribute_notes(self) -> list[str]:
+        read = {"POSITION", "COLOR_0"}  # with the released names, COLOR_0 is for other programs
+        for prefix in _PREFIXES:
+            read |= {prefix + name for name in ("SCALE", "ROTATION", "OPACITY", *coefficients(3))}
+        unread = [name for name in self._attributes.some_fields(()) if name not in read]
+        return [f"The attribute {name_text(name)} is not read." for name in unread]
+
+
+def _unread(extensions: Node) -> list[str]:
+    return [name for name in extensions.some_fields(()) if name not in READ_EXTENSIONS]
+
+
+def _encoded(gaussians: Gaussians) -> Gaussians:
+    """Gaussians whose colours are encoded as in sRGB, from linear ones: the harmonics
+    that are nearest in directions all around."""
+    bases = _core.sh_bases(gaussians.sh_degree, _directions())
+    inverse = np.linalg.pinv(bases)
+
+    def encode(rows: slice) -> NDArray[np.float64]:
+        colors = np.einsum("dk,nkc->ndc", bases, gaussians.sh[rows].astype(np.float64)) + 0.5
+        encoded = _srgb_from_linear(colors) - 0.5
+        return np.asarray(np.einsum("kd,ndc->nkc", inverse, encoded))
+
+    sh = np.empty_like(gaussians.sh)
+    with np.errstate(invalid="ignore", over="ignore"):
+        for start in range(0, len(gaussians), _FITTED_AT_ONCE):
+            rows = slice(start, start + _FITTED_AT_ONCE)
+            sh[rows] = encode(rows)
+    encoded = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, sh)
+    return encoded.trained(antialiased=gaussians.antialiased)
+
+
+def _directions() -> Floats:
+    """Unit vectors (D, 3), evenly around: a Fibonacci lattice."""
+    steps = np.arange(_NUM_DIRECTIONS)
+    z = 1 - (2 * steps + 1) / _NUM_DIRECTIONS
+    angles = steps * np.pi * (3 - np.sqrt(5))
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(angles), radius * np.sin(angles), z], axis=1)
+
+
+def _srgb_from_linear(colors: Floats) -> Floats:
+    """The transfer function of sRGB (IEC 61966-2-1); negative light is black."""
+    light = np.maximum(colors, 0.0)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)

@@ -1,0 +1,109 @@
+"""Measures what gaussians lose in a packed file: the values that are cut to the range
+of its format, and the rounding errors of the others."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg._json import JsonObject
+from v3dg.cleaning import SMALLEST_OPACITY, ball_of_most
+from v3dg.formats._packing import SH_C0, Limits, log_scales
+from v3dg.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class Losses:
+    """The losses of gaussians in a packed file.
+
+    Attributes:
+        cut: Number of values that were cut to the range of the format, by kind:
+            `scales`, `colors` of degree 0, `harmonics` of higher degrees, and
+            `opacities` that no pixel shows and that became 0. Kinds without any are
+            left out.
+        position_error: Largest error of a coordinate, relative to the diameter of the
+            ball of most gaussians.
+        color_error: Largest error of a colour of degree 0 that was not cut, where 1 is
+            from black to white.
+        harmonics_error: Largest error of a coefficient of higher harmonics that was not
+            cut.
+        limits: The range of the format.
+    """
+
+    cut: dict[str, int]
+    position_error: float
+    color_error: float
+    harmonics_error: float
+    limits: Limits
+
+    @property
+    def lines(self) -> list[str]:
+        """What was lost, in words."""
+        lines = []
+        if self.cut:
+            counts = ", ".join(f"{count:,} {self._kind(kind)}" for kind, count in self.cut.items())
+            lines.append(f"cut to what the format holds: {counts}")
+        errors = f"positions {self.position_error:.1e} of the size, colours {self.color_error:.4f}"
+        if self.harmonics_error:
+            errors += f", harmonics {self.harmonics_error:.4f}"
+        return [*lines, f"largest errors of rounding: {errors}"]
+
+    def result(self) -> JsonObject:
+        """Return the losses for a command's result as JSON."""
+        errors = {
+            "positions": self.position_error,
+            "colors": self.color_error,
+            "harmonics": self.harmonics_error,
+        }
+        return {"cut": self.cut, "largest_errors": errors}
+
+    def _kind(self, kind: str) -> str:
+        limits = self.limits
+        if kind == "scales":
+            low, high = map(math.exp, limits.log_scale)
+            return f"scales beyond {low:.2g} to {high:.2g}"
+        if kind == "colors":
+            low, high = (0.5 + SH_C0 * value for value in limits.color)
+            return f"colours beyond {low:.2f} to {high:.2f}"
+        if kind == "harmonics":
+            return f"harmonics beyond {limits.harmonic[0]:.2f} to {limits.harmonic[1]:.2f}"
+        return "opacities below 1/255, which became 0"
+
+
+def losses(written: Gaussians, read: Gaussians, limits: Limits) -> Losses:
+    """Compare gaussians on the host with those that a packed file gives back, in the
+    same order and axes."""
+    higher = written.sh[:, 1:]
+    is_cut = {
+        "scales": _is_outside(log_scales(written.scales), limits.log_scale),
+        "colors": _is_outside(written.sh[:, 0], limits.color),
+        "harmonics": _is_outside(higher, limits.harmonic),
+        "opacities": (written.opacities > 0) & (written.opacities < SMALLEST_OPACITY),
+    }
+    size = 1.0
+    if len(written):
+        size = 2 * ball_of_most(written.means)[1]
+    all_kept = np.zeros(written.means.shape, bool)
+    return Losses(
+        cut={kind: int(mask.sum()) for kind, mask in is_cut.items() if mask.any()},
+        position_error=_largest_error(written.means, read.means, all_kept) / size,
+        color_error=SH_C0 * _largest_error(written.sh[:, 0], read.sh[:, 0], is_cut["colors"]),
+        harmonics_error=_largest_error(higher, read.sh[:, 1:], is_cut["harmonics"]),
+        limits=limits,
+    )
+
+
+def _is_outside(
+    values: npt.NDArray[np.floating], bounds: tuple[float, float]
+) -> npt.NDArray[np.bool_]:
+    return np.asarray((values < bounds[0]) | (values > bounds[1]))
+
+
+def _largest_error(
+    values: npt.NDArray[np.floating],
+    read: npt.NDArray[np.floating],
+    is_cut: npt.NDArray[np.bool_],
+) -> float:
+    errors = np.abs(values.astype(np.float64) - read)
+    return float(errors[~is_cut].max(initial=0.0))

@@ -1,0 +1,107 @@
+"""Recognises the kind of a file by its first bytes, whatever its name says."""
+
+import contextlib
+import zipfile
+import zlib
+from typing import NamedTuple
+
+from v3dg import _files
+from v3dg.formats import ksplat
+from v3dg.formats._reading import AnyPath, listed
+
+_START_BYTES = ksplat.HEADER_BYTES
+_UNPACKED_BYTES = 64  # of a gzip, to tell what is in it
+_MAX_ZIP_NAMES = 4096  # looked at
+
+# The suffix of the reader for files that begin with these bytes.
+_BY_START = {
+    b"ply\n": ".ply",
+    b"ply\r": ".ply",
+    b"NGSP": ".spz",
+    b"glTF": ".glb",
+    b"#usda ": ".usda",
+    b"PXR-USDC": ".usdc",
+}
+# Beginnings of files that no reader reads, in lower case, and what these files are. A
+# `.splat` may begin with any number, but these are too long to begin one by chance.
+_NOT_READ = {
+    b"version https://git-lfs": "a pointer of Git LFS in place of the file; run git lfs pull",
+    b"<!doctype html": "a web page; download the file itself",
+    b"<html": "a web page; download the file itself",
+    b"<?xml": "a text of XML",
+    b"\x89png": "a picture",
+    b"\xff\xd8\xff\xe0": "a picture",
+    b"\xff\xd8\xff\xe1": "a picture",
+    b"\x80\x02\x8a\nl\xfc\x9cf": "a checkpoint of torch before 1.6; save it again",
+    b"7z\xbc\xaf\x27\x1c": "an archive of 7-Zip; unpack it",
+    b"rar!\x1a\x07": "an archive of RAR; unpack it",
+}
+
+
+class Content(NamedTuple):
+    """The kind of a file.
+
+    Attributes:
+        suffix: Suffix of the reader for the file; empty if there is none.
+        text: Part of a message: what the file is, and what to do with it.
+    """
+
+    suffix: str
+    text: str
+
+
+def content_of(path: AnyPath) -> Content | None:
+    """Return the kind of a file's content; None if its first bytes do not show it, or
+    cannot be read.
+
+    A few kilobytes are read, and of a zip its list of names.
+    """
+    # zipfile and zlib do not document what damaged content raises; the reader that the
+    # name determines then says what is wrong.
+    with contextlib.suppress(Exception):
+        with open(_files.open_regular(path), "rb") as file:
+            start = file.read(_START_BYTES)
+            if start.startswith(b"PK\3\4"):
+                return _zip_content(zipfile.ZipFile(file).namelist()[:_MAX_ZIP_NAMES])
+        if start.startswith(b"\x1f\x8b"):
+            return _gzip_content(start)
+        return _plain_content(start)
+    return None
+
+
+def _plain_content(start: bytes) -> Content | None:
+    for magic, suffix in _BY_START.items():
+        if start.startswith(magic):
+            return Content(suffix, f"a {suffix}")
+    if ksplat.is_start_of_one(start):
+        return Content(".ksplat", "a .ksplat")
+    lowered = start.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    for magic, text in _NOT_READ.items():
+        if lowered.startswith(magic):
+            return Content("", text)
+    header_bytes = int.from_bytes(start[:8], "little")
+    if start[8:10] == b'{"' and header_bytes < 1 << 32:
+        return Content("", "a file of safetensors, as bundles (.v3dg) are")
+    return None
+
+
+def _gzip_content(start: bytes) -> Content | None:
+    unpacked = zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(start, _UNPACKED_BYTES)
+    if unpacked.startswith(b"NGSP"):
+        return Content(".spz", "a .spz")
+    inner = _plain_content(unpacked)
+    if inner is None or not inner.suffix:
+        return None
+    return Content("", f"a gzip of {inner.text}; unpack it")
+
+
+def _zip_content(names: list[str]) -> Content:
+    parts = [name for name in names if not name.startswith("__MACOSX/")]
+    ends = {name.rsplit("/", 1)[-1] for name in parts}
+    if "data.pkl" in ends:
+        return Content(".pt", "a checkpoint of torch")
+    if "meta.json" in ends or "lod-meta.json" in ends:
+        return Content(".sog", "a .sog")
+    if parts and parts[0].endswith((".usda", ".usdc", ".usd")):
+        return Content(".usdz", "a .usdz")
+    return Content("", f"a zip of {listed(parts) or 'nothing'}; unpack it")

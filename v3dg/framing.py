@@ -1,0 +1,560 @@
+"""The first view of a subject: all of an object from outside, a room from inside.
+
+A grid of voxels around most of the gaussians says how much of every direction is
+blocked from each place (ambient occlusion). A subject surrounds its viewer if much of
+its middle is free, closed on nearly all sides, and holds something beside its outer
+walls: a room does, while a solid object has no such place, and a hollow one has nothing
+in it.
+"""
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg._numbers import Floats
+from v3dg.bundle import Bundle
+from v3dg.cameras import Camera, VectorLike
+from v3dg.cleaning import examine
+from v3dg.gaussians import Gaussians
+from v3dg.rotations import rotation_from_quaternion
+from v3dg.scene import Scene, Subject
+
+DEFAULT_ELEVATION = math.radians(20)
+"""Height of the first camera above the horizon, in radians, for a subject that is seen
+from outside."""
+
+# Enough gaussians to find where a subject is and what surrounds it, and quick to read.
+_MOST_GAUSSIANS = 60_000
+_MOST_INSTANCES = 15_000
+# Views around an object; a turntable is so far away that each of them shows it all.
+_DISTANCE_VIEWS = 36
+# Share of the picture that stays free at each of its sides.
+_MARGIN = 0.04
+# Tangents of half the field of view across the shorter side, and at most across the
+# longer one, which would be distorted beyond that.
+_OUTSIDE_TANGENT = math.tan(math.radians(22.5))
+_OUTSIDE_MOST = 1.0
+_INSIDE_TANGENT = math.tan(math.radians(32.5))
+_INSIDE_MOST = 1.2
+_INSIDE_PITCH = math.radians(-8)
+
+# Length of a step by which a box grows, as a share of its side; the most steps; and the
+# least share of the weight of all gaussians in one.
+_STEP = 0.06
+_MOST_STEPS = 100
+_LEAST_WEIGHT = 2e-4
+
+_VOXELS = 40  # along each side of the grid
+_DIRECTIONS = [step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)]
+# Share of directions that are blocked from a place inside a room, and the clearance and
+# the share of the middle that such places have, by which rooms differ from objects:
+# measured on captured and made rooms, towns, figures and rings.
+_CLOSED = 0.75
+_CLEARANCE = 0.1 * _VOXELS
+_LEAST_FREE = 0.1
+# Share of what blocks that stands free of the outer walls.
+_LEAST_CONTENT = 0.02
+_WALL_VOXELS = 3
+
+
+class _Sample(NamedTuple):
+    """Gaussians that stand for a subject.
+
+    Attributes:
+        means: (N, 3) centres.
+        first_axes, second_axes: (N, 3) the two longer half axes.
+        weights: (N,) opacities, times the number of gaussians that each stands for.
+    """
+
+    means: Floats
+    first_axes: Floats
+    second_axes: Floats
+    weights: Floats
+
+
+@dataclass(frozen=True)
+class Framing:
+    """The place and extent of a subject, which determine its first views.
+
+    Attributes:
+        center: (3,) centre of the box around nearly all gaussians, world units.
+        radius: Half of the diagonal of that box, above 0.
+        is_inside: Whether the subject surrounds its first camera.
+        points: (P, 3) points that the first picture of an object shows.
+    """
+
+    center: Floats
+    radius: float
+    is_inside: bool
+    points: Floats
+    _places: "_Places | None" = None
+
+    def camera(
+        self,
+        up: VectorLike,
+        width: int,
+        height: int,
+        *,
+        elevation: float = DEFAULT_ELEVATION,
+        azimuth: float = 0.0,
+    ) -> Camera:
+        """Return the first camera for pictures of this size: all of an object is in
+        them, whatever their aspect.
+
+        Args:
+            up: (3,) direction in the world.
+            elevation: Angle above the horizon, radians, for an object.
+            azimuth: Angle by which it goes around an object, or turns inside a room,
+                radians.
+        """
+        axis = _unit(up)
+        if self._places is not None:
+            return self._inside(self._places, axis, (width, height), azimuth)
+        forward = -_outwards(axis, elevation, azimuth)
+        right_tangent, down_tangent = _tangents(
+            width, height, _OUTSIDE_TANGENT, widest=_OUTSIDE_MOST
+        )
+        eye = _eye_that_sees(
+            self.points,
+            forward,
+            axis,
+            (1 - 2 * _MARGIN) * right_tangent,
+            (1 - 2 * _MARGIN) * down_tangent,
+        )
+        distance = float((self.center - eye) @ forward)
+        return Camera.look_at(
+            eye,
+            eye + distance * forward,
+            axis,
+            2 * math.atan(right_tangent),
+            width=width,
+            height=height,
+        )
+
+    def turntable(
+        self,
+        up: VectorLike,
+        count: int,
+        width: int,
+        height: int,
+        *,
+        elevation: float = DEFAULT_ELEVATION,
+    ) -> list[Camera]:
+        """Return cameras that go once around an object at one distance, from which each
+        sees all of it, or turn once inside a room. The distance does not depend on
+        their number, so view 0 is the same for all numbers."""
+        if self.is_inside:
+            return self._cameras_at(_azimuths(count), up, width, height, elevation)
+        cameras = self._cameras_at(_azimuths(_DISTANCE_VIEWS), up, width, height, elevation)
+        axis = _unit(up)
+        right_tangent, down_tangent = _tangents(
+            width, height, _OUTSIDE_TANGENT, widest=_OUTSIDE_MOST
+        )
+        distance = 0.0
+        for camera in cameras:
+            in_camera = (self.points - self.center) @ camera.viewmat[:3, :3].T
+            needed = np.maximum(
+                np.abs(in_camera[:, 0]) / right_tangent, np.abs(in_camera[:, 1]) / down_tangent
+            )
+            distance = max(distance, float((needed / (1 - 2 * _MARGIN) - in_camera[:, 2]).max()))
+        return [
+            Camera.look_at(
+                self.center + distance * _outwards(axis, elevation, azimuth),
+                self.center,
+                axis,
+                2 * math.atan(right_tangent),
+                width=width,
+                height=height,
+            )
+            for azimuth in _azimuths(count)
+        ]
+
+    def _cameras_at(
+        self, azimuths: Sequence[float], up: VectorLike, width: int, height: int, elevation: float
+    ) -> list[Camera]:
+        """Return the first view from each of the azimuths."""
+        return [
+            self.camera(up, width, height, elevation=elevation, azimuth=azimuth)
+            for azimuth in azimuths
+        ]
+
+    def focus(self, camera: Camera) -> Floats:
+        """Return the (3,) point ahead of a first camera that it turns about."""
+        forward = camera.viewmat[2, :3]
+        if self._places is not None:
+            return np.asarray(camera.position + 0.5 * self.radius * forward)
+        distance = (self.center - camera.position) @ forward
+        return np.asarray(camera.position + distance * forward)
+
+    def _inside(
+        self, places: "_Places", axis: Floats, size: tuple[int, int], azimuth: float
+    ) -> Camera:
+        """Return the camera at the place in a room from which most is visible."""
+        eye, best_azimuth = places.best(axis)
+        forward = -_outwards(axis, -_INSIDE_PITCH, best_azimuth + azimuth)
+        right_tangent, _ = _tangents(*size, _INSIDE_TANGENT, widest=_INSIDE_MOST)
+        return Camera.look_at(
+            eye,
+            eye + 0.5 * self.radius * forward,
+            axis,
+            2 * math.atan(right_tangent),
+            width=size[0],
+            height=size[1],
+        )
+
+
+def _azimuths(count: int) -> list[float]:
+    """Return angles all around, in radians, from 0 on."""
+    return [2 * math.pi * number / count for number in range(count)]
+
+
+def frame_subject(subject: Subject) -> Framing:
+    """Find where a scene, a bundle or an asset is, and from where it is seen best.
+
+    Of a bundle, a coarse level is read. A subject without gaussians has a ball of
+    radius 1 at the origin.
+    """
+    sample = _sample(subject)
+    if not len(sample.means):
+        corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+        return Framing(np.zeros(3), 1.0, is_inside=False, points=corners)
+    low, high = _box(sample.means, sample.weights)
+    points = _outline(sample, low, high)
+    center = (points.min(axis=0) + points.max(axis=0)) / 2
+    radius = max(float(np.linalg.norm(np.ptp(points, axis=0))) / 2, 1e-6)
+    places = _places(sample)
+    return Framing(center, radius, places is not None, points, places)
+
+
+def _sample(subject: Subject) -> _Sample:
+    if isinstance(subject, Gaussians):
+        host = subject.numpy()
+        return _sample_of(host.subset(examine(host).drawable), _MOST_GAUSSIANS)
+    scene = Scene.of(subject)
+    parts = [_empty_sample()]
+    stride = -(-len(scene) // _MOST_INSTANCES)
+    most_rows = max(_MOST_GAUSSIANS // max(len(scene) // max(stride, 1), 1), 8)
+    for number, bundle in enumerate(scene.bundles):
+        instances = np.flatnonzero(scene.instance_bundle == number)[:: max(stride, 1)]
+        if not len(instances) or not bundle.num_levels:
+            continue
+        local = _sample_of(_coarse_level(bundle), most_rows)
+        parts.append(_placed(local, scene, instances))
+    return _Sample(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def _empty_sample() -> _Sample:
+    return _Sample(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+
+
+def _coarse_level(bundle: Bundle) -> Gaussians:
+    """Return the finest undamaged level that is quick to read, else the coarsest level.
+
+    Drawing reports damaged pages; a first view can do without them.
+    """
+    levels = range(bundle.num_levels)
+    for level in levels:
+        clusters = bundle.level_range(level)
+        offsets = bundle.clusters.offset
+        if offsets[clusters.stop] - offsets[clusters.start] <= _MOST_GAUSSIANS:
+            try:
+                return bundle.level_gaussians(level)
+            except ValueError:
+                continue
+    return bundle.level_gaussians(levels[-1])
+
+
+def _sample_of(asset: Gaussians, most_rows: int) -> _Sample:
+    """Return at most `most_rows` gaussians of an asset, evenly spaced in its order."""
+    count = min(most_rows, len(asset))
+    rows = asset.numpy().subset(np.linspace(0, len(asset) - 1, count).astype(np.int64))
+    scales = np.asarray(rows.scales, np.float64)
+    order = np.argsort(-scales, axis=1)
+    quats = np.asarray(rows.quats, np.float64)
+    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+    axes = rotation_from_quaternion(quats / np.where(lengths > 0, lengths, 1))
+    half_axes = []
+    for place in (0, 1):
+        column = order[:, place, None]
+        directions = np.take_along_axis(axes, column[:, None], axis=2)[..., 0]
+        half_axes.append(directions * np.take_along_axis(scales, column, axis=1))
+    return _Sample(
+        np.asarray(rows.means, np.float64),
+        half_axes[0],
+        half_axes[1],
+        np.asarray(rows.opacities, np.float64) * len(asset) / max(count, 1),
+    )
+
+
+def _placed(local: _Sample, scene: Scene, instances: npt.NDArray[np.int64]) -> _Sample:
+    """Return the gaussians of a bundle at the poses of its instances."""
+    linear = scene.rotations[instances] * scene.scales[instances, None, None]
+    turned = [
+        np.einsum("iab,kb->ika", linear, values).reshape(-1, 3)
+        for values in (local.means, local.first_axes, local.second_axes)
+    ]
+    shift = np.repeat(scene.positions[instances], len(local.means), axis=0)
+    weights = np.tile(local.weights, len(instances))
+    return _Sample(turned[0] + shift, turned[1], turned[2], weights)
+
+
+def _box(means: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """Return the lowest and the highest corner of a box around all gaussians that are
+    not far from the others.
+
+    From the middle 96 % along each axis the box grows in steps while there are
+    gaussians in the next step, so that a thin tip belongs to it and a distant sky does
+    not.
+    """
+    low, high = np.percentile(means, (2, 98), axis=0)
+    longest = float((high - low).max())
+    for axis in range(3):
+        step = max(_STEP * (high[axis] - low[axis]), 1e-4 * longest, 1e-12)
+        distances_below = (low[axis] - means[:, axis]) / step
+        distances_above = (means[:, axis] - high[axis]) / step
+        low[axis] -= step * _steps_with_gaussians(distances_below, weights)
+        high[axis] += step * _steps_with_gaussians(distances_above, weights)
+    return low, high
+
+
+def _steps_with_gaussians(distances: Floats, weights: Floats) -> int:
+    """Return the number of consecutive steps beyond a border that have gaussians."""
+    is_beyond = (distances > 0) & (distances <= _MOST_STEPS)
+    numbers = np.ceil(distances[is_beyond]).astype(np.int64) - 1
+    amounts = np.bincount(numbers, weights[is_beyond], _MOST_STEPS)
+    is_empty = amounts <= _LEAST_WEIGHT * weights.sum()
+    if not is_empty.any():
+        return _MOST_STEPS
+    return int(is_empty.argmax())
+
+
+def _outline(sample: _Sample, low: Floats, high: Floats) -> Floats:
+    """Return (P, 3) points of the gaussians in a box, at two standard deviations."""
+    is_inside = ((sample.means >= low) & (sample.means <= high)).all(axis=1)
+    means = sample.means[is_inside]
+    first = sample.first_axes[is_inside]
+    second = sample.second_axes[is_inside]
+    points = [means]
+    for axes in (first, second):
+        points += [means + 2 * axes, means - 2 * axes]
+    usual_extent = float(np.median(np.linalg.norm(first, axis=1)))
+    least = 1e-6 * max(float(np.abs(means).max()), 1e-20)
+    border = max(0.02 * float((high - low).max()), 2 * usual_extent, least)
+    return np.clip(np.concatenate(points), low - border, high + border)
+
+
+def _unit(vector: VectorLike) -> Floats:
+    values = np.asarray(vector, np.float64)
+    scaled = values / np.abs(values).max()  # squares neither overflow nor underflow
+    return np.asarray(scaled / np.linalg.norm(scaled))
+
+
+def _outwards(up: Floats, elevation: float, azimuth: float) -> Floats:
+    """Return the (3,) unit vector from a subject to its camera.
+
+    At azimuth 0 the camera is where viewers take the front of an asset to be: at +z
+        where
+    y or x is up or down, at -y where z is.
+    """
+    front = np.array([0.0, 0.0, 1.0])
+    if int(np.abs(up).argmax()) == 2:
+        front = np.array([0.0, -1.0, 0.0])
+    front = front - up * (up @ front)
+    front /= np.linalg.norm(front)
+    aside = np.cross(up, front)
+    level = math.cos(azimuth) * front + math.sin(azimuth) * aside
+    return np.asarray(math.cos(elevation) * level + math.sin(elevation) * up)
+
+
+def _tangents(width: int, height: int, shorter: float, *, widest: float) -> tuple[float, float]:
+    """Return the tangents of half the fields of view across width and height."""
+    ratio = max(width, height) / min(width, height)
+    longer = min(shorter * ratio, widest)
+    if width >= height:
+        return longer, longer / ratio
+    return longer / ratio, longer
+
+
+def _eye_that_sees(
+    points: Floats, forward: Floats, up: Floats, right_tangent: float, down_tangent: float
+) -> Floats:
+    """Return (3,) the nearest eye whose frustum contains all points, with equal free
+    space to the left and the right, or above and below."""
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    depths = points @ forward
+    place = np.zeros(3)
+    nearest = math.inf
+    for direction, tangent in ((right, right_tangent), (down, down_tangent)):
+        across = points @ direction
+        plus = float((across - tangent * depths).max())
+        minus = float((-across - tangent * depths).max())
+        place += (plus - minus) / 2 * direction
+        nearest = min(nearest, -(plus + minus) / (2 * tangent))
+    return place + nearest * forward
+
+
+class _Grid(NamedTuple):
+    """Voxels around most of the gaussians.
+
+    Attributes:
+        origin, side: Lowest corner, and length of a voxel, world units.
+        density: (V, V, V) optical density across a voxel.
+        distances: (26, V, V, V) from each voxel to what blocks each direction, in
+            voxels; infinite where nothing does.
+    """
+
+    origin: Floats
+    side: float
+    density: Floats
+    distances: npt.NDArray[np.float32]
+
+    @property
+    def is_solid(self) -> npt.NDArray[np.bool_]:
+        return self.density > 0.5
+
+    def center(self, voxels: npt.NDArray[np.intp]) -> Floats:
+        """Return the centres (N, 3) of voxels (N, 3)."""
+        return np.asarray(self.origin + self.side * (voxels + 0.5))
+
+
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """Places inside a room: (N, 3), with gaussians (M, 3) that are to be seen from
+    them, and the size of the room."""
+
+    places: Floats
+    means: Floats
+    weights: Floats
+    size: float
+
+    def best(self, up: Floats) -> tuple[Floats, float]:
+        """Return the place, and the azimuth, from which most is visible and nothing is
+        close."""
+        heights = self.places @ up
+        low, high = np.quantile(self.means @ up, (0.02, 0.98))
+        is_at_eye_height = np.abs((heights - low) / max(high - low, 1e-12) - 0.55) < 0.15
+        places = self.places
+        if is_at_eye_height.any():
+            places = places[is_at_eye_height]
+        places = places[:: -(-len(places) // 200)]
+        best = (-math.inf, places[0], 0.0)
+        for place in places:
+            for azimuth, score in enumerate(self._scores(place, up)):
+                if score > best[0]:
+                    best = (float(score), place, 2 * math.pi * azimuth / _AZIMUTHS)
+        return best[1], best[2]
+
+    def _scores(self, place: Floats, up: Floats) -> Floats:
+        """Return how much is visible from a place at each of its azimuths."""
+        front = -_outwards(up, 0.0, 0.0)
+        aside = np.cross(up, front)
+        offsets = self.means - place
+        distances = np.linalg.norm(offsets, axis=1) + 1e-12
+        sines = offsets @ up / distances
+        in_height = np.abs(np.arcsin(np.clip(sines, -1, 1)) - _INSIDE_PITCH) < 0.6
+        azimuths = np.arctan2(offsets @ aside, offsets @ front)
+        numbers = np.round(azimuths / (2 * math.pi) * _AZIMUTHS).astype(np.int64) % _AZIMUTHS
+        # What is close by covers the rest.
+        weights = np.where(distances > 0.2 * self.size, 1.0, -4.0) * self.weights
+        histogram = np.bincount(numbers[in_height], weights[in_height], _AZIMUTHS)
+        reach = range(-_AZIMUTHS // 10, _AZIMUTHS // 10 + 1)
+        return np.asarray(np.sum([np.roll(histogram, shift) for shift in reach], axis=0))
+
+
+_AZIMUTHS = 36
+
+
+def _places(sample: _Sample) -> _Places | None:
+    """Return the places inside a subject that surrounds its viewer; None for any other
+    subject."""
+    grid = _grid(sample)
+    if grid is None:
+        return None
+    is_blocked = np.isfinite(grid.distances)
+    blocked = is_blocked.mean(axis=0)
+    clearance = np.where(is_blocked, grid.distances, _VOXELS).min(axis=0)
+    is_solid = grid.is_solid
+    places = np.argwhere(~is_solid & (blocked > _CLOSED) & (clearance >= _CLEARANCE))
+    solid = np.argwhere(is_solid)
+    if not len(places) or not len(solid):
+        return None
+    middle = _VOXELS**3 * np.prod(np.ptp(solid, axis=0) + 1) / _VOXELS**3 * 0.343
+    is_open = ~is_solid & (blocked < 0.6)
+    near_outside = _grown(is_open, _WALL_VOXELS)
+    weight = np.where(is_solid, grid.density, 0.0)
+    content = weight[~near_outside].sum() / max(weight.sum(), 1e-12)
+    if len(places) < _LEAST_FREE * middle or content < _LEAST_CONTENT:
+        return None
+    size = grid.side * _VOXELS
+    low = grid.origin
+    is_inside = ((sample.means >= low) & (sample.means <= low + size)).all(axis=1)
+    rows = np.flatnonzero(is_inside)[:: max(int(is_inside.sum()) // 5000, 1)]
+    return _Places(grid.center(places), sample.means[rows], sample.weights[rows], size)
+
+
+def _grid(sample: _Sample) -> _Grid | None:
+    """Return the voxels around most of a sample; None if there are too few gaussians to
+    enclose a place."""
+    means = sample.means
+    if len(means) < 200:
+        return None
+    median = np.median(means, axis=0)
+    spread = 3.5 * float(np.median(np.abs(means - median), axis=0).max())
+    low, high = np.percentile(means, (2, 98), axis=0)
+    low = np.maximum(low, median - spread)
+    high = np.minimum(high, median + spread)
+    side = float((high - low).max()) / (_VOXELS - 2)
+    if not side > 0:
+        return None
+    origin = (low + high) / 2 - side * _VOXELS / 2
+    areas = np.linalg.norm(np.cross(sample.first_axes, sample.second_axes), axis=1)
+    weights = sample.weights * 2 * math.pi * areas / (9 * side**2)
+    density = np.zeros(_VOXELS**3)
+    for first, second in itertools.product((-1, 0, 1), repeat=2):
+        points = means + first * sample.first_axes + second * sample.second_axes
+        voxels = np.floor(np.clip((points - origin) / side, -1, _VOXELS)).astype(np.int64)
+        is_inside = ((voxels >= 0) & (voxels < _VOXELS)).all(axis=1)
+        numbers = np.ravel_multi_index(tuple(voxels[is_inside].T), (_VOXELS,) * 3)
+        density += np.bincount(numbers, weights[is_inside], _VOXELS**3)
+    cube = density.reshape((_VOXELS,) * 3)
+    return _Grid(origin, side, cube, _distances(cube > 0.5))
+
+
+def _distances(is_solid: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
+    """Return the distances (26, V, V, V) to the next solid voxel in each direction."""
+    distances = np.full((len(_DIRECTIONS), *is_solid.shape), np.inf, np.float32)
+    for number, direction in enumerate(_DIRECTIONS):
+        source = tuple(_shifted(step) for step in direction)
+        target = tuple(_shifted(-step) for step in direction)
+        current = distances[number]
+        for _ in range(_VOXELS):
+            following = np.full_like(current, np.inf)
+            following[target] = np.where(is_solid[source], 1, current[source] + 1)
+            if np.array_equal(following, current):
+                break
+            current = following
+        distances[number] = current * np.linalg.norm(direction)
+    return distances
+
+
+def _shifted(step: int) -> slice:
+    return slice(max(step, 0), _VOXELS + min(step, 0))
+
+
+def _grown(mask: npt.NDArray[np.bool_], count: int) -> npt.NDArray[np.bool_]:
+    """Return a mask that is grown by `count` voxels; all voxels outside of the grid
+    belong to it."""
+    grown = np.pad(mask, count, constant_values=True)
+    for _ in range(count):
+        wider = grown.copy()
+        for axis in range(3):
+            wider |= np.roll(grown, 1, axis) | np.roll(grown, -1, axis)
+        grown = wider
+    return grown[count:-count, count:-count, count:-count]

@@ -1,0 +1,207 @@
+"""The columns of a scene's instances: their shapes, ranges and devices, and poses given
+in other ways."""
+
+from collections.abc import Sequence
+from typing import NamedTuple, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg import _device
+from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, check, floats, one_of
+from v3dg.bundle import Bundle
+from v3dg.cameras import AXES, Axis
+from v3dg.gaussians import Array
+from v3dg.rotations import (
+    Similarity,
+    product,
+    product_matrix,
+    rotation_from_quaternion,
+    similarity_of,
+    turn_between,
+)
+
+
+class Columns(NamedTuple):
+    """Checked columns of new instances."""
+
+    positions: Array
+    quaternions: Array
+    scales: Array
+    importance: npt.NDArray[np.float32]
+    opacity: npt.NDArray[np.float32]
+    tint: npt.NDArray[np.float32]
+
+
+_ROW = {
+    "positions": (3,),
+    "quaternions": (4,),
+    "scales": (),
+    "importance": (),
+    "opacity": (),
+    "tint": (3,),
+}
+# Columns that are on the host, as float32, wherever the poses are.
+_ON_HOST = ("importance", "opacity", "tint")
+_DEFAULTS: dict[str, Array] = {"quaternions": (1.0, 0.0, 0.0, 0.0), "scales": 1.0}
+_RANGES = {
+    "scales": (5e-324, np.inf, "positive numbers"),
+    "importance": (LEAST_FLOAT, MOST_FLOAT, "positive numbers that a float32 can hold"),
+    "opacity": (0.0, 1.0, "numbers of 0 to 1"),
+    "tint": (0.0, MOST_FLOAT, "numbers of 0 or more that a float32 can hold"),
+}
+
+
+def columns_of(
+    positions: Array | npt.ArrayLike | None,
+    quaternions: Array | npt.ArrayLike | None,
+    scales: Array | npt.ArrayLike | None,
+    importance: npt.ArrayLike,
+    opacity: npt.ArrayLike,
+    tint: npt.ArrayLike,
+) -> Columns:
+    """Return the columns of as many instances as there are positions."""
+    points = _points_of(positions)
+    count = len(points)
+    return Columns(
+        positions=column(points, "positions", count),
+        quaternions=column(quaternions, "quaternions", count),
+        scales=column(scales, "scales", count),
+        importance=column(importance, "importance", count),
+        opacity=column(opacity, "opacity", count),
+        tint=column(tint, "tint", count),
+    )
+
+
+def composed(outer: Columns, inner: Columns) -> Columns:
+    """Return the columns of instances that one pose places as a whole."""
+    size = outer.scales[0]
+    rotation = rotation_from_quaternion(outer.quaternions[0])
+    with np.errstate(over="ignore", under="ignore"):  # columns_of() refuses the results
+        return columns_of(
+            positions=size * inner.positions @ rotation.T + outer.positions,
+            quaternions=product(outer.quaternions, inner.quaternions),
+            scales=size * inner.scales,
+            importance=outer.importance * inner.importance,
+            opacity=outer.opacity * inner.opacity,
+            tint=outer.tint * inner.tint,
+        )
+
+
+def _points_of(positions: Array | npt.ArrayLike | None) -> Array:
+    """Return (I, 3) positions; a single one may be given as (3,), and None stands for
+    the origin."""
+    points: Array = positions
+    if positions is None:
+        points = (0.0, 0.0, 0.0)
+    if not getattr(points, "is_cuda", False):
+        points = floats(points, "positions")
+    if len(points.shape) == 1:
+        points = points[None]
+    shape = tuple(points.shape)
+    check("positions", shape[1:] == (3,), f"shape (I, 3), got {shape}")
+    return points
+
+
+def parts_of(matrix: Array | npt.ArrayLike, *parts: Array | npt.ArrayLike | None) -> Similarity:
+    """Return the position, the quaternion and the scale of matrices; ValueError if
+    other parts are given, too."""
+    if any(part is not None for part in parts):
+        raise ValueError(
+            "matrix: it already places the instances; leave out positions, quaternions and scales"
+        )
+    return similarity_of(matrix)
+
+
+def turned(quaternions: Array, bundles: Sequence[Bundle], up: Axis) -> Array:
+    """Return the rotations (I, 4) of instances after the axis that is up in their
+    bundles was turned to another axis; `bundles` has one bundle, or I."""
+    one_of(up, "up", AXES)
+    turns = {bundle: turn_between(up_of_bundle(bundle), up) for bundle in set(bundles)}
+    matrices = product_matrix(np.array([turns[bundle] for bundle in bundles]).reshape(-1, 4))
+    return (quaternions[:, None, :] @ on_device_of(quaternions, matrices))[:, 0]
+
+
+def up_of_bundle(bundle: Bundle) -> Axis:
+    """Return the axis that is up in a bundle according to its file, else -y, as in
+    trained assets."""
+    recorded = bundle.config.get("up")
+    if recorded in AXES:
+        return cast(Axis, recorded)
+    return "-y"
+
+
+def column(values: Array | None, name: str, count: int) -> Array:
+    """Return a contiguous copy (count, ...) of a column, or of its default for None. A
+    single row stands for all, except of positions."""
+    source: Array = values
+    if values is None:
+        source = _DEFAULTS.get(name)
+    row = _ROW[name]
+    is_on_device = getattr(source, "is_cuda", False) and name not in _ON_HOST
+    if is_on_device:
+        import torch
+
+        array = source.detach().to(torch.float64, copy=True)
+    else:
+        array = floats(source, name)
+    if name != "positions" and tuple(array.shape) == row:
+        if is_on_device:
+            array = array.expand(count, *row)
+        else:
+            array = np.broadcast_to(array, (count, *row))
+    shape = tuple(array.shape)
+    check(name, shape == (count, *row), f"shape {(count, *row)}, got {shape}")
+    if is_on_device:
+        return array.contiguous()
+    if name in _RANGES:
+        low, high, expected = _RANGES[name]
+        wrong = (array < low) | (array > high)
+        if wrong.any():
+            raise ValueError(f"{name}: expected {expected}, got {array[wrong][0]:g}")
+    if name == "quaternions":
+        largest = np.abs(array).max(axis=1, keepdims=True)
+        check("quaternions", largest.all(), "a rotation, got a quaternion of zeros")
+        array = array / largest  # so that squares neither overflow nor underflow
+        array /= np.linalg.norm(array, axis=1, keepdims=True)
+    if name in _ON_HOST:
+        return np.ascontiguousarray(array, np.float32)
+    return np.ascontiguousarray(array, np.float64)
+
+
+def on_device_of(array: Array, values: Array) -> Array:
+    """Return the values as a tensor on the device of ``array``; unchanged if that is a
+    NumPy array."""
+    if isinstance(array, np.ndarray):
+        return values
+    import torch
+
+    if isinstance(values, np.ndarray):
+        values = np.array(values)  # a copy, because torch warns of arrays that are read-only
+    return torch.as_tensor(values, device=array.device)
+
+
+def _on_one_device(first: Array, second: Array) -> tuple[Array, Array]:
+    """Return both arrays on the device of the one that is a tensor; on the host if
+    neither is."""
+    target = first
+    if isinstance(first, np.ndarray):
+        target = second
+    return on_device_of(target, first), on_device_of(target, second)
+
+
+def joined(first: Array, second: Array) -> Array:
+    """Return the concatenation of two arrays, on the device of either."""
+    first, second = _on_one_device(first, second)
+    return _device.library_of(first).concatenate([first, second])
+
+
+def replaced(values: Array, rows: npt.NDArray[np.int64], row_values: Array) -> Array:
+    """Return a copy of an array with other values in some rows."""
+    values, row_values = _on_one_device(values, row_values)
+    if isinstance(values, np.ndarray):
+        values = values.copy()
+    else:
+        values = values.clone()
+    values[on_device_of(values, rows)] = row_values
+    return values
