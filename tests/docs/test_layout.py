@@ -252,7 +252,7 @@ def test_bindings_ask_for_the_backend_in_one_place():
         if re.search(r"is_host\(|if constexpr.*CUDA", text)
     ]
     assert ladders == []
-    assert "Add a backend" in sources[CSRC / "bindings" / "backend.h"].partition("#include")[0]
+    assert "To add a backend" in sources[CSRC / "bindings" / "backend.h"].partition("#include")[0]
 
 
 def test_only_the_backend_of_cuda_sees_cuda():

@@ -175,6 +175,7 @@ def test_a_build_that_is_killed_leaves_its_levels(file, device, tmp_path):
     """The refinement of 20,020 pictures is far from its end."""
     output = tmp_path / "out.v3dg"
     roots = [str(Path(path).parents[1]) for path in (v3dg.__file__, Path(__file__).parent)]
+    roots.append(os.environ.get("PYTHONPATH", ""))
     process = subprocess.Popen(
         [sys.executable, "-c", SCRIPT, file, output, device],
         env=os.environ | {"PYTHONPATH": os.pathsep.join(roots)},

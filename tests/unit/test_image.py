@@ -83,9 +83,9 @@ def test_an_image_is_saved_as_it_is_or_transparent(tmp_path):
     color[0] = 0
     alpha[0] = 0
     image = Image(color, alpha, None)
-    image.save(tmp_path / "new" / "a.png")
+    image.save(tmp_path / "a.png")
     image.save(tmp_path / "b.png", transparent=True)
-    opaque = PIL.Image.open(tmp_path / "new" / "a.png")
+    opaque = PIL.Image.open(tmp_path / "a.png")
     assert (opaque.mode, opaque.getpixel((1, 1))) == ("RGB", (64, 64, 64))
     straight = PIL.Image.open(tmp_path / "b.png")
     assert straight.getpixel((1, 1)) == (128, 128, 128, 128)

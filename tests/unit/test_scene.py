@@ -372,7 +372,7 @@ def test_a_placed_scene_is_turned_from_its_own_up():
     scene = Scene()
     scene.add_scene(inner, up="z")
     np.testing.assert_allclose(scene.rotations[0] @ (0, -1, 0), (0, 0, 1), atol=1e-12)
-    with pytest.raises(ValueError, match="scales: expected positive numbers"):
+    with pytest.raises(ValueError, match="scale: expected a positive number"):
         scene.add_scene(inner, scale=0)
     with pytest.raises(TypeError, match="scene: expected a Scene"):
         scene.add_scene(BUNDLE)

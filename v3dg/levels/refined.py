@@ -97,7 +97,7 @@ def default_steps(device: Device) -> RefineSteps:
     """The steps for a kind of device: a GPU is busy only with several windows at once,
     a CPU with one."""
     if device.is_cuda:
-        return RefineSteps(windows=8)
+        return RefineSteps(windows=16, cuts_per_view=4)
     return RefineSteps(windows=1)
 
 

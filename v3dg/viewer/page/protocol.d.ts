@@ -99,7 +99,7 @@ export interface Hello {
 }
 
 /**
- * What a tab first shows, in a window of a certain aspect.
+ * The first view of a tab in a window of a certain aspect.
  *
  * Attributes:
  *     focus: The point that orbits go around.
