@@ -3,6 +3,7 @@ runs."""
 
 import json
 import os
+import struct
 
 import numpy as np
 import pytest
@@ -254,6 +255,19 @@ def test_only_images_without_finite_numbers_are_left_out(tmp_path, text, place):
     message = r"images.txt: 1 of 3 images have cameras .* not finite and are left out: c d\.jpg"
     with pytest.warns(CameraWarning, match=message):
         assert list(read_cameras(tmp_path)) == ["a b.jpg", "e.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("file", "place"), [("cameras.bin", 32), ("images.bin", 12), ("images.bin", 44)]
+)
+def test_numbers_of_binary_models_may_not_be_finite(tmp_path, cameras, file, place):
+    write_model(tmp_path / "a", cameras)
+    path = tmp_path / "a" / file
+    content = bytearray(path.read_bytes())
+    content[place : place + 8] = struct.pack("<d", float("nan"))
+    path.write_bytes(content)
+    with pytest.warns(CameraWarning, match="left out: images/é3.jpg"):
+        assert list(read_cameras(tmp_path / "a")) == list(cameras)[1:]
 
 
 def test_models_that_claim_too_much_are_refused(tmp_path, cameras):
