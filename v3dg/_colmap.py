@@ -5,7 +5,9 @@ Source: COLMAP's documentation, Output Format, and its table of camera models.
 """
 
 import codecs
+import math
 import os
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -27,6 +29,10 @@ _LENS = struct.Struct("<IiQQ")  # id, model, width, height
 _IMAGE = struct.Struct("<I7dI")  # id, quaternion, translation, id of the lens
 _POINT_BYTES = 24  # x, y and the number of a point
 _IMAGE_WORDS = 9  # of a line of text, before the name
+# NaN and infinity as the runtime libraries of Windows print them.
+_WINDOWS_NOT_FINITE = re.compile(
+    rb"[+-]?(?:s?nan\(\w*\)|1\.#(?:IND|INF|QNAN|SNAN)\d*)", re.IGNORECASE
+)
 
 
 class _Model(NamedTuple):
@@ -88,15 +94,23 @@ class Lens:
             return self.distortion[0] != 0  # its other parameter then has no effect
         return any(self.distortion)
 
+    @property
+    def is_finite(self) -> bool:
+        return all(map(math.isfinite, (*self.focal_lengths, *self.center, *self.distortion)))
+
 
 @dataclass(frozen=True)
 class Image:
     """A registered image: its name, its lens, and the (4, 4) matrix from world to
-    camera."""
+    camera. Numbers that the file has as NaN or infinity stay so."""
 
     name: str
     lens: Lens
     viewmat: Floats
+
+    @property
+    def is_finite(self) -> bool:
+        return self.lens.is_finite and bool(np.isfinite(self.viewmat).all())
 
 
 def read_model(images: Path) -> list[Image]:
@@ -137,7 +151,9 @@ def _opened(path: Path) -> IO[bytes]:
 
 def _viewmat(quaternion: tuple[float, ...], translation: tuple[float, ...]) -> Floats:
     viewmat = np.eye(4)
-    if any(quaternion):  # Camera refuses a matrix of zeros
+    if not all(map(math.isfinite, quaternion)):
+        viewmat[:3, :3] = math.nan
+    elif any(quaternion):  # Camera refuses a matrix of zeros
         viewmat[:3, :3] = rotation_from_quaternion(normalised(np.array(quaternion)))
     else:
         viewmat[:3, :3] = 0
@@ -226,6 +242,14 @@ def _text(content: bytes) -> str:
     return content.decode("utf-8", errors="backslashreplace")
 
 
+def _number(word: bytes) -> float:
+    """A number of a text, NaN for each that is not finite; ValueError for other
+    words."""
+    if _WINDOWS_NOT_FINITE.fullmatch(word):
+        return math.nan
+    return float(word)
+
+
 def _bad_line(path: Path, number: int, expected: str, line: bytes) -> NoReturn:
     refuse(path, f"{expected} in line {number}, got {_text(line[:60])!a}")
 
@@ -246,7 +270,7 @@ def _text_lenses(path: Path, file: IO[bytes]) -> Iterator[tuple[int, Lens]]:
             continue
         try:
             identity, width, height = (int(words[i]) for i in (0, 2, 3))
-            parameters = [float(word) for word in words[4:]]
+            parameters = [_number(word) for word in words[4:]]
         except (ValueError, IndexError):
             _bad_line(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", line)
         name = _text(words[1])
@@ -262,7 +286,7 @@ def _text_images(path: Path, file: IO[bytes]) -> Iterator[_ImageEntry]:
             continue
         try:
             identity = int(words[0])
-            pose = [float(word) for word in words[1:8]]
+            pose = [_number(word) for word in words[1:8]]
             lens = int(words[8])
         except (ValueError, IndexError):
             _bad_line(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line)

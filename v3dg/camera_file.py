@@ -5,6 +5,7 @@ models of COLMAP; and folders with one of them, and runs of nerfstudio."""
 import math
 import os
 import re
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -33,6 +34,7 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _UNDISTORT = (
     "undistort the pictures first, or leave it out: distortion='ignore', or --distortion ignore"
 )
+_MOST_NAMED = 8  # images in a warning
 _RUN = "config.yml"  # identifies a run of nerfstudio
 _TRAINING = "dataparser_transforms.json"  # from a run's data to its training
 _FRAMES = ("transforms.json", "transforms_train.json")
@@ -42,6 +44,10 @@ _DATA = re.compile(
 # Rotation from a camera with x right, y up, z backward to one with x right, y down, z
 # forward.
 _FLIP = np.diag([1.0, -1.0, -1.0])
+
+
+class CameraWarning(UserWarning):
+    """Cameras of a file were left out because their numbers are not finite."""
 
 
 def read_cameras(
@@ -68,7 +74,8 @@ def read_cameras(
 
     A camera is named by its `file_path`, its image, or `img_name`; if any is missing or
     repeats, all are named by their number, from 0. Pictures, depths, masks and point
-    clouds that the file names are not read.
+    clouds that the file names are not read. Images of a COLMAP model whose pose or lens
+    has numbers that are not finite are left out, with a `CameraWarning`.
 
     Args:
         size: Width and height in px for a file that has neither `w` and `h` nor focal
@@ -298,8 +305,19 @@ def _trained(file: Path) -> tuple[Floats, float]:
 
 
 def _read_colmap(images: Path, distortion: str) -> dict[str, Camera]:
+    model = read_model(images)
+    finite = [image for image in model if image.is_finite]
+    if len(finite) < len(model):
+        names = [image.name for image in model if not image.is_finite]
+        text = f"{len(names)} of {len(model)} images have cameras whose numbers are not finite"
+        check(images, finite, f"an image with finite numbers, got none: {text}")
+        shown_names = ", ".join(names[:_MOST_NAMED])
+        if len(names) > _MOST_NAMED:
+            shown_names += f" and {len(names) - _MOST_NAMED} more"
+        text += f" and are left out: {shown_names}"
+        warnings.warn(f"{images}: {text}", CameraWarning, stacklevel=3)
     named = []
-    for image in read_model(images):
+    for image in finite:
         lens = image.lens
         place = f"{images}: {image.name}"
         is_plain = distortion == "ignore" or not lens.is_distorted

@@ -97,6 +97,12 @@ def examine(asset: Gaussians) -> Findings:
     return Findings(drawable=faults == 0, counts=counts, wrong=(faults & _WRONG) != 0)
 
 
+def has_no_rotation(asset: Gaussians) -> npt.NDArray[np.bool_]:
+    """(N,) whether each quaternion is zero. Such a gaussian is drawn as if it were not
+    rotated, and a quantised format cannot hold it."""
+    return np.asarray(~asset.numpy().quats.any(axis=1))
+
+
 def outliers(
     means: npt.NDArray[np.float32], reference: npt.NDArray[np.float32] | None = None
 ) -> npt.NDArray[np.bool_]:

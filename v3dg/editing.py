@@ -176,4 +176,5 @@ def _kept(gaussians: Gaussians, is_inside: _Mask, keep: Part) -> Gaussians:
 
 
 def _with_sh(gaussians: Gaussians, sh: Array) -> Gaussians:
-    return Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, sh)
+    changed = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, sh)
+    return changed.trained(antialiased=gaussians.antialiased)

@@ -9,7 +9,9 @@ from dataclasses import replace
 from functools import partial
 from typing import Literal, TypeAlias, TypeVar, get_args
 
-from v3dg import _core
+import numpy as np
+from numpy.typing import NDArray
+
 from v3dg._numbers import check, check_type, one_of
 from v3dg._urls import FileAtUrl, beside, folder_of, in_parts, reading, shown
 from v3dg.cameras import AXES, Axis
@@ -30,7 +32,7 @@ from v3dg.formats import (
 )
 from v3dg.formats._declared import declare
 from v3dg.formats._losses import Losses, losses
-from v3dg.formats._packing import Limits
+from v3dg.formats._packing import Limits, curve_order, file_order
 from v3dg.formats._reading import AnyPath, AssetFile, bytes_of
 from v3dg.formats.content import content_of
 from v3dg.formats.ply import PlyEncoding
@@ -72,12 +74,12 @@ _FILES: dict[str, Callable[[pathlib.Path], list[pathlib.Path]]] = {
     "": lambda path: [path],
 }
 
-# Ends of the names of packed files, what these can hold, and whether gaussians are put
-# in the order of a Morton curve.
-_PACKED: dict[str, tuple[Limits, bool]] = {
-    ".compressed.ply": (compressed_ply.LIMITS, True),
-    ".spz": (spz.LIMITS, False),
-    ".sog": (Limits(), True),
+# Ends of the names of packed files, what these can hold, and the order that they put
+# gaussians in.
+_PACKED: dict[str, tuple[Limits, Callable[[Gaussians], NDArray[np.int64]]]] = {
+    ".compressed.ply": (compressed_ply.LIMITS, compressed_ply.chunk_order),
+    ".spz": (spz.LIMITS, file_order),
+    ".sog": (Limits(), curve_order),
 }
 
 # Checkpoints of gsplat, one for each GPU, and of nerfstudio, and what the code of the
@@ -338,14 +340,13 @@ def losses_of(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP
         up: As it was given to `write_asset`.
     """
     name = beside(path).name.lower()
-    for ending, (limits, is_sorted) in _PACKED.items():
+    for ending, (limits, order) in _PACKED.items():
         if not name.endswith(ending):
             continue
         written = gaussians.numpy()
         if turned_up(path) is not None:
             written = _axes.turned(written, _axes.axes_of_up(up), _axes.MEMORY)
-        if is_sorted:
-            written = written.subset(_core.morton_order(written.means))
+        written = written.subset(order(written))
         file = open_asset(path)
         return losses(written, file.read(0, file.num_gaussians), limits)
     return None

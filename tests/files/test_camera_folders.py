@@ -3,6 +3,7 @@ runs."""
 
 import json
 import os
+import struct
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from command_line import fails
 from command_line import run as run_command
 from scenes_lod import random_camera
 from v3dg import read_cameras
+from v3dg.camera_file import CameraWarning
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -219,7 +221,11 @@ TEXTS = {
     ),
     "too few numbers": ("1 1 0 0\n\n", "expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME in"),
     "no rotation": ("1 0 0 0 0 0 0 0 1 a.jpg\n\n", "a.jpg: expected a camera, got viewmat: expe"),
-    "no number": ("1 nan 0 0 0 0 0 0 1 a.jpg\n\n", "a.jpg: expected a camera, got viewmat: expe"),
+    "no finite number": (
+        "1 nan 0 0 0 0 0 0 1 a.jpg\n\n",
+        "expected an image with finite numbers, got none: 1 of 1 images have cameras whose",
+    ),
+    "no number": ("1 one 0 0 0 0 0 0 1 a.jpg\n\n", "expected IMAGE_ID QW QX QY QZ TX TY TZ CAM"),
 }
 
 
@@ -231,6 +237,37 @@ def test_texts_that_lose_an_image_are_refused(tmp_path, case):
     with pytest.raises(ValueError, match=message) as error:
         read_cameras(tmp_path)
     assert "images.txt: " in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "text", ["nan", "-nan(ind)", "NaN(snan)", "1.#QNAN", "-1.#IND00", "1.#INF", "inf", "-Infinity"]
+)
+@pytest.mark.parametrize("place", ["lens", "pose"])
+def test_only_images_without_finite_numbers_are_left_out(tmp_path, text, place):
+    numbers = {"lens": "50", "pose": "0"} | {place: text}
+    (tmp_path / "cameras.txt").write_text(
+        f"1 PINHOLE 64 48 50 50 32 24\r\n2 PINHOLE 64 48 {numbers['lens']} 50 32 24\r\n"
+    )
+    (tmp_path / "images.txt").write_text(
+        f"1 1 0 0 0 0 0 0 1 a b.jpg\n\n2 1 {numbers['pose']} 0 0 0 0 0 2 c d.jpg\n\n"
+        "3 1 0 0 0 0 0 5 1 e.jpg\n\n"
+    )
+    message = r"images.txt: 1 of 3 images have cameras .* not finite and are left out: c d\.jpg"
+    with pytest.warns(CameraWarning, match=message):
+        assert list(read_cameras(tmp_path)) == ["a b.jpg", "e.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("file", "place"), [("cameras.bin", 32), ("images.bin", 12), ("images.bin", 44)]
+)
+def test_numbers_of_binary_models_may_not_be_finite(tmp_path, cameras, file, place):
+    write_model(tmp_path / "a", cameras)
+    path = tmp_path / "a" / file
+    content = bytearray(path.read_bytes())
+    content[place : place + 8] = struct.pack("<d", float("nan"))
+    path.write_bytes(content)
+    with pytest.warns(CameraWarning, match="left out: images/é3.jpg"):
+        assert list(read_cameras(tmp_path / "a")) == list(cameras)[1:]
 
 
 def test_models_that_claim_too_much_are_refused(tmp_path, cameras):

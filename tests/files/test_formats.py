@@ -27,7 +27,7 @@ from half_turns import half_turn
 from test_ply import random_gaussians
 from v3dg import Gaussians, read_asset, write_asset
 from v3dg.cleaning import AssetWarning
-from v3dg.formats import _reading
+from v3dg.formats import _reading, compressed_ply
 from v3dg.io import open_asset
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
@@ -355,6 +355,42 @@ def test_a_compressed_ply_is_told_by_its_content(tmp_path):
     write_asset(tmp_path / "b.ply", random_gaussians(3, 0))
     (tmp_path / "b.ply").rename(tmp_path / "b.compressed.ply")
     assert len(read_asset(tmp_path / "b.compressed.ply")) == 3
+
+
+@pytest.mark.parametrize("num_far", [0, 1, 300, 3000])
+def test_a_far_background_costs_a_compressed_ply_nothing(tmp_path, num_far):
+    """A chunk, whose range has 1,024 or 2,048 steps, does not mix near and far
+    gaussians, except for less than 256 of the least visible."""
+    near = random_gaussians(3000, 1)
+    near.means[:] = np.random.default_rng(1).uniform(-1, 1, near.means.shape)
+    far = random_gaussians(num_far, 1)
+    far.means[:] *= 1000
+    far.scales[:] *= 1000
+    asset = v3dg.Gaussians.concatenate([near, far])
+    write_asset(tmp_path / "a.compressed.ply", asset)
+    found = read_asset(tmp_path / "a.compressed.ply")
+    order = compressed_ply.chunk_order(asset)
+    assert sorted(order) == list(range(len(asset)))
+    assert (order[:3000] < 3000).all()
+    num_whole = len(near) // 256 * 256
+    errors = np.abs(found.means - asset.means[order])
+    assert errors[:num_whole].max() < np.ptp(near.means, axis=0).max() / 1000
+    factors = found.scales[:num_whole] / asset.scales[order[:num_whole]]
+    assert factors.min() > 0.97
+    assert factors.max() < 1.03
+    if num_far:
+        area = np.prod(np.sort(near.scales.astype(float), axis=1)[:, 1:], axis=1)
+        visibility = near.opacities * area
+        least = visibility[order[:num_whole]].min()
+        assert visibility[order[num_whole:3000]].max() <= least
+
+
+@pytest.mark.parametrize("count", [0, 1, 300])
+def test_equal_positions_are_written(tmp_path, count):
+    asset = random_gaussians(count, 0)
+    asset.means[:] = 1
+    write_asset(tmp_path / "a.compressed.ply", asset)
+    np.testing.assert_array_equal(read_asset(tmp_path / "a.compressed.ply").means, asset.means)
 
 
 def test_chunks_without_colours_mean_black_to_white(tmp_path):

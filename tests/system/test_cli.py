@@ -211,6 +211,16 @@ def test_info_of_a_bundle(folder):
     assert result["levels"][0]["gaussians"] == 1000
 
 
+def test_info_counts_rotations_of_length_zero(folder, tmp_path):
+    asset = v3dg.read_asset(folder / "tuft.ply")
+    asset.quats[:3] = 0
+    v3dg.write_asset(tmp_path / "flat.ply", asset)
+    done = run("info", tmp_path / "flat.ply")
+    assert "3 with a rotation of length zero, drawn unrotated; convert --drop-bad" in done.stdout
+    assert json.loads(run("info", tmp_path / "flat.ply", "--json").stdout)["without_rotation"] == 3
+    assert "rotation" not in run("info", folder / "tuft.ply").stdout
+
+
 def test_info_of_an_asset(folder):
     assert "1,000 gaussians, SH degree 1" in run("info", folder / "tuft.ply").stdout
     result = json.loads(run("info", folder / "tuft.ply", "--json").stdout)

@@ -138,6 +138,10 @@ def test_what_a_packed_format_cuts_and_rounds_is_said(folder):
     size = np.ptp(asset.means, axis=0).max()
     error = np.abs(found.means - asset.means).max()
     assert 0.3 * error / size < result["largest_errors"]["positions"] < 3 * error / size
+    is_held = (logs >= -10) & (logs <= -10 + 255 / 16)
+    factors = (found.scales / asset.scales)[is_held]
+    largest = max(factors.max(), 1 / factors.min()) - 1
+    assert result["largest_errors"]["scales"] == pytest.approx(largest, rel=1e-3)
     lines = result["notes"]
     assert lines[1].startswith("wild.spz: cut to what the format holds: ")
     assert f"{result['cut']['harmonics']:,} harmonics beyond -1.00 to 1.00" in lines[1]

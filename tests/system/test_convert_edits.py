@@ -51,6 +51,12 @@ def test_the_text_says_how_many_were_left_out_and_why(folder):
     done = run("convert", "tuft.ply", "a.ply", "--drop-outliers", "--degree", "0", cwd=folder)
     assert "left out 1 of 2,001 gaussians: 1 outliers" in done.stdout
     assert "SH of degree 1 cut to 0" in done.stdout
+    done = run("convert", "tuft.ply", "b.ply", "--degree", "3", cwd=folder)
+    assert "SH of degree 1 extended to 3 by zeros" in done.stdout
+    extended = v3dg.read_asset(folder / "b.ply").sh
+    np.testing.assert_array_equal(extended[:, :4], v3dg.read_asset(folder / "tuft.ply").sh)
+    assert extended.shape[1] == 16
+    assert not extended[:, 4:].any()
 
 
 def test_files_are_placed_and_joined(folder):

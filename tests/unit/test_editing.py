@@ -91,6 +91,14 @@ def test_degrees_are_cut_and_extended_by_zeros(kind):
 
 
 @KINDS
+@pytest.mark.parametrize("antialiased", [None, False, True])
+def test_another_degree_keeps_how_an_asset_was_trained(kind, antialiased):
+    whole = of_kind(kind, asset(sh_degree=1)).trained(antialiased=antialiased)
+    for degree in range(4):
+        assert v3dg.to_degree(whole, degree).antialiased is antialiased
+
+
+@KINDS
 def test_joined_assets_have_the_highest_degree(kind):
     parts = [asset(3, 0), asset(4, 2, seed=1)]
     joined = v3dg.join([of_kind(kind, part) for part in parts]).numpy()

@@ -43,7 +43,8 @@ class EditOptions:
     min_opacity: Annotated[float | None, option("X")] = None
     """Drop gaussians with an opacity below X, 0 to 1."""
     degree: Annotated[Literal[0, 1, 2, 3] | None, option("{0,1,2,3}")] = None
-    """Cut the spherical harmonics down to this degree."""
+    """Write spherical harmonics of this degree: higher ones are cut; missing ones are
+    zeros, for programs that read files of degree 3 only."""
 
     def option_names(self) -> list[str]:
         """Return the names of the options on the command line."""
@@ -120,7 +121,7 @@ class Editor:
             )
         self._degree_before = remaining.sh_degree
         self._degree_after = remaining.sh_degree
-        if options.degree is not None and options.degree < remaining.sh_degree:
+        if options.degree is not None:
             self._degree_after = options.degree
             remaining = editing.to_degree(remaining, options.degree)
         return remaining
@@ -142,6 +143,10 @@ class Editor:
             lines.append(f"left out {numbers}: {self._counts()}")
         if self._degree_after < self._degree_before:
             lines.append(f"SH of degree {self._degree_before} cut to {self._degree_after}")
+        if self._degree_after > self._degree_before:
+            lines.append(
+                f"SH of degree {self._degree_before} extended to {self._degree_after} by zeros"
+            )
         return lines
 
     def _without_outliers(self, gaussians: Gaussians) -> Gaussians:

@@ -9,7 +9,7 @@ import numpy as np
 import tyro
 
 from v3dg._urls import shown
-from v3dg.cleaning import describe, examine
+from v3dg.cleaning import describe, examine, has_no_rotation
 from v3dg.cli._common import Flag, check_usage
 from v3dg.gaussians import Gaussians
 
@@ -50,14 +50,14 @@ def checked(options: FaultOptions, gaussians: Gaussians, subject: Path, output: 
     """Apply the options; ValueError names the file whose wrong values cannot be
     written."""
     findings = examine(gaussians)
-    has_no_rotation = ~gaussians.quats.any(axis=1)
-    is_wrong = findings.wrong | has_no_rotation
+    is_unrotated = has_no_rotation(gaussians)
+    is_wrong = findings.wrong | is_unrotated
     num_wrong = int(is_wrong.sum())
     if not num_wrong:
         return Checked(gaussians, {}, "")
     counts = {kind: count for kind, count in findings.counts.items() if kind != "transparent"}
-    if has_no_rotation.any():
-        counts["quats_zero"] = int(has_no_rotation.sum())
+    if is_unrotated.any():
+        counts["quats_zero"] = int(is_unrotated.sum())
     text = f"{num_wrong:,} of {len(gaussians):,} gaussians have wrong values: {_text(counts)}"
     if options.drop_bad:
         return Checked(gaussians.subset(~is_wrong), counts, f"{shown(subject)}: left out: {text}")

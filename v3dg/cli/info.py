@@ -14,7 +14,7 @@ from v3dg._json import Json, JsonObject
 from v3dg._urls import is_url, shown
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
-from v3dg.cleaning import OUTLIER_DISTANCE, describe, examine, outliers
+from v3dg.cleaning import OUTLIER_DISTANCE, Findings, describe, examine, has_no_rotation, outliers
 from v3dg.cli import _common
 from v3dg.formats._declared import declared_of
 from v3dg.framing import frame_subject
@@ -94,6 +94,7 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
         "gaussians": len(asset),
         "drawable": len(drawable),
         "not_drawable": findings.counts,
+        "without_rotation": int(has_no_rotation(asset).sum()),
         "outliers": int(far.sum()),
         "sh_degree": asset.sh_degree,
         "bytes": num_bytes,
@@ -104,12 +105,24 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
     }
     lines = [f"{shown(path)}: asset, {_common.bytes_text(num_bytes)}"]
     lines += [f"{len(asset):,} gaussians, SH degree {asset.sh_degree}"]
-    if findings.counts:
-        lines.append(f"{findings.num_dropped:,} cannot be drawn: {describe(findings.counts)}")
+    lines += _fault_lines(findings, result["without_rotation"])
     lines += [*_extent_lines(result), *_spread_lines(spread)]
     if declared.antialiased:
         lines.append("trained with antialiasing")
     return result, lines
+
+
+def _fault_lines(findings: Findings, num_unrotated: int) -> list[str]:
+    """Lines about gaussians that cannot be drawn, or not as their file means it."""
+    lines = []
+    if findings.counts:
+        lines.append(f"{findings.num_dropped:,} cannot be drawn: {describe(findings.counts)}")
+    if num_unrotated:
+        lines.append(
+            f"{num_unrotated:,} with a rotation of length zero, drawn unrotated; "
+            "convert --drop-bad leaves them out"
+        )
+    return lines
 
 
 def _extent_lines(result: JsonObject) -> list[str]:

@@ -24,6 +24,7 @@ class Losses:
             left out.
         position_error: Largest error of a coordinate, relative to the diameter of the
             ball of most gaussians.
+        scale_error: Largest error of a scale that was not cut, relative to it.
         color_error: Largest error of a colour of degree 0 that was not cut, where 1 is
             from black to white.
         harmonics_error: Largest error of a coefficient of higher harmonics that was not
@@ -33,6 +34,7 @@ class Losses:
 
     cut: dict[str, int]
     position_error: float
+    scale_error: float
     color_error: float
     harmonics_error: float
     limits: Limits
@@ -44,7 +46,8 @@ class Losses:
         if self.cut:
             counts = ", ".join(f"{count:,} {self._kind(kind)}" for kind, count in self.cut.items())
             lines.append(f"cut to what the format holds: {counts}")
-        errors = f"positions {self.position_error:.1e} of the size, colours {self.color_error:.4f}"
+        errors = f"positions {self.position_error:.1e} of the size"
+        errors += f", scales {self.scale_error:.1%}, colours {self.color_error:.4f}"
         if self.harmonics_error:
             errors += f", harmonics {self.harmonics_error:.4f}"
         return [*lines, f"largest errors of rounding: {errors}"]
@@ -53,6 +56,7 @@ class Losses:
         """Return the losses for a command's result as JSON."""
         errors = {
             "positions": self.position_error,
+            "scales": self.scale_error,
             "colors": self.color_error,
             "harmonics": self.harmonics_error,
         }
@@ -75,8 +79,9 @@ def losses(written: Gaussians, read: Gaussians, limits: Limits) -> Losses:
     """Compare gaussians on the host with those that a packed file gives back, in the
     same order and axes."""
     higher = written.sh[:, 1:]
+    logs = log_scales(written.scales)
     is_cut = {
-        "scales": _is_outside(log_scales(written.scales), limits.log_scale),
+        "scales": _is_outside(logs, limits.log_scale),
         "colors": _is_outside(written.sh[:, 0], limits.color),
         "harmonics": _is_outside(higher, limits.harmonic),
         "opacities": (written.opacities > 0) & (written.opacities < SMALLEST_OPACITY),
@@ -85,9 +90,11 @@ def losses(written: Gaussians, read: Gaussians, limits: Limits) -> Losses:
     if len(written):
         size = 2 * ball_of_most(written.means)[1]
     all_kept = np.zeros(written.means.shape, bool)
+    log_error = _largest_error(logs, log_scales(read.scales), is_cut["scales"])
     return Losses(
         cut={kind: int(mask.sum()) for kind, mask in is_cut.items() if mask.any()},
         position_error=_largest_error(written.means, read.means, all_kept) / size,
+        scale_error=math.expm1(log_error),
         color_error=SH_C0 * _largest_error(written.sh[:, 0], read.sh[:, 0], is_cut["colors"]),
         harmonics_error=_largest_error(higher, read.sh[:, 1:], is_cut["harmonics"]),
         limits=limits,

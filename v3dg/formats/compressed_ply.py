@@ -22,6 +22,10 @@ from v3dg.formats._reading import AnyPath, AssetFile, File, check, listed
 from v3dg.gaussians import Gaussians
 
 _CHUNK = 256
+# The inner shell has four times the distance from the median position that a tenth of
+# the gaussians have: all of a compact asset, and what is near where most is far away.
+_INNER_SHARE = 0.1
+_INNER_FACTOR = 4.0
 _MAX_LOG_SCALE = 20.0
 LIMITS = _packing.Limits(log_scale=(-20.0, _MAX_LOG_SCALE), harmonic=(-4.0, 4.0))
 """What the format can hold."""
@@ -138,7 +142,7 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
     """Write a `.compressed.ply` file; gaussians are put in an order that keeps
     neighbours together."""
     host = _packing.check_writable(gaussians)
-    order = _core.morton_order(host.means)
+    order = chunk_order(host)
     count = len(host)
     num_rest = 3 * (host.sh.shape[1] - 1)
     num_chunks = -(-count // _CHUNK)
@@ -177,6 +181,46 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
                 file.write(
                     np.clip(np.floor((higher / 8 + 0.5) * 256), 0, 255).astype(np.uint8).tobytes()
                 )
+
+
+def chunk_order(gaussians: Gaussians) -> NDArray[np.int64]:
+    """The order (N,) of gaussians on the host, with finite positions, in a file.
+
+    The range of a chunk has 1,024 or 2,048 steps, of which far gaussians would leave
+    none to near ones. So shells around the median position follow one another, each
+    along its own Morton curve. If a chunk has the end of one shell and the beginning of
+    the next, that end has the least visible gaussians of its shell.
+    """
+    shells = _shells(gaussians.means)
+    order = np.argsort(shells, kind="stable")
+    scales = np.sort(gaussians.scales.astype(np.float64), axis=1)
+    visibility = gaussians.opacities * scales[:, 1] * scales[:, 2]  # opacity times area
+    ends = np.cumsum(np.bincount(shells))
+    start = 0
+    for end in ends:
+        rows = order[start:end]
+        num_whole = end // _CHUNK * _CHUNK - start
+        if end < len(order) and num_whole > 0:
+            rows = rows[np.argsort(-visibility[rows], kind="stable")]
+        parts = np.split(rows, [max(num_whole, 0)])
+        curves = [part[_core.morton_order(gaussians.means[part])] for part in parts]
+        order[start:end] = np.concatenate(curves)
+        start = end
+    return order
+
+
+def _shells(means: NDArray[np.float32]) -> NDArray[np.intp]:
+    """The shell (N,) of each position: 0 in the inner shell, and one more for each
+    doubling of its radius."""
+    if not len(means):
+        return np.zeros(0, np.intp)
+    positions = means.astype(np.float64)
+    distance = np.abs(positions - np.median(positions, axis=0)).max(axis=1)
+    radius = _INNER_FACTOR * np.quantile(distance, _INNER_SHARE)
+    if radius == 0:
+        return np.zeros(len(means), np.intp)
+    shells: NDArray[np.intp] = np.ceil(np.log2(np.maximum(distance / radius, 1.0))).astype(np.intp)
+    return shells
 
 
 def _header(host: Gaussians, num_chunks: int) -> bytes:

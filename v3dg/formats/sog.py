@@ -310,7 +310,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     # A small asset keeps the higher SH of every gaussian, and a larger one many: half
     # the palette would halve its bytes and cost 5 to 30 dB.
     size = max(len(host) // 4, min(len(host), _FULL_PALETTE))
-    contents = encode(host.subset(_core.morton_order(host.means)), palette_size=size)
+    contents = encode(host.subset(_packing.curve_order(host)), palette_size=size)
     # Readers refuse files that are too small for what they claim; equal gaussians
     # compress to almost nothing.
     missing = least_bytes(len(host)) - sum(map(len, contents.values()))
