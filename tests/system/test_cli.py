@@ -497,7 +497,7 @@ def test_options_of_a_turntable_are_refused_beside_cameras(folder, option, comma
     """Whatever their values: those that are the defaults say nothing of what was
     given."""
     message = (
-        f"{option[0]}: expected a turntable to set with it, got the cameras of scene.json; "
+        f"{option[0]}: expected a subject without cameras, got the cameras of scene.json; "
         "leave it out"
     )
     fails(2, message, *command.split(), *option, cwd=folder)

@@ -116,7 +116,7 @@ class ViewOptions(CameraFile):
         """Refuse options of the views around a subject where other cameras draw it."""
         for name, value in self.turntable().items():
             is_used = name == "--up" and self.eye is not None
-            expected = f"views around the subject to set with it, got {source}; leave it out"
+            expected = f"a subject without cameras, got {source}; leave it out"
             check_usage(name, value is None or is_used, expected)
 
     def turntable(self) -> dict[str, object]:
