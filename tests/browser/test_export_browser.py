@@ -317,7 +317,7 @@ def test_the_budget_holds_in_movement(watched):
 @needs_engine
 @pytest.mark.parametrize("watched", ["phone"], indirect=True)
 def test_a_budget_that_changes_holds(watched):
-    for budget in (100_000, 8_000, 40_000):
+    for budget in (100_000, 12_000, 40_000):
         watched.settled()
         watched.set_budget(budget)
         assert 0.7 * budget < watched.settled() <= budget
