@@ -109,7 +109,8 @@ def _answer(pipe: Connection) -> object:
 
 
 def mean_of(rows: Sequence[Mapping[str, float | None]], *names: str) -> JsonObject:
-    """Return means of columns, to six digits; None if every value is missing."""
+    """Return the mean of each column, to six significant digits; a column without
+    values has the mean None."""
     means: dict[str, float | None] = {}
     for name in names:
         values = [value for row in rows if (value := row.get(name)) is not None]

@@ -126,7 +126,7 @@ class Camera:
         check(
             "eye, target",
             np.isfinite(distance),
-            f"a distance that a double can hold, got {_text(goal)}",
+            f"points whose distance a double can hold, got {_text(position)} and {_text(goal)}",
         )
         forward = (goal - position) / distance
         # Squares neither overflow nor underflow.

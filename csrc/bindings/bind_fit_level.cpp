@@ -55,8 +55,10 @@ std::vector<FitGroup> groups_of(const py::array& target_range, const py::array& 
         if (bounds[0] < 0 || bounds[1] < bounds[0] ||
             bounds[1] > static_cast<int64_t>(num_targets) || bounds[2] < 0 ||
             bounds[3] < bounds[2] || bounds[3] > static_cast<int64_t>(num_rows))
-            throw py::value_error("range: expected [first, last) within the gaussians, group " +
-                                  std::to_string(g) + " is not");
+            throw py::value_error(
+                "target_range, range: expected [first, last) within the gaussians, got another "
+                "for group " +
+                std::to_string(g));
         FitGroup group{.target_first = static_cast<uint64_t>(bounds[0]),
                        .target_count = static_cast<uint64_t>(bounds[1] - bounds[0]),
                        .first = static_cast<uint64_t>(bounds[2]),
@@ -293,7 +295,7 @@ void bind_fit_level(py::module_& m) {
           "parts "
           "of the pixels of each picture, and in how many of the cuts it was (N,).");
     m.def("dssim", &dssim_of, "picture"_a, "target"_a,
-          "Mean of 1 - SSIM of one channel, and its gradient by the picture.");
+          "Mean of 1 - SSIM of one channel, and its gradient with respect to the picture.");
     m.def("ssim", &ssim_of_pictures, "picture"_a, "target"_a,
           "Mean of SSIM of pictures (H, W, C), both float32 or both float64; the border is "
           "mirrored.");

@@ -253,7 +253,7 @@ class BoundAssetFrame {
     BoundAssetFrame(const py::object& model_object, float filter_px2, bool antialiased) {
         const auto& model = held<BoundModel>(model_object, "model");
         if (model.has_codes())
-            throw py::value_error("model: expected a model of rows, got a model of codes");
+            throw py::value_error("model: expected float32 gaussians, got quantized ones");
         const Work work(model.device());
         const Appearance<float> appearance{filter_px2, antialiased, false};
         frame_ = work.backend().make_asset_frame(model.handle(), appearance, work);

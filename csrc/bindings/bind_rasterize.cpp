@@ -94,8 +94,9 @@ void bind_rasterize(py::module_& m) {
         .def_readonly("background", &Gradients::background)
         .def_readonly("centers", &Gradients::centers,
                       "(N, 2), by the centres on the image, or None.")
-        .def_readonly("center_sizes", &Gradients::center_sizes,
-                      "(N, 2), sums over pixels of absolute gradients by the centres, or None.");
+        .def_readonly(
+            "center_sizes", &Gradients::center_sizes,
+            "(N, 2), sums over pixels of absolute gradients with respect to the centres, or None.");
     py::class_<BoundEllipses>(
         m, "Ellipses", "Gaussians projected onto an image; zeros for those that are not visible.")
         .def_readonly("centers", &BoundEllipses::centers, "(N, 2), px.")

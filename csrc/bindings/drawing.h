@@ -13,10 +13,10 @@
 
 namespace v3dg {
 
-// Gives one thread exclusive use of a frame while it exists. Python's lock does not
-// suffice, because torch releases it while it allocates memory. For the same reason the
-// constructor releases Python's lock while it waits for another thread. Used by
-// backends whose frames share buffers.
+// A Turn gives one thread exclusive use of a frame until the Turn is destroyed.
+// Python's lock does not suffice, because torch releases that lock during allocations.
+// The constructor waits without Python's lock, which the other thread may need to
+// finish. Used by backends whose frames share buffers.
 class V3DG_SCOPED_CAPABILITY Turn {
   public:
     explicit Turn(Mutex& mutex) V3DG_ACQUIRE(mutex) : mutex_(mutex) { wait_for(mutex); }
@@ -48,7 +48,7 @@ struct FrameStats {
 };
 
 // A frame that has been drawn, or enqueued on a device, with its inputs and outputs. A
-// backend whose drawings are unfinished on return derives from it.
+// backend that returns before the frame is drawn uses a derived class.
 class BoundDrawing {
   public:
     BoundDrawing(NewPictures pictures, const FrameStats& stats)

@@ -25,7 +25,7 @@ BoundModel::BoundModel(const py::object& codes, int device) : device_{device}, i
 
 py::tuple BoundModel::decode(const py::array& cluster_ids) const {
     if (!has_codes())
-        throw py::value_error("decode: expected a model of codes, got a model of rows");
+        throw py::value_error("decode: expected quantized gaussians, got float32 ones");
     const Span<const int32_t> cluster = span_of<const int32_t>(cluster_ids, "cluster_ids", {-1});
     std::vector<int64_t> offset{0};
     for (const int32_t c : cluster) {

@@ -9,7 +9,7 @@
 
 namespace v3dg {
 
-// The requested gradients by the gaussians' centres on the image.
+// The requested gradients with respect to the gaussians' centres on the image.
 struct Centers {
     bool sum, size;
 };

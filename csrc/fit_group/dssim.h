@@ -20,9 +20,9 @@ struct SsimScratch {
 };
 
 // Returns the mean of 1 - SSIM over one channel of width x height, row major, and adds
-// `weight` times its gradient by `picture` to `d_picture`. The Gaussian window is 11 x
-// 11 with sigma 1.5, pixels beyond the border are zero, and the constants are 0.01² and
-// 0.03² (Wang et al. 2004, as 3D Gaussian Splatting uses it).
+// `weight` times its gradient with respect to `picture` to `d_picture`. The Gaussian
+// window is 11 x 11 with sigma 1.5, pixels beyond the border are zero, and the
+// constants are 0.01² and 0.03² (Wang et al. 2004, as 3D Gaussian Splatting uses it).
 float dssim(const float* picture, const float* target, int width, int height, float weight,
             float* d_picture, SsimScratch& scratch);
 

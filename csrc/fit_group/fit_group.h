@@ -117,12 +117,12 @@ struct FitSignals {
     int cancel;
 };
 
-// A group, with the indices of its pictures and of its result.
+// A group, with the indices of its pictures, views and residual.
 struct FitJob {
     FitGroup group;
     uint64_t first_pixel;  // index of its first pixel in `targets`
     uint64_t first_view;   // index of its first view in `views`
-    uint32_t error;        // index of its result in `error`
+    uint32_t error;        // index of its residual in `error`
     int size;              // side of its pictures, px
 };
 

@@ -174,9 +174,9 @@ struct FitBlock : Shape {
     __device__ Index* list(int half) const {
         return hot_at<Index>(layout.lists + (2 * warp() + half) * layout.list_size);
     }
-    // Returns the gradients by the exponent of each gaussian at each pixel, and its
-    // weight there, [gaussian][pixel]. Rows have a spare column, so that lanes that
-    // read the same pixel of different gaussians access different banks.
+    // Returns the gradients with respect to the exponent of each gaussian at each
+    // pixel, and its weight there, [gaussian][pixel]. Rows have a spare column, so that
+    // lanes that read the same pixel of different gaussians access different banks.
     __device__ float2* fragments() const {
         return reinterpret_cast<float2*>(shared_memory() + layout.fragments +
                                          threadIdx.x / 32 * fragments_bytes(kChunk));
@@ -190,9 +190,9 @@ struct FitBlock : Shape {
                2 * kChunk * (threadIdx.x / 32);
     }
     __device__ int num_regions() const { return regions_across * regions_across; }
-    // Returns the gradients by the values from view b of a batch. Blocks that share
-    // views write the gradients of one batch while others may still read those of the
-    // batch before, so two values of `turn` alternate.
+    // Returns the gradients with respect to the values from view b of a batch. Blocks
+    // that share views write the gradients of one batch while others may still read
+    // those of the batch before, so two values of `turn` alternate.
     __device__ float* gradient(int turn, int b) const {
         if (view_stride == 1) return at(layout.by_view) + static_cast<size_t>(b) * num_values;
         return reinterpret_cast<float*>(exchange) +

@@ -41,8 +41,8 @@ V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, const PixelBox<int>& b
     r.y1 = static_cast<uint16_t>(box.y1);
 }
 
-// The sum over pixels of the absolute gradient by a record's centre, for both axes. It
-// is large even where the gradients of different pixels cancel.
+// The sum over pixels of the absolute gradient with respect to a record's centre, for
+// both axes. It is large even where the gradients of different pixels cancel.
 template <class V>
 struct CenterSize {
     V u, v;

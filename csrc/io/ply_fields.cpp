@@ -1,5 +1,6 @@
 // Finds the properties of a vertex that make a gaussian, in the files of the 3DGS code
-// and in those of other trainers, and says what a file is that has too few.
+// and in those of other trainers. If properties are missing, the error says what kind
+// of file it probably is.
 
 #include "io/ply_fields.h"
 

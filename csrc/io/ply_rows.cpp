@@ -70,7 +70,8 @@ bool is_swapped(PlyEncoding encoding) {
     return (encoding == PlyEncoding::binary_big_endian) == (first == 1);
 }
 
-// Converts rows of binary numbers of fixed size, from which lists were removed.
+// Converts rows of binary numbers to gaussians. Lists have been removed from the rows,
+// so all rows have the same size.
 class RowDecoder {
   public:
     RowDecoder(const PlyFile& ply, const PlyGaussians<float>& out)

@@ -43,8 +43,8 @@ struct WindowTables {
     PictureGradient<float> slope[kMostWindows];
 };
 
-// Returns the memory of a window in one block that has room for `most_pixels` of each
-// window.
+// Returns the colour and alpha planes of one window. `memory` has room for
+// `most_pixels` pixels of each window, four floats each.
 V3DG_HD inline PicturePlanes planes_of_window(float* memory, size_t most_pixels, size_t window) {
     float* color = memory + 4 * most_pixels * window;
     return {color, color + 3 * most_pixels, nullptr};

@@ -434,8 +434,8 @@ void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows,
     const DeviceBuffer<float> grey(3 * rows.size, stream);
     if (rows.size > 0)
         check(cudaMemsetAsync(grey.data(), 0, grey.bytes(), stream), "cudaMemsetAsync");
-    // The gradient by a colour says how much is seen of a gaussian, whatever its own
-    // colour is.
+    // The gradient with respect to a colour says how much is seen of a gaussian,
+    // whatever its own colour is.
     GaussianRows<const float> rows_in_grey = rows;
     rows_in_grey.sh = grey.data();
     rows_in_grey.sh_degree = 0;

@@ -149,8 +149,8 @@ V3DG_HD inline void copy_gaussian(const GaussianRows<const float>& source, size_
     for (size_t k = 0; k < num_sh; ++k) rows.sh[num_sh * to + k] = source.sh[num_sh * from + k];
 }
 
-// Copies a gaussian in grey, of SH degree 0. The gradient by that colour says how much
-// is seen of it, whatever its own colour is.
+// Copies a gaussian in grey, of SH degree 0. The gradient with respect to that colour
+// says how much is seen of it, whatever its own colour is.
 V3DG_HD inline void copy_in_grey(const GaussianRows<const float>& source, size_t from,
                                  const GaussianRows<float>& rows, size_t to) {
     copy_shape(source, from, rows, to);

@@ -24,8 +24,8 @@ V3DG_DECLARE_PER_ISA(template <class T>
                                          const Picture<T>& picture))
 
 // Writes the gradients of a tile's sorted entries, in their order, to `d_entry`.
-// `size`, unless null, receives the sizes of the gradients by the centres. Both must be
-// zero on entry. Adds to `d_background` (3).
+// `size`, unless null, receives the sizes of the gradients with respect to the centres.
+// Both must be zero on entry. Adds to `d_background` (3).
 V3DG_DECLARE_PER_ISA(template <class T> void rasterize_tile_backward(
     const Record<T>* records, EntryFormat format, const uint64_t* entry, size_t count, int left,
     int top, const Picture<T>& picture, const PictureGradient<T>& d_picture,

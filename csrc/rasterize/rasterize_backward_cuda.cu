@@ -98,8 +98,8 @@ struct PixelGradient {
     float x, y;
     float d_color[3], d_depth, d_weight;
     float total,
-        // Sums over gaussians of weight * (gradient by that weight): all of them, and
-        // those so far.
+        // Sums over gaussians of weight * (gradient with respect to that weight): all
+        // of them, and those so far.
         running;
     float transmittance;
 };

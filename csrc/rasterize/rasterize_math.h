@@ -115,10 +115,10 @@ V3DG_HD V3DG_INLINE void blend_weights(const T (&alpha)[kCount], T& t, T (&befor
     }
 }
 
-// Returns the gradient by the exponent of a gaussian that was blended with `alpha` and
-// `weight` where the transmittance was `before`. `by_weight` is the gradient by its
-// weight; `behind` is the sum, over all gaussians behind it, of weight times gradient
-// by that weight.
+// Returns the gradient with respect to the exponent of a gaussian that was blended with
+// `alpha` and `weight` where the transmittance was `before`. `by_weight` is the
+// gradient with respect to its weight; `behind` is the sum, over all gaussians behind
+// it, of weight times gradient by that weight.
 template <class V>
 V3DG_HD V3DG_INLINE V exponent_vjp(V alpha, V before, V weight, V by_weight, V behind) {
     // Alpha increases the gaussian's weight and attenuates everything behind it.
@@ -127,15 +127,15 @@ V3DG_HD V3DG_INLINE V exponent_vjp(V alpha, V before, V weight, V by_weight, V b
     return moves ? Lane<V>(kLn2) * alpha * d_alpha : V{};
 }
 
-// Sums over pixels of the gradients by the terms of the exponent.
+// Sums over pixels of the gradients with respect to the terms of the exponent.
 template <class T>
 struct FalloffSums {
     T exponent, t1, t2;
-    T t1_dx, t1_dy, t2_dy;  // gradient by t1 times dx, ...
+    T t1_dx, t1_dy, t2_dy;  // gradient with respect to t1 times dx, ...
 };
 
-// Sums over the pixels of one row, which share dy and t2: the gradient by the exponent,
-// and its products with t1 and t1 dx.
+// Sums over the pixels of one row, which share dy and t2: the gradient with respect to
+// the exponent, and this gradient times t1 and times t1 dx.
 template <class T>
 struct RowSums {
     T exponent, t1, t1_dx;
@@ -161,8 +161,8 @@ struct RowSums {
     }
 };
 
-// Returns the contribution of a pixel to the size of the gradient by the centre: the
-// absolute values of both components of falloff_vjp().
+// Returns the contribution of a pixel to the size of the gradient with respect to the
+// centre: the absolute values of both components of falloff_vjp().
 template <class V>
 V3DG_HD V3DG_INLINE CenterSize<V> size_of_center_vjp(V l11, V l12, V l22, const Falloff<V>& f,
                                                      V d_exponent) {

@@ -36,11 +36,12 @@ struct TilePlanes {
 template <class T>
 struct TileGradient {
     alignas(64) T d_color[3][kTilePixels];
-    alignas(64) T d_depth[kTilePixels];  // gradient by the sum of weight * depth
+    alignas(64) T d_depth[kTilePixels];  // gradient with respect to the sum of weight * depth
     alignas(
         // The gradient that all weights share, through alpha and the hidden background.
         64) T d_weight[kTilePixels];
-    alignas(64) T total[kTilePixels];  // sum over gaussians of weight * (gradient by that weight)
+    alignas(64) T total[kTilePixels];  // sum over gaussians of weight * (gradient with respect to
+                                       // that weight)
 };
 
 // Returns the blocks of the tile at (left, top) that the record's pixel box touches.

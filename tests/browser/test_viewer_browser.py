@@ -548,7 +548,8 @@ def test_dropped_file_is_shown(tab, tmp_path):
     tab.page.wait_for_selector("#panel h1:text-is('few')", timeout=1000 * SECONDS)
     tab.page.wait_for_timeout(900)  # until the camera is there
     assert tab.settled().max() > 60
-    assert tab.figure("selected") == tab.figure("in the frustum") == 300
+    assert tab.figure("selected") == 300
+    assert tab.figure("in the frustum") >= 0.96 * 300  # the share that a first view frames
 
 
 def test_photographs_lie_over_the_picture_of_their_camera(browser, site, tmp_path):
@@ -589,9 +590,12 @@ def test_phone_has_the_picture_to_itself(browser, site):
         assert tab.page.locator("#stage").bounding_box()["width"] == 390
         assert not tab.page.locator("#panel").is_visible()
         assert (picture.max(axis=2) > 30).mean() > 0.03
-        half_width = "Math.atan(Math.tan(viewer.camera.fov_y / 2) * viewer.look.aspect)"
-        fits = f"Math.asin(0.9 * viewer.scene.radius / viewer.camera.distance) < {half_width}"
-        assert tab.page.evaluate(fits)
+        # The first view is the one for a narrow window, in which the subject's width fits.
+        homes = "viewer.scene.homes.map((home) => home.view.aspect)"
+        aspects = tab.page.evaluate(homes)
+        assert min(aspects) <= tab.page.evaluate("viewer.look.aspect") < max(aspects)
+        edges = np.concatenate([picture[:, :4].reshape(-1, 3), picture[:, -4:].reshape(-1, 3)])
+        assert (edges.max(axis=1) > 60).mean() < 0.05  # stray gaussians reach the edges
         tab.page.touchscreen.tap(195, 300)
         tab.page.get_by_role("button", name="Panel").tap()
         assert tab.page.locator("#panel").bounding_box()["y"] > 380
@@ -741,12 +745,19 @@ def test_a_box_is_drawn_dragged_and_saved_as_a_new_asset(browser, site, tmp_path
     alone = Site(SceneView(bundle, device="cpu"), name="blob", port=0, edits_folder=tmp_path)
     try:
         with Tab(browser, alone.url) as tab:
+            # The first view frames nearly all gaussians; the box of all is larger.
+            tab.settled()
+            tab.page.mouse.move(300, 300)
+            for _ in range(5):
+                tab.page.mouse.wheel(0, 1500)
+                tab.page.wait_for_timeout(300)
             before = tab.settled()
             tab.open("Crop")
             tab.press("Draw a box")
             tab.page.wait_for_function("() => viewer.crop.isOn")
             assert differ(before, tab.settled()) > 0.002
-            face = "viewer.crop.inWorld(viewer.crop.middleOf({ axis: 0, end: 1 }))"
+            # The face on the left, because the panel covers the picture on the right.
+            face = "viewer.crop.inWorld(viewer.crop.middleOf({ axis: 0, end: 0 }))"
             place = f"viewer.overlay.projection.place({face})"
             handle = tab.page.evaluate(place)
             low, high = tab.page.evaluate("viewer.crop.box")
@@ -755,9 +766,9 @@ def test_a_box_is_drawn_dragged_and_saved_as_a_new_asset(browser, site, tmp_path
             tab.drag(handle, end)
             dragged = tab.page.evaluate("viewer.crop.box")
             # The face is where the pointer let go of it, and no other has moved.
-            np.testing.assert_allclose(dragged[1][0], target[0], atol=0.02 * (high[0] - low[0]))
-            assert dragged[0] == low
-            assert dragged[1][1:] == high[1:]
+            np.testing.assert_allclose(dragged[0][0], target[0], atol=0.02 * (high[0] - low[0]))
+            assert dragged[1] == high
+            assert dragged[0][1:] == low[1:]
             assert tab.page.evaluate("viewer.crop.text").startswith("box:")
             tab.page.get_by_label("Part").select_option("outside")
             tab.page.get_by_label("New file").fill("rest.ply")

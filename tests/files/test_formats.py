@@ -852,9 +852,7 @@ def test_a_glb_that_is_cut_off_is_refused(tmp_path):
     content = (FIXTURES / "sh3.glb").read_bytes()
     for size in (0, 3, 19, 400, len(content) - 1):
         (tmp_path / "a.glb").write_bytes(content[:size])
-        assert_refused_cheaply(
-            tmp_path / "a.glb", "expected a .glb file, glTF 2.0 that is whole, got"
-        )
+        assert_refused_cheaply(tmp_path / "a.glb", "expected a complete .glb file of glTF 2.0, got")
 
 
 def hier_of(asset, half, inner=7):

@@ -187,7 +187,7 @@ def test_camera_refuses_bad_values(change, message):
     ("change", "message"),
     [
         ({"target": (1, 1, 1)}, "target: expected a point away from the eye"),
-        ({"target": (1e200, 0, 0)}, "target: expected a distance that a double can hold"),
+        ({"target": (1e200, 0, 0)}, "target: expected points whose distance a double can hold"),
         ({"up": (2, 2, 2)}, "up: expected a direction that is not along the view"),
         ({"up": (0, 0, 0)}, "up: expected a direction that is not along the view"),
         ({"fov_x": 0.0}, "fov_x: expected radians between 0 and pi, got 0.0"),

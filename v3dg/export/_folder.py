@@ -91,7 +91,7 @@ def replacing_export(
         OSError: A file cannot be written.
     """
     is_free = folder.is_dir() or not os.path.lexists(os.path.realpath(folder))
-    check(folder, is_free, "a new folder, or one with an earlier export, got something else")
+    check(folder, is_free, "a new folder, or one with an earlier export, got a file")
     check_outside(folder, (bundle.path for bundle in scene.bundles))
     with _made(folder) as target, _naming_errors(folder, target), Folder(target, folder) as root:
         lock(root.descriptor, folder, "export")

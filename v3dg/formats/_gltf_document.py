@@ -46,7 +46,7 @@ class Document:
             expected = "a .gltf file, glTF 2.0 as JSON in UTF-8"
         else:
             text = self._text_of_binary(content)
-            expected = "a .glb file, glTF 2.0 that is whole"
+            expected = "a complete .glb file of glTF 2.0"
         num_data = sum(match.end() - match.start() for match in _DATA_URI.finditer(text))
         structure = len(text) - num_data
         check(path, structure <= _MOST_JSON, f"at most {_MOST_JSON} bytes of JSON, got {structure}")
@@ -57,7 +57,7 @@ class Document:
 
     def _text_of_binary(self, content: bytes) -> bytes:
         """The JSON of a `.glb`; its binary chunk is the one after that."""
-        expected = "a .glb file, glTF 2.0 that is whole"
+        expected = "a complete .glb file of glTF 2.0"
         check(self.path, len(content) >= 20, f"{expected}, got {len(content)} bytes")
         magic, version, total, size, kind = struct.unpack_from("<IIIII", content)
         is_whole = (magic, version, total, kind) == (MAGIC, 2, len(content), JSON_CHUNK)
@@ -70,7 +70,7 @@ class Document:
             check(
                 self.path,
                 size_of_second <= len(tail) - 8,
-                f"{expected}, got a chunk of {size_of_second} bytes in the last {len(tail)}",
+                f"{expected}, got a chunk of {size_of_second} bytes where {len(tail) - 8} are left",
             )
             if kind_of_second == BINARY_CHUNK:
                 self._binary = tail[8 : 8 + size_of_second]

@@ -1,5 +1,4 @@
-"""The unit of work: it makes the levels above the leaves of an asset or of a subtree of
-it."""
+"""Makes the levels above the leaves, for a whole asset or for a subtree."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -136,7 +136,7 @@ def test_a_model_decodes_clusters_in_any_order(device, sh_degree):
     assert len(model.decode(np.zeros(0, np.int32))[0]) == 0
     with pytest.raises(IndexError, match="cluster_ids: expected ids below"):
         model.decode(np.array([len(codes.clusters)], np.int32))
-    with pytest.raises(ValueError, match="expected a model of codes"):
+    with pytest.raises(ValueError, match="expected quantized gaussians"):
         residency.model(rows, _device.resolve(device)).decode(ids)
 
 

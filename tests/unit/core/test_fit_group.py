@@ -426,7 +426,7 @@ def test_no_groups_are_legal(device):
     ("change", "message"),
     [
         *(
-            (change, r"range: expected \[first, last\) within the gaussians, group 0 is not")
+            (change, r"range: expected \[first, last\) within the gaussians, got another for")
             for change in ({"target_range": [[0, 11]]}, {"range": [[3, 2]]}, {"range": [[-1, 2]]})
         ),
         ({"target_range": [[0, 5], [5, 10]]}, "target_range: expected shape"),
