@@ -1,5 +1,6 @@
 """`v3dg render`: cameras without a file, backgrounds, films and panoramas."""
 
+import dataclasses
 import json
 import math
 
@@ -127,6 +128,18 @@ def test_views_become_a_film(render):
         assert stream.average_rate == 10
         assert sum(1 for _ in film.decode(stream)) == 5
     assert "with even sides, got 63 x 48" in render("--size", 63, 48, output="odd.mp4")[1]
+
+
+def test_render_says_what_is_not_drawn(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    blob = scenes_lod.blob(np.random.default_rng(0), 400, size=0.4)
+    means = blob.means.copy()
+    means[:100] = np.nan
+    v3dg.write_asset(tmp_path / "wrong.ply", dataclasses.replace(blob, means=means))
+    for asset, is_told in ((tmp_path / "wrong.ply", True), ("blob.ply", False)):
+        assert cli.main(["render", str(asset), "-o", str(tmp_path / "out.png"), *SMALL]) == 0
+        text = "100 of 400 gaussians cannot be drawn: 100 with a position that is not finite"
+        assert (text in capsys.readouterr().out) == is_told
 
 
 def test_panorama_shows_all_directions(render):

@@ -12,6 +12,7 @@ from v3dg._json import JsonObject
 from v3dg._progress import counted
 from v3dg._urls import shown
 from v3dg.cameras import Axis, Camera
+from v3dg.cleaning import examine
 from v3dg.cli._common import (
     Color,
     Column,
@@ -28,11 +29,13 @@ from v3dg.cli._common import (
 )
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, choose_up, picture_paths
 from v3dg.false_color import ColorBy
+from v3dg.gaussians import Gaussians
 from v3dg.image import Image, RenderedImage
 from v3dg.io import subject_name
 from v3dg.panorama import draw_panorama
 from v3dg.pictures import check_picture_path, check_size
 from v3dg.render import Renderer
+from v3dg.scene import Subject
 from v3dg.select import DEFAULT_FADE, CutOptions
 from v3dg.upright import direction_of
 from v3dg.video import write_video
@@ -103,6 +106,7 @@ def run(options: Render) -> None:
         options.view.up, notes = choose_up(options.view.up, subject, own_cameras, options.subject)
     cameras = choose_cameras(options.view, options.subject, subject, own_cameras)
     _check_sizes(options, cameras)
+    notes += _lines_of_faults(options.subject, subject)
     fade = options.fade
     is_sequence = options.is_film or (needs_up and len(cameras) > 1)
     if fade is None and is_sequence:
@@ -179,6 +183,17 @@ def _check_sizes(options: Render, cameras: Mapping[str, Camera]) -> None:
     texts = ", ".join(f"{width} x {height}" for width, height in sorted(sizes)[:3])
     expected = f"pictures of one size for a film, with even sides, got {texts}"
     check_usage(str(options.output), fits, expected)
+
+
+def _lines_of_faults(path: Path, subject: Subject) -> list[str]:
+    """Return a line that says how many gaussians of an asset have wrong values, which
+    are not drawn; no line without any."""
+    if not isinstance(subject, Gaussians):
+        return []
+    findings = examine(subject)
+    if not findings.num_wrong:
+        return []
+    return [f"{shown(path)}: {findings.text}; `v3dg info` says more"]
 
 
 def _drawn(
