@@ -1,5 +1,7 @@
 """`v3dg render`: cameras without a file, backgrounds, films and panoramas."""
 
+import dataclasses
+import itertools
 import json
 import math
 
@@ -127,6 +129,42 @@ def test_views_become_a_film(render):
         assert stream.average_rate == 10
         assert sum(1 for _ in film.decode(stream)) == 5
     assert "with even sides, got 63 x 48" in render("--size", 63, 48, output="odd.mp4")[1]
+
+
+def test_a_film_flies_through_cameras_at_an_even_pace(render, tmp_path):
+    av = pytest.importorskip("av")
+    cameras = {}
+    for angle in (0.0, 0.1, 0.5, 0.6, 1.0, 1.4):
+        eye = (4 * math.sin(angle), -1, -4 * math.cos(angle))
+        cameras[f"{angle}.png"] = v3dg.Camera.look_at(
+            eye, (0, 0, 0), (0, -1, 0), width=64, height=48
+        )
+    v3dg.write_cameras(tmp_path / "transforms.json", cameras)
+    options = ("--cameras", tmp_path / "transforms.json", "--fps", 10)
+    code, result, path = render(*options, "--seconds", 2, output="film.mp4")
+    assert code == 0, result
+    with av.open(str(path)) as film:
+        pictures = [picture.to_ndarray(format="rgb24") / 255 for picture in film.decode(video=0)]
+    assert len(pictures) == 21
+    for picture, camera in ((pictures[0], cameras["0.0.png"]), (pictures[-1], cameras["1.4.png"])):
+        assert np.abs(picture - drawn(camera).color).mean() < 0.02
+    steps = [np.abs(second - first).mean() for first, second in itertools.pairwise(pictures)]
+    assert max(steps) < 2 * np.median(steps)
+    alone = render(*options, "--camera", 0, "--seconds", 2, output="film.mp4")[1]
+    assert "--seconds: expected two or more cameras, got only 0.0.png" in alone
+    assert "a film (.mp4) beside it" in render("--views", 3, "--seconds", 2)[1]
+
+
+def test_render_says_what_is_not_drawn(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    blob = scenes_lod.blob(np.random.default_rng(0), 400, size=0.4)
+    means = blob.means.copy()
+    means[:100] = np.nan
+    v3dg.write_asset(tmp_path / "wrong.ply", dataclasses.replace(blob, means=means))
+    for asset, is_told in ((tmp_path / "wrong.ply", True), ("blob.ply", False)):
+        assert cli.main(["render", str(asset), "-o", str(tmp_path / "out.png"), *SMALL]) == 0
+        text = "100 of 400 gaussians cannot be drawn: 100 with a position that is not finite"
+        assert (text in capsys.readouterr().out) == is_told
 
 
 def test_panorama_shows_all_directions(render):

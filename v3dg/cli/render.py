@@ -12,12 +12,14 @@ from v3dg._json import JsonObject
 from v3dg._progress import counted
 from v3dg._urls import shown
 from v3dg.cameras import Axis, Camera
+from v3dg.cleaning import examine
 from v3dg.cli._common import (
     Color,
     Column,
     Cut,
     OnPool,
     check_output,
+    check_range,
     check_usage,
     color_of,
     finite,
@@ -28,14 +30,18 @@ from v3dg.cli._common import (
 )
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, choose_up, picture_paths
 from v3dg.false_color import ColorBy
+from v3dg.gaussians import Gaussians
 from v3dg.image import Image, RenderedImage
 from v3dg.io import subject_name
 from v3dg.panorama import draw_panorama
 from v3dg.pictures import check_picture_path, check_size
 from v3dg.render import Renderer
+from v3dg.scene import Subject
 from v3dg.select import DEFAULT_FADE, CutOptions
 from v3dg.upright import direction_of
 from v3dg.video import write_video
+
+_MOST_SECONDS = 600.0  # a path of the viewer may last as long
 
 
 @dataclass
@@ -66,6 +72,9 @@ class Render(Cut, OnPool):
     twice as much width as height."""
     fps: Annotated[int, tyro.conf.arg(metavar="N")] = 30
     """Pictures a second of a film."""
+    seconds: Annotated[float | None, option("S")] = None
+    """Length of a film along a smooth curve through the cameras, at an even pace; by
+    default a film has one picture of each camera."""
     view: Views = field(default_factory=ViewOptions)
 
     @property
@@ -103,6 +112,9 @@ def run(options: Render) -> None:
         options.view.up, notes = choose_up(options.view.up, subject, own_cameras, options.subject)
     cameras = choose_cameras(options.view, options.subject, subject, own_cameras)
     _check_sizes(options, cameras)
+    if options.seconds is not None:
+        cameras = _flight(cameras, options.seconds, options.fps)
+    notes += _lines_of_faults(options.subject, subject)
     fade = options.fade
     is_sequence = options.is_film or (needs_up and len(cameras) > 1)
     if fade is None and is_sequence:
@@ -147,6 +159,9 @@ def _checked_output(options: Render, background: Color | None) -> Path:
     output = options.output or Path(f"{subject_name(options.subject)}.png")
     check_output(output, options.subject)
     check_usage("--fps", 1 <= options.fps <= 1000, f"1 to 1000, got {options.fps}")
+    if options.seconds is not None:
+        check_usage("--seconds", options.is_film, f"a film (.mp4) beside it, got {output}")
+        check_range("--seconds", options.seconds, 0.1, _MOST_SECONDS)
     if options.is_panorama:
         width, height = options.view.size
         fits = width == 2 * height and width >= 8
@@ -179,6 +194,31 @@ def _check_sizes(options: Render, cameras: Mapping[str, Camera]) -> None:
     texts = ", ".join(f"{width} x {height}" for width, height in sorted(sizes)[:3])
     expected = f"pictures of one size for a film, with even sides, got {texts}"
     check_usage(str(options.output), fits, expected)
+
+
+def _flight(cameras: Mapping[str, Camera], seconds: float, fps: int) -> dict[str, Camera]:
+    """Return the cameras of a film along a smooth curve through these, which have one
+    size."""
+    from v3dg.viewer.path import CameraPath
+    from v3dg.viewer.view import View
+
+    names = ", ".join(cameras)
+    check_usage("--seconds", len(cameras) > 1, f"two or more cameras, got only {names}")
+    path = CameraPath.through([View.of_camera(camera) for camera in cameras.values()], seconds)
+    first = next(iter(cameras.values()))
+    near = min(camera.near for camera in cameras.values())
+    return path.cameras(fps, first.width, first.height, near)
+
+
+def _lines_of_faults(path: Path, subject: Subject) -> list[str]:
+    """Return a line that says how many gaussians of an asset have wrong values, which
+    are not drawn; no line without any."""
+    if not isinstance(subject, Gaussians):
+        return []
+    findings = examine(subject)
+    if not findings.num_wrong:
+        return []
+    return [f"{shown(path)}: {findings.text}; `v3dg info` says more"]
 
 
 def _drawn(

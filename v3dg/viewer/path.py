@@ -11,6 +11,10 @@ from v3dg.cameras import Camera, Floats
 from v3dg.rotations import normalised
 from v3dg.viewer.view import View
 
+_LEAST_SHARE = 1e-3
+"""Least share of the time between two views; equal views would have none, and the curve
+no slope."""
+
 
 @dataclass(frozen=True)
 class CameraPath:
@@ -22,6 +26,22 @@ class CameraPath:
     """
 
     stops: Sequence[tuple[float, View]] = ()
+
+    @classmethod
+    def through(cls, views: Sequence[View], seconds: float) -> "CameraPath":
+        """Return the path through two or more views that lasts this long.
+
+        Its pace is even: the time between two views is proportional to the sum of the
+        distance and of the angle between them, each as a share of those of the whole
+        path. If no view differs from the one before, the times are equal.
+        """
+        rows = _rows(list(views))
+        distances = np.linalg.norm(np.diff(rows[:, 4:7], axis=0), axis=1)
+        halves = np.linalg.norm(np.diff(rows[:, :4], axis=0), axis=1) / 2
+        angles = 4 * np.arcsin(np.minimum(halves, 1.0))
+        shares = _shares(distances) + _shares(angles)
+        shares = _shares(np.maximum(shares, _LEAST_SHARE))
+        return cls([(0.0, views[0]), *zip((shares * seconds).tolist(), views[1:], strict=True)])
 
     def __len__(self) -> int:
         return len(self.stops)
@@ -75,6 +95,15 @@ class CameraPath:
         views = self.film(fps)
         digits = len(str(len(views) - 1))
         return {f"{i:0{digits}}": view.camera(width, height, near) for i, view in enumerate(views)}
+
+
+def _shares(lengths: Floats) -> Floats:
+    """Lengths as shares of their sum; of a sum of zero, they are zero."""
+    total = lengths.sum()
+    if total == 0:
+        return np.zeros_like(lengths)
+    shares: Floats = lengths / total
+    return shares
 
 
 def _rows(views: list[View]) -> Floats:

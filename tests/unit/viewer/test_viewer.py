@@ -690,6 +690,17 @@ def test_path_becomes_cameras():
     assert len(path_of([turned(0.0)]).cameras(10, 64, 48, 0.01)) == 2
 
 
+def test_path_through_views_has_an_even_pace():
+    views = [turned(angle) for angle in (0.0, 0.1, 0.5, 0.6, 1.4)]
+    path = CameraPath.through(views, 7.0)
+    np.testing.assert_allclose(path.times, [0.0, 0.5, 2.5, 3.0, 7.0])
+    resting = CameraPath.through([views[1]] * 3, 2.0)
+    np.testing.assert_allclose(resting.times, [0.0, 1.0, 2.0])
+    assert view_at(resting, 0.7).position == pytest.approx(views[1].position)
+    paused = CameraPath.through([views[0], views[0], views[4]], 1.0)
+    assert 0 < paused.times[1] < 0.01
+
+
 def test_empty_path_is_an_error():
     with pytest.raises(ValueError, match="path: expected at least one view"):
         view_at(CameraPath(), 0.0)
