@@ -590,7 +590,7 @@ def test_phone_has_the_picture_to_itself(browser, site):
         assert tab.page.locator("#stage").bounding_box()["width"] == 390
         assert not tab.page.locator("#panel").is_visible()
         assert (picture.max(axis=2) > 30).mean() > 0.03
-        # The first view is the one for a narrow window, in which the subject's width fits.
+        # The first view is the one for a narrow window, which the subject's width fits.
         homes = "viewer.scene.homes.map((home) => home.view.aspect)"
         aspects = tab.page.evaluate(homes)
         assert min(aspects) <= tab.page.evaluate("viewer.look.aspect") < max(aspects)
