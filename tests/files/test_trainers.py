@@ -305,7 +305,24 @@ def test_a_newer_ksplat_is_told(tmp_path):
 
 
 FILES = ["sh3.sog", "sh3_v3.spz", "sh3_v4.spz", "sh3_mkkellogg_0.ksplat", "sh3.glb"]
-FILES += ["sh3_mkkellogg_2.ksplat"]
+FILES += ["sh3_mkkellogg_2.ksplat", "sh0_gaussforge.splat"]
+
+
+def test_only_records_are_recognised_as_a_splat(tmp_path):
+    """A `.splat` has no mark: its numbers show what it is."""
+    content = (FIXTURES / "sh0_gaussforge.splat").read_bytes()
+    path = tmp_path / "a.ply"
+    turned = bytearray(content)
+    turned[28:32] = b"\x80\x80\x80\x80"
+    negative = bytearray(content)
+    negative[12:16] = np.float32(-1).tobytes()
+    noise = np.random.default_rng(0).bytes(len(content))
+    for wrong in (content[:-1], bytes(turned), bytes(negative), noise):
+        path.write_bytes(wrong)
+        with pytest.raises(ValueError, match="expected a first line 'ply'"):
+            open_asset(path)
+    path.write_bytes(content)
+    assert len(open_asset(path).read(0, 3)) == 3
 
 
 @pytest.mark.parametrize("suffix", [".splat", ".ply", ".compressed.ply", ".ksplat", ".spz", ".pt"])

@@ -1,12 +1,13 @@
 """Recognises the kind of a file by its first bytes, whatever its name says."""
 
 import contextlib
+import os
 import zipfile
 import zlib
 from typing import NamedTuple
 
 from v3dg import _files
-from v3dg.formats import ksplat
+from v3dg.formats import ksplat, splat
 from v3dg.formats._reading import AnyPath, listed
 
 _START_BYTES = ksplat.HEADER_BYTES
@@ -60,12 +61,16 @@ def content_of(path: AnyPath) -> Content | None:
     # name determines then says what is wrong.
     with contextlib.suppress(Exception):
         with open(_files.open_regular(path), "rb") as file:
+            num_bytes = os.fstat(file.fileno()).st_size
             start = file.read(_START_BYTES)
             if start.startswith(b"PK\3\4"):
                 return _zip_content(zipfile.ZipFile(file).namelist()[:_MAX_ZIP_NAMES])
         if start.startswith(b"\x1f\x8b"):
             return _gzip_content(start)
-        return _plain_content(start)
+        content = _plain_content(start)
+        if content is None and splat.is_start_of_one(start, num_bytes):
+            return Content(".splat", "a .splat")
+        return content
     return None
 
 

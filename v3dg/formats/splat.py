@@ -15,6 +15,23 @@ from v3dg.rotations import normalised
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
+_QUATERNION_LENGTHS = (124.0, 132.0)  # of one of length 1, in steps of its bytes
+_LARGEST = 1e9  # a coordinate or a scale beyond it is not one of an asset
+
+
+def is_start_of_one(start: bytes, num_bytes: int) -> bool:
+    """Return whether these first bytes of a file of this length can only be records:
+    their quaternions have the length 1, and their numbers are plausible."""
+    num_records = len(start) // _RECORD.itemsize
+    if num_bytes % _RECORD.itemsize or not num_records:
+        return False
+    records = np.frombuffer(start, _RECORD, num_records)
+    lengths = np.linalg.norm(records["quat"].astype(np.float64) - 128.0, axis=1)
+    is_rotation = (lengths > _QUATERNION_LENGTHS[0]) & (lengths < _QUATERNION_LENGTHS[1])
+    is_mean = np.abs(records["mean"]) < _LARGEST
+    is_scale = (records["scale"] > 0) & (records["scale"] < _LARGEST)
+    return bool(is_rotation.all() and is_mean.all() and is_scale.all())
+
 
 def open_file(path: AnyPath) -> AssetFile:
     """Open a `.splat` file."""
