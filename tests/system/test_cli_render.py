@@ -91,7 +91,7 @@ def test_a_link_of_the_viewer_places_the_camera(render):
         (("--at", "#at=1,2,3&turn=0,0,0,0"), "a rotation of length 1 in turn="),
         (("--at", "#x", "--eye", 1, 2, 3), "--eye, --at: expected one of them"),
         (("--target", 1, 2, 3), "--target: expected --eye beside it"),
-        (("--eye", 1, 2, 3, "--views", 3), "--views: expected views around the subject"),
+        (("--eye", 1, 2, 3, "--views", 3), "--views: expected a subject without cameras"),
         (("--eye", 1, 2, 3, "--fov", 180), "--fov: expected 0.001 to 179"),
         (("--background", "nocolor"), "--background: expected three numbers"),
         (("--projection", "equirectangular"), "--size: expected twice the height as width"),
