@@ -215,7 +215,7 @@ def test_what_cannot_be_meant_is_refused(folder):
         "float32",
         cwd=folder,
     )
-    fails(1, "create it first", "convert", "tuft.ply", "no/x.ply", cwd=folder)
+    fails(1, "Not a directory", "convert", "tuft.ply", "tuft.v3dg/x.ply", cwd=folder)
     options = ("--camera", "far", "--budget", "1")
     fails(1, "budget: expected at least", "convert", "scene.json", "x.ply", *options, cwd=folder)
 

@@ -107,7 +107,7 @@ def test_page_is_told_what_a_tab_begins_with(blob_bundle):
         with viewer_client.Tab(site.port) as tab:
             expected = in_json(Settings(tolerance=0.0, budget=5000))
             assert tab.hello["settings"] == expected
-            assert tab.hello["defaults"] == asdict(Settings())
+            assert tab.hello["defaults"] == in_json(Settings())
     finally:
         site.close()
 

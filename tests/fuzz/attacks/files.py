@@ -22,6 +22,7 @@ from fuzz.attacks import bombs, changes, damages
 from fuzz.attacks.good_files import good_files
 from fuzz.attacks.memory_use import Watch, limit_growth
 from fuzz.attacks.pool import Outcome
+from v3dg.camera_file import CameraWarning
 from v3dg.cleaning import AssetWarning
 from v3dg.cli import main
 
@@ -286,6 +287,7 @@ def _tried(read, path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", AssetWarning)  # notes about what is not read
+        warnings.simplefilter("ignore", CameraWarning)  # and about images that are left out
         try:
             return read(path), "", None
         except MemoryError as error:

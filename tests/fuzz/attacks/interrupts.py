@@ -36,6 +36,7 @@ LIMIT_S = 100
 PACKAGE = os.path.dirname(v3dg.__file__) + os.sep
 # What runs before Ctrl-C is heard is Python's start and the import of one small module
 # of ours.
+NOTE = re.compile(r"\S+\.\w+: ")  # what a command says of a file
 OURS = re.compile(re.escape(PACKAGE) + r"(?!__init__\.py\", line 3, |_start\.py)")
 SOON_S = 15  # on a machine with much else to do
 
@@ -193,6 +194,8 @@ def _fault(ended: Ended, name):
     is_view = name.startswith("view")
     fault = fault_of(ended, codes=(0, 130), is_heard=not is_view)
     lines = [line for line in shown_lines(ended.err) if not PROGRESS.match(line)]
+    if ended.code == 0:  # a command that came to its end says what it noticed of its files
+        lines = [line for line in lines if not NOTE.match(line)]
     if fault is None and len(lines) > (ended.code != 0):
         fault = f"{len(lines)} lines: {ended.err[-200:]!a}"
     return fault
