@@ -13,6 +13,7 @@
 
 #include "base/scan.cuh"
 #include "cluster/cluster.h"
+#include "math/ascending_bits.cuh"
 
 namespace v3dg {
 namespace cuda {
@@ -68,9 +69,8 @@ __global__ void keys_kernel(const Point* means, size_t count, const Node* segmen
                             uint32_t num_segments, int axis, uint64_t* keys, uint32_t* indices) {
     const size_t i = blockIdx.x * size_t(kBlockSize) + threadIdx.x;
     if (i >= count) return;
-    const uint32_t bits = __float_as_uint(means[i].axis[axis] + 0.0f);
-    const uint32_t ascending = bits ^ (bits >> 31 ? 0xffffffffu : 0x80000000u);
-    keys[i] = uint64_t(node_at(segments, 0, num_segments - 1, i)) << 32 | ascending;
+    keys[i] = uint64_t(node_at(segments, 0, num_segments - 1, i)) << 32 |
+              ascending_bits(means[i].axis[axis]);
     indices[i] = static_cast<uint32_t>(i);
 }
 

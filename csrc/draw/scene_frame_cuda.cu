@@ -23,10 +23,6 @@ FrameImage frame_image(const Intrinsics<float>& camera, int width, int height,
             .planes = planes};
 }
 
-static uint32_t num_tiles(const FrameImage& image) {
-    return static_cast<uint32_t>(image.tile_columns) * static_cast<uint32_t>(image.tile_rows);
-}
-
 PackedModel::PackedModel(const GaussianRows<const float>& rows, cudaStream_t stream)
     : rows_(rows), planes_(16 * rows.size, stream), packed_(pack(rows, planes_.data(), stream)) {}
 
@@ -109,7 +105,7 @@ void SceneFrame::set_models(std::vector<DeviceModel> models,
 }
 
 EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_transmittance) {
-    right.first_tile = num_tiles(left);
+    right.first_tile = num_tiles_of(left);
     return {{left, right}, 2, min_transmittance};
 }
 
@@ -121,7 +117,7 @@ FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures
             .placements = placements_.reserve(pictures.count * scene.num_instances(), stream),
             .images = images_.reserve(pictures.count, stream),
             .num_images = pictures.count,
-            .num_tiles = last.first_tile + num_tiles(last),
+            .num_tiles = last.first_tile + num_tiles_of(last),
             .packed = has_packed_ ? packed_.data() : nullptr,
             .coded = has_coded_ ? coded_.data() : nullptr,
             .has_shared_items = scene.num_instances() > 1,
@@ -246,7 +242,7 @@ std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows,
                            .placements = &on_device->placement,
                            .images = &on_device->image,
                            .num_images = 1,
-                           .num_tiles = num_tiles(image),
+                           .num_tiles = num_tiles_of(image),
                            .packed = packed == nullptr ? nullptr : &on_device->packed,
                            .min_transmittance = min_transmittance,
                            .has_depth = image.planes.depth != nullptr};

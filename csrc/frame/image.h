@@ -84,6 +84,10 @@ struct FrameImage {
     PicturePlanes planes;
 };
 
+V3DG_HD inline uint32_t num_tiles_of(const FrameImage& image) {
+    return static_cast<uint32_t>(image.tile_columns) * static_cast<uint32_t>(image.tile_rows);
+}
+
 // The pictures of a scene's frame, one per eye. The tiles of the second follow those of
 // the first.
 struct EyeImages {

@@ -95,7 +95,8 @@ constexpr size_t kViewSlots = 128;
 // many new ones. The first views have fewer cuts.
 inline PlannedWindow planned_window(uint64_t number, size_t cuts_per_view) {
     const auto slot = static_cast<size_t>(number % kViewSlots);
-    const uint64_t round = number / kViewSlots, turn = round + slot % cuts_per_view;
+    const uint64_t round = number / kViewSlots;
+    const uint64_t turn = round + slot % cuts_per_view;
     const auto cut = static_cast<size_t>(turn % cuts_per_view);
     return {.view = turn / cuts_per_view * kViewSlots + slot,
             .slot = slot,

@@ -5,6 +5,7 @@
 #include "levels/cut_windows_cuda.h"
 
 #include "base/scan.cuh"
+#include "residency/upload.h"
 #include "select/cut_math.h"
 
 namespace v3dg {
@@ -12,7 +13,8 @@ namespace cuda {
 
 namespace {
 
-constexpr unsigned kCutThreads = 512, kItemThreads = 256;
+constexpr unsigned kCutThreads = 512;
+constexpr unsigned kItemThreads = 256;
 
 __device__ uint32_t items_of(const ClusterTable& table, size_t c) {
     return blocks_for(static_cast<size_t>(table.num_gaussians(c)), kItemSize);
@@ -54,7 +56,8 @@ __global__ void __launch_bounds__(kItemThreads)
     window_items_kernel(ClusterTable table, uint32_t num_windows, const int32_t* item_of_cluster,
                         const uint32_t* num_items, Appearance<float> appearance, ItemList items) {
     const unsigned w = blockIdx.y;
-    unsigned long long total = 0, first = 0;
+    unsigned long long total = 0;
+    unsigned long long first = 0;
     for (uint32_t k = 0; k < num_windows; ++k) {
         if (k < w) first += num_items[k];
         total += num_items[k];
@@ -83,31 +86,16 @@ __global__ void __launch_bounds__(kItemThreads)
     }
 }
 
-uint32_t num_tiles_of(const FrameImage& image) {
-    return static_cast<uint32_t>(image.tile_columns) * static_cast<uint32_t>(image.tile_rows);
-}
-
 }  // namespace
 
-DeviceTable::DeviceTable(const ClusterTable& table, cudaStream_t stream)
-    : ball_(table.ball, stream),
-      weight_(table.weight, stream),
-      level_(table.level, stream),
-      own_group_(table.own_group, stream),
-      parent_group_(table.parent_group, stream),
-      box_(table.box, stream),
-      offset_(table.offset, stream),
-      table_(table) {
-    table_.ball = {ball_.data(), table.ball.size};
-    table_.weight = {weight_.data(), table.weight.size};
-    table_.level = {level_.data(), table.level.size};
-    table_.own_group = {own_group_.data(), table.own_group.size};
-    table_.parent_group = {parent_group_.data(), table.parent_group.size};
-    table_.box = {box_.data(), table.box.size};
-    table_.offset = {offset_.data(), table.offset.size};
+DeviceTable::DeviceTable(const ClusterTable& table, cudaStream_t stream) : table_(table) {
+    // Kernels of windows do not read these.
     table_.top_group = {};
     table_.top_cluster = {};
     table_.pages = {};
+    Upload upload;
+    upload.add(table_);
+    upload.finish(storage_, stream);
 }
 
 void DeviceWindows::cut(const DeviceTable& table, const WindowTables& windows, Shown shown,

@@ -18,11 +18,7 @@ class DeviceTable {
     const ClusterTable& table() const { return table_; }
 
   private:
-    DeviceBuffer<Ball> ball_;
-    DeviceBuffer<float> weight_;
-    DeviceBuffer<int32_t> level_, own_group_, parent_group_;
-    DeviceBuffer<Box> box_;
-    DeviceBuffer<int64_t> offset_;
+    DeviceBuffer<unsigned char> storage_;  // memory of all arrays
     ClusterTable table_;
 };
 
@@ -73,7 +69,8 @@ class DeviceWindows {
                      const ItemList& items, cudaStream_t stream) const;
 
   private:
-    uint32_t count_ = 0, num_tiles_ = 0;
+    uint32_t count_ = 0;
+    uint32_t num_tiles_ = 0;
     DeviceBuffer<WindowTables> tables_;
     DeviceBuffer<int32_t> item_of_cluster_;
     DeviceBuffer<uint32_t> num_items_;

@@ -58,8 +58,7 @@ void add_window(const ClusterTable& table, const Camera& camera, const SelectRul
     windows.image[w] = image_of(camera, planes);
     if (w > 0) {
         const FrameImage& before = windows.image[w - 1];
-        windows.image[w].first_tile =
-            before.first_tile + static_cast<uint32_t>(before.tile_columns * before.tile_rows);
+        windows.image[w].first_tile = before.first_tile + num_tiles_of(before);
     }
 }
 
@@ -222,8 +221,7 @@ class TargetPainter {
 
   private:
     PicturePlanes planes_in(DeviceBuffer<float>& memory, size_t count) {
-        float* color = memory.reserve(4 * count, stream_);
-        return {color, color + 3 * count, nullptr};
+        return planes_of_window(memory.reserve(4 * count, stream_), count, 0);
     }
 
     const DeviceFitTarget& target_;

@@ -118,7 +118,8 @@ __device__ PixelGradient read_pixel(const FrameImage& image,
                     .transmittance = -1};
     if (column >= image.width || row >= image.height) return p;
     const size_t pixel = static_cast<size_t>(row) * image.width + column;
-    const float alpha = image.planes.alpha[pixel], t = 1 - alpha;
+    const float alpha = image.planes.alpha[pixel];
+    const float t = 1 - alpha;
     p.transmittance = 1;
     p.d_weight = d_picture.alpha[pixel];
     for (int c = 0; c < 3; ++c) {
@@ -286,10 +287,12 @@ __global__ void __launch_bounds__(kThreads, 2)
     const int lane = threadIdx.x % 32;
     const int warp = __shfl_sync(kAllLanes, static_cast<int>(threadIdx.x) / 32,
                                  0);  // shows the compiler that all lanes agree
-    const uint32_t tile = in.plans[blockIdx.x].tile, number = in.plans[blockIdx.x].image;
+    const uint32_t tile = in.plans[blockIdx.x].tile;
+    const uint32_t number = in.plans[blockIdx.x].image;
     const FrameImage& image = image_of<kIsBatch>(in, batch, number);
     const uint32_t in_image = tile - image.first_tile;
-    const int tile_column = in_image % image.tile_columns, tile_row = in_image / image.tile_columns;
+    const int tile_column = in_image % image.tile_columns;
+    const int tile_row = in_image / image.tile_columns;
     const int left = tile_column * kFrameTileWidth, top = tile_row * kFrameTileHeight;
     const int warp_left = left + warp % kWarpColumns * kWarpWidth,
               warp_top = top + warp / kWarpColumns * kWarpHeight;

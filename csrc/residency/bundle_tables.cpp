@@ -1,47 +1,13 @@
 #include "residency/bundle_tables.h"
 
 #include <algorithm>
-#include <functional>
 #include <vector>
 
 #include "base/parallel_for.h"
+#include "residency/upload.h"
 
 namespace v3dg {
 namespace cuda {
-
-namespace {
-
-// Copies arrays of the host into one allocation on the device.
-class Upload {
-  public:
-    // `span` points to memory of the host; finish() makes it point to memory of the
-    // device.
-    template <class T>
-    void add(Span<const T>& span) {
-        const size_t first = (num_bytes_ + kAlignment - 1) / kAlignment * kAlignment;
-        num_bytes_ = first + span.size * sizeof(T);
-        moves_.push_back([&span, first](unsigned char* start, cudaStream_t stream) {
-            if (span.size > 0)
-                check(cudaMemcpyAsync(start + first, span.data, span.size * sizeof(T),
-                                      cudaMemcpyHostToDevice, stream),
-                      "cudaMemcpyAsync");
-            span.data = reinterpret_cast<const T*>(start + first);
-        });
-    }
-    void finish(DeviceBuffer<unsigned char>& storage, cudaStream_t stream) {
-        storage.reserve(num_bytes_, stream);
-        for (const auto& move : moves_) move(storage.data(), stream);
-        check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
-    }
-
-  private:
-    static constexpr size_t kAlignment = 256;  // equal to the alignment of the device's allocator
-
-    size_t num_bytes_ = 0;
-    std::vector<std::function<void(unsigned char*, cudaStream_t)>> moves_;
-};
-
-}  // namespace
 
 std::vector<uint8_t> joins_of_clusters(const ClusterTable& table,
                                        const ClusterAppearance& appearance) {
@@ -72,19 +38,8 @@ BundleTables::BundleTables(const ClusterTable& table, const ClusterAppearance& a
     const std::vector<uint8_t> joins = joins_of_clusters(table, appearance);
     on_device_.bounds = {bounds.data(), bounds.size()};
     Span<const uint8_t> joins_on_device{joins.data(), joins.size()};
-    ClusterTable& t = on_device_.table;
     Upload upload;
-    upload.add(t.ball);
-    upload.add(t.weight);
-    upload.add(t.level);
-    upload.add(t.own_group);
-    upload.add(t.parent_group);
-    upload.add(t.box);
-    upload.add(t.offset);
-    upload.add(t.top_group);
-    upload.add(t.top_cluster);
-    upload.add(t.pages.shift);
-    upload.add(t.pages.begins);
+    upload.add(on_device_.table);
     upload.add(on_device_.appearance.filter_px2);
     upload.add(on_device_.appearance.antialiased);
     upload.add(on_device_.bounds);

@@ -7,6 +7,7 @@
 #include <algorithm>
 
 #include "base/launch.cuh"
+#include "math/ascending_bits.cuh"
 #include "simplify/simplify.h"
 #include "simplify/simplify_math.h"
 
@@ -17,16 +18,6 @@ namespace {
 
 constexpr unsigned kBlockSize = 128;
 constexpr unsigned kMostBlocksOfGroup = 64;
-
-// Returns bits that ascend as unsigned numbers as the finite values do. -0 counts as 0.
-__device__ uint32_t ascending_bits(float value) {
-    const uint32_t bits = __float_as_uint(value + 0.0f);
-    return bits ^ (bits >> 31 ? 0xffffffffu : 0x80000000u);
-}
-
-__device__ float value_of_bits(uint32_t ascending) {
-    return __uint_as_float(ascending ^ (ascending >> 31 ? 0x80000000u : 0xffffffffu));
-}
 
 // Finds the median of one axis of a group bit by bit, from the highest: of the values
 // that share the bits found so far, those whose next bit is 0 come first.
