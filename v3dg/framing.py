@@ -9,8 +9,7 @@ in it.
 
 import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -84,15 +83,18 @@ class Framing:
     Attributes:
         center: (3,) centre of the box around nearly all gaussians, world units.
         radius: Half of the diagonal of that box, above 0.
-        is_inside: Whether the subject surrounds its first camera.
         points: (P, 3) points that the first picture of an object shows.
     """
 
     center: Floats
     radius: float
-    is_inside: bool
     points: Floats
     _places: "_Places | None" = None
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether the subject surrounds its first camera."""
+        return self._places is not None
 
     def camera(
         self,
@@ -148,20 +150,22 @@ class Framing:
         """Return cameras that go once around an object at one distance, from which each
         sees all of it, or turn once inside a room. The distance does not depend on
         their number, so view 0 is the same for all numbers."""
-        if self.is_inside:
-            return self._cameras_at(_azimuths(count), up, width, height, elevation)
-        cameras = self._cameras_at(_azimuths(_DISTANCE_VIEWS), up, width, height, elevation)
         axis = _unit(up)
+        if self._places is not None:
+            size = (width, height)
+            return [self._inside(self._places, axis, size, a) for a in _azimuths(count)]
         right_tangent, down_tangent = _tangents(
             width, height, _OUTSIDE_TANGENT, widest=_OUTSIDE_MOST
         )
+        offsets = self.points - self.center
         distance = 0.0
-        for camera in cameras:
-            in_camera = (self.points - self.center) @ camera.viewmat[:3, :3].T
+        for azimuth in _azimuths(_DISTANCE_VIEWS):
+            forward = -_outwards(axis, elevation, azimuth)
+            right, down = _across(forward, axis)
             needed = np.maximum(
-                np.abs(in_camera[:, 0]) / right_tangent, np.abs(in_camera[:, 1]) / down_tangent
+                np.abs(offsets @ right) / right_tangent, np.abs(offsets @ down) / down_tangent
             )
-            distance = max(distance, float((needed / (1 - 2 * _MARGIN) - in_camera[:, 2]).max()))
+            distance = max(distance, float((needed / (1 - 2 * _MARGIN) - offsets @ forward).max()))
         return [
             Camera.look_at(
                 self.center + distance * _outwards(axis, elevation, azimuth),
@@ -172,15 +176,6 @@ class Framing:
                 height=height,
             )
             for azimuth in _azimuths(count)
-        ]
-
-    def _cameras_at(
-        self, azimuths: Sequence[float], up: VectorLike, width: int, height: int, elevation: float
-    ) -> list[Camera]:
-        """Return the first view from each of the azimuths."""
-        return [
-            self.camera(up, width, height, elevation=elevation, azimuth=azimuth)
-            for azimuth in azimuths
         ]
 
     def focus(self, camera: Camera) -> Floats:
@@ -222,13 +217,12 @@ def frame_subject(subject: Subject) -> Framing:
     sample = _sample(subject)
     if not len(sample.means):
         corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
-        return Framing(np.zeros(3), 1.0, is_inside=False, points=corners)
+        return Framing(np.zeros(3), 1.0, corners)
     low, high = _box(sample.means, sample.weights)
     points = _outline(sample, low, high)
     center = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = max(float(np.linalg.norm(np.ptp(points, axis=0))) / 2, 1e-6)
-    places = _places(sample)
-    return Framing(center, radius, places is not None, points, places)
+    return Framing(center, radius, points, _places(sample))
 
 
 def _sample(subject: Subject) -> _Sample:
@@ -358,8 +352,7 @@ def _outwards(up: Floats, elevation: float, azimuth: float) -> Floats:
     """Return the (3,) unit vector from a subject to its camera.
 
     At azimuth 0 the camera is where viewers take the front of an asset to be: at +z
-        where
-    y or x is up or down, at -y where z is.
+    where y or x is up or down, at -y where z is.
     """
     front = np.array([0.0, 0.0, 1.0])
     if int(np.abs(up).argmax()) == 2:
@@ -380,14 +373,19 @@ def _tangents(width: int, height: int, shorter: float, *, widest: float) -> tupl
     return longer / ratio, longer
 
 
+def _across(forward: Floats, up: Floats) -> tuple[Floats, Floats]:
+    """Return the (3,) unit vectors to the right and down in a picture."""
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    return right, np.cross(forward, right)
+
+
 def _eye_that_sees(
     points: Floats, forward: Floats, up: Floats, right_tangent: float, down_tangent: float
 ) -> Floats:
     """Return (3,) the nearest eye whose frustum contains all points, with equal free
     space to the left and the right, or above and below."""
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    down = np.cross(forward, right)
+    right, down = _across(forward, up)
     depths = points @ forward
     place = np.zeros(3)
     nearest = math.inf
@@ -433,10 +431,17 @@ class _Places:
     means: Floats
     weights: Floats
     size: float
+    _best: dict[tuple[float, ...], tuple[Floats, float]] = field(default_factory=dict)
 
     def best(self, up: Floats) -> tuple[Floats, float]:
         """Return the place, and the azimuth, from which most is visible and nothing is
-        close."""
+        close; views of all sizes and azimuths share the search."""
+        key = tuple(up.tolist())
+        if key not in self._best:
+            self._best[key] = self._search(up)
+        return self._best[key]
+
+    def _search(self, up: Floats) -> tuple[Floats, float]:
         heights = self.places @ up
         low, high = np.quantile(self.means @ up, (0.02, 0.98))
         is_at_eye_height = np.abs((heights - low) / max(high - low, 1e-12) - 0.55) < 0.15
@@ -485,7 +490,7 @@ def _places(sample: _Sample) -> _Places | None:
     solid = np.argwhere(is_solid)
     if not len(places) or not len(solid):
         return None
-    middle = _VOXELS**3 * np.prod(np.ptp(solid, axis=0) + 1) / _VOXELS**3 * 0.343
+    middle = np.prod(np.ptp(solid, axis=0) + 1) * 0.343
     is_open = ~is_solid & (blocked < 0.6)
     near_outside = _grown(is_open, _WALL_VOXELS)
     weight = np.where(is_solid, grid.density, 0.0)

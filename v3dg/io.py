@@ -325,11 +325,7 @@ def write_asset(
 def turned_up(path: AnyPath) -> Axis | None:
     """Return the axis that is up in a file that `write_asset` writes, by its name; None
     for formats without axes."""
-    name = beside(path).name.lower()
-    for ending, axis in _UP.items():
-        if name.endswith(ending):
-            return axis
-    return None
+    return _of_name(path, _UP)
 
 
 def losses_of(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) -> Losses | None:
@@ -339,24 +335,33 @@ def losses_of(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP
     Args:
         up: As it was given to `write_asset`.
     """
+    packed = _of_name(path, _PACKED)
+    if packed is None:
+        return None
+    limits, order = packed
+    written = gaussians.numpy()
+    if turned_up(path) is not None:
+        written = _axes.turned(written, _axes.axes_of_up(up), _axes.MEMORY)
+    written = written.subset(order(written))
+    file = open_asset(path)
+    return losses(written, file.read(0, file.num_gaussians), limits)
+
+
+def _of_name(path: AnyPath, formats: Mapping[str, Format]) -> Format | None:
+    """Return what a table has for the first of its endings that a file's name has; None
+    without one."""
     name = beside(path).name.lower()
-    for ending, (limits, order) in _PACKED.items():
-        if not name.endswith(ending):
-            continue
-        written = gaussians.numpy()
-        if turned_up(path) is not None:
-            written = _axes.turned(written, _axes.axes_of_up(up), _axes.MEMORY)
-        written = written.subset(order(written))
-        file = open_asset(path)
-        return losses(written, file.read(0, file.num_gaussians), limits)
+    for ending, value in formats.items():
+        if name.endswith(ending):
+            return value
     return None
 
 
 def _by_name(path: AnyPath, formats: Mapping[str, Format]) -> Format:
-    name = beside(path).name.lower()
-    for ending, function in formats.items():
-        if name.endswith(ending):
-            return function
+    """Return what `_of_name` does; ValueError if the name has none of the endings."""
+    value = _of_name(path, formats)
+    if value is not None:
+        return value
     advice = ""
     if formats is not _WRITERS:
         advice = "; v3dg.open opens bundles (.v3dg) and scenes (.json)"

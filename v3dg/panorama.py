@@ -37,8 +37,7 @@ def draw_panorama(
     """Draw all directions around a camera as an equirectangular picture.
 
     Columns are longitudes: the middle is where the camera looks, the right end half a
-        turn
-    to its right. Rows are latitudes, from `up` in the first to the opposite in the
+    turn to its right. Rows are latitudes, from `up` in the first to the opposite in the
     last.
 
     The projection of a gaussian is exact in the middle of a pinhole picture and off

@@ -44,8 +44,8 @@ def refine_bundle(
         cameras: Views of the asset, also by name: for a room, those of its photographs.
             Views from elsewhere may get worse. Without cameras, pictures are taken from
             all around.
-        steps: Number of pictures that are compared. A GPU takes eight for each step of
-            its gradients, and rounds up.
+        steps: Number of pictures that are compared. A GPU takes sixteen for each step
+            of its gradients, and rounds up.
         drop: Share of a level's visibility, 0 to 0.5, up to which its least visible
             gaussians are dropped; 0 keeps all. Refining a bundle again drops gaussians
             again.

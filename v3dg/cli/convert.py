@@ -100,7 +100,7 @@ def run(options: Convert) -> None:
     if _is_bundle(output):
         part = _write_bundle(options, subject, part_options)
     else:
-        part = _part(options, subject, own_cameras, part_options)
+        part = _part(options, subject, own_cameras, part_options, is_cut=is_cut)
         part = _written(options, subject, part, editor, notes)
     num_bytes = output.stat().st_size
     result = {
@@ -226,13 +226,14 @@ def _part(
     subject: Subject,
     own_cameras: dict[str, Camera] | None,
     part_options: list[str],
+    *,
+    is_cut: bool,
 ) -> _Part:
     """Return the asset, a level of the bundle, or a cut."""
     if isinstance(subject, Gaussians):
         expected = "a bundle or a scene; build one first"
         _common.check_usage(", ".join(part_options), not part_options, expected)
         return _Part(subject, {})
-    is_cut = any(name != "--level" for name in part_options)
     if isinstance(subject, Bundle) and not is_cut:
         return _level(options, subject)
     return _cut(options, subject, own_cameras)

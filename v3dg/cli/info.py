@@ -13,7 +13,7 @@ import tyro
 from v3dg._json import Json, JsonObject
 from v3dg._urls import is_url, shown
 from v3dg.bundle import Bundle
-from v3dg.cameras import Camera
+from v3dg.cameras import Axis, Camera
 from v3dg.cleaning import OUTLIER_DISTANCE, Findings, describe, examine, has_no_rotation, outliers
 from v3dg.cli import _common
 from v3dg.formats._declared import declared_of
@@ -52,20 +52,20 @@ def run(options: Info) -> None:
     result = {**result, "up": up, "up_reason": reason}
     lines.insert(1, f"{up} is up, {reason}")
     if not cameras and not is_url(options.file):
-        first_view, line = _first_view(subject)
+        first_view, line = _first_view(subject, up)
         result["first_view"] = first_view
         lines.append(line)
     _common.print_result(result, lines, as_json=options.json)
 
 
-def _first_view(subject: Subject) -> tuple[JsonObject | None, str]:
+def _first_view(subject: Subject, up: Axis) -> tuple[JsonObject | None, str]:
     """Return the camera that first shows a subject, also in `v3dg render` and the
     viewer; None if pages that it needs are damaged."""
     try:
         framing = frame_subject(subject)
     except (OSError, ValueError) as error:
         return None, f"first view unknown: {error}"
-    camera = framing.camera(direction_of(up_of(subject)[0]), 800, 800)
+    camera = framing.camera(direction_of(up), 800, 800)
     eye = camera.position.tolist()
     target = framing.focus(camera).tolist()
     side = "outside"

@@ -259,8 +259,7 @@ def _drawn(
 
 
 def _costs(faces: list[RenderedImage]) -> JsonObject:
-    """Return the costs of a picture; for a panorama, they are sums over its six
-    faces."""
+    """Return the costs of a picture; for a panorama, they are sums over its sides."""
     stats = [face.stats for face in faces]
     costs: JsonObject = stats[0]._asdict()
     for name in ("gaussians_selected", "gaussians_in_frustum", "select_ms", "draw_ms"):

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from v3dg import _extras, _files
 from v3dg._numbers import check
 from v3dg.cameras import Axis, Floats, is_rotation
+from v3dg.editing import join
 from v3dg.formats import _axes
 from v3dg.formats._declared import Declared
 from v3dg.formats._packing import check_writable
@@ -116,12 +117,10 @@ def read(path: AnyPath) -> tuple[Gaussians, Declared]:
                 gaussians = gaussians.transform(*_similarity(prim, matrix))
             parts.append(gaussians)
             notes += notes_of_prim
-        degree = max(part.sh_degree for part in parts)
-        joined = Gaussians.concatenate([_padded(part, degree) for part in parts])
         letter = str(usd.UsdGeom.GetStageUpAxis(root.GetStage()))
         if letter not in _AXES:
             raise ValueError(f"the up axis {letter[:20]!a}; only Y and Z can be read")
-        gaussians = _axes.turned(joined, _AXES[letter], _axes.MEMORY)
+        gaussians = _axes.turned(join(parts), _AXES[letter], _axes.MEMORY)
         declared = _declared(usd, root.GetStage(), letter, notes)
         return gaussians, replace(declared, antialiased=gaussians.antialiased)
 
@@ -137,16 +136,6 @@ def _declared(usd: ModuleType, stage: Usd.Stage, letter: str, notes: list[str]) 
     if not stage.HasAuthoredMetadata("upAxis"):
         reason = f"as in OpenUSD ({letter} is up in the file)"
     return Declared(up=_axes.MEMORY_UP, up_reason=reason, notes=tuple(distinct))
-
-
-def _padded(gaussians: Gaussians, degree: int) -> Gaussians:
-    """Return the same gaussians with zeros for the coefficients up to a degree."""
-    missing = (degree + 1) ** 2 - gaussians.sh.shape[1]
-    if missing == 0:
-        return gaussians
-    zeros = np.zeros((len(gaussians), missing, 3), np.float32)
-    padded = replace(gaussians, sh=np.concatenate([gaussians.numpy().sh, zeros], axis=1))
-    return padded.trained(antialiased=gaussians.antialiased)
 
 
 def has_instances(path: AnyPath) -> bool:
