@@ -106,7 +106,8 @@ def test_a_bundle_or_a_scene_read_as_an_asset_is_sent_to_open(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "got"), [("a.sog", "begins with b''"), ("a.glb", "complete .glb file of glTF 2.0, got 0 bytes")]
+    ("name", "got"),
+    [("a.sog", "begins with b''"), ("a.glb", "complete .glb file of glTF 2.0, got 0 bytes")],
 )
 def test_empty_files_are_told_in_our_words(tmp_path, name, got):
     (tmp_path / name).touch()
