@@ -25,9 +25,9 @@ Surroundings surroundings_of(Span<const float> means, double share);
 
 // Returns a camera that looks at the centre of the ball from `distance` radii away, in
 // the direction `outwards`. `right` is to the right in its picture; both are unit
-// vectors. The caller sets its pixels.
+// vectors.
 Camera camera_at(const Surroundings& ball, double distance, const double outwards[3],
-                 const double right[3]);
+                 const double right[3], const Pinhole<double>& projection);
 
 // A picture of the asset, and the window of it in which cuts are compared. The asset is
 // drawn `samples` times as large.
