@@ -153,7 +153,9 @@ def test_bad_input_is_named_and_nothing_is_left(place):
     with pytest.raises(ValueError, match="scene: expected instances to export, got none"):
         write_site(v3dg.Scene(), "site")
     scene, cameras = v3dg.read_scene("town.json")
-    with pytest.raises(TypeError, match=r"cameras: expected cameras by their names.*, got list"):
+    with pytest.raises(
+        TypeError, match=r"cameras: expected a mapping from names to cameras.*, got list"
+    ):
         write_site(scene, "site", list(cameras.values()))
     with pytest.raises(ValueError, match="up: expected 'x' or"):
         write_site(v3dg.Bundle.open("a b1.v3dg"), "site", up="up")

@@ -260,7 +260,7 @@ def test_build_leaves_out_what_cannot_be_drawn_and_says_so(dirty, tmp_path):
         "left out: 1 with a colour that is not finite, 1 with an opacity below 1/255" in done.stdout
     )
     assert v3dg.Bundle.open(tmp_path / "out.v3dg").config["asset_gaussians"] == 1000
-    message = f"{dirty}: asset: expected gaussians that can be drawn, got others: 2 of 1,000"
+    message = f"{dirty}: asset: expected only gaussians that can be drawn, but 2 of 1,000"
     (tmp_path / "out.v3dg").unlink()
     fails(1, message, "build", dirty, "-o", "out.v3dg", "--strict", cwd=tmp_path)
 

@@ -213,7 +213,7 @@ def test_several_files_make_one_asset(tmp_path):
     )
     assert (tmp_path / "city.v3dg").read_bytes() == (tmp_path / "again.v3dg").read_bytes()
     for amount, message in (
-        ("much", "expected bytes, or text like '8GiB', got 'much'"),
+        ("much", "expected a positive number of bytes, or text like '8GiB', got 'much'"),
         ("1", "expected at least 7"),
     ):
         fails(

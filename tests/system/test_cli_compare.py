@@ -224,11 +224,11 @@ POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\ns
         (grey_png(8)[:50], "expected a PNG or a JPEG that is not damaged, got"),
         (
             grey_png(12_000),
-            "expected a picture of at most 65,500 px a side and 33,554,432 px in all",
+            "expected a picture of at most 65,500 px a side and at most 33,554,432 px in total",
         ),
         (grey_png(20_000), "expected a PNG or a JPEG that is not damaged, got Image size"),
         (grey_png(2**31 - 1), "expected a PNG or a JPEG that is not damaged, got Image size"),
-        (grey_png(8, depth=16, rows=8), "expected 8 bits a channel, got 16"),
+        (grey_png(8, depth=16, rows=8), "expected 8 bits per channel, got 16"),
     ],
 )
 def test_pictures_that_users_hand_in_are_refused_before_they_cost(tmp_path, content, message):

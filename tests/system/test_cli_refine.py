@@ -102,7 +102,7 @@ def test_what_cannot_be_meant_is_told(folder):
     fails(1, "Not a directory", "refine", "donut.v3dg", "donut.v3dg/x.v3dg", cwd=folder)
     fails(
         1,
-        "steps: expected 1 step or more",
+        "steps: expected at least 1 step",
         "refine",
         "donut.v3dg",
         "x.v3dg",

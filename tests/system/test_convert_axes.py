@@ -83,7 +83,7 @@ def test_spz_of_other_programs_says_what_it_was_taken_for(folder, asset):
     write_without_record(folder / "theirs.spz", upright)
     result, found = convert(folder, "theirs.spz", "theirs.ply")
     np.testing.assert_allclose(found.means, upright.means, atol=1e-3)
-    reason = "guessed from its ground, with which -y is up in the file"
+    reason = "guessed from its ground, which shows that -y is up in the file"
     assert result["notes"] == [f"theirs.spz: -y is up, {reason}"]
     told = run("info", "theirs.spz", cwd=folder)
     assert told.stdout.splitlines()[1] == f"-y is up, {reason}"

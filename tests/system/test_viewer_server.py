@@ -250,7 +250,9 @@ def test_command_refuses_what_cannot_be_meant(arguments, message, tmp_path, monk
 
 def test_cameras_without_names_are_refused(blob_view):
     before = set(threading.enumerate())
-    with pytest.raises(TypeError, match=r"cameras: expected cameras by their names.*, got list"):
+    with pytest.raises(
+        TypeError, match=r"cameras: expected a mapping from names to cameras.*, got list"
+    ):
         Site(blob_view, port=0, cameras=v3dg.turntable((0, 0, 0), 3.0, 2))
     assert set(threading.enumerate()) == before
 
