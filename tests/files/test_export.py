@@ -361,15 +361,17 @@ def test_other_folders_and_impossible_chunks_are_refused(tmp_path, bundle):
     (tmp_path / "file").touch()
     for name in ("mine", "file"):
         with pytest.raises(
-            ValueError, match=f"{name}: expected a new folder, or one with an earlier export"
+            ValueError, match=f"{name}: expected a new folder or one with an earlier export"
         ):
             write_streamed_sog(bundle, tmp_path / name)
     with pytest.raises(
         ValueError,
-        match=r"chunk: expected at least \d+ gaussians, the size of a group of the asset, got 9",
+        match=r"chunk: expected at least \d+ gaussians, the size of the largest group, got 9",
     ):
         write_streamed_sog(bundle, tmp_path / "web", chunk=9)
-    with pytest.raises(ValueError, match="bundle: expected gaussians to export, got none"):
+    with pytest.raises(
+        ValueError, match="bundle: expected at least one gaussian to export, got none"
+    ):
         write_streamed_sog(random_bundle(num_levels=0), tmp_path / "web")
     with pytest.raises(ValueError, match="chunk: expected at least"):
         write_streamed_sog(bundle, tmp_path / "absent" / "web", chunk=9)

@@ -154,7 +154,9 @@ def test_bad_files_are_refused(tmp_path):
         v3dg.read_asset(tmp_path / "none.usda")
     with pytest.raises(ValueError, match=r"path: expected '\.usd' or"):
         write_usd(random_bundle(3), tmp_path / "a.usdx")
-    with pytest.raises(ValueError, match="scene: expected instances to export, got none"):
+    with pytest.raises(
+        ValueError, match="scene: expected at least one instance to export, got none"
+    ):
         write_usd(v3dg.Scene(), tmp_path / "none.usda")
 
 

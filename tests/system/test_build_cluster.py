@@ -483,7 +483,8 @@ def test_what_is_no_address_is_told_so(address):
 
     with (
         pytest.raises(
-            RuntimeError, match=r"expected a dask scheduler such as tcp://host:8786, got no address"
+            RuntimeError,
+            match=r"expected a dask scheduler such as tcp://host:8786, got an invalid address",
         ),
         build._executor_at(address),
     ):

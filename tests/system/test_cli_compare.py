@@ -160,7 +160,7 @@ def test_text_names_the_view_that_differs_most(folder, tmp_path):
     lines = done.stdout.splitlines()
     assert lines[0].split() == ["view", "FLIP", "PSNR", "SSIM", "gaussians"]
     assert [line.split()[0] for line in lines[1:4]] == ["near", "far", "mean"]
-    assert "which differs most" in lines[-1]
+    assert "which has the largest difference" in lines[-1]
 
 
 def test_a_view_that_shows_no_coarser_level_says_so(folder, tmp_path):
@@ -191,7 +191,7 @@ def test_errors(folder, tmp_path):
     (tmp_path / "compare.png").symlink_to("a.png")
     fails(
         2,
-        "compare.png: expected another file than the input a.png",
+        "compare.png: expected an output that is not the input a.png",
         "compare",
         "a.png",
         "b.png",

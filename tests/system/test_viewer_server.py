@@ -233,7 +233,7 @@ def test_command_ends_at_once_whatever_a_tab_does(blob_bundle, blob_view, tmp_pa
             "--budget: expected a bundle or a scene, got the asset asset.ply; build a bundle",
         ),
         (["asset.ply", "--port", "70000"], "--port: expected 0 to 65535, got 70000"),
-        (["asset.ply", "--tolerance", "inf"], "--tolerance: expected a number, got inf"),
+        (["asset.ply", "--tolerance", "inf"], "--tolerance: expected a finite number, got inf"),
         (
             ["asset.ply", "--host", "192.0.2.1"],
             "host: expected an address of this machine, got 192.0.2.1",
