@@ -522,9 +522,9 @@ def test_extensions_after_the_gaussians_of_spz_are_told(tmp_path, content):
 @pytest.mark.parametrize(
     ("place", "value", "message"),
     [
-        (15, 5, "expected a table of 6 streams after the header, got 5 at 32"),
-        (16, 31, "expected a table of 6 streams after the header, got 6 at 31"),
-        (19, 255, "expected a table of 6 streams after the header, got 6 at 42"),
+        (15, 5, "expected a table of 6 streams after the header, got one of 5 at offset 32"),
+        (16, 31, "expected a table of 6 streams after the header, got one of 6 at offset 31"),
+        (19, 255, "expected a table of 6 streams after the header, got one of 6 at offset 42"),
         (8, 65, "expected 585 bytes in stream 0, got 576"),
         (
             11,

@@ -473,7 +473,7 @@ def test_a_document_may_have_its_buffers_inside(tmp_path):
     assert_same(read(path), ASSET)
     for uri in ("data:application/octet-stream;base64,!", "data:text/plain,abc", "data:"):
         file.write(path, uri)
-        with pytest.raises(ValueError, match=r"buffers\[0\].uri: expected complete data in base64"):
+        with pytest.raises(ValueError, match=r"buffers\[0\].uri: expected .*data in base64"):
             v3dg.read_asset(path)
 
 
