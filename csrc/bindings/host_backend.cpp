@@ -99,8 +99,9 @@ class HostBackend final : public Backend {
     void leave(Device, int) const noexcept override {}
 
     void median_split(Span<const Point> points, Span<const int64_t> offset, int depth,
-                      Span<int64_t> order, Span<int64_t> leaf_offset, const Work&) const override {
-        cpu::median_split(points, offset, depth, order, leaf_offset);
+                      size_t unit, Span<int64_t> order, Span<int64_t> leaf_offset,
+                      const Work&) const override {
+        cpu::median_split(points, offset, depth, unit, order, leaf_offset);
     }
     void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double margin,
                        Span<Ball> out, const Work&) const override {

@@ -15,27 +15,29 @@ namespace v3dg {
 int num_halvings(size_t n, size_t cluster_size);
 
 // Computes the beginnings of the leaves if each segment is halved `depth` times; the
-// left part gets ceil(n / 2) points.
+// left part gets left_half(n, unit) of n points.
 //
-// offset: [S + 1], ascending from 0. leaf_offset: [S * 2^depth + 1].
-void halve_segments(Span<const int64_t> offset, int depth, Span<int64_t> leaf_offset);
+// offset: [S + 1], ascending from 0. unit: >= 1. leaf_offset: [S * 2^depth + 1].
+void halve_segments(Span<const int64_t> offset, int depth, size_t unit, Span<int64_t> leaf_offset);
 
 // Sorts the points of each segment so that each cluster of a perfect binary tree is
 // contiguous.
 //
 // Every node is split `depth` times at the median rank along the longest axis of its
 // means' bounding box. Ties go to the lowest axis, and to the left for the lowest
-// index. Leaf l of segment s is s * 2^depth + l; it has ceil or floor of n / 2^depth of
-// the segment's points, and its indices ascend. The result does not depend on the
-// number of threads; the CPU and CUDA give the same bits.
+// index. Leaf l of segment s is s * 2^depth + l, and its indices ascend. With a unit of
+// 1 it has ceil or floor of n / 2^depth of the segment's points; with a larger unit,
+// all leaves but the last one that is not empty begin and end at multiples of it,
+// counted from the segment's first position. The result does not depend on the number
+// of threads; the CPU and CUDA give the same bits.
 //
-// means: [N], finite, N < 2^32. offset: [S + 1], ascending from 0 to N. order: [N], the
-// index at each position. leaf_offset: [S * 2^depth + 1].
+// means: [N], finite, N < 2^32. offset: [S + 1], ascending from 0 to N. unit: >= 1.
+// order: [N], the index at each position. leaf_offset: [S * 2^depth + 1].
 //
 // This split is also the tree of clusters; docs/levels.md compares it with the paper's
 // (V3DG).
 namespace cpu {
-void median_split(Span<const Point> means, Span<const int64_t> offset, int depth,
+void median_split(Span<const Point> means, Span<const int64_t> offset, int depth, size_t unit,
                   Span<int64_t> order, Span<int64_t> leaf_offset);
 
 // Computes a ball around each segment of spheres (gaussians with their reach, or the
@@ -54,7 +56,7 @@ void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double 
 // host. Work is queued on the stream. Throws std::runtime_error if CUDA reports an
 // error.
 namespace cuda {
-void median_split(Span<const Point> means, Span<const int64_t> offset, int depth,
+void median_split(Span<const Point> means, Span<const int64_t> offset, int depth, size_t unit,
                   Span<int64_t> order, Span<int64_t> leaf_offset, Stream stream);
 void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double margin,
                    Span<Ball> ball, Stream stream);
