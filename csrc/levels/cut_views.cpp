@@ -1,6 +1,6 @@
-// Views of random cuts of a bundle. A view follows from its number: a size, a camera,
-// and a window in which cuts are compared. Each of its cuts has a share of the
-// gaussians that goes with its size.
+// Views of random cuts of a bundle. The number of a view determines a size, a camera,
+// and a window in which cuts are compared. The shares of gaussians in its cuts depend
+// on the size.
 
 #include "levels/cut_views.h"
 
@@ -18,18 +18,18 @@ namespace v3dg {
 namespace {
 
 constexpr double kNarrowestPx = 8, kMostPx = 1 << 15;  // limits of a picture's side, px
-// px² a gaussian at which a cut is selected at the default tolerance: the native size.
+// The px² per gaussian of a cut that is selected at the default tolerance: native size.
 constexpr double kNativePx2 = 2;
 // The range of a picture's side, relative to the native size of its cut.
 constexpr double kLeastSize = 0.18, kOctavesOfSize = 5.75;
-constexpr double kDistance = 2.5;  // distance from the centre, in radii
-constexpr double kNear = 0.01;     // radii
-constexpr int kMostTries = 16;     // attempts to find a gaussian that a picture shows
+constexpr double kDistance = 2.5;  // distance of the camera from the centre, in radii
+constexpr double kNear = 0.01;     // near depth, in radii
+constexpr int kMostTries = 16;     // attempts to find a gaussian that is in the picture
 constexpr int kMostTriesOfShare = 64;
-// More random numbers than a view, or one of its shares, takes.
+// More random numbers than one view, or one of its shares, uses.
 constexpr uint64_t kRandomNumbersOfView = 1024;
 constexpr double kMostOfAsset = 0.7;  // largest share of the asset's gaussians in a cut
-// The share of the gaussians within the radius; the rest may float far away.
+// The share of gaussians in CutPictures::ball; others may be far away.
 constexpr double kShare = 0.99;
 
 // The random numbers of one view.
@@ -50,8 +50,8 @@ class Random {
     uint64_t seed_, stream_, counter_;
 };
 
-// Returns a camera that looks at the centre from anywhere around it; its picture is one
-// px wide.
+// Returns a camera that looks at the centre of the ball from a random direction. Its
+// picture is one pixel large.
 Camera camera_around(const CutPictures& pictures, Random& random) {
     double outwards[3], up[3], right[3];
     random.direction(outwards);
@@ -71,7 +71,7 @@ Camera camera_around(const CutPictures& pictures, Random& random) {
     return camera;
 }
 
-// Returns the camera with its picture scaled.
+// Returns the camera with the size of its picture scaled.
 Camera resized(Camera camera, double scale) {
     const double width = std::ceil(scale * camera.width), height = std::ceil(scale * camera.height);
     camera.cx = scale * camera.cx + (width - scale * camera.width) / 2;
@@ -84,8 +84,8 @@ Camera resized(Camera camera, double scale) {
     return camera;
 }
 
-// Returns the camera with its picture shifted to a random place among the pixels of a
-// screen, and widened where it is narrow.
+// Returns the camera with its picture shifted by a random fraction of a pixel, and
+// enlarged if it is narrow.
 Camera on_screen(Camera camera, Random& random) {
     const double width = std::max(camera.width, kNarrowestPx),
                  height = std::max(camera.height, kNarrowestPx);
@@ -96,8 +96,8 @@ Camera on_screen(Camera camera, Random& random) {
     return camera;
 }
 
-// Returns a window of the picture around a random gaussian. A gaussian that is twice as
-// large in the asset is chosen twice as often.
+// Returns a window of the picture around a random gaussian. Gaussians are chosen with a
+// probability in proportion to CutPictures::weight.
 Camera window_of(const Camera& camera, double widest_px, const CutPictures& pictures,
                  Random& random) {
     double at[2] = {camera.width / 2, camera.height / 2};
@@ -130,7 +130,7 @@ Camera window_of(const Camera& camera, double widest_px, const CutPictures& pict
     return window;
 }
 
-// The only instance of a bundle, where it was built.
+// The tables of a scene with a single instance of a bundle, without transformation.
 struct OneInstance {
     const int32_t bundle = 0;
     const double position[3] = {}, quaternion[4] = {1, 0, 0, 0}, scale = 1;
@@ -155,7 +155,7 @@ SelectOutput selected(const ClusterTable& table, const Camera& camera, const Sel
     return out;
 }
 
-// The cuts of a picture that meet budgets.
+// Returns the cut of a picture for each budget.
 std::vector<BudgetCut> cuts_within(const ClusterTable& table, const Camera& camera,
                                    const SelectRule& rule, Span<const uint64_t> budgets) {
     const OneInstance instance;
@@ -166,14 +166,14 @@ std::vector<BudgetCut> cuts_within(const ClusterTable& table, const Camera& came
     return cuts;
 }
 
-// Returns a share of the gaussians of a picture, by a uniform number.
+// Converts a uniform random number to the share of the gaussians in a cut.
 double share_of_part(const CutPictures& pictures, double part) {
     const auto all = static_cast<double>(pictures.weight.size());
     return pictures.most * std::pow(pictures.least / pictures.most, part * part) / all;
 }
 
-// Returns the share of another cut of a view. It has the distribution of all shares, as
-// far as the picture's size relative to the native size of the cut stays in its range.
+// Returns the share of gaussians in cut `cut` of a view. Shares are distributed like
+// those of first cuts, but the picture must be within the range of sizes for the cut.
 double share_of_cut(const CutPictures& pictures, const AssetView& view, uint64_t number,
                     size_t cut) {
     if (cut == 0) return view.share;
@@ -186,10 +186,9 @@ double share_of_cut(const CutPictures& pictures, const AssetView& view, uint64_t
     return view.share;
 }
 
-// The way in which a picture is compared: the largest side of the window, and the
-// samples of a side of a pixel of the asset. The larger its gaussians appear, the
-// smoother the picture is; small pictures cost little. `size` is that of the picture,
-// relative to the asset's native size.
+// How pictures are compared: the largest side of the window, and the samples per pixel
+// side of the asset's picture. The larger gaussians appear, the smoother a picture is,
+// and the fewer samples it needs. `size` is relative to the asset's native size.
 struct Comparison {
     double widest_px;
     int samples;
@@ -262,7 +261,7 @@ CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const
         pictures.least += static_cast<double>(table.num_gaussians(static_cast<size_t>(c)));
     pictures.least = std::max(pictures.least, 1.0);
     pictures.most = std::max(kMostOfAsset * static_cast<double>(asset.size), pictures.least);
-    // A gaussian that is twice as large is looked at twice as often.
+    // Weight gaussians by size: the mean of their two larger scales, times the opacity.
     double sum = 0;
     for (size_t i = 0; i < asset.size; ++i) {
         double scale[3];
@@ -318,9 +317,9 @@ std::vector<SelectRule> cuts_of_view(const CutPictures& pictures, const AssetVie
     for (size_t cut = 0; cut < count; ++cut) {
         SelectRule rule = whole;
         BudgetCut found = cuts[cut];
-        // A camera inside of groups refines these at any tolerance, and only the
-        // coarsest clusters meet a budget below what remains of them. Then coarser
-        // levels alone are used.
+        // If the camera is inside of a group's ball, the group is refined at any
+        // tolerance. So a budget may be met only by the coarsest cut, with far fewer
+        // gaussians. Then exclude the finest levels instead.
         while (std::isinf(found.tolerance_px2) &&
                2 * found.num_gaussians < static_cast<int64_t>(budgets[cut]) &&
                rule.min_level < coarsest) {

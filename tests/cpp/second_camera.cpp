@@ -1,6 +1,6 @@
-// A second camera model, orthographic, that goes through projection as Pinhole does. It shows what
-// a model supplies, and that the formulas of projection name none. Prints what is wrong, if
-// anything.
+// Projects gaussians with a second camera model, an orthographic one. The test shows
+// what a camera model has to supply, and that projection works with any model. Prints
+// what is wrong, if anything.
 
 #include <cmath>
 #include <cstdio>
@@ -17,7 +17,8 @@ struct Edges {
     double half_width, half_height;
 };
 
-// A point (x, y, z) has its image at (scale x + cx, scale y + cy), in px.
+// An orthographic camera. The point (x, y, z) in view space is drawn at pixel
+// (scale x + cx, scale y + cy).
 template <class T>
 struct Orthographic {
     using Scalar = T;
@@ -92,7 +93,7 @@ struct Orthographic {
 
 static_assert(CameraModel<Orthographic<float>> && CameraModel<Orthographic<double>>);
 
-// A model that cannot tell where a point is on the image.
+// An incomplete camera model: it has no to_pixel().
 struct Blind : Orthographic<float> {
     void to_pixel() = delete;
 };
@@ -121,7 +122,7 @@ static Ellipse<double> projected(const Gaussian3d<double>& g, Projection<double,
     return project_gaussian(g, view, camera, kFilter, true, s);
 }
 
-// A loss that depends on every number of the ellipse.
+// Returns a loss that depends on every value of the ellipse.
 static double loss_of(const Gaussian3d<double>& g, const Camera2& camera) {
     Projection<double, Camera2> s;
     const Ellipse<double> e = projected(g, s, camera);
@@ -144,7 +145,7 @@ int main() {
     expect_close("u", e.u, 20 * (0.8 * 0.5 + 0.6 * 0.3) + 64);
     expect_close("v", e.v, 20 * (0.6 * 0.5 - 0.8 * 0.3) + 48);
     expect_close("depth", e.depth, 4.7);
-    // The determinant of the covariance, from that of L.
+    // The determinant of the covariance follows from the determinant of L.
     const double det_l = e.l11 * e.l22;
     expect_close("det", s.det * det_l * det_l, std::pow(kFalloffScale, 4));
 
