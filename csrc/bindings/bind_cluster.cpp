@@ -38,8 +38,7 @@ py::tuple median_split(const py::object& means, const py::array& offset, int dep
     const Span<const int64_t> offsets = offsets_of(offset, points.size);
     if (depth < 0 || depth > kDeepest)
         throw py::value_error("depth: expected 0 to 32, got " + std::to_string(depth));
-    if (unit < 1)
-        throw py::value_error("unit: expected at least 1, got " + std::to_string(unit));
+    if (unit < 1) throw py::value_error("unit: expected at least 1, got " + std::to_string(unit));
     const Work work(device);
     if (work.backend().traits.host_reads_arrays) check_finite(values);
     const NewArray<int64_t> order(device, {static_cast<py::ssize_t>(points.size)});

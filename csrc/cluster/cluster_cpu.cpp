@@ -18,8 +18,7 @@ int num_halvings(size_t n, size_t cluster_size) {
     return depth;
 }
 
-void halve_segments(Span<const int64_t> offset, int depth, size_t unit,
-                    Span<int64_t> leaf_offset) {
+void halve_segments(Span<const int64_t> offset, int depth, size_t unit, Span<int64_t> leaf_offset) {
     const size_t leaves = size_t(1) << depth;
     assert(leaf_offset.size == (offset.size - 1) * leaves + 1);
     for (size_t s = 0; s < offset.size; ++s) leaf_offset[s * leaves] = offset[s];
