@@ -93,7 +93,7 @@ class Lens:
     @property
     def is_distorted(self) -> bool:
         if self.model.name == "EUCM":
-            # If this is 0, the other parameter has no effect.
+            # If the first parameter is 0, the second one has no effect.
             return self.distortion[0] != 0
         return any(self.distortion)
 

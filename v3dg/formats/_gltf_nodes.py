@@ -189,7 +189,7 @@ def _stretched(gaussians: Gaussians, factors: Floats) -> Gaussians:
         scales = gaussians.scales[rows].astype(np.float64)
         axes = rotation_from_quaternion(normalised(quats)) * scales[:, None, :]
         axes *= factors[:, None]
-        # Gaussians with other values cannot be drawn, and are not changed.
+        # Gaussians whose values are not finite cannot be drawn. They are not changed.
         is_good = np.isfinite(axes).all(axis=(1, 2))
         rotations, lengths, _ = np.linalg.svd(axes[is_good])
         rotations[:, :, 2] *= np.sign(np.linalg.det(rotations))[:, None]

@@ -123,7 +123,7 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
     count, degree = _size(meta)
     names = _names(meta)
     pictures = {name: load(name) for part in names.values() for name in part}
-    # After opening all files, because their total size bounds the number.
+    # All files are open now. Their total size limits the number of gaussians.
     claims.add(path, count)
 
     def pixels(name: str) -> _Pixels:
