@@ -9,8 +9,8 @@ process at once. While a command runs, Ctrl-C raises KeyboardInterrupt.
 
 from __future__ import annotations
 
-# Type: ignore[import-not-found] # `signal` without its enumerations.
-import _signal as signal
+# The module `signal` without its enumerations, which take long to import.
+import _signal as signal  # type: ignore[import-not-found]
 import importlib
 import os
 import sys
@@ -55,8 +55,9 @@ def begin() -> None:
         signal.signal(signal.SIGINT, _end_at_once)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
-        # Otherwise a file that is opened later could get the descriptor of a standard
-        # stream, and output would be written to that file.
+        # The null device takes the closed descriptors from 0 to 2. Otherwise a file
+        # that is opened later could get one of them, and output would be written to
+        # that file.
         pass
     os.close(descriptor)
     for name in ("stdout", "stderr"):

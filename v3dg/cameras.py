@@ -68,8 +68,8 @@ class Camera:
         if viewmat[3].tolist() != [0, 0, 0, 1]:
             refuse("viewmat", f"the last row 0 0 0 1, got {_text(viewmat[3])}")
         K = vector(self.K, "K", (3, 3))
-        # These are Python numbers: for so few values, NumPy is slower, and every frame
-        # may have a new camera.
+        # `tolist` gives Python numbers. For so few values, NumPy is slower, and every
+        # frame may have a new camera.
         (fx, skew, cx), (skew_y, fy, cy), last_row = K.tolist()
         if not (fx > 0 and fy > 0):
             refuse("K", f"positive focal lengths, got {fx:g} and {fy:g}")

@@ -999,7 +999,9 @@ def test_tables_of_wrong_kind_are_refused(saved):
     clusters, groups = saved[0].clusters, saved[0].groups
     with pytest.raises(TypeError, match=r"clusters.level: expected a NumPy array, got list"):
         dataclasses.replace(clusters, level=clusters.level.tolist())
-    with pytest.raises(ValueError, match=r"clusters.offset: expected dtype int64 and shape \(\d+,\), got int32"):
+    with pytest.raises(
+        ValueError, match=r"clusters.offset: expected dtype int64 and shape \(\d+,\), got int32"
+    ):
         dataclasses.replace(clusters, offset=clusters.offset.astype(np.int32))
     with pytest.raises(
         ValueError, match=r"clusters.box: expected float32 \(\d+, 2, 3\), got float32 \(\d+, 6\)"

@@ -142,8 +142,8 @@ class Bundle:
             clusters = Clusters(**{f.name: tables[f"clusters.{f.name}"] for f in fields(Clusters)})
             groups = Groups(**{f.name: tables[f"groups.{f.name}"] for f in fields(Groups)})
             num_gaussians = int(clusters.offset[-1])
-            # This must be checked before any size is computed from the number of
-            # gaussians.
+            # The number of gaussians must be checked before any size is computed from
+            # it.
             max_gaussians = file.pages_bytes // file.codec.gaussian_bytes
             expected = f"at most {max_gaussians} gaussians, got {num_gaussians}"
             check("clusters.offset[-1]", num_gaussians <= max_gaussians, expected)

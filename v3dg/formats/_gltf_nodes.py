@@ -162,7 +162,9 @@ def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
         determinant = float(np.linalg.det(rotation))
     expected = "expected a rotation, a translation and positive scales"
     if not (np.isfinite(matrix).all() and (lengths > 0).all() and np.isfinite(lengths).all()):
-        raise placement.node.problem(f"{expected}, got a scale of 0 or a number that overflows")
+        raise placement.node.problem(
+            f"{expected}, got a scale of 0 or a number that overflows; correct the node"
+        )
     if determinant < 0:
         raise placement.node.problem(f"{expected}, got a reflection; apply it to the file first")
     if not abs(determinant - 1) <= _MOST_SHEAR:

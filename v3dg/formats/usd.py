@@ -382,7 +382,7 @@ def _antialiased(prim: Usd.Prim) -> bool | None:
 def _degree(usd: ModuleType, prim: Usd.Prim) -> int:
     """Return the SH degree of a prim; the default of the schema is 3."""
     degree = _value(usd, prim, f"{_SH}Degree")
-    if degree is None:  # then the prim has no coefficients either
+    if degree is None:  # a prim without a degree has no coefficients, either
         return 0
     if not isinstance(degree, int) or not 0 <= degree <= _MOST_DEGREE:
         raise ValueError(f"an invalid SH degree, {degree}, in {prim.GetPath()}")

@@ -109,11 +109,7 @@ def leaves_on_disk(
     files = map(open_asset, paths)  # lazy, so that few files are open at once
     tiles = list(map(_Tile.of, files))
     count = sum(tile.num_gaussians for tile in tiles)
-    check(
-        "asset",
-        count < MOST_GAUSSIANS,
-        f"fewer than 2^32 gaussians, got {count:,}; divide the asset",
-    )
+    check("asset", count < MOST_GAUSSIANS, f"fewer than 2^32 gaussians, got {count:,}; divide it")
     degree = max(tile.sh_degree for tile in tiles)
     sizes = _Sizes.of(memory, reserved(count, degree), degree, tiles)
     folder = Path(folder)

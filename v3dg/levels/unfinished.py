@@ -235,7 +235,8 @@ class Unfinished:
             try:
                 self._plan.write_header(descriptor)
             except OSError:
-                # This works on a full disk, because it overwrites existing bytes.
+                # Writing the head works on a full disk, because it overwrites existing
+                # bytes.
                 os.pwrite(descriptor, self.pages.head, 0)
                 raise
             self.is_whole = True
