@@ -323,7 +323,7 @@ def _read_colmap(images: Path, distortion: str) -> dict[str, Camera]:
         shown_names = ", ".join(names[:_MOST_NAMED])
         if len(names) > _MOST_NAMED:
             shown_names += f" and {len(names) - _MOST_NAMED} more"
-        text += f"and are skipped: {shown_names}"
+        text += f" and are skipped: {shown_names}"
         warnings.warn(f"{images}: {text}", CameraWarning, stacklevel=3)
     named = []
     for image in finite:

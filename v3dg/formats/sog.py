@@ -282,7 +282,7 @@ def _decoded(
     has_size = num_pixels <= width * height <= _MAX_PIXELS_FACTOR * num_pixels + _FREE_PIXELS
     expected = f"{num_pixels} pixels"
     if row is not None:
-        expected += f"in rows of {row} pixels"
+        expected += f" in rows of {row} pixels"
     check(
         path, has_size and row in (None, width), f"{expected} in {name!a}, got {width} x {height}"
     )
