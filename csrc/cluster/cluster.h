@@ -21,7 +21,8 @@ int num_halvings(size_t n, size_t cluster_size);
 void halve_segments(Span<const int64_t> offset, int depth, Span<int64_t> leaf_offset);
 
 // Sorts the points of each segment so that the points of each node of a perfect binary
-// tree are contiguous. The leaves of the tree are clusters.
+// tree are contiguous. The leaves of the tree are clusters. docs/levels.md compares the
+// tree with the tree of the paper (V3DG).
 //
 // A node is split at the median along the longest axis of the bounding box of its
 // points; of equal axes, the first one counts. Points of equal coordinate are ordered
@@ -31,9 +32,6 @@ void halve_segments(Span<const int64_t> offset, int depth, Span<int64_t> leaf_of
 //
 // means: [N], finite, N < 2^32. offset: [S + 1], ascending from 0 to N. order: [N],
 // index of the point at each position. leaf_offset: [S * 2^depth + 1].
-//
-// The tree of clusters is this tree. docs/levels.md compares it with the tree of the
-// paper (V3DG).
 namespace cpu {
 void median_split(Span<const Point> means, Span<const int64_t> offset, int depth,
                   Span<int64_t> order, Span<int64_t> leaf_offset);

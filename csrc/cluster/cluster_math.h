@@ -45,7 +45,7 @@ constexpr double kCoreTolerance = 1e-4;
 V3DG_HD inline bool move_center(const Ball& farthest, double radius, int step, Center& center) {
     const double distance = radius - farthest.radius;
     if (distance <= 0.0) return false;
-    // Move towards the sphere's farthest point, not its centre.
+    // Move the centre towards the farthest point of the sphere, not towards its centre.
     const double move = radius / distance / step;
     center.x += (farthest.x - center.x) * move;
     center.y += (farthest.y - center.y) * move;

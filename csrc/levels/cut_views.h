@@ -16,8 +16,8 @@ namespace v3dg {
 
 double median(std::vector<double> values);
 
-// A ball around the median of the means. It contains a given share of the means; others
-// may be far away.
+// A ball around the median of the means. It contains a given share of the means; the
+// other means may be far away.
 struct Surroundings {
     double center[3], radius;
 };

@@ -16,7 +16,7 @@ namespace {
 constexpr int kThreads = kItemSize;
 // One thread sums up to this many slots of a record; a warp sums more.
 constexpr uint32_t kFewSlots = 16;
-// SH words that a thread loads before it stores the first one
+// SH words that a thread loads before it stores any of them
 constexpr int kWordsAtOnce = 6;
 
 template <class Value>
@@ -114,7 +114,7 @@ struct ShRow {
     static constexpr int kStride = kWords | 1;
 };
 
-// The gaussians that a block processes: those of an item.
+// The rows of the gaussians that a block processes.
 struct BlockRows {
     uint64_t first;  // row of the first gaussian
     int count;

@@ -12,7 +12,7 @@ namespace cuda {
 
 constexpr unsigned kWarps = 8;
 constexpr unsigned kQueue = 64;  // up to 31 gaussians remain queued when 32 are added
-// up to 31 large records remain queued when 32 are added
+// Up to 31 large records remain queued when 32 are added.
 constexpr unsigned kMostWaiting = 64;
 
 // A gaussian in the queue of a warp.
@@ -59,7 +59,7 @@ struct Loaded {
 
 // Stores the tables of an item in shared memory. Lane i passes the i-th 32-bit word of
 // the item and of the placement. The image and the model are loaded only if they differ
-// from those of the last item.
+// from the image and the model of the previous item.
 template <class Model>
 __device__ void store_tables(ItemTables<Model>& tables, uint32_t item_word, uint32_t placement_word,
                              const ProjectInput& in, const Model* models, Loaded& loaded) {

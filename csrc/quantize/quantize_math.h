@@ -167,7 +167,7 @@ V3DG_HD V3DG_INLINE void decode(const Bits<V> record[kRecordWords], const Cluste
             y = number_at<V>(c, 19, 9) - float(kZeroQuat),
             z = number_at<V>(d, 23, 9) - float(kZeroQuat);
     g.quat[0] =
-        // the operands are integers, so the sum is exact
+        // The operands are integers, so the sum is exact.
         exact_sqrt(float(kQuatLength2) - x * x - y * y - z * z) * kQuatStep;
     g.quat[1] = x * kQuatStep;
     g.quat[2] = y * kQuatStep;

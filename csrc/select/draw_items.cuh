@@ -8,7 +8,7 @@
 namespace v3dg {
 namespace cuda {
 
-// What a lane will write.
+// The amount that a lane will write.
 struct WriteCount {
     unsigned units, gaussians;  // `units`: number of list elements
 };

@@ -22,10 +22,10 @@ void prune(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
            Span<const int64_t> out_offset, Span<int64_t> kept);
 
 // Joins pairs of gaussians, cheapest first, until the wanted number is left. The cost
-// of a pair grows with the distance of the two in position and in colour. The joined
-// gaussian has the first and second moments of the pair, weighted by opacity times
-// surface area. It has the pair's total of area times opacity, as far as an opacity of
-// 1 allows.
+// of a pair grows with the distance between its gaussians in position and in colour.
+// The joined gaussian has the first and second moments of the pair, weighted by opacity
+// times surface area. Its area times opacity is the pair's total, as far as an opacity
+// of 1 allows.
 void merge(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
            Span<const int64_t> out_offset, const GaussianRows<float>& out);
 }  // namespace cpu
