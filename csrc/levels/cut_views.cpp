@@ -62,38 +62,34 @@ Camera camera_around(const CutPictures& pictures, Random& random) {
         length = std::sqrt(dot3(right, right));
     }
     for (double& x : right) x /= length;
-    Camera camera = camera_at(pictures.ball, kDistance, outwards, right);
-    // The ball fills the picture.
-    camera.fx = camera.fy = std::sqrt(kDistance * kDistance - 1) / 2;
-    camera.cx = camera.cy = 0.5;
-    camera.width = camera.height = 1;
-    camera.near_depth = kNear * pictures.ball.radius;
-    return camera;
+    const double focal = std::sqrt(kDistance * kDistance - 1) / 2;  // the ball fills the picture
+    return camera_at(pictures.ball, kDistance, outwards, right,
+                     {.fx = focal,
+                      .fy = focal,
+                      .cx = 0.5,
+                      .cy = 0.5,
+                      .width = 1,
+                      .height = 1,
+                      .near_depth = kNear * pictures.ball.radius});
 }
 
-// Returns the camera with the size of its picture scaled.
-Camera resized(Camera camera, double scale) {
-    const double width = std::ceil(scale * camera.width), height = std::ceil(scale * camera.height);
-    camera.cx = scale * camera.cx + (width - scale * camera.width) / 2;
-    camera.cy = scale * camera.cy + (height - scale * camera.height) / 2;
-    camera.fx *= scale;
-    camera.fy *= scale;
-    camera.width = camera.x1 = width;
-    camera.height = camera.y1 = height;
-    camera.x0 = camera.y0 = 0;
-    return camera;
+// Returns the camera with the size of its picture scaled, and extended to whole pixels.
+Camera resized(const Camera& camera, double scale) {
+    const Camera scaled = camera.scaled(scale);
+    const double width = std::ceil(scaled.width);
+    const double height = std::ceil(scaled.height);
+    return scaled.cropped(-(width - scaled.width) / 2, -(height - scaled.height) / 2, width,
+                          height);
 }
 
 // Returns the camera with its picture shifted by a random fraction of a pixel, and
 // enlarged if it is narrow.
-Camera on_screen(Camera camera, Random& random) {
+Camera on_screen(const Camera& camera, Random& random) {
     const double width = std::max(camera.width, kNarrowestPx),
                  height = std::max(camera.height, kNarrowestPx);
-    camera.cx += (width - camera.width) / 2 + random.uniform() - 0.5;
-    camera.cy += (height - camera.height) / 2 + random.uniform() - 0.5;
-    camera.width = camera.x1 = width;
-    camera.height = camera.y1 = height;
-    return camera;
+    const double left = (width - camera.width) / 2 + random.uniform() - 0.5;
+    const double above = (height - camera.height) / 2 + random.uniform() - 0.5;
+    return camera.cropped(-left, -above, width, height);
 }
 
 // Returns a window of the picture around a random gaussian. Gaussians are chosen with a
@@ -113,21 +109,19 @@ Camera window_of(const Camera& camera, double widest_px, const CutPictures& pict
                 p[row] +=
                     camera.rotation[3 * row + k] * static_cast<double>(pictures.means[3 * i + k]);
         }
-        if (!(p[2] > camera.near_depth)) continue;
-        const double x = camera.fx * p[0] / p[2] + camera.cx,
-                     y = camera.fy * p[1] / p[2] + camera.cy;
+        if (!(camera.depth_of(p) > camera.near_depth)) continue;
+        double x, y;
+        camera.to_pixel(camera.linearized(camera.limits(), p), p, x, y);
         if (!(x >= 0 && x < camera.width && y >= 0 && y < camera.height)) continue;
         at[0] = x;
         at[1] = y;
         break;
     }
-    Camera window = camera;
-    window.width = window.x1 = std::min(camera.width, widest_px);
-    window.height = window.y1 = std::min(camera.height, widest_px);
-    window.cx -= std::clamp(std::round(at[0] - window.width / 2), 0.0, camera.width - window.width);
-    window.cy -=
-        std::clamp(std::round(at[1] - window.height / 2), 0.0, camera.height - window.height);
-    return window;
+    const double width = std::min(camera.width, widest_px);
+    const double height = std::min(camera.height, widest_px);
+    const double left = std::clamp(std::round(at[0] - width / 2), 0.0, camera.width - width);
+    const double top = std::clamp(std::round(at[1] - height / 2), 0.0, camera.height - height);
+    return camera.cropped(left, top, width, height);
 }
 
 // The tables of a scene with a single instance of a bundle, without transformation.
@@ -211,10 +205,10 @@ double median(std::vector<double> values) {
 }
 
 Camera camera_at(const Surroundings& ball, double distance, const double outwards[3],
-                 const double right[3]) {
+                 const double right[3], const Pinhole<double>& projection) {
     double down[3];
     cross3(right, outwards, down);
-    Camera camera{};
+    Camera camera = with_projection(projection);
     for (int k = 0; k < 3; ++k) {
         camera.rotation[k] = right[k];
         camera.rotation[3 + k] = down[k];

@@ -25,9 +25,9 @@ Surroundings surroundings_of(Span<const float> means, double share);
 
 // Returns a camera that looks at the centre of the ball from `distance` radii away, in
 // direction `outwards`. `right` is the direction to the right in its picture. Both are
-// unit vectors. The caller sets the camera's size and focal length.
+// unit vectors.
 Camera camera_at(const Surroundings& ball, double distance, const double outwards[3],
-                 const double right[3]);
+                 const double right[3], const Pinhole<double>& projection);
 
 // A picture of the asset, and the window of it in which cuts are compared. For the
 // comparison, the asset is drawn with `samples` x `samples` pixels per pixel.

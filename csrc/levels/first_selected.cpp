@@ -73,14 +73,17 @@ Camera FirstSelected::camera(size_t picture) const {
     double up[3] = {0, 0, 1}, right[3];
     cross3(up, outwards, right);  // no camera is straight above
     for (double& x : right) x /= flat;
-    Camera camera = camera_at(around_, kDistance, outwards, right);
-    camera.fx = camera.fy = focal_[picture / kSides];
-    camera.width = std::floor(2 * camera.fx / std::sqrt(kDistance * kDistance - 1)) + 2 * kBorderPx;
-    camera.height = camera.x1 = camera.y1 = camera.width;
-    camera.cx = camera.width / 2 + random_uniform(0, picture, 0) - 0.5;
-    camera.cy = camera.height / 2 + random_uniform(0, picture, 1) - 0.5;
-    camera.near_depth = around_.radius;
-    return camera;
+    const double focal = focal_[picture / kSides];
+    const double size =
+        std::floor(2 * focal / std::sqrt(kDistance * kDistance - 1)) + 2 * kBorderPx;
+    return camera_at(around_, kDistance, outwards, right,
+                     {.fx = focal,
+                      .fy = focal,
+                      .cx = size / 2 + random_uniform(0, picture, 0) - 0.5,
+                      .cy = size / 2 + random_uniform(0, picture, 1) - 0.5,
+                      .width = size,
+                      .height = size,
+                      .near_depth = around_.radius});
 }
 
 void FirstSelected::add(size_t picture, Span<const float> shares, Span<const int64_t> leaf_offset) {

@@ -130,7 +130,7 @@ class Targets {
     const Canvas& picture_of(const CutWindow& window) {
         Canvas& picture = pictures_[window.plan.slot];
         if (!window.plan.is_new) return picture;
-        const Camera larger = enlarged(window.camera, window.samples);
+        const Camera larger = window.camera.scaled(window.samples);
         const Draw<float> whole{.model = target_.model,
                                 .first = 0,
                                 .count = count_,

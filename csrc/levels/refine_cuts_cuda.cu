@@ -199,7 +199,7 @@ class TargetPainter {
     // `picture`, and belongs to the stream.
     ReadPlanes draw(const ClusterTable& table, const AssetView& view, WindowTables& windows,
                     DeviceBuffer<float>& picture) {
-        const Camera camera = enlarged(view.window, view.samples);
+        const Camera camera = view.window.scaled(view.samples);
         const PicturePlanes larger = planes_in(larger_, num_pixels(camera));
         windows.count = 0;
         add_window(table, camera, SelectRule{}, larger, windows);

@@ -12,14 +12,6 @@
 
 namespace v3dg {
 
-// Returns the camera with `factor` times the resolution.
-V3DG_HD inline Camera enlarged(Camera camera, int factor) {
-    for (double* px : {&camera.fx, &camera.fy, &camera.cx, &camera.cy, &camera.width,
-                       &camera.height, &camera.x0, &camera.y0, &camera.x1, &camera.y1})
-        *px *= factor;
-    return camera;
-}
-
 // Returns the number of pixels of a camera's picture.
 inline size_t num_pixels(const Camera& camera) {
     return static_cast<size_t>(camera.width) * static_cast<size_t>(camera.height);
