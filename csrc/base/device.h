@@ -94,7 +94,7 @@ class StreamMutex {
 
 // Holds a StreamMutex. No other thread can hold it meanwhile. Work that this thread
 // enqueues on `stream` runs after the work that was enqueued under the previous lock.
-// Captured work is not ordered; the code that replays the graph must do that.
+// Captured work is not ordered; the code that replays the graph must order it.
 class V3DG_SCOPED_CAPABILITY StreamLock {
   public:
     StreamLock(StreamMutex& mutex, cudaStream_t stream) V3DG_ACQUIRE(mutex.busy_);

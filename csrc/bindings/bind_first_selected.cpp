@@ -114,8 +114,8 @@ py::list grown_balls(const py::list& balls, const py::array& growth) {
         } else {
             if (here.size == 0 || below.size() % here.size != 0)
                 throw py::value_error(
-                    "balls: expected a number that divides the number of the level below, got " +
-                    std::to_string(here.size) + " over " + std::to_string(below.size()));
+                    "balls: expected a count that divides the count of the level below, got " +
+                    std::to_string(here.size) + " and " + std::to_string(below.size()));
             std::vector<int64_t> offset;
             for (size_t g = 0; g <= here.size; ++g)
                 offset.push_back(static_cast<int64_t>(g * (below.size() / here.size)));

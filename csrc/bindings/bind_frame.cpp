@@ -74,7 +74,8 @@ struct BoundRequest {
     py::object cluster_colors;  // see BoundLook; null if there is none
 
     // `camera` is a Camera or an Eyes. A test in the constructor is faster than
-    // overloads or implicit conversions, which would take most of its time.
+    // overloads or implicit conversions, which would take most of the constructor's
+    // time.
     BoundRequest(const py::object& camera, const SelectRule* rule, const Shade* shade,
                  const BoundGivenCut* given, const BoundLook* look)
         : plain{.eyes = eyes_of(camera),
@@ -100,7 +101,9 @@ struct BoundRequest {
         const py::list arrays(cluster_colors);
         for (size_t b = 0; b < scene.tables.size(); ++b) {
             if (b >= arrays.size())
-                throw py::value_error("colors: expected none, or one array for each bundle");
+                throw py::value_error("colors: expected none, or one array for each of " +
+                                      std::to_string(scene.tables.size()) + " bundles, got " +
+                                      std::to_string(arrays.size()));
             const auto clusters = static_cast<py::ssize_t>(scene.tables[b].num_clusters());
             const auto colors = arrays[b].cast<py::array>();
             request.cluster_colors.push_back(
@@ -123,7 +126,9 @@ class BoundSceneFrame {
     // their clusters.
     void set_models(const py::list& models, const py::list& palettes) {
         if (!palettes.empty() && palettes.size() != models.size())
-            throw py::value_error("palettes: expected none, or one for each model");
+            throw py::value_error("palettes: expected none, or one for each of " +
+                                  std::to_string(models.size()) + " models, got " +
+                                  std::to_string(palettes.size()));
         std::vector<std::shared_ptr<const backend::Model>> model_handles;
         std::vector<std::shared_ptr<const backend::Palette>> palette_handles;
         std::vector<size_t> num_gaussians;

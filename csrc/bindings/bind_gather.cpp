@@ -23,8 +23,10 @@ void check_clusters(const GatherInput& in) {
         const auto rows = static_cast<int64_t>(in.bundles[in.bundle[i]].size);
         const int64_t size = in.offset[s + 1] - in.offset[s];
         if (size < 0 || in.first_row[s] < 0 || in.first_row[s] > rows - size)
-            throw py::value_error("first_row, offset: expected rows of the bundle, cluster " +
-                                  std::to_string(s) + " has others");
+            throw py::value_error(
+                "first_row, offset: expected rows of the bundle, got other rows for "
+                "cluster " +
+                std::to_string(s));
     }
 }
 

@@ -19,7 +19,8 @@ std::string printable(std::string name) {
     return name;
 }
 
-// The name of a file: encoded for the system, and as messages show it.
+// The name of a file: in the encoding of the system, and in the form that messages
+// show.
 struct Path {
     explicit Path(py::object path) : shown(path) {
         PyObject* bytes = nullptr;

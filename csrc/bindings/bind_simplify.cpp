@@ -25,8 +25,8 @@ struct Segments {
         if (in.size == 0 || in[0] != 0 || in[in.size - 1] != static_cast<int64_t>(num_rows) ||
             out[0] != 0)
             throw py::value_error(
-                "in_offset, out_offset: expected segments from 0, and in_offset up to the "
-                "number of gaussians");
+                "in_offset, out_offset: expected segments from 0, and in_offset up to " +
+                std::to_string(num_rows) + ", the number of gaussians, got other numbers");
         for (size_t g = 0; g + 1 < in.size; ++g) {
             const int64_t num_in = in[g + 1] - in[g];
             const int64_t num_out = out[g + 1] - out[g];

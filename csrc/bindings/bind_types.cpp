@@ -185,7 +185,7 @@ Span<const int64_t> offsets_of(const py::handle& offset, size_t last) {
     for (size_t i = 1; good && i < values.size; ++i) good = values[i - 1] <= values[i];
     if (!good)
         throw py::value_error("offset: expected ascending boundaries from 0 to " +
-                              std::to_string(last) + ", got others");
+                              std::to_string(last) + ", got other numbers");
     return values;
 }
 

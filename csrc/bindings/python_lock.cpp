@@ -13,8 +13,8 @@ namespace {
 namespace py = pybind11;
 
 // Serialises the registration of threads with Python. Registration uses state that the
-// interpreter destroys when it ends. `is_closed` becomes true before that, and ends
-// registration.
+// interpreter destroys when it ends. `is_closed` becomes true before the interpreter
+// destroys that state, and ends registration.
 struct Entrance {
     std::mutex busy;
     bool is_closed = false;

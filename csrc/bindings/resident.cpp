@@ -30,9 +30,9 @@ py::tuple BoundModel::decode(const py::array& cluster_ids) const {
     std::vector<int64_t> offset{0};
     for (const int32_t c : cluster) {
         if (c < 0 || static_cast<size_t>(c) >= num_gaussians_.size())
-            throw std::out_of_range("cluster_ids: expected ids from 0 to below " +
-                                    std::to_string(num_gaussians_.size()) +
-                                    " and none negative, got " + std::to_string(c));
+            throw std::out_of_range("cluster_ids: expected ids of at least 0 and below " +
+                                    std::to_string(num_gaussians_.size()) + ", got " +
+                                    std::to_string(c));
         offset.push_back(offset.back() + num_gaussians_[c]);
     }
     const Work work(device_);

@@ -1,7 +1,7 @@
 #pragma once
 
 // The box of one gaussian, for the CPU and CUDA. It is compiled without floating-point
-// contraction, so that both compute the same bits.
+// contraction, so that the CPU and CUDA compute the same bits.
 
 #include <cmath>
 

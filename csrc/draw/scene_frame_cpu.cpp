@@ -197,7 +197,7 @@ std::vector<float> tint_of(const HostScene& scene, const FrameRequest& request,
         const ClusterTable& table = scene.tables[scene.instances.bundle[given.instance[s]]];
         const bool is_finest = level_of(table, given.cluster[s]) <= rule.min_level;
         const float grey = std::min(share[s], cpu::kMostShare);
-        // 1.0001: a margin for the rounding of metrics.
+        // 1.0001 is a margin for the rounding of metrics.
         const Rgb rgb =
             is_metric ? Rgb{grey, grey, grey}
                       : missing_color(is_finest ? 0.0f : share[s], 1.0001f * rule.fade.factor);

@@ -71,7 +71,7 @@ Camera FirstSelected::camera(size_t picture) const {
     const double flat = std::sqrt(1 - z * z);
     const double outwards[3] = {flat * std::cos(angle), flat * std::sin(angle), z};
     double up[3] = {0, 0, 1}, right[3];
-    cross3(up, outwards, right);  // no camera is straight above
+    cross3(up, outwards, right);  // not parallel: no camera is straight above
     for (double& x : right) x /= flat;
     const double focal = focal_[picture / kSides];
     const double size =

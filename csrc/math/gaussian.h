@@ -12,7 +12,7 @@
 namespace v3dg {
 
 constexpr double kMinAlpha = 1.0 / 255;  // smaller alphas are not blended
-constexpr double kMaxAlpha = 0.999;      // alpha is clamped to this
+constexpr double kMaxAlpha = 0.999;      // larger alphas are clamped to this value
 // gsplat's stop rule keeps the transmittance of a pixel above this value.
 constexpr double kMinTransmittance = 1e-4;
 constexpr double kLog2MinAlpha = -7.994353436858858;

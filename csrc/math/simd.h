@@ -106,7 +106,7 @@ V3DG_INLINE unsigned sign_bits_of(V x) {
 // undefined for other x. The integer part of x becomes the exponent. A minimax
 // polynomial on [-1/2, 1/2] computes the rest.
 V3DG_INLINE Vec<float> exp2_in_range(Vec<float> x) {
-    // 1.5 * 2^23: adding it rounds to an integer.
+    // Adding 1.5 * 2^23 rounds to an integer.
     const Vec<float> magic = Vec<float>{} + 12582912.0f;
     const Vec<float> shifted = x + magic;
     const Vec<float> f = x - (shifted - magic);

@@ -189,7 +189,7 @@ V3DG_HD V3DG_INLINE Gaussian3d<V> project_gaussian_vjp(const Gaussian3d<V>& g,
     V d_det = -d_l11 * e.l11 / (2 * s.det);
     V d_det0 = V{};
     Gaussian3d<V> out;
-    // log2_opacity = log2(opacity) + log2(det0 / det) / 2; the last term if
+    // log2_opacity = log2(opacity) + log2(det0 / det) / 2. The last term exists only if
     // antialiased.
     out.opacity = d.log2_opacity / (T(kLn2) * g.opacity);
     if (antialiased) {

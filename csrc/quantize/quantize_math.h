@@ -71,7 +71,7 @@ V3DG_HD constexpr size_t page_bytes(size_t num_gaussians, size_t num_clusters, i
 // Converts a finite half to a float.
 V3DG_HD inline float float_of_half(uint32_t half) {
     const uint32_t exponent = half >> 10 & 31, fraction = half & 1023;
-    // 2^-24
+    // A denormal half is `fraction` * 2^-24.
     const float size = exponent == 0 ? static_cast<float>(fraction) * 5.9604645e-8f
                                      : float_of_bits((exponent + 112) << 23 | fraction << 13);
     return half & 0x8000 ? -size : size;

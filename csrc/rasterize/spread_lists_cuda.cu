@@ -375,8 +375,9 @@ uint32_t most_held() {
 }  // namespace
 
 uint32_t most_plans(uint32_t num_tiles, uint32_t num_places) {
-    // A tile is divided in two from one share of the load on, and in four from two
-    // shares on. There are num_places shares, which bounds the number of plans.
+    // A tile with at least one share of the load is divided in two, and a tile with at
+    // least two shares in four. There are num_places shares, which bounds the number of
+    // plans.
     return num_tiles + (kMostParts - 1) * num_places / 2 + 1;
 }
 

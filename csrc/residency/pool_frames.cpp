@@ -170,7 +170,7 @@ NotedView PoolFrames::note_needs(PoolShared& shared, FrameNeeds* needs, bool wai
     return noted;
 }
 
-// Returns how many pages the cut missed, by the tables of the current frame.
+// Returns how many pages the cut missed, according to the tables of the frame.
 size_t PoolFrames::count_absent(const FrameNeeds& needs) const {
     size_t count = needs.num_left_out;
     for (size_t k = 0; k < needs.count; ++k) {

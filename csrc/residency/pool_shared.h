@@ -64,7 +64,7 @@ struct PoolShared {
     // `free_needs`.
     FrameNeeds* noted V3DG_GUARDED_BY(busy) = nullptr;  // not decided about yet
     std::vector<FrameNeeds*> free_needs V3DG_GUARDED_BY(busy);
-    // The last view that was decided about.
+    // The last view that the decider has processed.
     uint64_t decided_view V3DG_GUARDED_BY(busy) = 0;
     // Whether a view was noted since a frame last took `ready`.
     bool has_noted V3DG_GUARDED_BY(busy) = false;

@@ -1,7 +1,7 @@
 #pragma once
 
 // The output lists of a cut: pairs, or the items of a frame. A lane counts its elements
-// first. It writes them after a prefix sum over all lanes has given their position.
+// first. A prefix sum over all lanes then gives the position at which it writes them.
 
 #include "select/cut_parts.cuh"
 

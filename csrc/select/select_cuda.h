@@ -30,7 +30,7 @@ struct NeedList {
     size_t num_words = 0;
     uint32_t* const* need = nullptr;  // per bundle: its elements in `words`
     PageRequest* list = nullptr;
-    unsigned capacity = 0;  // of `list` and `reported`
+    unsigned capacity = 0;  // largest length of `list` and of `reported`
     NeedsReport* report = nullptr;
     PageRequest* reported = nullptr;
 };

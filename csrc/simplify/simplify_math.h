@@ -36,8 +36,8 @@ V3DG_HD inline int octant_of(const float mean[3], const float median[3]) {
     return 4 * (mean[0] >= median[0]) + 2 * (mean[1] >= median[1]) + (mean[2] >= median[2]);
 }
 
-// Returns the rank of the median of `count` values; of two in the middle, the lower
-// one.
+// Returns the rank of the median of `count` values. If two values are in the middle,
+// the lower rank is returned.
 V3DG_HD inline int64_t median_rank(int64_t count) { return (count - 1) / 2; }
 
 // Returns how many gaussians of an octant are kept, if a group of `count` keeps

@@ -37,7 +37,7 @@ def test_environment_chooses_the_isa_or_says_why_not(isa):
     else:
         assert result.returncode != 0
         assert (
-            f"V3DG_ISA: this processor does not support {isa}, its widest is {widest}"
+            f"V3DG_ISA: this processor does not support {isa}; use at most {widest}"
             in result.stderr
         )
 
