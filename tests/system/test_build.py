@@ -553,7 +553,7 @@ def test_gaussians_that_no_pixel_can_show_are_left_out_silently(asset, device):
 def test_asset_with_nothing_left_is_refused(asset, device):
     hidden = scenes.replaced(asset, opacities=np.full(1200, 0.001, np.float32))
     with pytest.raises(
-        ValueError, match=r"asset: expected a gaussian that can be drawn, got none: 1,200 of"
+        ValueError, match=r"asset: expected at least one gaussian that can be drawn, but 1,200 of"
     ):
         build(hidden, device=device)
 
@@ -586,7 +586,7 @@ def test_unknown_choice_for_unusable_gaussians_is_refused(asset):
         ({"image_size": 2**31}, "image_size: expected 0 to 8,192, got 2147483648"),
         (
             {"image_size": 8000},
-            "image_size: expected views of at most 8192 px a side with `supersample`",
+            "image_size: expected views of at most 8192 px a side after multiplication",
         ),
         ({"image_size": 2000, "num_views": 64}, "image_size: expected views of at most 8192 px"),
         ({"min_gaussians": 0}, "min_gaussians: expected 1 to 4,611,686,018,427,387,904, got 0"),

@@ -121,10 +121,12 @@ def test_a_bundle_whose_asset_is_empty_stays_as_it_is(device):
 
 
 def test_wrong_arguments_are_told(bundle):
-    with pytest.raises(ValueError, match="steps: expected 1 step or more, got 0"):
+    with pytest.raises(ValueError, match="steps: expected at least 1 step, got 0"):
         refine_bundle(bundle, steps=0)
     for share in (-0.1, 0.6, np.nan, "some"):
-        with pytest.raises(ValueError, match=f"drop: expected a share of 0 to 0.5, got '?{share}"):
+        with pytest.raises(
+            ValueError, match=f"drop: expected a share from 0 to 0.5, got '?{share}"
+        ):
             refine_bundle(bundle, drop=share)
     with pytest.raises(TypeError, match="bundle: expected a Bundle, got Gaussians"):
         refine_bundle(make_donut(1000))
