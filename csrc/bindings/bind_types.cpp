@@ -161,7 +161,8 @@ Instances::Instances(py::array bundle, py::array positions, py::array quaternion
 }
 
 Span<const InstanceFactors> factors_of(const py::object& factors, py::ssize_t count) {
-    static_assert(sizeof(InstanceFactors) == 4 * sizeof(float), "a row of four numbers");
+    static_assert(sizeof(InstanceFactors) == 4 * sizeof(float),
+                  "InstanceFactors must have the layout of a row of four floats");
     if (factors.is_none()) return {};
     const Span<const float> rows = span_of<const float>(factors, "factors", {count, 4});
     return {reinterpret_cast<const InstanceFactors*>(rows.data), static_cast<size_t>(count)};

@@ -118,7 +118,8 @@ struct Camera : CameraPose, Intrinsics<double>, ImagePart {
         return camera;
     }
 };
-static_assert(sizeof(Camera) == 26 * sizeof(double), "nothing but its numbers is compared");
+static_assert(sizeof(Camera) == 26 * sizeof(double),
+              "operator== compares all bytes, so Camera must have no padding");
 
 // Returns a camera with the given projection, whose whole image is requested. The
 // caller sets the pose.

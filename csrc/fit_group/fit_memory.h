@@ -18,7 +18,7 @@ constexpr int kViewsAtOnce = 2;
 constexpr int kCell = 4, kCellPixels = kCell * kCell;
 constexpr int kRegion = 32, kRegionCells = kRegion / kCell;
 static_assert(kRegionCells * kRegionCells == 64 && kCellPixels == 16,
-              "a mask is a word, a cell half a warp");
+              "a CellMask has 64 bits, and a half-warp has 16 lanes");
 using CellMask = unsigned long long;
 constexpr int kAtOnce = 4;  // gaussians that a half-warp blends together
 constexpr int kSums = 9;    // values per slot: FalloffSums and colour
@@ -142,7 +142,7 @@ FitLayout layout_of(const FitSizes& sizes) {
         l.sort_keys = over_fragments(size * sizeof(unsigned long long));
     }
     static_assert(kSumStride * kFloat == sizeof(Record<float>),
-                  "sums take the place of the records");
+                  "sums overwrite the records, so they must have the same size");
     l.sums = {l.records, kSmall};
     l.value = arena.anywhere(values * kFloat);
     l.m = arena.anywhere(values * kFloat);

@@ -98,7 +98,8 @@ V3DG_HD inline uint32_t key_order(TileEntry e) {
 V3DG_HD inline uint32_t blocks_of(TileEntry e) {
     // The entry stores the first block, and the number of columns and of rows that the
     // box lacks to fill the tile.
-    static_assert(kTileBlockColumns == 8 && kTileBlockRows == 4, "a row of blocks is a byte");
+    static_assert(kTileBlockColumns == 8 && kTileBlockRows == 4,
+                  "each row of blocks must fill one byte of the mask");
     const uint32_t box = static_cast<uint32_t>(e.key), fewer = box >> 5;
     return (0xffu >> (fewer & 7)) * (0x01010101u >> (fewer & 24)) << (box & 31);
 }

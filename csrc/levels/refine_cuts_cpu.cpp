@@ -18,7 +18,8 @@ namespace v3dg {
 namespace {
 
 constexpr size_t kGaussiansAtOnce = 256, kWindowsAtOnce = 32;
-static_assert(kWindowsAtOnce <= kViewSlots, "windows that are made together have own slots");
+static_assert(kWindowsAtOnce <= kViewSlots,
+              "windows that are planned together must use different slots");
 
 // The memory of one picture: colour and alpha.
 class Canvas {

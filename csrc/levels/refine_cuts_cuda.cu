@@ -26,7 +26,8 @@ namespace {
 // The number of steps that each thread plans ahead.
 constexpr unsigned kStepsAhead = 3;
 // A slot's target may be overwritten while the preceding steps are drawn.
-static_assert(kViewSlots >= (kStepsAhead + 1) * kMostWindows, "no step that is drawn reads it");
+static_assert(kViewSlots >= (kStepsAhead + 1) * kMostWindows,
+              "no step that is being drawn may read it");
 constexpr unsigned kMostPlanners = 4;
 
 // Returns the number of threads that plan steps. The number must satisfy two

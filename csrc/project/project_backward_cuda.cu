@@ -21,7 +21,7 @@ constexpr int kWordsAtOnce = 6;
 
 template <class Value>
 __device__ void add_slot(const Value* of_slot, uint32_t i, Value& sum) {
-    static_assert(sizeof sum % sizeof(float2) == 0, "loaded as pairs");
+    static_assert(sizeof sum % sizeof(float2) == 0, "values are loaded as pairs of floats");
     Value slot;
     for (size_t k = 0; k < sizeof sum / sizeof(float2); ++k)
         reinterpret_cast<float2*>(&slot)[k] = reinterpret_cast<const float2*>(of_slot + i)[k];

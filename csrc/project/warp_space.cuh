@@ -40,7 +40,8 @@ struct WarpSpace {
 // Copies a table to shared memory with a warp: lane i copies the i-th 32-bit word.
 template <class T>
 __device__ uint32_t load_word(const T& from) {
-    static_assert(sizeof(T) <= 32 * sizeof(uint32_t), "a warp copies a table");
+    static_assert(sizeof(T) <= 32 * sizeof(uint32_t),
+                  "each lane copies at most one 32-bit word of a table");
     const unsigned lane = threadIdx.x % 32;
     return lane < sizeof(T) / sizeof(uint32_t)
                ? __ldg(reinterpret_cast<const uint32_t*>(&from) + lane)

@@ -39,7 +39,7 @@ struct ClusterCode {
     uint16_t color_step[3];             // halves, in units of kStepUnit
     uint16_t scale_first, scale_step;
 };
-static_assert(sizeof(ClusterCode) == 40, "a format of files");
+static_assert(sizeof(ClusterCode) == 40, "the file format fixes the size of ClusterCode");
 
 // Returns the bytes of a cluster's ranges: a ClusterCode, then three halves per SH band
 // above degree 0.
@@ -89,7 +89,8 @@ struct alignas(16) ClusterRanges {
     float sh_step[9];               // [band][channel]
 };
 V3DG_HD constexpr uint32_t range_bytes(int sh_degree) { return 64 + (3 * sh_degree + 3) / 4 * 16; }
-static_assert(range_bytes(3) == sizeof(ClusterRanges), "all of it");
+static_assert(range_bytes(3) == sizeof(ClusterRanges),
+              "the largest degree must use the whole struct");
 
 // The gaussians of a bundle as codes, on the host or on a device. Row r of cluster c
 // has four words of `records`, from index 4 (record_base + r) on. It has two words per

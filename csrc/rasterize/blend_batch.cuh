@@ -20,7 +20,7 @@ namespace v3dg {
 namespace cuda {
 
 static_assert(SubTile<2>::kColumns == 2 && SubTile<2>::kHeight == 4 && kEntryBlockSize == 4,
-              "place_of(), subs_of(), publish_alive() and reached_cells() know this");
+              "place_of(), subs_of(), publish_alive() and reached_cells() require it");
 
 // The pixels that a lane blends.
 template <int kPixels>

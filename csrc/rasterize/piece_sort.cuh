@@ -40,7 +40,7 @@ struct SubTile {
 };
 constexpr int kFrameTilePixels = kFrameTileWidth * kFrameTileHeight;
 
-static_assert(2 * kFewEntries <= kBlendThreads, "two threads rank an entry");
+static_assert(2 * kFewEntries <= kBlendThreads, "two threads compute the rank of each entry");
 
 // A part of the list that is in bucket order, and ends before `end`. It is in
 // lists.entries or in scratch memory.
@@ -101,8 +101,8 @@ struct BlendShared {
     alignas(float2) float depth[kFrameTilePixels];
 };
 static_assert(sizeof(BlendShared) < 1 << 15,
-              "`list` has 16 bits; a block's memory begins within the lower half");
-static_assert(kBlendBatch % 32 == 0, "a warp takes 32 records");
+              "addresses in `list` have 16 bits, and BlendShared begins below 32 KiB");
+static_assert(kBlendBatch % 32 == 0, "a warp processes 32 records at once");
 
 // Returns the end of the bucket that contains entry `first`. The entries up to `last`
 // must be in bucket order.

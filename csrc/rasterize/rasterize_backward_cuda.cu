@@ -32,7 +32,7 @@ template <bool kWithSize>
 constexpr int kValuesOf = kGradientValues + (kWithSize ? kSizeValues : 0);
 static_assert(kHeld * kWarpHeight == 32 && kWarpHeight == 4, "a lane sums one row of one gaussian");
 constexpr int kTogether = 2;  // gaussians that are blended without a branch in between
-static_assert(kPairs >= kWarps, "one entry fits");
+static_assert(kPairs >= kWarps, "a batch must have room for all pairs of an entry");
 static_assert(kBatch <= 255 && kBatch % 32 == 0 && kHeld % kTogether == 0, "");
 
 // One pixel's contribution to the gradient of a gaussian.
@@ -71,7 +71,8 @@ struct Shared {
     float d_background[kWarps][3];
 };
 
-static_assert(sizeof(Shared<true>) <= 99 * 1024, "the most that a block can have on every device");
+static_assert(sizeof(Shared<true>) <= 99 * 1024,
+              "some devices have 99 KiB of shared memory per block");
 
 // Returns the warps whose pixels the record may reach, one bit per warp. Nothing is
 // rounded to pixel centres. A tile marks the gradient slots of all records that it

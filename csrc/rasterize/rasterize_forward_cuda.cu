@@ -26,7 +26,7 @@ constexpr int kBlocks = 8;
 constexpr int kBlocksForPairs = 5;
 
 static_assert(kBlocks * (offsetof(BlendShared, depth) + 1024) <= 228 << 10,
-              "the driver keeps 1024 of each");
+              "the driver reserves 1024 bytes of shared memory per block");
 
 // Returns a mask of the blocks in a part of a tile: all of it, a half or a quarter.
 __device__ uint32_t blocks_of_part(int part, int log2_parts) {

@@ -30,7 +30,7 @@ struct BatchRecord {
     V3DG_INLINE void take(const Record<T>& g, int left, int top) {
         static_assert(
             sizeof *this <= sizeof g && offsetof(Record<T>, depth) == offsetof(BatchRecord, depth),
-            "the first part of a record");
+            "BatchRecord must have the layout of the first part of a Record");
         std::memcpy(static_cast<void*>(this), &g, sizeof *this);
         u = g.u - T(left);
         v = g.v - T(top);

@@ -21,7 +21,7 @@ constexpr int kSpreadThreads = 1024;
 constexpr int kMostParts = 4;  // most parts of a tile
 
 static_assert(kPiece % (3 * kMostParts) == 0 && (kPiece / 3 & (kPiece / 3 - 1)) == 0,
-              "kPiece and kPiece / kMostParts begin classes of plan_kernel");
+              "kPiece and kPiece / kMostParts must be the lowest loads of classes");
 
 __device__ uint32_t count_of(const FrameLists& lists, uint32_t tile) {
     return static_cast<uint32_t>(lists.tile_first[tile + 1] - lists.tile_first[tile]);
@@ -85,7 +85,7 @@ __global__ void __launch_bounds__(kPlanThreads)
 __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, uint32_t num_places) {
     await_kernel_before();
     __shared__ uint32_t place[kPlanClasses], in_block[kPlanClasses], num_planned;
-    static_assert(kPlanClasses == 64, "a lane has two");
+    static_assert(kPlanClasses == 64, "each lane of a warp processes two classes");
     if (!lists.capacity.holds(*lists.counters)) return;
     const PlanRules rules(lists, num_places);
     const uint32_t tile = blockIdx.x * kPlanThreads + threadIdx.x;
@@ -150,7 +150,8 @@ __device__ uint32_t num_window_ends(uint32_t count) {
 // Returns the number of entries that a list needs if it is spread into windows: the
 // list, followed by the ends of its windows.
 __device__ uint32_t room_in_windows(uint32_t count) {
-    static_assert(sizeof(TileEntry) == 2 * sizeof(uint32_t), "two ends in the place of an entry");
+    static_assert(sizeof(TileEntry) == 2 * sizeof(uint32_t),
+                  "two ends of windows occupy the memory of an entry");
     return count + num_window_ends(count) / 2 + 1;
 }
 
@@ -295,7 +296,7 @@ __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t 
 __device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t count,
                             uint32_t most_held, SpreadSpace& space) {
     static_assert(offsetof(SpreadSpace, finer) % sizeof(TileEntry) == 0,
-                  "entries lie where `finer` does");
+                  "entries share the memory of `finer`, so it must be aligned for them");
     SpreadShared<kLog2Spread>& s = space.even;
     auto* held = reinterpret_cast<TileEntry*>(&space.finer);
     if (count <= kPiece || plan.part != 0) return;

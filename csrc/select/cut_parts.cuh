@@ -15,7 +15,7 @@ using Count = unsigned long long;
 constexpr unsigned kLaneClusters = kClustersOfBounds;
 constexpr unsigned kPartSize = 32 * kLaneClusters;
 constexpr unsigned kCutThreads = 256, kCutWarps = kCutThreads / 32;
-static_assert(kLaneClusters == 8, "a byte says which of them are drawn");
+static_assert(kLaneClusters == 8, "a byte has one bit per cluster of a lane");
 
 // The work of one warp. If `lanes` is 0, the part is clusters [first, first +
 // kPartSize) of one instance. Otherwise each set bit k of `lanes` means that lane k
@@ -83,7 +83,7 @@ struct alignas(16) LaneWeights {
         return static_cast<int32_t>((k < 4 ? low : high) >> 16 * (k % 4) & 0xffff);
     }
 };
-static_assert(kLaneClusters == 8 && kWhole < 1 << 16, "two words hold the weights of a lane");
+static_assert(kLaneClusters == 8 && kWhole < 1 << 16, "LaneWeights holds eight weights of 16 bits");
 
 // The clusters of a part that one lane processes. All belong to one instance. Bit k of
 // `drawn` is set if the k-th cluster is drawn. Weights are set only in cuts with a
@@ -154,7 +154,7 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
     __shared__ uint8_t owners[kCutThreads];  // indices of threads that own clusters
     __shared__ uint8_t drawn[kCutThreads];   // [thread] one bit per drawn cluster
     __shared__ LaneWeights weights[kKeepsWeights ? kCutThreads : 1];
-    static_assert(kCutThreads <= 256, "a byte says which thread");
+    static_assert(kCutThreads <= 256, "`owners` stores the index of a thread in a byte");
     const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
     bool is_owner = false;
     // The condition is equal in all lanes of the warp.

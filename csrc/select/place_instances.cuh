@@ -48,7 +48,7 @@ struct RecordRow {
     __device__ void write(bool has_one, Record* first) const {
         constexpr unsigned kVectors = sizeof(Record) / sizeof(uint4);
         static_assert(sizeof(Record) % sizeof(uint4) == 0 && alignof(Record) % sizeof(uint4) == 0,
-                      "records are whole vectors");
+                      "records are copied as vectors of 16 bytes");
         const unsigned writers = __ballot_sync(kAllLanes, has_one);
         __syncwarp();
         if (writers == 0) return;
@@ -76,7 +76,8 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
                                         const BundleSides& sides, const SelectRule& rule,
                                         Placement* placements) {
     __shared__ InstanceView space[kPlaceThreads];
-    static_assert(sizeof(Placement) <= sizeof(InstanceView), "rows of both use the same memory");
+    static_assert(sizeof(Placement) <= sizeof(InstanceView),
+                  "placements are stored in the memory of views");
     InstanceView* of_warp = space + threadIdx.x / 32 * 32;
     const RecordRow<Placement> placement_row{reinterpret_cast<Placement*>(of_warp)};
     const RecordRow<InstanceView> view_row{of_warp};

@@ -240,7 +240,8 @@ struct WaitingPlaces {
     FewTiles few[kMost];
     uint32_t record[kMost];  // the upper bits contain the number of the tile
 };
-static_assert(kFewTiles <= 1u << (32 - kMostRecordBits), "a tile fits above a record");
+static_assert(kFewTiles <= 1u << (32 - kMostRecordBits),
+              "the number of a tile is stored in the bits above the record");
 
 // Writes one entry per record of `places`. All lanes of the warp must call it.
 __device__ void scatter_few(const Scatter& to, const ItemTiles& item,
@@ -258,7 +259,7 @@ __device__ void scatter_few(const Scatter& to, const ItemTiles& item,
                       ? kNoTile
                       : item.first_tile + tile_of(few) + row[j] * item.columns + column[j];
     }
-    static_assert(kAtOnce == 2, "`found` has two");
+    static_assert(kAtOnce == 2, "`found` is initialised with two elements");
     const Places found[kAtOnce] = {{to, tile[0]}, {to, tile[1]}};
 #pragma unroll
     for (unsigned j = 0; j < kAtOnce; ++j) {
