@@ -137,7 +137,8 @@ void bind_first_selected(py::module_& m) {
           "Returns the factors by which the balls of level 1 must grow. Then its groups are "
           "selected only where they look as good as their leaves at one sample per pixel.");
     m.def("grown_balls", &grown_balls, "balls"_a, "growth"_a,
-          "Returns the balls of all levels after those of level 1 have grown by these factors.");
+          "Multiplies the radii of the balls of level 1 by the factors, and enlarges the balls of "
+          "higher levels to contain them. Returns the balls of all levels.");
 }
 
 }  // namespace v3dg

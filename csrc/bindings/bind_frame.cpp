@@ -353,8 +353,8 @@ void bind_frame(py::module_& m) {
              "steps"_a = nullptr, "stop"_a = nullptr)
         .def("pick", &BoundSceneFrame::pick, "scene"_a, "request"_a, "pool"_a = py::none())
         .def("memory", &BoundSceneFrame::memory,
-             "Returns the bytes of the frame on a CUDA device, by part, and those of the memory "
-             "pool that all frames on the device share.");
+             "Returns the bytes of the frame on a CUDA device, by part, and the bytes of the "
+             "memory pool that all frames on the device share.");
     py::class_<BoundAssetFrame>(m, "AssetFrame", "Draws gaussians without levels on their device.")
         .def(py::init<py::object, float, bool>(), "model"_a, py::kw_only(), "filter_px2"_a = 0.0f,
              "antialiased"_a = false)

@@ -214,9 +214,9 @@ void bind_pages(py::module_& m) {
         .def(py::init<>())
         .def("read", &BoundReader::read, "path"_a, "descriptor"_a, "before"_a, "offset"_a,
              "num_bytes"_a, "in_pieces"_a,
-             "Starts to read bytes of a file that end with a BLAKE2b-128 hash: the hash of "
-             "`before` and the bytes, or of the hashes of their pieces. The bytes are aligned to"
-             " 8 if the size of `before` is a multiple of 8.");
+             "Starts to read bytes of a file that end with a BLAKE2b-128 hash. The hash is of "
+             "`before` followed by the bytes, or of the hashes of their pieces. The bytes are "
+             "aligned to 8 if the size of `before` is a multiple of 8.");
     m.def("blake2b", &hash_messages, "messages"_a,
           "Returns the BLAKE2b-128 hashes of several messages, computed in parallel.");
     m.attr("DAMAGED") = kDamaged;

@@ -72,8 +72,8 @@ void bind_quantize(py::module_& m) {
           "Returns the bytes per gaussian and per cluster in a coded page, and the alignment of "
           "pages.");
     m.def("encode_page", &encode_rows, "gaussians"_a, "offset"_a,
-          "Encodes the gaussians of a page: those from offset[0] to offset[K]. Cluster k begins "
-          "at offset[k]. Returns the page as (W,) int32.");
+          "Encodes gaussians offset[0] to offset[K] as a page. Cluster k begins at offset[k]. "
+          "Returns the page as (W,) int32.");
     m.def("decode_page", &decode_rows, "page"_a, "offset"_a, "out"_a,
           "Decodes the gaussians of a coded page to the rows from offset[0] on.");
     m.def("codebook_of", &codebook_of, "values"_a,

@@ -213,8 +213,7 @@ py::object sh_bases_of(int degree, const py::array& directions) {
 void bind_types(py::module_& m) {
     m.def("sh_bases", &sh_bases_of, "degree"_a, "directions"_a,
           "Returns the bases of spherical harmonics in unit directions: (D, (degree + 1)^2).");
-    py::class_<BoundCamera>(
-        m, "Camera", "A pinhole camera, or a window of its image; the input of every operation.")
+    py::class_<BoundCamera>(m, "Camera", "A pinhole camera, or a window of its image.")
         .def(py::init(&make_camera), py::kw_only(), "viewmat"_a, "K"_a, "width"_a, "height"_a,
              "near"_a)
         .def("window", &window_of_camera, "x0"_a, "y0"_a, "x1"_a, "y1"_a,
