@@ -841,7 +841,7 @@ def test_values_that_have_no_code_are_refused():
     bundle = random_bundle(3)
     bundle.gaussians.scales[4, 1] = np.inf
     with pytest.raises(
-        ValueError, match="gaussians: expected finite values, got infinite or NaN ones at 4"
+        ValueError, match="gaussians: expected finite values, got infinite or NaN ones in row 4"
     ):
         Bundle(bundle.clusters, bundle.groups, bundle.gaussians, codec="quantized")
 
@@ -1034,7 +1034,9 @@ def test_a_ball_that_barely_sticks_out_is_refused():
         1 + 4e-6
     )
     ball[above, 3] = np.float32(needed * (1 - 1e-6))
-    with pytest.raises(ValueError, match=r"groups.ball\[0\]: expected a ball inside that of group"):
+    with pytest.raises(
+        ValueError, match=r"groups.ball\[0\]: expected a ball inside the ball of group"
+    ):
         Bundle(bundle.clusters, dataclasses.replace(bundle.groups, ball=ball), bundle.gaussians)
 
 
