@@ -163,6 +163,34 @@ class BoundSceneFrame {
         return drawing;
     }
 
+    // Draws a picture for each camera with the gaussians that were set. The planes are
+    // written: colour (B, H, W, 3 or 4), alpha (B, H, W) or None, depth (B, H, W) or
+    // None.
+    std::unique_ptr<BoundBatch> draw_batch(const py::object& scene_object,
+                                           const py::object& cameras_object, const SelectRule& rule,
+                                           const Shade& shade, const py::object& color,
+                                           const py::object& alpha, const py::object& depth) {
+        const BoundScene& scene = checked(scene_object);
+        const auto& cameras = held<BoundCameras>(cameras_object, "cameras");
+        if (cameras.device() != device_)
+            throw py::value_error("cameras: expected arrays on the frame's device");
+        if (rule.budget != kNoBudget)
+            throw py::value_error(
+                "budget: a batch has no budget; leave it out, or draw the cameras one by one");
+        const std::shared_ptr<const SceneState> state = scene.state();
+        check_environments(cameras, state->environments->table());
+        const BatchRequest request{.rule = rule,
+                                   .shade = shade,
+                                   .width = cameras.width(),
+                                   .height = cameras.height(),
+                                   .planes = planes_of(cameras, color, alpha, depth)};
+        std::unique_ptr<BoundBatch> batch = frame_->draw_batch(
+            {.request = request, .cameras = cameras, .scene = scene.handle(), .state = state});
+        batch->keep(
+            py::make_tuple(py::cast(this), scene_object, cameras_object, color, alpha, depth));
+        return batch;
+    }
+
     // Returns the gaussian with the largest weight in the first pixel of the window, or
     // nothing.
     std::optional<ScenePick> pick(const py::object& scene_object, const py::object& request_object,
@@ -187,6 +215,39 @@ class BoundSceneFrame {
     }
 
   private:
+    // Borrows the planes of a batch.
+    BatchPlanes planes_of(const BoundCameras& cameras, const py::object& color,
+                          const py::object& alpha, const py::object& depth) const {
+        const auto count = static_cast<py::ssize_t>(cameras.size());
+        const py::ssize_t height = cameras.height();
+        const py::ssize_t width = cameras.width();
+        const std::vector<py::ssize_t> shape = shape_of(color, "color");
+        const int channels = shape.size() == 4 && shape[3] == 4 ? 4 : 3;
+        if (channels == 4 && !alpha.is_none())
+            throw py::value_error("alpha: colour has alpha as its fourth channel; leave it out");
+        const auto plane = [&](const py::object& array, const char* name) -> float* {
+            if (array.is_none()) return nullptr;
+            return span_on<float>(device_, array, name, {count, height, width}).data;
+        };
+        return {
+            .color =
+                span_on<float>(device_, color, "color", {count, height, width, channels}).data,
+            .channels = channels,
+            .alpha = plane(alpha, "alpha"),
+            .depth = plane(depth, "depth")};
+    }
+
+    // Throws ValueError if a camera on the host belongs to no environment of the scene.
+    static void check_environments(const BoundCameras& cameras, const EnvironmentTable& table) {
+        if (cameras.device() != kHost || cameras.environments() == nullptr) return;
+        const auto* environment = static_cast<const int32_t*>(cameras.environments());
+        for (size_t b = 0; b < cameras.size(); ++b)
+            if (environment[b] < kShared || environment[b] >= table.num_environments())
+                throw py::value_error("environments[" + std::to_string(b) + "]: expected -1 to " +
+                                      std::to_string(table.num_environments() - 1) +
+                                      ", as the scene has, got " + std::to_string(environment[b]));
+    }
+
     // Checks that the scene, the request and the pool are consistent, then calls body()
     // with them.
     template <class Body>
@@ -295,7 +356,8 @@ void bind_frame(py::module_& m) {
         .def(py::init(
                  [](const std::array<double, 3>& background, float min_transmittance,
                     bool with_depth) { return Shade{background, min_transmittance, with_depth}; }),
-             py::kw_only(), "background"_a, "min_transmittance"_a, "with_depth"_a);
+             py::kw_only(), "background"_a, "min_transmittance"_a, "with_depth"_a)
+        .def_readonly("with_depth", &Shade::with_depth);
     py::class_<NewPicture>(m, "Picture", "The planes of a picture.")
         .def_readonly("color", &NewPicture::color)
         .def_readonly("alpha", &NewPicture::alpha)
@@ -342,6 +404,8 @@ void bind_frame(py::module_& m) {
         .def("set_models", &BoundSceneFrame::set_models, "models"_a, "palettes"_a)
         .def("draw", &BoundSceneFrame::draw, "scene"_a, "request"_a, "pool"_a = py::none(),
              "steps"_a = nullptr, "stop"_a = nullptr)
+        .def("draw_batch", &BoundSceneFrame::draw_batch, "scene"_a, "cameras"_a, "rule"_a,
+             "shade"_a, "color"_a, "alpha"_a = py::none(), "depth"_a = py::none())
         .def("pick", &BoundSceneFrame::pick, "scene"_a, "request"_a, "pool"_a = py::none())
         .def("memory", &BoundSceneFrame::memory,
              "Returns the bytes that it holds on a CUDA device by part, and the bytes of the "

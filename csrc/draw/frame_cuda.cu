@@ -125,6 +125,20 @@ void Frame::enlarge(const FrameCounters& counters) {
     trim_pool(last_stream_);
 }
 
+void Frame::release_buffers() {
+    if (was_captured_) return;
+    capacity_ = kFirstCapacity;
+    items_ = {};
+    item_records_ = {};
+    item_tiles_ = {};
+    records_ = {};
+    boxes_ = {};
+    large_ = {};
+    entries_ = {};
+    scratch_ = {};
+    trim_pool(last_stream_);
+}
+
 std::unique_ptr<Drawing> Frame::draw(const FrameBatch& batch, Prepare prepare, cudaStream_t stream,
                                      const Place& place) {
     std::unique_ptr<Drawing> drawing(new Drawing(*this, batch, std::move(prepare), stream));
@@ -200,7 +214,8 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
              .has_shared_items = batch.has_shared_items,
              .has_faded_items = batch.has_faded_items,
              .factors = batch.factors,
-             .num_factors = batch.num_factors},
+             .num_factors = batch.num_factors,
+             .image_counts = batch.image_counts},
             {.records = planes,
              .few = few,
              .item_records = item_records,
@@ -241,6 +256,7 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     }
     if (place) place(drawing.planes_);
     of_frame.has_depth = batch.has_depth;
+    of_frame.num_marked = batch.marks_undrawn ? batch.num_images : 0;
     for (int k = 0; k < 2; ++k) {
         of_frame.planes[k] = drawing.planes_[k];
         of_frame.has_depth = of_frame.has_depth || drawing.planes_[k].depth != nullptr;
@@ -341,6 +357,12 @@ const FrameCounters& Drawing::settle() {
         ++num_draws_;
     }
     return *slot_->counters;
+}
+
+bool Drawing::finish_or_enlarge() {
+    wait();
+    if (!was_drawn()) frame_.enlarge(*slot_->counters);
+    return was_drawn();
 }
 
 FrameTimes Drawing::times() const {

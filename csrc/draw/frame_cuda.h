@@ -39,6 +39,10 @@ struct FrameBatch {
     size_t num_zeros = 0;  // size of ItemList::zeros
     // Whether any image that has a destination is drawn with depth.
     bool has_depth = true;
+    ImageCounts* image_counts = nullptr;  // see ProjectInput
+    // Whether images that are not drawn, because a buffer is too small, become NaN. All
+    // of them have planes.
+    bool marks_undrawn = false;
 };
 
 // The output of a frame for its backward pass, valid until the next frame is drawn.
@@ -93,6 +97,10 @@ class Frame {
     // Returns the bytes on the device by part.
     std::vector<std::pair<const char*, size_t>> bytes() const;
 
+    // Frees the buffers, so that a smaller frame fits; not if a graph was captured, which
+    // may still use them.
+    void release_buffers();
+
     // Returns the tape of the last frame; requires Keeps::tape.
     FrameTape tape() const;
 
@@ -110,7 +118,8 @@ class Frame {
     T* room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing);
 
     const Keeps keeps_;
-    Capacity capacity_{64, 4096, 4096, 4096, 4096};
+    static constexpr Capacity kFirstCapacity{64, 4096, 4096, 4096, 4096};
+    Capacity capacity_ = kFirstCapacity;
     DeviceBuffer<DrawItem> items_;
     DeviceBuffer<uint32_t> item_records_, source_, first_slot_, image_of_tile_, order_, blended_;
     DeviceBuffer<float> records_;
@@ -155,6 +164,11 @@ class Drawing {
     // For a captured frame, it reports the last replay, which must have ended; throws
     // std::runtime_error if a buffer was too small.
     const FrameCounters& finish();
+    // Waits for the drawing, and returns whether it was drawn. If a buffer was too small,
+    // enlarges it, for a caller that draws a new frame in place of this one. Throws as
+    // finish() does. Not allowed for a captured frame.
+    bool finish_or_enlarge();
+    bool is_captured() const { return is_captured_; }
     FrameTimes times() const;
     // Returns how often the frame was drawn: more than once if buffers were too small.
     // Known after finish().

@@ -127,11 +127,11 @@ static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_ti
 // The approximate size of the records and entries that a frame holds at once. It is
 // small because they are accessed randomly, yet large enough that a band has tiles for
 // all threads. With a `stop` flag it is the minimum, because the flag is rarely checked
-// while a band is binned.
+// while a band is binned; also while each thread draws its own frame.
 constexpr double kLeastBandBytes = 96 << 20, kMostBandBytes = 768 << 20,
                  kThreadBandBytes = 48 << 20;
 static double band_bytes_of(const std::atomic<bool>* stop) {
-    if (stop != nullptr) return kLeastBandBytes;
+    if (stop != nullptr || omp_in_parallel() != 0) return kLeastBandBytes;
     return std::clamp(kThreadBandBytes * most_threads(), kLeastBandBytes, kMostBandBytes);
 }
 // Up to this number of gaussians, one band is used without estimating their coverage.
@@ -257,8 +257,8 @@ static Picture<T> band_of(const Picture<T>& picture, const Window& band) {
                         static_cast<size_t>(picture.window.width());
     Picture<T> part = picture;
     part.window = band;
-    part.color += 3 * skip;
-    part.alpha += skip;
+    part.color += picture.color_step * skip;
+    if (part.alpha != nullptr) part.alpha += picture.alpha_step * skip;
     if (part.depth != nullptr) part.depth += skip;
     if (part.count != nullptr) part.count += skip;
     return part;

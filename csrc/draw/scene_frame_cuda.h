@@ -72,6 +72,17 @@ class DevicePalette {
 // Returns the pictures of two eyes in one frame.
 EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_transmittance);
 
+// What a batch that is being drawn has on the device.
+struct BatchTables {
+    BatchTables(uint32_t num_cameras, cudaStream_t stream)
+        : cameras(num_cameras, stream), counts(num_cameras, stream) {}
+
+    DeviceBuffer<BatchCamera> cameras;
+    DeviceBuffer<ImageCounts> counts;
+};
+
+class BatchDrawing;
+
 // Draws a scene that is on the device: selects a cut, then draws it.
 class SceneFrame {
   public:
@@ -93,10 +104,25 @@ class SceneFrame {
                                   const EyeImages& pictures, cudaStream_t stream,
                                   const Frame::Place& place);
 
+    // Draws a picture for each camera of a batch, in parts if the batch is large. As
+    // draw(), but the planes of the request are written. The cameras are read at once,
+    // in the order of the stream.
+    std::unique_ptr<BatchDrawing> draw_batch(const SceneTables& scene, const BatchRequest& request,
+                                             const CameraArrays& arrays, uint32_t num_cameras,
+                                             cudaStream_t stream);
+
     // Returns the bytes on the device by part, without the models.
     std::vector<std::pair<const char*, size_t>> bytes() const;
 
   private:
+    friend class BatchDrawing;
+    std::shared_ptr<BatchTables> tables_for(uint32_t num_cameras, cudaStream_t stream);
+    // Draws cameras [first, first + count) of a batch.
+    std::unique_ptr<Drawing> draw_part(const BatchDrawing& batch, uint32_t first, uint32_t count,
+                                       cudaStream_t stream);
+    // Draws smaller parts from now on.
+    void halve_parts(uint32_t num_cameras);
+
     std::unique_ptr<Drawing> draw_selected(const SceneTables& scene, const Eyes& eyes,
                                            const SelectRule& rule, const EyeImages& pictures,
                                            cudaStream_t stream, const Frame::Place& place);
@@ -118,9 +144,55 @@ class SceneFrame {
     DeviceBuffer<CodedGaussians> coded_;
     bool has_packed_ = false, has_coded_ = false;
     DeviceBuffer<Placement> placements_;
+    DeviceBuffer<InstanceFactors> factors_;  // of the places of a batch
     DeviceBuffer<FrameImage> images_;
+    uint32_t most_cameras_ = ~0u;  // in a part of a batch
+    // Of batches that are captured; graphs continue to use retired ones.
+    std::shared_ptr<BatchTables> captured_tables_;
+    std::vector<std::shared_ptr<BatchTables>> retired_tables_;
     Cut cut_;
     Frame frame_;
+};
+
+// A batch that has been enqueued. The frame, the scene and the planes must outlive it.
+class BatchDrawing {
+  public:
+    // Waits until the device has finished the drawing; finish() may still draw parts of
+    // it again.
+    void wait() const;
+    // Waits until the pictures are drawn. Parts for which a buffer was too small are
+    // drawn again, in smaller parts if the memory does not suffice; throws OutOfMemory
+    // or std::length_error if it does not suffice for a single camera.
+    void finish();
+    // Returns the counts of each image. Waits. Call it after finish().
+    std::vector<ImageCounts> counts() const;
+    // Returns the sum over all parts; after finish().
+    FrameTimes times() const;
+    size_t num_parts() const { return parts_.size(); }
+    bool is_captured() const { return is_captured_; }
+
+  private:
+    friend class SceneFrame;
+    struct Part {
+        uint32_t first, count;
+        std::unique_ptr<Drawing> drawing;
+    };
+    BatchDrawing(SceneFrame& frame, const SceneTables& scene, const BatchRequest& request,
+                 bool is_in_environments, uint32_t num_cameras,
+                 std::shared_ptr<BatchTables> tables, cudaStream_t stream);
+    // Draws the cameras from `first` on, in parts.
+    void enqueue(uint32_t first, uint32_t count);
+    void finish_part(Part part, std::vector<Part>& finished);
+
+    SceneFrame& frame_;
+    const SceneTables& scene_;
+    const BatchRequest request_;
+    const bool is_in_environments_;  // whether each camera sees one environment
+    const uint32_t num_cameras_;
+    const std::shared_ptr<BatchTables> tables_;
+    const cudaStream_t stream_;
+    const bool is_captured_;
+    std::vector<Part> parts_;
 };
 
 // One model in front of one camera.

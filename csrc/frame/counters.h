@@ -25,6 +25,11 @@ struct FrameCounters {
     CutChoice choice;           // valid if there is a budget
 };
 
+// Counts of one image of a frame, for frames that report them.
+struct ImageCounts {
+    unsigned long long gaussians, in_frustum;
+};
+
 // The numbers of elements that a frame's buffers hold.
 struct Capacity {
     unsigned long long items, records, large, entries, spread;

@@ -173,6 +173,9 @@ struct FrameLists {
     bool has_depth = true;  // must be true if any image has depth
     // Destination of a copy of the counters on the host; may be null.
     FrameCounters* report = nullptr;
+    // The number of images, all with planes, that become NaN if the counters exceed a
+    // capacity; 0 leaves them as they are.
+    uint32_t num_marked = 0;
 };
 
 // A record over more tiles than this is processed by rows of tiles.

@@ -34,6 +34,8 @@ struct ProjectInput {
     // Null if all factors are 1.
     const InstanceFactors* factors;
     uint32_t num_factors;
+    // [images] the kernel adds to them; null if they are not requested.
+    ImageCounts* image_counts;
 
     // Returns the factors of the first placement of an item; those of the placements
     // that share it follow. Precondition: `factors` is not null.

@@ -15,12 +15,13 @@ constexpr unsigned kLaneClusters = kClustersOfBounds;  // clusters of a table's 
 constexpr unsigned kPartSize = 32 * kLaneClusters;
 constexpr unsigned kCutThreads = 256, kCutWarps = kCutThreads / 32;
 static_assert(kLaneClusters == 8, "a byte says which of them are drawn");
+static_assert(kPartSize == kClustersOfPart, "scenes bound the number of parts");
 
 // The work of one warp. If `lanes` is zero: clusters [first, first + kPartSize) of one
-// instance's table. Else each set bit k of `lanes` assigns instance + k to a lane,
-// which processes its top clusters or the last clusters of its table.
+// instance's table. Else each set bit k of `lanes` assigns the instance at place + k to
+// a lane, which processes its top clusters or the last clusters of its table.
 struct CutPart {
-    uint32_t instance, first, lanes;
+    uint32_t place, first, lanes;
 };
 
 // Returns the first of a table's last, coarsest clusters, which are few enough for a
@@ -29,10 +30,12 @@ __device__ inline uint32_t last_of_table(const ClusterTable& table) {
     return static_cast<uint32_t>(table.num_clusters() - 1) / kLaneClusters * kLaneClusters;
 }
 
-// A scene, and the output of place_kernel about its instances.
+// A scene, and the output of place_kernel about its instances. With one viewpoint, an
+// instance's place is its index; a batch has a place for each instance of each camera.
 struct PlacedScene {
     const BundleOnDevice* bundles;
     InstanceTable instances;
+    const int32_t* bundle_of_place;
     InstanceView* views;  // written for instances whose tables are tested
     // For an instance that a single lane processes: a bit for each top cluster that is
     // drawn, or 0 if the lane tests the last clusters of the table.
@@ -89,7 +92,7 @@ static_assert(kLaneClusters == 8 && kWhole < 1 << 16, "two words hold the weight
 // each says whether it is drawn. Weights are set only in cuts with a fade.
 struct LaneClusters {
     const BundleOnDevice* bundle;
-    uint32_t instance;
+    uint32_t place;  // of the instance
     uint32_t first;  // index in the table
     bool is_alone;   // whether this lane alone has the instance; else all lanes of the warp have it
     bool are_tops;
@@ -113,7 +116,7 @@ __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const 
     const unsigned lane = threadIdx.x % 32;
     const bool is_alone = part.lanes != 0;
     LaneClusters mine{.bundle = nullptr,
-                      .instance = part.instance,
+                      .place = part.place,
                       .first = part.first + kLaneClusters * lane,
                       .is_alone = is_alone,
                       .are_tops = false,
@@ -121,12 +124,12 @@ __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const 
                       .weights = {}};
     if (is_alone) {
         if ((part.lanes >> lane & 1) == 0) return mine;
-        mine.instance += lane;
-        mine.drawn = scene.tops[mine.instance];
+        mine.place += lane;
+        mine.drawn = scene.tops[mine.place];
         mine.are_tops = mine.drawn != 0;
         mine.weights = LaneWeights::all(kWhole);
     }
-    mine.bundle = &scene.bundles[scene.instances.bundle[mine.instance]];
+    mine.bundle = &scene.bundles[scene.bundle_of_place[mine.place]];
     if (is_alone && !mine.are_tops) mine.first = last_of_table(mine.bundle->table);
     return mine;
 }
@@ -142,7 +145,7 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
                              Tolerances tolerances, LaneClusters& mine, const Ask& ask) {
     struct Table {
         const BundleOnDevice* bundle;  // null: each lane has an instance of its own
-        // first cluster; if each lane has an instance, the instance of the first lane
+        // first cluster; if each lane has an instance, the place of the first lane's
         uint32_t first;
     };
     __shared__ InstanceView views[kCutWarps];
@@ -155,16 +158,16 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
     const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
     bool is_owner = false;
     if (!mine.is_alone && mine.bundle != nullptr) {  // the condition is uniform in the warp
-        const auto* view = reinterpret_cast<const uint32_t*>(scene.views + mine.instance);
+        const auto* view = reinterpret_cast<const uint32_t*>(scene.views + mine.place);
         for (unsigned w = lane; w < sizeof(InstanceView) / sizeof *view; w += 32)
             reinterpret_cast<uint32_t*>(views + warp)[w] = view[w];
         if (lane == 0) tables[warp] = {mine.bundle, mine.first};
     }
-    if (mine.is_alone && lane == 0) tables[warp] = {nullptr, mine.instance};
+    if (mine.is_alone && lane == 0) tables[warp] = {nullptr, mine.place};
     __syncwarp();
     if (mine.bundle != nullptr && !mine.are_tops) {
         const ClusterTable& table = mine.bundle->table;
-        const InstanceView& view = mine.is_alone ? scene.views[mine.instance] : views[warp];
+        const InstanceView& view = mine.is_alone ? scene.views[mine.place] : views[warp];
         is_owner = mine.first < table.num_clusters() &&
                    may_draw(table, mine.bounds(), view, rule, tolerances);
     }
@@ -189,10 +192,10 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
             const Table& of = tables[owner / 32];
             const bool is_alone = of.bundle == nullptr;
             // valid only if the owner's lane has an instance of its own
-            const uint32_t instance = of.first + owner % 32;
+            const uint32_t lane_place = of.first + owner % 32;
             const BundleOnDevice* bundle =
-                is_alone ? &scene.bundles[scene.instances.bundle[instance]] : of.bundle;
-            const InstanceView& view = is_alone ? scene.views[instance] : views[owner / 32];
+                is_alone ? &scene.bundles[scene.bundle_of_place[lane_place]] : of.bundle;
+            const InstanceView& view = is_alone ? scene.views[lane_place] : views[owner / 32];
             const uint32_t c = k + (is_alone ? last_of_table(bundle->table)
                                              : of.first + kLaneClusters * (owner % 32));
             if (c < bundle->table.num_clusters())

@@ -48,6 +48,9 @@ struct SelectInput {
     // which means that a page is not needed. Empty if not requested.
     Span<const Span<uint32_t>> needs = {};
     uint32_t* last_bin = nullptr;  // for a budget in steps: the state of tolerance_of_budget()
+    // As runs_of_bundles() returns them, for callers that select many cuts; if empty, each
+    // cut finds them anew.
+    Span<const ClusterRuns> runs = {};
 };
 
 struct SelectOutput {
@@ -72,6 +75,11 @@ struct BudgetCut {
     bool fits;              // whether any cut does; if not, the number is that of the coarsest one
     int64_t num_gaussians;  // before pages that are not resident and fades change it
 };
+
+// Returns the runs of each bundle for this number of cuts; empty for bundles with few
+// instances in all cuts together.
+std::vector<ClusterRuns> runs_of_bundles(Span<const ClusterTable> bundles,
+                                         const InstanceTable& instances, size_t num_cuts);
 
 namespace cpu {
 void select(const SelectInput& in, SelectOutput& out);
