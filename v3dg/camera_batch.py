@@ -162,9 +162,8 @@ class CameraBatch:
             ValueError: The tensors are on another CUDA device, or the device is the
                 CPU and they are not.
         """
-        own = self.device
-        expected = f"tensors on {device}, which draws, got some on {own}"
-        check("cameras", own in (CPU, device), expected)
+        expected = f"tensors on {device}, which draws, got some on {self.device}"
+        check("cameras", self.device in (CPU, device), expected)
         if device not in self._on_device:
             self._on_device[device] = self._make_core(device)
         return self._on_device[device]
@@ -247,7 +246,7 @@ def _tensor(
     """Return a tensor on a CUDA device without its gradient; raise ValueError for
     another dtype, shape or layout."""
     shape = tuple(tensor.shape)
-    expected = " or ".join(str(wanted) for wanted in shapes)
+    expected = " or ".join(map(str, shapes))
     check(name, shape in shapes, f"shape {expected}, got {shape}")
     check(name, str(tensor.dtype) in dtypes, f"{' or '.join(dtypes)}, got {tensor.dtype}")
     check(name, tensor.is_contiguous(), "a contiguous tensor, got a strided one")

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 import tyro
@@ -22,6 +22,8 @@ import tyro
 import v3dg
 from benchmarks.evaluation import record
 from benchmarks.worlds.procedural import make_asset
+
+Row: TypeAlias = dict[str, float]
 
 
 @dataclass
@@ -44,7 +46,7 @@ class Config:
 
 def main(config: Config) -> None:
     bundles = make_bundles(config)
-    result: dict[str, Any] = {"cameras": config.cameras, "gaussians": config.gaussians}
+    result: dict[str, object] = {"cameras": config.cameras, "gaussians": config.gaussians}
     result["objects"] = sizes_of(floor_of(bundles, config.objects), config)
     if config.device == "cuda":
         result["crowd"] = sizes_of(floor_of(bundles, config.crowd), config)
@@ -75,8 +77,8 @@ def floor_of(bundles: list[v3dg.Bundle], count: int) -> v3dg.Scene:
     positions[:, :2] -= 1.5 * (side - 1)
     turn = np.random.default_rng(0).uniform(0, np.pi, count)
     quaternions = np.stack([np.cos(turn), 0 * turn, 0 * turn, np.sin(turn)], axis=1)
-    chosen = [bundles[number % len(bundles)] for number in range(count)]
-    scene.add(chosen, positions, quaternions)
+    in_turn = [bundles[number % len(bundles)] for number in range(count)]
+    scene.add(in_turn, positions, quaternions)
     return scene
 
 
@@ -88,39 +90,40 @@ def cameras_of(scene: v3dg.Scene, count: int, size: int) -> list[v3dg.Camera]:
     for _ in range(count):
         eye = np.append(rng.uniform(-reach, reach, 2), 0.9)
         angle = rng.uniform(0, 2 * np.pi)
-        target = eye + [np.cos(angle), np.sin(angle), -0.15]
+        target = eye + np.array([np.cos(angle), np.sin(angle), -0.15])
         cameras.append(v3dg.Camera.look_at(eye, target, fov_x=1.2, width=size, height=size))
     return cameras
 
 
-def sizes_of(scene: v3dg.Scene, config: Config) -> list[dict[str, Any]]:
-    rows = []
-    for size in config.sizes:
-        cameras = cameras_of(scene, config.cameras, size)
-        renderer = v3dg.Renderer(scene, device=config.device, memory=None)
-        batch = batch_on(cameras, config.device)
-        one = batch_on(cameras[:1], config.device)
-        stats = renderer.render_batch(batch).stats
-        rows.append(
-            {
-                "size": size,
-                "gaussians": float(stats.gaussians_in_frustum.mean()),
-                "parts": stats.num_parts,
-                "batch": rate(lambda: renderer.render_batch(batch), config.cameras, config),
-                "loop": rate(
-                    lambda: [renderer.render(camera) for camera in cameras], config.cameras, config
-                ),
-                "one_in_a_batch": rate(lambda: renderer.render_batch(one), 1, config),
-                "one": rate(lambda: renderer.render(cameras[0]), 1, config),
-                "select_ms": stats.select_ms,
-                "draw_ms": renderer.render_batch(batch).stats.draw_ms,
-            }
-        )
-        print(rows[-1], flush=True)
+def sizes_of(scene: v3dg.Scene, config: Config) -> list[Row]:
+    rows = [row_of(scene, size, config) for size in config.sizes]
+    for row in rows:
+        print(row, flush=True)
     return rows
 
 
-def environments_of(bundle: v3dg.Bundle, config: Config) -> dict[str, Any]:
+def row_of(scene: v3dg.Scene, size: int, config: Config) -> Row:
+    cameras = cameras_of(scene, config.cameras, size)
+    renderer = v3dg.Renderer(scene, device=config.device, memory=None)
+    batch = batch_on(cameras, config.device)
+    single = batch_on(cameras[:1], config.device)
+    stats = renderer.render_batch(batch).stats
+    return {
+        "size": size,
+        "gaussians": float(stats.gaussians_in_frustum.mean()),
+        "parts": stats.num_parts,
+        "batch": rate(lambda: renderer.render_batch(batch), config.cameras, config),
+        "loop": rate(
+            lambda: [renderer.render(camera) for camera in cameras], config.cameras, config
+        ),
+        "single_in_a_batch": rate(lambda: renderer.render_batch(single), 1, config),
+        "single": rate(lambda: renderer.render(cameras[0]), 1, config),
+        "select_ms": stats.select_ms,
+        "draw_ms": renderer.render_batch(batch).stats.draw_ms,
+    }
+
+
+def environments_of(bundle: v3dg.Bundle, config: Config) -> Row:
     import torch
 
     scene = v3dg.Scene()

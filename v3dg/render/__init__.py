@@ -20,8 +20,8 @@ from v3dg.render.request import (
 )
 
 __all__ = [
-    "BatchPlanes",
     "DEFAULT_MIN_TRANSMITTANCE",
+    "BatchPlanes",
     "CutRequest",
     "Frame",
     "FrameRequest",

@@ -89,8 +89,8 @@ def render(
             again.
         camera: Pinhole camera. With several, each has its own cut and its own picture,
             as if drawn alone; those of one size and one near plane are drawn at once,
-            unless there is a budget, a cut or a pool (docs/sensors.md). The two eyes of a stereo camera share one cut and one
-            frame. Their two pictures have common statistics, which are sums, except for
+            unless there is a budget, a cut or a pool (docs/sensors.md). The two eyes of
+            a stereo camera share one cut and one frame. Their two pictures have common statistics, which are sums, except for
             the number of selected gaussians. None means the first camera of a scene's
             file, else the camera of `first_camera`.
         tolerance: As in `v3dg.select`; so are `budget` and `min_level`.
@@ -136,9 +136,9 @@ def render(
         return frame.chosen(opened_subject).draw_settled(opened_subject, request)
 
     if isinstance(camera, list | tuple) and cut is None and budget is None and are_alike(camera):
-        chosen = frame.chosen(opened_subject)
-        if isinstance(chosen, SceneFrame):
-            return _pictures_at_once(chosen, opened_subject, camera, cut_request, shade)
+        scene_frame = frame.chosen(opened_subject)
+        if isinstance(scene_frame, SceneFrame):
+            return _pictures_at_once(scene_frame, opened_subject, camera, cut_request, shade)
     pictures: Picture | list[Picture] = for_each(camera, picture)
     return cast(
         "RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]", pictures

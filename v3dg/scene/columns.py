@@ -59,6 +59,7 @@ def columns_of(
     positions: Array | npt.ArrayLike | None,
     quaternions: Array | npt.ArrayLike | None,
     scales: Array | npt.ArrayLike | None,
+    *,
     importance: npt.ArrayLike,
     opacity: npt.ArrayLike,
     tint: npt.ArrayLike,

@@ -162,7 +162,15 @@ class Scene:
         bundles = _bundles_of(bundle)
         if matrix is not None:
             positions, quaternions, scales = parts_of(matrix, positions, quaternions, scales)
-        rows = columns_of(positions, quaternions, scales, importance, opacity, tint, environment)
+        rows = columns_of(
+            positions,
+            quaternions,
+            scales,
+            importance=importance,
+            opacity=opacity,
+            tint=tint,
+            environment=environment,
+        )
         count = len(rows.importance)
         if isinstance(bundle, list | tuple):
             check("bundle", len(bundles) == count, f"one for all or {count}, got {len(bundles)}")
@@ -187,8 +195,9 @@ class Scene:
         """Place all instances of another scene as a whole and return their ids here.
 
         Poses are composed; importance, opacity and tint are multiplied; an environment
-        replaces those of the other scene. Later changes of the other scene have no effect. The arguments are those of `add` for one
-        instance; a scene whose `up` is None has z up.
+        replaces those of the other scene. Later changes of the other scene have no
+        effect. The arguments are those of `add` for one instance; a scene whose `up` is
+        None has z up.
 
         Raises:
             TypeError: ``scene`` is no scene.
@@ -204,23 +213,16 @@ class Scene:
         parts: tuple[Array, Array, Array] = (position, quaternion, scale)
         if matrix is not None:
             parts = parts_of(matrix, *parts)
-        outer = columns_of(*parts, importance, opacity, tint, environment)
+        outer = columns_of(
+            *parts, importance=importance, opacity=opacity, tint=tint, environment=environment
+        )
         check("position", len(outer.importance) == 1, f"one, got {len(outer.importance)}")
         inner = copy.copy(scene)  # other threads may change the original meanwhile
         if up is not None:
             turned_quaternions = product(outer.quaternions, turn_of(inner, up))
             outer = outer._replace(quaternions=turned_quaternions)
-        columns = Columns(
-            positions=inner.positions,
-            quaternions=inner.quaternions,
-            scales=inner.scales,
-            importance=inner.importance,
-            opacity=inner.opacity,
-            tint=inner.tint,
-            environments=inner.environments,
-        )
         bundles = [inner.bundles[number] for number in inner.instance_bundle]
-        return self._append(bundles, composed(outer, columns), up)
+        return self._append(bundles, composed(outer, _columns_of(inner)), up)
 
     def _append(self, bundles: Sequence[Bundle], rows: Columns, up: Axis | None) -> range:
         """Append instances of one bundle, or of one for each; returns their ids."""
@@ -300,7 +302,7 @@ class Scene:
         with _lock:
             state = self._state
             rows = self._rows(ids)
-            check_rows_for_up(rows, up)
+            _check_rows_for_up(rows, up)
             self._take_up(up)
             for name, part in parts.items():
                 if part is None:
@@ -496,7 +498,20 @@ class Scene:
         return f"Scene({instances} of {num_bundles} bundle{'s' * (num_bundles != 1)})"
 
 
-def check_rows_for_up(rows: Array, up: Axis | None) -> None:
+def _columns_of(scene: Scene) -> Columns:
+    """Return the columns of all instances, on the host."""
+    return Columns(
+        positions=scene.positions,
+        quaternions=scene.quaternions,
+        scales=scene.scales,
+        importance=scene.importance,
+        opacity=scene.opacity,
+        tint=scene.tint,
+        environments=scene.environments,
+    )
+
+
+def _check_rows_for_up(rows: Array, up: Axis | None) -> None:
     """Raise ValueError for rows on a device with an axis that is up: their bundles are
     known on the host."""
     is_on_host = isinstance(rows, np.ndarray)

@@ -11,7 +11,8 @@ from frames import composed_scene
 from v3dg import BatchPlanes, Camera, CameraBatch, Scene
 from v3dg.residency import residency
 
-WIDTH, HEIGHT = 45, 37
+WIDTH = 45
+HEIGHT = 37
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +57,9 @@ def one_by_one(scene, cameras, device, **options):
 
 def assert_same(batch, pictures, *, depth=False):
     for number, (got, wanted) in enumerate(zip(batch, pictures, strict=True)):
-        planes = ("color", "alpha", "depth") if depth else ("color", "alpha")
+        planes = ["color", "alpha"]
+        if depth:
+            planes.append("depth")
         for plane in planes:
             np.testing.assert_array_equal(
                 host(getattr(got, plane)), host(getattr(wanted, plane)), f"{plane} of {number}"
@@ -456,8 +459,7 @@ def test_a_batch_that_is_too_small_is_marked_and_drawn_again(scene):
 
 @pytest.mark.gpu
 def test_a_large_batch_is_drawn_in_parts(scene):
-    width, height = 512, 512
-    cameras = cameras_around(40, seed=21, width=width, height=height)
+    cameras = cameras_around(40, seed=21, width=512, height=512)
     batch = v3dg.Renderer(scene, device="cuda").render_batch(cameras, tolerance=2.0)
     assert batch.stats.num_parts == 2
     for number in (0, 31, 32, 39):
