@@ -27,7 +27,8 @@ class CameraBatch:
     """B pinhole cameras of one size, in the convention of `Camera`: x right, y down, z
     forward.
 
-    Arrays on the host (NumPy, lists, torch tensors on the CPU) are copied and checked.
+    Arrays on the host (NumPy, lists, torch tensors on the CPU) are copied, checked, and
+    read-only.
     Torch tensors on a CUDA device are kept and read there each time that the batch is
     drawn, so they may be changed in place between pictures; they are not checked,
     because that would wait for the device. There a camera whose numbers are not those
@@ -93,6 +94,9 @@ class CameraBatch:
             )
         if environments is not None:
             self.environments = _environments(environments, count)
+            self.environments.flags.writeable = False
+        self.viewmats.flags.writeable = False
+        self.K.flags.writeable = False
 
     def _take_tensors(
         self, viewmats: Array, K: Array | npt.ArrayLike, environments: Array | npt.ArrayLike | None
@@ -174,7 +178,8 @@ class CameraBatch:
                 return array
             import torch
 
-            return torch.as_tensor(array, device=str(device))
+            # A copy, because torch warns of arrays that are read-only.
+            return torch.as_tensor(np.array(array), device=str(device))
 
         environments = None
         if self.environments is not None:

@@ -69,8 +69,11 @@ class RenderedBatch:
     the same arrays without waiting, for work that is queued on the same stream.
     """
 
-    def __init__(self, core: _core.Batch, planes: BatchPlanes, tolerance: float) -> None:
+    def __init__(
+        self, core: _core.Batch, cameras: CameraBatch, planes: BatchPlanes, tolerance: float
+    ) -> None:
         self.planes = planes
+        self._cameras = cameras
         self._core = core
         self._tolerance = tolerance
         self._stats: _core.BatchStats | None = None
@@ -111,6 +114,19 @@ class RenderedBatch:
                 "depth: expected pictures that were drawn with depth=True, got others without"
             )
         return self.planes.depth
+
+    @property
+    def distance(self) -> Array:
+        """(B, H, W) expected distance from the eye along the ray through each pixel's
+        centre, 0 where nothing was drawn. Computed from the depth, with the K that the
+        cameras have now."""
+        depth = self.depth
+        if isinstance(depth, np.ndarray):
+            return np.where(depth > 0, depth * ray_lengths(self._cameras), 0).astype(np.float32)
+        import torch
+
+        lengths = ray_lengths(self._cameras, depth)
+        return torch.where(depth > 0, depth * lengths, 0).to(torch.float32)
 
     @property
     def stats(self) -> BatchStats:
@@ -213,7 +229,29 @@ def draw_batch(
         planes.depth,
     )
     resident.add_drawing(core)
-    return RenderedBatch(core, planes, rule.tolerance_px2)
+    return RenderedBatch(core, cameras, planes, rule.tolerance_px2)
+
+
+def ray_lengths(cameras: CameraBatch, like: Array | None = None) -> Array:
+    """Return (B, H, W) or (1, H, W) lengths of the vectors from the eyes through the
+    centres of pixels to depth 1, in double precision: on the host, or as a tensor where
+    `like` is."""
+    K: Array = cameras.K
+    columns: Array = np.arange(cameras.width) + 0.5
+    rows: Array = np.arange(cameras.height) + 0.5
+    if like is not None:
+        import torch
+
+        if isinstance(K, np.ndarray):
+            K = np.array(K)  # a copy, because torch warns of arrays that are read-only
+        K, columns, rows = (
+            torch.as_tensor(array, dtype=torch.float64, device=like.device)
+            for array in (K, columns, rows)
+        )
+    K = K.reshape(-1, 3, 3)
+    x = (columns[None, :] - K[:, 0, 2, None]) / K[:, 0, 0, None]
+    y = (rows[None, :] - K[:, 1, 2, None]) / K[:, 1, 1, None]
+    return (x[:, None, :] ** 2 + y[:, :, None] ** 2 + 1) ** 0.5
 
 
 def check_planes(planes: BatchPlanes | None, *, with_depth: bool) -> None:

@@ -166,6 +166,21 @@ def test_planes_of_the_caller_are_written(scene, device):
         batch.depth  # noqa: B018
 
 
+def test_distances_are_those_along_rays(scene, device):
+    cameras = cameras_around(4, seed=8)
+    batch = v3dg.Renderer(scene, device=device).render_batch(cameras, depth=True)
+    depth = host(batch.depth).astype(np.float64)
+    distance = host(batch.distance)
+    assert distance.shape == depth.shape
+    for number, camera in enumerate(cameras):
+        for y, x in ((0, 0), (HEIGHT - 1, 3), (HEIGHT // 2, WIDTH // 2)):
+            ray = [(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1.0]
+            expected = depth[number, y, x] * np.linalg.norm(ray)
+            np.testing.assert_allclose(distance[number, y, x], expected, rtol=1e-6)
+    assert (distance[depth == 0] == 0).all()
+    assert depth.max() > 0
+
+
 def test_one_lens_may_serve_all_cameras(scene, device):
     cameras = v3dg.turntable((0, 0, 0), 6.0, 5, width=WIDTH, height=HEIGHT)
     batch = CameraBatch.of(cameras)
