@@ -145,12 +145,14 @@ void BatchDrawing::enqueue(uint32_t first, uint32_t count) {
             parts_.push_back({.first = first,
                               .count = size,
                               .drawing = frame_.draw_part(*this, first, size, stream_)});
+            first += size;
+            continue;
         } catch (const OutOfMemory&) {
             if (size == 1 || is_captured_) throw;
-            frame_.halve_parts(size);
-            continue;
+        } catch (const std::length_error&) {  // of an earlier batch
+            if (size == 1 || is_captured_) throw;
         }
-        first += size;
+        frame_.halve_parts(size);
     }
 }
 

@@ -80,6 +80,7 @@ Frame::Slot* Frame::take_slot(bool capturing) {
     }
     Slot* slot = free_slots_.front();
     free_slots_.pop_front();
+    std::erase(unchecked_, slot);
     return slot;
 }
 
@@ -144,17 +145,26 @@ std::unique_ptr<Drawing> Frame::draw(const FrameBatch& batch, Prepare prepare, c
     std::unique_ptr<Drawing> drawing(new Drawing(*this, batch, std::move(prepare), stream));
     drawing->is_captured_ = is_capturing(stream);
     was_captured_ = was_captured_ || drawing->is_captured_;
+    if (!drawing->is_captured_) check_counts();
     drawing->slot_ = take_slot(drawing->is_captured_);
-    // If the last frame is done and exceeded or nearly filled a buffer, this frame is
-    // likely to do so, too.
-    if (last_ != nullptr && !last_->is_captured_ && !drawing->is_captured_) {
-        const cudaError_t over = cudaEventQuery(last_->slot_->done);
-        if (over == cudaSuccess) enlarge(*last_->slot_->counters);
-        if (over != cudaSuccess && over != cudaErrorNotReady) check(over, "a frame");
-    }
     enqueue(*drawing, place);
-    last_ = drawing.get();
+    if (!drawing->is_captured_) unchecked_.push_back(drawing->slot_);
     return drawing;
+}
+
+void Frame::check_counts() {
+    std::vector<const Slot*> done;
+    std::erase_if(unchecked_, [&done](const Slot* slot) {
+        const cudaError_t over = cudaEventQuery(slot->done);
+        if (over == cudaErrorNotReady) {
+            cudaGetLastError();
+            return false;
+        }
+        check(over, "a frame");
+        done.push_back(slot);
+        return true;
+    });
+    for (const Slot* slot : done) enlarge(*slot->counters);
 }
 
 void Frame::enqueue(Drawing& drawing, const Place& place) {
@@ -320,7 +330,6 @@ Drawing::Drawing(Frame& frame, const FrameBatch& batch, Frame::Prepare prepare, 
     : frame_(frame), batch_(batch), prepare_(std::move(prepare)), stream_(stream) {}
 
 Drawing::~Drawing() {
-    if (frame_.last_ == this) frame_.last_ = nullptr;
     // A graph continues to write to its slot.
     if (slot_ != nullptr && !is_captured_) frame_.free_slots_.push_back(slot_);
 }

@@ -112,6 +112,9 @@ class Frame {
     // Returns the lists in the current buffers.
     FrameLists lists(const FrameBatch& batch) const;
     RecordPlanes records() const;
+    // Enlarges the buffers if an earlier frame that is done exceeded or nearly filled one,
+    // because the next frame is then likely to do so, too. Its drawing may be gone.
+    void check_counts();
     void enlarge(const FrameCounters& counters);
     Slot* take_slot(bool capturing);
     template <class T>
@@ -139,7 +142,7 @@ class Frame {
     std::deque<Slot*> free_slots_;                // slots whose frames may still be in flight
     std::vector<std::shared_ptr<void>> retired_;  // buffers that captured graphs still use
     bool was_captured_ = false;
-    Drawing* last_ = nullptr;
+    std::vector<Slot*> unchecked_;  // of frames whose counts were not compared with the buffers
     FrameBatch last_batch_{};
     cudaStream_t last_stream_ = nullptr;
     StreamMutex busy_;

@@ -473,6 +473,22 @@ def test_a_batch_that_is_too_small_is_marked_and_drawn_again(scene):
 
 
 @pytest.mark.gpu
+def test_buffers_grow_for_callers_that_ignore_results(scene):
+    import torch
+
+    near = Camera.look_at((0, -2, 0.5), (0, 0, 0), width=WIDTH, height=HEIGHT)
+    far = Camera.look_at((0, -500, 0.5), (0, 0, 0), width=WIDTH, height=HEIGHT)
+    renderer = v3dg.Renderer(scene, device="cuda")
+    renderer.render_batch([far] * 24)
+    planes = BatchPlanes(torch.zeros(24, HEIGHT, WIDTH, 3, device="cuda"))
+    for _ in range(4):  # items and gaussians are counted first, then entries, then long lists
+        renderer.render_batch([near] * 24, tolerance=0.0, out=planes)
+        torch.cuda.synchronize()
+    alone = v3dg.render(scene, near, tolerance=0.0, device="cuda")
+    np.testing.assert_array_equal(host(planes.color)[17], host(alone.color))
+
+
+@pytest.mark.gpu
 def test_a_large_batch_is_drawn_in_parts(scene):
     cameras = cameras_around(40, seed=21, width=512, height=512)
     batch = v3dg.Renderer(scene, device="cuda").render_batch(cameras, tolerance=2.0)
