@@ -1,18 +1,19 @@
-// The cut of a scene on the device, in two kernels.
+// Selects the cut of a scene on the device, in two kernels.
 //
-// place_kernel has a thread for each instance (place_instances.cuh). The thread
-// transforms the camera into the frame of the instance and chooses the source of its
-// cut: nothing, the top clusters, or the whole table. The kernel divides the work into
-// parts for cut_kernel. A part is up to 256 clusters of one table that bounds could not
-// exclude; or the top clusters of up to 32 neighbouring instances; or the last clusters
-// of their tables, where bounds exclude all but what one lane can test.
+// place_kernel has a thread per instance (place_instances.cuh). A thread transforms the
+// camera into the frame of its instance, and chooses the source of the instance's cut:
+// nothing, the top clusters, or the whole table. The kernel divides the work into parts
+// for cut_kernel. A part is one of three things: up to 256 clusters of one table that
+// bounds could not exclude; the top clusters of up to 32 consecutive instances; or the
+// last clusters of such instances' tables, if one lane per instance suffices.
 //
-// cut_kernel has a block for up to eight parts, one per warp. The block tests which
+// A block of cut_kernel processes up to eight parts, one per warp. It tests which
 // clusters are drawn (cut_parts.cuh), records which pages they need (page_needs.cuh),
-// and writes them at positions given by a prefix sum (write_clusters.cuh).
+// and writes the drawn clusters at positions given by a prefix sum
+// (write_clusters.cuh).
 //
-// With a budget, the kernels of budget_cuda.cu run between these two, in two rounds,
-// each after a place_kernel.
+// With a budget, place_kernel and the kernels of budget_cuda.cu run in two rounds
+// before cut_kernel.
 
 #include "select/select_cuda.h"
 
@@ -31,8 +32,8 @@
 namespace v3dg {
 namespace cuda {
 
-// Where to write the choice of a budget, and the pictures and placements of a frame.
-// Pointers to outputs that are not requested are null.
+// The optional outputs of a cut: the choice of a budget, and the pictures and
+// placements of a frame. Pointers are null if not requested.
 struct Cut::Target {
     EyeImages pictures;
     FrameImage* images;
@@ -44,14 +45,13 @@ namespace {
 
 constexpr unsigned kReportBlocks = 64;
 
-// One thread per bundle.
 __global__ void sides_kernel(const BundleOnDevice* bundles, size_t num_bundles, Eyes eyes,
                              CameraSides* sides) {
     const size_t b = size_t(blockIdx.x) * blockDim.x + threadIdx.x;
     if (b < num_bundles) sides[b] = sides_of_eyes(eyes, bundles[b].table.pad_px);
 }
 
-// One thread per instance. `kAreTwo` says whether there are two eyes.
+// One thread per instance. `kAreTwo`: there are two eyes.
 template <bool kAreTwo>
 __global__ void __launch_bounds__(kPlaceThreads, kAreTwo ? kPlaceBlocks / 2 : kPlaceBlocks)
     place_kernel(PlacedScene scene, Eyes eyes, BundleSides sides, SelectRule rule,
@@ -84,7 +84,7 @@ __global__ void place_all_kernel(PlacedScene scene, Camera camera, FrameImage im
         placement_of(axes_of_instance(camera, pose), pose, scene.instances.bundle[i], 0);
 }
 
-// One thread per pair. Pairs whose instance is not drawn are left out.
+// One thread per pair. Skips pairs whose instance is not drawn.
 template <class Output>
 __global__ void __launch_bounds__(kCutThreads)
     given_kernel(PlacedScene scene, GivenCut given, CutScratch scratch, Output output) {
@@ -148,7 +148,7 @@ void Cut::cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule
                              .parts = parts_.reserve(parts, stream)};
     const auto blocks = static_cast<unsigned>(std::clamp<size_t>(parts, 1, 2 * num_places));
     const bool has_budget = rule.budget != kNoBudget;
-    Count* change = zeros + 2 * zeros_of_round(count);  // used with a budget only
+    Count* change = zeros + 2 * zeros_of_round(count);  // used only with a budget
     BudgetState* state = has_budget ? budget_state(stream) : nullptr;
     BundleSides sides{};
     const size_t num_bundles = scene.num_bundles();
@@ -248,7 +248,7 @@ void Cut::select_pairs(const SceneTables& scene, const Eyes& eyes, const SelectR
     const bool has_budget = rule.budget != kNoBudget;
     const bool keeps_bin = has_budget && last_bin != nullptr;
     uint32_t* bin_on_device = keeps_bin ? &budget_state(stream)->last_bin : nullptr;
-    // Most cuts fit into the initial capacity, so the loop runs once.
+    // Repeat with larger buffers if the pairs do not fit. Most cuts fit the first time.
     for (Count capacity = std::max<Count>(1u << 16, pair_instance_.capacity());;
          capacity = counts.pairs) {
         const PairOutput<kFades> output{

@@ -15,7 +15,7 @@ namespace cuda {
 constexpr unsigned kCutBlocks = 4;     // blocks of cut_kernel per multiprocessor
 constexpr unsigned kPlaceBlocks = 12;  // blocks of place_kernel per multiprocessor
 
-// `kTells` says whether the kernel records which pages are needed.
+// Tests and writes clusters. `kTells`: the kernel records which pages are needed.
 template <class Output, bool kTells>
 static __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
     cut_kernel(PlacedScene scene, SelectRule rule, const CutChoice* choice,
