@@ -609,6 +609,19 @@ class Cameras:
 
 def fault_of_cameras(viewmats: Float64, K: Float64) -> tuple[int, str] | None: ...
 
+class BatchPlanes:
+    """The planes of a batch; keeps the arrays.
+
+    Args:
+        color: (B, H, W, 3 or 4).
+        alpha: (B, H, W), or None.
+        depth: (B, H, W), or None.
+    """
+
+    def __init__(
+        self, color: Array, alpha: Array | None = None, depth: Array | None = None
+    ) -> None: ...
+
 class BatchStats:
     """The statistics of each picture of a batch."""
 
@@ -628,6 +641,12 @@ class BatchStats:
 class Batch:
     """Pictures that have been drawn, or enqueued on a device."""
 
+    @property
+    def color(self) -> Array: ...
+    @property
+    def alpha(self) -> Array | None: ...
+    @property
+    def depth(self) -> Array | None: ...
     def finish(self) -> None: ...
     def stats(self) -> BatchStats: ...
 
@@ -713,9 +732,7 @@ class SceneFrame:
         cameras: Cameras,
         rule: Rule,
         shade: Shade,
-        color: Array,
-        alpha: Array | None = None,
-        depth: Array | None = None,
+        planes: BatchPlanes | None = None,
     ) -> Batch: ...
     def pick(
         self, scene: ResidentScene, request: FrameRequest, pool: PagePool | None = None

@@ -108,6 +108,7 @@ def row_of(scene: v3dg.Scene, size: int, config: Config) -> Row:
     batch = batch_on(cameras, config.device)
     single = batch_on(cameras[:1], config.device)
     stats = renderer.render_batch(batch).stats
+    planes = renderer.render_batch(single).planes
     return {
         "size": size,
         "gaussians": float(stats.gaussians_in_frustum.mean()),
@@ -117,6 +118,7 @@ def row_of(scene: v3dg.Scene, size: int, config: Config) -> Row:
             lambda: [renderer.render(camera) for camera in cameras], config.cameras, config
         ),
         "single_in_a_batch": rate(lambda: renderer.render_batch(single), 1, config),
+        "single_in_planes": rate(lambda: renderer.render_batch(single, out=planes), 1, config),
         "single": rate(lambda: renderer.render(cameras[0]), 1, config),
         "select_ms": stats.select_ms,
         "draw_ms": renderer.render_batch(batch).stats.draw_ms,

@@ -7,6 +7,7 @@
 
 #include "bindings/array.h"
 #include "bindings/drawing.h"
+#include "frame/image.h"
 
 namespace v3dg {
 
@@ -49,6 +50,29 @@ class BoundCameras {
     const void* environments_ = nullptr;
 };
 
+// The planes of a batch: arrays that belong to the caller, or new ones.
+class BoundPlanes {
+  public:
+    // color: (B, H, W, 3 or 4). alpha, depth: (B, H, W), or None; no alpha beside four
+    // channels.
+    BoundPlanes(py::object color, py::object alpha, py::object depth);
+    // Makes arrays of three channels, alpha and, if requested, depth.
+    BoundPlanes(const BoundCameras& cameras, Device device, bool with_depth);
+
+    const py::object& color() const { return color_; }
+    const py::object& alpha() const { return alpha_; }
+    const py::object& depth() const { return depth_; }
+    const BatchPlanes& planes() const { return planes_; }
+    // Throws ValueError unless the planes are for these cameras, on this device.
+    void check(const BoundCameras& cameras, Device device) const;
+
+  private:
+    py::object color_, alpha_, depth_;
+    Device device_;
+    py::ssize_t count_, height_, width_;
+    BatchPlanes planes_{};
+};
+
 // The statistics of each picture of a batch.
 struct BatchStats {
     std::vector<int64_t> gaussians, in_frustum;
@@ -70,7 +94,14 @@ class BoundBatch {
     // Waits for the pictures, and returns their statistics.
     virtual BatchStats stats() = 0;
     // Keeps inputs and planes alive as long as this object.
-    void keep(py::object kept) { kept_ = std::move(kept); }
+    void keep(py::object kept, const BoundPlanes& planes) {
+        kept_ = std::move(kept);
+        color = planes.color();
+        alpha = planes.alpha();
+        depth = planes.depth();
+    }
+
+    py::object color, alpha, depth;  // as in BoundPlanes
 
   private:
     py::object kept_;  // destroyed after the members of a derived class

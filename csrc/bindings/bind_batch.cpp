@@ -75,12 +75,69 @@ BoundCameras::BoundCameras(py::object viewmats, py::object K, int width, int hei
             span_on<const int32_t>(device_, environments_object_, "environments", {count}).data;
 }
 
+BoundPlanes::BoundPlanes(py::object color, py::object alpha, py::object depth)
+    : color_(std::move(color)),
+      alpha_(std::move(alpha)),
+      depth_(std::move(depth)),
+      device_(device_of(color_, "color")) {
+    const std::vector<py::ssize_t> shape = shape_of(color_, "color");
+    const bool fits = shape.size() == 4 && (shape[3] == 3 || shape[3] == 4);
+    if (!fits) refuse_value("color", "expected shape (B, H, W, 3) or (B, H, W, 4), got " +
+                                         shape_text(color_));
+    count_ = shape[0];
+    height_ = shape[1];
+    width_ = shape[2];
+    planes_.channels = static_cast<int>(shape[3]);
+    if (planes_.channels == 4 && !alpha_.is_none())
+        refuse_value("alpha", "colour has alpha as its fourth channel; leave it out");
+    planes_.color =
+        span_on<float>(device_, color_, "color", {count_, height_, width_, shape[3]}).data;
+    const auto plane = [&](const py::object& array, const char* name) -> float* {
+        if (array.is_none()) return nullptr;
+        return span_on<float>(device_, array, name, {count_, height_, width_}).data;
+    };
+    planes_.alpha = plane(alpha_, "alpha");
+    planes_.depth = plane(depth_, "depth");
+}
+
+BoundPlanes::BoundPlanes(const BoundCameras& cameras, Device device, bool with_depth)
+    : depth_(py::none()),
+      device_(device),
+      count_(static_cast<py::ssize_t>(cameras.size())),
+      height_(cameras.height()),
+      width_(cameras.width()) {
+    const NewArray<float> color(device, {count_, height_, width_, 3});
+    const NewArray<float> alpha(device, {count_, height_, width_});
+    color_ = color.object;
+    alpha_ = alpha.object;
+    planes_ = {.color = color.span.data, .channels = 3, .alpha = alpha.span.data, .depth = nullptr};
+    if (!with_depth) return;
+    const NewArray<float> depth(device, {count_, height_, width_});
+    depth_ = depth.object;
+    planes_.depth = depth.span.data;
+}
+
+void BoundPlanes::check(const BoundCameras& cameras, Device device) const {
+    if (device_ != device) refuse_value("out", "expected planes on the device that draws");
+    const bool fits = count_ == static_cast<py::ssize_t>(cameras.size()) &&
+                      height_ == cameras.height() && width_ == cameras.width();
+    if (fits) return;
+    const auto channels = static_cast<py::ssize_t>(planes_.channels);
+    const auto count = static_cast<py::ssize_t>(cameras.size());
+    refuse_value("color", "expected shape " +
+                              shape_text({count, cameras.height(), cameras.width(), channels}) +
+                              ", as the cameras have, got " + shape_text(color_));
+}
+
 void bind_batch(py::module_& m) {
     m.def("fault_of_cameras", &fault_of_cameras, "viewmats"_a, "K"_a);
     py::class_<BoundCameras>(m, "Cameras", "The cameras of a batch; borrows the arrays.")
         .def(py::init<py::object, py::object, int, int, double, py::object>(), py::kw_only(),
              "viewmats"_a, "K"_a, "width"_a, "height"_a, "near"_a, "environments"_a = py::none())
         .def("__len__", &BoundCameras::size);
+    py::class_<BoundPlanes>(m, "BatchPlanes", "The planes of a batch; keeps the arrays.")
+        .def(py::init<py::object, py::object, py::object>(), "color"_a, "alpha"_a = py::none(),
+             "depth"_a = py::none());
     py::class_<BatchStats>(m, "BatchStats", "The statistics of each picture of a batch.")
         .def_readonly("gaussians", &BatchStats::gaussians)
         .def_readonly("in_frustum", &BatchStats::in_frustum)
@@ -89,6 +146,9 @@ void bind_batch(py::module_& m) {
         .def_readonly("levels", &BatchStats::levels)
         .def_readonly("num_parts", &BatchStats::num_parts);
     py::class_<BoundBatch>(m, "Batch", "Pictures that have been drawn, or enqueued on a device.")
+        .def_readonly("color", &BoundBatch::color)
+        .def_readonly("alpha", &BoundBatch::alpha)
+        .def_readonly("depth", &BoundBatch::depth)
         .def("finish", &BoundBatch::finish, "Waits for the pictures.")
         .def("stats", &BoundBatch::stats);
 }

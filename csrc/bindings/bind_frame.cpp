@@ -163,13 +163,11 @@ class BoundSceneFrame {
         return drawing;
     }
 
-    // Draws a picture for each camera with the gaussians that were set. The planes are
-    // written: colour (B, H, W, 3 or 4), alpha (B, H, W) or None, depth (B, H, W) or
-    // None.
+    // Draws a picture for each camera with the gaussians that were set, into planes of
+    // the caller or new ones.
     std::unique_ptr<BoundBatch> draw_batch(const py::object& scene_object,
                                            const py::object& cameras_object, const SelectRule& rule,
-                                           const Shade& shade, const py::object& color,
-                                           const py::object& alpha, const py::object& depth) {
+                                           const Shade& shade, const BoundPlanes* planes) {
         const BoundScene& scene = checked(scene_object);
         const auto& cameras = held<BoundCameras>(cameras_object, "cameras");
         if (cameras.device() != device_)
@@ -179,15 +177,17 @@ class BoundSceneFrame {
                 "budget: a batch has no budget; leave it out, or draw the cameras one by one");
         const std::shared_ptr<const SceneState> state = scene.state();
         check_environments(cameras, state->environments->table());
+        std::optional<BoundPlanes> new_planes;
+        if (planes == nullptr) planes = &new_planes.emplace(cameras, device_, shade.with_depth);
+        planes->check(cameras, device_);
         const BatchRequest request{.rule = rule,
                                    .shade = shade,
                                    .width = cameras.width(),
                                    .height = cameras.height(),
-                                   .planes = planes_of(cameras, color, alpha, depth)};
+                                   .planes = planes->planes()};
         std::unique_ptr<BoundBatch> batch = frame_->draw_batch(
             {.request = request, .cameras = cameras, .scene = scene.handle(), .state = state});
-        batch->keep(
-            py::make_tuple(py::cast(this), scene_object, cameras_object, color, alpha, depth));
+        batch->keep(py::make_tuple(py::cast(this), scene_object, cameras_object), *planes);
         return batch;
     }
 
@@ -215,28 +215,6 @@ class BoundSceneFrame {
     }
 
   private:
-    // Borrows the planes of a batch.
-    BatchPlanes planes_of(const BoundCameras& cameras, const py::object& color,
-                          const py::object& alpha, const py::object& depth) const {
-        const auto count = static_cast<py::ssize_t>(cameras.size());
-        const py::ssize_t height = cameras.height();
-        const py::ssize_t width = cameras.width();
-        const std::vector<py::ssize_t> shape = shape_of(color, "color");
-        const int channels = shape.size() == 4 && shape[3] == 4 ? 4 : 3;
-        if (channels == 4 && !alpha.is_none())
-            throw py::value_error("alpha: colour has alpha as its fourth channel; leave it out");
-        const auto plane = [&](const py::object& array, const char* name) -> float* {
-            if (array.is_none()) return nullptr;
-            return span_on<float>(device_, array, name, {count, height, width}).data;
-        };
-        return {
-            .color =
-                span_on<float>(device_, color, "color", {count, height, width, channels}).data,
-            .channels = channels,
-            .alpha = plane(alpha, "alpha"),
-            .depth = plane(depth, "depth")};
-    }
-
     // Throws ValueError if a camera on the host belongs to no environment of the scene.
     static void check_environments(const BoundCameras& cameras, const EnvironmentTable& table) {
         if (cameras.device() != kHost || cameras.environments() == nullptr) return;
@@ -405,7 +383,7 @@ void bind_frame(py::module_& m) {
         .def("draw", &BoundSceneFrame::draw, "scene"_a, "request"_a, "pool"_a = py::none(),
              "steps"_a = nullptr, "stop"_a = nullptr)
         .def("draw_batch", &BoundSceneFrame::draw_batch, "scene"_a, "cameras"_a, "rule"_a,
-             "shade"_a, "color"_a, "alpha"_a = py::none(), "depth"_a = py::none())
+             "shade"_a, "planes"_a = nullptr)
         .def("pick", &BoundSceneFrame::pick, "scene"_a, "request"_a, "pool"_a = py::none())
         .def("memory", &BoundSceneFrame::memory,
              "Returns the bytes that it holds on a CUDA device by part, and the bytes of the "

@@ -1,6 +1,6 @@
 // Batches of pictures of a scene on a CUDA device. A batch is one frame with a picture
-// for each camera, or several such frames, one after another, if it is large. Cameras
-// are copied when the batch is enqueued, because a frame that is drawn again must not
+// for each camera, or several such frames, one after another, if it is large. The first
+// kernel of a frame copies its cameras, because a frame that is drawn again must not
 // depend on what the caller has written to the arrays since.
 
 #include <algorithm>
@@ -29,8 +29,9 @@ FrameImage first_image(const BatchRequest& request) {
     return frame_image(Intrinsics<float>{}, request.width, request.height, background, {});
 }
 
-const SeenBounds& seen_of(const SceneTables& scene, bool is_in_environments) {
-    return is_in_environments ? scene.seen_in_environment() : scene.seen_by_all();
+// Returns bounds on what one camera sees.
+const SeenBounds& seen_of(const SceneTables& scene, const CameraArrays& arrays) {
+    return arrays.environments == nullptr ? scene.seen_by_all() : scene.seen_in_environment();
 }
 
 // Returns the most cameras of a part, at least 1.
@@ -44,29 +45,29 @@ uint32_t cameras_of_part(const BatchRequest& request, const SeenBounds& seen) {
 }  // namespace
 
 std::shared_ptr<BatchTables> SceneFrame::tables_for(uint32_t num_cameras, cudaStream_t stream) {
-    const bool fits =
-        captured_tables_ != nullptr && captured_tables_->cameras.capacity() >= num_cameras;
+    const auto is_free = [num_cameras](const std::shared_ptr<BatchTables>& tables) {
+        return tables.use_count() == 1 && tables->cameras.capacity() >= num_cameras;
+    };
+    const auto found = std::find_if(tables_.begin(), tables_.end(), is_free);
     if (is_capturing(stream)) {
-        if (!fits) refuse_capture(stream);
-        return captured_tables_;
+        if (found == tables_.end()) refuse_capture(stream);
+        captured_tables_.push_back(*found);
+        return *found;
     }
-    // A later capture must not allocate.
-    if (!fits) {
-        if (captured_tables_ != nullptr) retired_tables_.push_back(captured_tables_);
-        captured_tables_ = std::make_shared<BatchTables>(num_cameras, stream);
-    }
-    return std::make_shared<BatchTables>(num_cameras, stream);
+    if (found != tables_.end()) return *found;
+    std::erase_if(tables_, [](const auto& tables) { return tables.use_count() == 1; });
+    // There is one more than necessary, because a later capture must not allocate.
+    for (int k = 0; k < 2; ++k)
+        tables_.push_back(std::make_shared<BatchTables>(std::max(num_cameras, 1u), stream));
+    return tables_.back();
 }
 
 std::unique_ptr<BatchDrawing> SceneFrame::draw_batch(const SceneTables& scene,
                                                      const BatchRequest& request,
                                                      const CameraArrays& arrays,
                                                      uint32_t num_cameras, cudaStream_t stream) {
-    const bool is_in_environments = arrays.environments != nullptr;
-    std::unique_ptr<BatchDrawing> batch(new BatchDrawing(*this, scene, request, is_in_environments,
-                                                         num_cameras,
-                                                         tables_for(num_cameras, stream), stream));
-    read_cameras(arrays, scene, num_cameras, batch->tables_->cameras.data(), stream);
+    std::unique_ptr<BatchDrawing> batch(
+        new BatchDrawing(*this, scene, request, arrays, num_cameras, stream));
     batch->enqueue(0, num_cameras);
     return batch;
 }
@@ -77,19 +78,23 @@ void SceneFrame::halve_parts(uint32_t num_cameras) {
 }
 
 std::unique_ptr<Drawing> SceneFrame::draw_part(const BatchDrawing& batch, uint32_t first,
-                                               uint32_t count, cudaStream_t stream) {
+                                               uint32_t count, CameraSource source) {
+    const cudaStream_t stream = batch.stream_;
     const BatchRequest& request = batch.request_;
     const SceneTables& scene = batch.scene_;
-    const SeenBounds& seen = seen_of(scene, batch.is_in_environments_);
+    const SeenBounds& seen = seen_of(scene, batch.arrays_);
     const FrameImage image = first_image(request);
     const size_t num_pixels = static_cast<size_t>(request.width) * request.height;
-    const BatchViews views{.cameras = batch.tables_->cameras.data() + first,
+    const BatchViews views{.arrays = batch.arrays_,
+                           .first_camera = first,
                            .num_cameras = count,
+                           .cameras = batch.tables_->cameras.data() + first,
+                           .source = source,
                            .num_slots = static_cast<uint32_t>(batch_slots(seen.instances)),
                            .most_parts = seen.parts,
                            .first = image,
-                           .planes = request.planes.from(first * num_pixels)};
-    ImageCounts* counts = batch.tables_->counts.data() + first;
+                           .planes = request.planes.from(first * num_pixels),
+                           .counts = batch.tables_->counts.data() + first};
     const bool has_factors = !scene.on_device().instances.factors.empty();
     const BatchPlacements out{
         .images = images_.reserve(count, stream),
@@ -110,33 +115,29 @@ std::unique_ptr<Drawing> SceneFrame::draw_part(const BatchDrawing& batch, uint32
                                 .guards_models = nullptr,
                                 .num_zeros = Cut::num_batch_zeros(views.num_places()),
                                 .has_depth = request.planes.depth != nullptr,
-                                .image_counts = counts,
+                                .image_counts = views.counts,
                                 .marks_undrawn = true};
     return frame_.draw(
         of_cameras,
-        [this, &scene, views, rule = request.rule, out, counts](const ItemList& items,
-                                                                cudaStream_t on) {
-            check(cudaMemsetAsync(counts, 0, views.num_cameras * sizeof *counts, on),
-                  "cudaMemsetAsync");
+        [this, &scene, views, rule = request.rule, out](const ItemList& items, cudaStream_t on) {
             cut_.cut_batch(scene, views, rule, out, items, on);
         },
         stream);
 }
 
 BatchDrawing::BatchDrawing(SceneFrame& frame, const SceneTables& scene, const BatchRequest& request,
-                           bool is_in_environments, uint32_t num_cameras,
-                           std::shared_ptr<BatchTables> tables, cudaStream_t stream)
+                           const CameraArrays& arrays, uint32_t num_cameras, cudaStream_t stream)
     : frame_(frame),
       scene_(scene),
       request_(request),
-      is_in_environments_(is_in_environments),
+      arrays_(arrays),
       num_cameras_(num_cameras),
-      tables_(std::move(tables)),
+      tables_(frame.tables_for(num_cameras, stream)),
       stream_(stream),
       is_captured_(is_capturing(stream)) {}
 
 void BatchDrawing::enqueue(uint32_t first, uint32_t count) {
-    const SeenBounds& seen = seen_of(scene_, is_in_environments_);
+    const SeenBounds& seen = seen_of(scene_, arrays_);
     const uint32_t end = first + count;
     while (first < end) {
         const uint32_t most = std::min(cameras_of_part(request_, seen), frame_.most_cameras_);
@@ -144,7 +145,7 @@ void BatchDrawing::enqueue(uint32_t first, uint32_t count) {
         try {
             parts_.push_back({.first = first,
                               .count = size,
-                              .drawing = frame_.draw_part(*this, first, size, stream_)});
+                              .drawing = frame_.draw_part(*this, first, size, CameraSource::arrays)});
             first += size;
             continue;
         } catch (const OutOfMemory&) {
@@ -175,7 +176,7 @@ void BatchDrawing::finish_part(Part part, std::vector<Part>& finished) {
     try {
         while (!part.drawing->finish_or_enlarge()) {
             part.drawing.reset();
-            part.drawing = frame_.draw_part(*this, part.first, part.count, stream_);
+            part.drawing = frame_.draw_part(*this, part.first, part.count, CameraSource::copies);
         }
         finished.push_back(std::move(part));
         return;
@@ -193,7 +194,7 @@ void BatchDrawing::finish_part(Part part, std::vector<Part>& finished) {
     for (const Part& one : halves)
         finish_part({.first = one.first,
                      .count = one.count,
-                     .drawing = frame_.draw_part(*this, one.first, one.count, stream_)},
+                     .drawing = frame_.draw_part(*this, one.first, one.count, CameraSource::copies)},
                     finished);
 }
 

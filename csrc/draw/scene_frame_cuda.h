@@ -72,7 +72,7 @@ class DevicePalette {
 // Combines the pictures of two eyes into one frame.
 EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_transmittance);
 
-// What a batch that is being drawn has on the device.
+// The memory of a batch in progress: copies of its cameras, and the counts of its images.
 struct BatchTables {
     BatchTables(uint32_t num_cameras, cudaStream_t stream)
         : cameras(num_cameras, stream), counts(num_cameras, stream) {}
@@ -106,8 +106,8 @@ class SceneFrame {
                                   const Frame::Place& place);
 
     // Draws a picture for each camera of a batch, in parts if the batch is large. As
-    // draw(), but the planes of the request are written. The cameras are read at once,
-    // in the order of the stream.
+    // draw(), but the planes of the request are written. The cameras are read by the
+    // first kernels.
     std::unique_ptr<BatchDrawing> draw_batch(const SceneTables& scene, const BatchRequest& request,
                                              const CameraArrays& arrays, uint32_t num_cameras,
                                              cudaStream_t stream);
@@ -117,10 +117,11 @@ class SceneFrame {
 
   private:
     friend class BatchDrawing;
+    // Returns memory that no other batch in progress has.
     std::shared_ptr<BatchTables> tables_for(uint32_t num_cameras, cudaStream_t stream);
     // Draws cameras [first, first + count) of a batch.
     std::unique_ptr<Drawing> draw_part(const BatchDrawing& batch, uint32_t first, uint32_t count,
-                                       cudaStream_t stream);
+                                       CameraSource source);
     // Draws smaller parts from now on.
     void halve_parts(uint32_t num_cameras);
 
@@ -148,9 +149,8 @@ class SceneFrame {
     DeviceBuffer<InstanceFactors> factors_;  // of the places of a batch
     DeviceBuffer<FrameImage> images_;
     uint32_t most_cameras_ = ~0u;  // in a part of a batch
-    // Of batches that are captured; graphs continue to use retired ones.
-    std::shared_ptr<BatchTables> captured_tables_;
-    std::vector<std::shared_ptr<BatchTables>> retired_tables_;
+    std::vector<std::shared_ptr<BatchTables>> tables_;           // of batches
+    std::vector<std::shared_ptr<BatchTables>> captured_tables_;  // graphs continue to use these
     Cut cut_;
     Frame frame_;
 };
@@ -179,8 +179,7 @@ class BatchDrawing {
         std::unique_ptr<Drawing> drawing;
     };
     BatchDrawing(SceneFrame& frame, const SceneTables& scene, const BatchRequest& request,
-                 bool is_in_environments, uint32_t num_cameras,
-                 std::shared_ptr<BatchTables> tables, cudaStream_t stream);
+                 const CameraArrays& arrays, uint32_t num_cameras, cudaStream_t stream);
     // Draws the cameras from `first` on, in parts.
     void enqueue(uint32_t first, uint32_t count);
     void finish_part(Part part, std::vector<Part>& finished);
@@ -188,7 +187,7 @@ class BatchDrawing {
     SceneFrame& frame_;
     const SceneTables& scene_;
     const BatchRequest request_;
-    const bool is_in_environments_;  // whether each camera sees one environment
+    const CameraArrays arrays_;
     const uint32_t num_cameras_;
     const std::shared_ptr<BatchTables> tables_;
     const cudaStream_t stream_;

@@ -19,8 +19,6 @@ namespace cuda {
 
 namespace {
 
-constexpr unsigned kReadThreads = 128;
-
 __device__ double number_of(const void* numbers, bool are_double, size_t i) {
     return are_double ? static_cast<const double*>(numbers)[i]
                       : static_cast<double>(static_cast<const float*>(numbers)[i]);
@@ -38,11 +36,8 @@ __device__ int32_t environment_of(const CameraArrays& arrays, uint32_t b) {
     return is_one ? static_cast<int32_t>(environment) : kMostEnvironment + 1;
 }
 
-// One thread per camera.
-__global__ void read_cameras_kernel(CameraArrays arrays, EnvironmentTable environments,
-                                    uint32_t count, BatchCamera* cameras) {
-    const uint32_t b = blockIdx.x * kReadThreads + threadIdx.x;
-    if (b >= count) return;
+__device__ BatchCamera read_camera(const CameraArrays& arrays,
+                                   const EnvironmentTable& environments, uint32_t b) {
     double viewmat[16], K[9];
     for (int k = 0; k < 16; ++k)
         viewmat[k] = number_of(arrays.viewmats, arrays.are_viewmats_double, 16 * size_t(b) + k);
@@ -52,10 +47,9 @@ __global__ void read_cameras_kernel(CameraArrays arrays, EnvironmentTable enviro
     const int32_t environment = environment_of(arrays, b);
     const bool is_drawn =
         fault_of_camera(viewmat, K) == CameraFault::none && environments.has(environment);
-    cameras[b] = {
-        .camera = camera_of(viewmat, K, arrays.width, arrays.height, arrays.near_depth),
-        .environment = environment,
-        .is_drawn = is_drawn ? 1u : 0u};
+    return {.camera = camera_of(viewmat, K, arrays.width, arrays.height, arrays.near_depth),
+            .environment = environment,
+            .is_drawn = is_drawn ? 1u : 0u};
 }
 
 // Returns the image of camera b.
@@ -82,12 +76,16 @@ __global__ void __launch_bounds__(kPlaceThreads, kPlaceBlocks / 2)
     const unsigned blocks_each = views.num_slots / kPlaceThreads;
     const uint32_t b = static_cast<uint32_t>(block / blocks_each);
     const int32_t s = static_cast<int32_t>(block % blocks_each * kPlaceThreads + threadIdx.x);
-    static_assert(sizeof(BatchCamera) % sizeof(double) == 0, "it is copied in doubles");
-    for (unsigned k = threadIdx.x; k < sizeof(BatchCamera) / sizeof(double); k += kPlaceThreads)
-        reinterpret_cast<double*>(&own)[k] =
-            reinterpret_cast<const double*>(views.cameras + b)[k];
+    const bool reads_copies = views.source == CameraSource::copies;
+    if (threadIdx.x == 0)
+        own = reads_copies ? views.cameras[b]
+                           : read_camera(views.arrays, environments, views.first_camera + b);
+    if (s == 0) {
+        if (!reads_copies) views.cameras[b] = own;
+        out.images[b] = image_of(views, own.camera, b);
+        views.counts[b] = {};
+    }
     __syncthreads();
-    if (s == 0) out.images[b] = image_of(views, own.camera, b);
     const int32_t num_instances = own.is_drawn != 0 ? environments.num_slots(own.environment) : 0;
     InstanceSlot slot{.is_taken = s < num_instances,
                       .instance = 0,
@@ -110,13 +108,6 @@ __global__ void __launch_bounds__(kPlaceThreads, kPlaceBlocks / 2)
 }
 
 }  // namespace
-
-void read_cameras(const CameraArrays& arrays, const SceneTables& scene, uint32_t count,
-                  BatchCamera* cameras, cudaStream_t stream) {
-    const StreamLock lock = scene.lock(stream);
-    launch("read_cameras_kernel", read_cameras_kernel, blocks_for(count, kReadThreads),
-           kReadThreads, 0, stream, arrays, scene.on_device().environments, count, cameras);
-}
 
 size_t batch_slots(size_t most_instances) {
     return kPlaceThreads * size_t(place_blocks(most_instances));

@@ -58,20 +58,26 @@ struct CameraArrays {
     double near_depth;
 };
 
-// Reads the cameras of a batch. A camera whose numbers are wrong, or whose environment
-// the scene does not have, is not drawn.
-void read_cameras(const CameraArrays& arrays, const SceneTables& scene, uint32_t count,
-                  BatchCamera* cameras, cudaStream_t stream);
+// What the cameras of a batch are read from.
+enum class CameraSource {
+    arrays,
+    copies,  // for a frame that is drawn again, because the arrays may have changed
+};
 
 // The viewpoints of a batch, and where their instances are placed. The instance in slot
-// s of camera b has place b * num_slots + s.
+// s of camera b has place b * num_slots + s. A camera whose numbers are wrong, or whose
+// environment the scene does not have, is not drawn.
 struct BatchViews {
-    const BatchCamera* cameras;
+    CameraArrays arrays;    // of all cameras of the batch
+    uint32_t first_camera;  // of these views
     uint32_t num_cameras;
+    CameraSource source;
+    BatchCamera* cameras;  // copies of the cameras of these views; written, or read
     uint32_t num_slots;  // of each camera: batch_slots()
     size_t most_parts;   // of the tables that one camera sees
     FrameImage first;    // the image of the first camera; the others follow it
     BatchPlanes planes;  // of all images
+    ImageCounts* counts;  // of all images; the cut clears them
 
     size_t num_places() const { return size_t(num_cameras) * num_slots; }
 };

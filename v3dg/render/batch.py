@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from v3dg import _core
-from v3dg._device import Device, memory_errors
+from v3dg._device import Device
 from v3dg._numbers import check, check_type
 from v3dg.camera_batch import CameraBatch, form_of
 from v3dg.cameras import Camera
@@ -16,7 +17,7 @@ from v3dg.image import Planes, RenderedImage, Stats
 from v3dg.render.request import CutRequest
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -40,6 +41,12 @@ class BatchPlanes:
     color: Array
     alpha: Array | None = None
     depth: Array | None = None
+
+    @cached_property
+    def core(self) -> _core.BatchPlanes:
+        """The planes for the compiled operations; ValueError if they do not fit
+        together."""
+        return _core.BatchPlanes(self.color, self.alpha, self.depth)
 
 
 class BatchStats(NamedTuple):
@@ -65,18 +72,20 @@ class BatchStats(NamedTuple):
 class RenderedBatch:
     """B pictures of H x W pixels.
 
-    CUDA may still be drawing them; reading an attribute waits for the end. `planes` are
-    the same arrays without waiting, for work that is queued on the same stream.
+    CUDA may still be drawing them; reading an attribute waits for the end.
     """
 
-    def __init__(
-        self, core: _core.Batch, cameras: CameraBatch, planes: BatchPlanes, tolerance: float
-    ) -> None:
-        self.planes = planes
+    def __init__(self, core: _core.Batch, cameras: CameraBatch, tolerance: float) -> None:
         self._cameras = cameras
         self._core = core
         self._tolerance = tolerance
         self._stats: _core.BatchStats | None = None
+
+    @property
+    def planes(self) -> BatchPlanes:
+        """The arrays of the attributes without waiting, for work that is queued on the
+        same stream."""
+        return BatchPlanes(self._core.color, self._core.alpha, self._core.depth)
 
     def wait(self) -> None:
         """Wait until all pictures are drawn. If the buffers of the renderer were too
@@ -88,7 +97,7 @@ class RenderedBatch:
         """(B, H, W, 3) premultiplied colour, the background composed last; (B, H, W, 4)
         in planes that have alpha as the fourth channel."""
         self._core.finish()
-        return self.planes.color
+        return self._core.color
 
     @property
     def alpha(self) -> Array:
@@ -98,22 +107,24 @@ class RenderedBatch:
 
     @property
     def _alpha(self) -> Array:
-        if self.planes.alpha is None:
-            if self.planes.color.shape[-1] == 4:
-                return self.planes.color[..., 3]
-            raise AttributeError("alpha: expected planes with alpha, got planes without")
-        return self.planes.alpha
+        alpha = self._core.alpha
+        if alpha is not None:
+            return alpha
+        if self._core.color.shape[-1] == 4:
+            return self._core.color[..., 3]
+        raise AttributeError("alpha: expected planes with alpha, got planes without")
 
     @property
     def depth(self) -> Array:
         """(B, H, W) expected depth along the axes of the cameras, 0 where nothing was
         drawn."""
         self._core.finish()
-        if self.planes.depth is None:
+        depth = self._core.depth
+        if depth is None:
             raise AttributeError(
                 "depth: expected pictures that were drawn with depth=True, got others without"
             )
-        return self.planes.depth
+        return depth
 
     @property
     def distance(self) -> Array:
@@ -149,10 +160,10 @@ class RenderedBatch:
     def picture_planes(self, number: int) -> Planes:
         """Return the planes of one picture, once it is drawn."""
         self._core.finish()
-        depth = self.planes.depth
+        depth = self._core.depth
         if depth is not None:
             depth = depth[number]
-        return Planes(self.planes.color[number][..., :3], self._alpha[number], depth)
+        return Planes(self._core.color[number][..., :3], self._alpha[number], depth)
 
     def picture_stats(self, number: int) -> Stats:
         """Return the costs of one picture; on CUDA, times are those of the whole
@@ -172,7 +183,7 @@ class RenderedBatch:
         )
 
     def __len__(self) -> int:
-        return len(self.planes.color)
+        return len(self._core.color)
 
     def __getitem__(self, number: int) -> RenderedImage:
         """Return one picture."""
@@ -181,7 +192,7 @@ class RenderedBatch:
         return _PictureOfBatch(self, number % len(self))
 
     def __repr__(self) -> str:
-        _, height, width = self.planes.color.shape[:3]
+        _, height, width = self._core.color.shape[:3]
         return f"RenderedBatch({len(self)} pictures of {width}x{height})"
 
 
@@ -215,21 +226,13 @@ def draw_batch(
 ) -> RenderedBatch:
     """Draw a batch of a resident scene with the gaussians of a frame."""
     cameras = request.cameras
-    planes = request.planes
-    if planes is None:
-        planes = _new_planes(cameras, device, with_depth=request.shade.with_depth)
+    planes = None
+    if request.planes is not None:
+        planes = request.planes.core
     rule = request.cut.rule
-    core = frame.draw_batch(
-        resident.core,
-        cameras.core_on(device),
-        rule,
-        request.shade,
-        planes.color,
-        planes.alpha,
-        planes.depth,
-    )
+    core = frame.draw_batch(resident.core, cameras.core_on(device), rule, request.shade, planes)
     resident.add_drawing(core)
-    return RenderedBatch(core, cameras, planes, rule.tolerance_px2)
+    return RenderedBatch(core, cameras, rule.tolerance_px2)
 
 
 def ray_lengths(cameras: CameraBatch, like: Array | None = None) -> Array:
@@ -269,22 +272,3 @@ def are_alike(cameras: Sequence[Camera]) -> bool:
     if len(cameras) < 2 or any(type(camera) is not Camera for camera in cameras):
         return False
     return len({form_of(camera) for camera in cameras}) == 1
-
-
-def _new_planes(cameras: CameraBatch, device: Device, *, with_depth: bool) -> BatchPlanes:
-    shape = (len(cameras), cameras.height, cameras.width)
-    make = _maker(device)
-    depth = None
-    with memory_errors():
-        if with_depth:
-            depth = make(shape)
-        return BatchPlanes(make((*shape, 3)), make(shape), depth)
-
-
-def _maker(device: Device) -> Callable[[tuple[int, ...]], Array]:
-    """Return the function that makes uninitialised arrays of a shape on a device."""
-    if not device.is_cuda:
-        return lambda shape: np.empty(shape, np.float32)
-    import torch
-
-    return lambda shape: torch.empty(shape, dtype=torch.float32, device=str(device))
