@@ -73,8 +73,9 @@ def floor_of(bundles: list[v3dg.Bundle], count: int) -> v3dg.Scene:
     scene = v3dg.Scene()
     side = int(np.ceil(np.sqrt(count)))
     place = np.arange(count)
-    positions = np.stack([place % side, place // side, np.zeros(count)], axis=1) * 3.0
-    positions[:, :2] -= 1.5 * (side - 1)
+    middle = 1.5 * (side - 1)
+    rows = [3.0 * (place % side) - middle, 3.0 * (place // side) - middle, np.zeros(count)]
+    positions = np.stack(rows, axis=1)
     turn = np.random.default_rng(0).uniform(0, np.pi, count)
     quaternions = np.stack([np.cos(turn), 0 * turn, 0 * turn, np.sin(turn)], axis=1)
     in_turn = [bundles[number % len(bundles)] for number in range(count)]

@@ -275,14 +275,13 @@ def _subjects_of(
 
 
 _POSE = ("position", "quaternion", "scale")
+_FACTORS = ("importance", "opacity", "tint", "environment")
 
 
 def _instance_of(node: Node, subjects: _Subjects, scene: Scene) -> _Instance:
     """Return an instance of a scene file; if it names an axis that is up, its scene
     takes that axis."""
-    optional = ("bundle", "scene", *_POSE, "matrix", "up", "importance", "opacity", "tint")
-    optional = (*optional, "environment")
-    fields = node.fields((), optional)
+    fields = node.fields((), ("bundle", "scene", *_POSE, "matrix", "up", *_FACTORS))
     if ("bundle" in fields) == ("scene" in fields):
         raise node.error("either the field bundle or the field scene")
     if "matrix" not in fields:
