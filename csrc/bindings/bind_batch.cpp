@@ -82,8 +82,9 @@ BoundPlanes::BoundPlanes(py::object color, py::object alpha, py::object depth)
       device_(device_of(color_, "color")) {
     const std::vector<py::ssize_t> shape = shape_of(color_, "color");
     const bool fits = shape.size() == 4 && (shape[3] == 3 || shape[3] == 4);
-    if (!fits) refuse_value("color", "expected shape (B, H, W, 3) or (B, H, W, 4), got " +
-                                         shape_text(color_));
+    if (!fits)
+        refuse_value("color",
+                     "expected shape (B, H, W, 3) or (B, H, W, 4), got " + shape_text(color_));
     count_ = shape[0];
     height_ = shape[1];
     width_ = shape[2];

@@ -98,8 +98,8 @@ void BoundScene::set_instances(const py::array& bundle, const py::array& importa
     instances.importance = span_of<const float>(importance, "importance", {count});
     instances.factors = factors_of(factors, count);
     const std::vector<int32_t> environment = environments_of(environments, count);
-    state->environments = std::make_shared<Environments>(
-        Span<const int32_t>{environment.data(), environment.size()});
+    state->environments =
+        std::make_shared<Environments>(Span<const int32_t>{environment.data(), environment.size()});
     state->arrays = py::make_tuple(bundle, importance, positions, quaternions, scales, factors);
     const Work work(device_);
     scene_->set_instances(*state, work);

@@ -143,9 +143,10 @@ void BatchDrawing::enqueue(uint32_t first, uint32_t count) {
         const uint32_t most = std::min(cameras_of_part(request_, seen), frame_.most_cameras_);
         const uint32_t size = std::min(most, end - first);
         try {
-            parts_.push_back({.first = first,
-                              .count = size,
-                              .drawing = frame_.draw_part(*this, first, size, CameraSource::arrays)});
+            parts_.push_back(
+                {.first = first,
+                 .count = size,
+                 .drawing = frame_.draw_part(*this, first, size, CameraSource::arrays)});
             first += size;
             continue;
         } catch (const OutOfMemory&) {
@@ -188,14 +189,15 @@ void BatchDrawing::finish_part(Part part, std::vector<Part>& finished) {
     part.drawing.reset();
     frame_.halve_parts(part.count);
     const uint32_t half = part.count / 2;
-    const Part halves[2] = {{.first = part.first, .count = half, .drawing = nullptr},
-                            {.first = part.first + half, .count = part.count - half,
-                             .drawing = nullptr}};
+    const Part halves[2] = {
+        {.first = part.first, .count = half, .drawing = nullptr},
+        {.first = part.first + half, .count = part.count - half, .drawing = nullptr}};
     for (const Part& one : halves)
-        finish_part({.first = one.first,
-                     .count = one.count,
-                     .drawing = frame_.draw_part(*this, one.first, one.count, CameraSource::copies)},
-                    finished);
+        finish_part(
+            {.first = one.first,
+             .count = one.count,
+             .drawing = frame_.draw_part(*this, one.first, one.count, CameraSource::copies)},
+            finished);
 }
 
 std::vector<ImageCounts> BatchDrawing::counts() const {

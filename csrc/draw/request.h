@@ -52,8 +52,8 @@ struct FrameRequest {
     }
 };
 
-// The request for pictures of one size, each with a cut for its own camera. The rule has
-// no budget.
+// The request for pictures of one size, each with a cut for its own camera. The rule
+// has no budget.
 struct BatchRequest {
     SelectRule rule;
     Shade shade;  // whether depth is drawn follows from the planes

@@ -36,9 +36,9 @@ struct HostScene {
 // The cameras of a batch on the host. All have the size of the request, and belong to
 // environments of the scene.
 struct HostCameras {
-    Span<const Camera> camera;          // [B]
-    Span<const int32_t> environment;    // [B] as in EnvironmentTable
-    EnvironmentTable environments;      // of the scene's instances
+    Span<const Camera> camera;        // [B]
+    Span<const int32_t> environment;  // [B] as in EnvironmentTable
+    EnvironmentTable environments;    // of the scene's instances
 };
 
 // The counts of one frame.

@@ -322,8 +322,7 @@ Picture<float> picture_of(const BatchRequest& request, size_t k) {
 // Draws the picture of camera k.
 SceneFrameCounts draw_picture(const HostScene& scene, const BatchRequest& request,
                               const HostCameras& cameras, size_t k, Workspace<float>& workspace) {
-    const FrameRequest one{
-        .eyes = cameras.camera[k], .rule = request.rule, .shade = request.shade};
+    const FrameRequest one{.eyes = cameras.camera[k], .rule = request.rule, .shade = request.shade};
     const Picture<float> picture = picture_of(request, k);
     const int32_t environment = cameras.environment[k];
     if (environment == kSeesAll)

@@ -72,7 +72,8 @@ class DevicePalette {
 // Combines the pictures of two eyes into one frame.
 EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_transmittance);
 
-// The memory of a batch in progress: copies of its cameras, and the counts of its images.
+// The memory of a batch in progress: copies of its cameras, and the counts of its
+// images.
 struct BatchTables {
     BatchTables(uint32_t num_cameras, cudaStream_t stream)
         : cameras(num_cameras, stream), counts(num_cameras, stream) {}
@@ -148,7 +149,7 @@ class SceneFrame {
     DeviceBuffer<Placement> placements_;
     DeviceBuffer<InstanceFactors> factors_;  // of the places of a batch
     DeviceBuffer<FrameImage> images_;
-    uint32_t most_cameras_ = ~0u;  // in a part of a batch
+    uint32_t most_cameras_ = ~0u;                                // in a part of a batch
     std::vector<std::shared_ptr<BatchTables>> tables_;           // of batches
     std::vector<std::shared_ptr<BatchTables>> captured_tables_;  // graphs continue to use these
     Cut cut_;

@@ -11,7 +11,7 @@
 
 namespace v3dg {
 
-constexpr int32_t kShared = -1;   // as an instance's environment: all see it
+constexpr int32_t kShared = -1;  // as an instance's environment: all see it
 constexpr int32_t kMostEnvironment = (1 << 24) - 1;
 constexpr int32_t kSeesAll = -2;  // as a camera's environment: it sees all instances
 

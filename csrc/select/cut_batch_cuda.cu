@@ -1,8 +1,8 @@
 // The cut of a batch: each camera has the cut that cut_cuda.cu computes for it alone.
 // There are as many kernels as for a single camera.
 //
-// place_batch_kernel has a thread for each slot of each camera, and its blocks belong to
-// one camera each. Slots are aligned to blocks, so that the lanes of a warp have the
+// place_batch_kernel has a thread for each slot of each camera, and its blocks belong
+// to one camera each. Slots are aligned to blocks, so that the lanes of a warp have the
 // instances that they have in the cut of a single camera, and the same neighbours share
 // items. cut_kernel then tests the parts of all cameras.
 
@@ -36,8 +36,8 @@ __device__ int32_t environment_of(const CameraArrays& arrays, uint32_t b) {
     return is_one ? static_cast<int32_t>(environment) : kMostEnvironment + 1;
 }
 
-__device__ BatchCamera read_camera(const CameraArrays& arrays,
-                                   const EnvironmentTable& environments, uint32_t b) {
+__device__ BatchCamera read_camera(const CameraArrays& arrays, const EnvironmentTable& environments,
+                                   uint32_t b) {
     double viewmat[16], K[9];
     for (int k = 0; k < 16; ++k)
         viewmat[k] = number_of(arrays.viewmats, arrays.are_viewmats_double, 16 * size_t(b) + k);
@@ -102,8 +102,8 @@ __global__ void __launch_bounds__(kPlaceThreads, kPlaceBlocks / 2)
         return sides_of_eyes(eyes, scene.bundles[bundle].table.pad_px);
     };
     const Placed placed = place_instance(scene, slot, eyes, sides_of, rule, out.placements);
-    const unsigned num_parts = write_parts(scene, placed, block, slot.place,
-                                           static_cast<size_t>(num_instances), scratch);
+    const unsigned num_parts =
+        write_parts(scene, placed, block, slot.place, static_cast<size_t>(num_instances), scratch);
     if (block + 1 == gridDim.x && threadIdx.x == 0) *scratch.num_parts = num_parts;
 }
 

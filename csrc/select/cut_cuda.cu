@@ -295,9 +295,9 @@ void Cut::select(const SceneTables& scene, const Eyes& eyes, const SelectRule& r
 }
 
 size_t Cut::bytes() const {
-    return sides_.bytes() + views_.bytes() + bundle_of_place_.bytes() + tops_.bytes() + parts_.bytes() + states_.bytes() +
-           zeros_.bytes() + budget_.bytes() + pair_instance_.bytes() + pair_cluster_.bytes() +
-           pair_weight_.bytes() + pairs_.bytes();
+    return sides_.bytes() + views_.bytes() + bundle_of_place_.bytes() + tops_.bytes() +
+           parts_.bytes() + states_.bytes() + zeros_.bytes() + budget_.bytes() +
+           pair_instance_.bytes() + pair_cluster_.bytes() + pair_weight_.bytes() + pairs_.bytes();
 }
 
 }  // namespace cuda

@@ -43,7 +43,8 @@ struct View {
     const SelectInput& in;
     std::vector<CameraSides> sides;  // one per bundle
     std::vector<ClusterRuns> own_runs;
-    Span<const ClusterRuns> runs;  // one per bundle, set by find_runs(); empty if there are few instances
+    Span<const ClusterRuns>
+        runs;  // one per bundle, set by find_runs(); empty if there are few instances
     size_t most_groups = 0, most_clusters = 0;  // largest numbers in any bundle
 
     explicit View(const SelectInput& input) : in(input) {

@@ -73,11 +73,11 @@ struct BatchViews {
     uint32_t num_cameras;
     CameraSource source;
     BatchCamera* cameras;  // copies of the cameras of these views; written, or read
-    uint32_t num_slots;  // of each camera: batch_slots()
-    size_t most_parts;   // of the tables that one camera sees
-    FrameImage first;    // the image of the first camera; the others follow it
-    BatchPlanes planes;  // of all images
-    ImageCounts* counts;  // of all images; the cut clears them
+    uint32_t num_slots;    // of each camera: batch_slots()
+    size_t most_parts;     // of the tables that one camera sees
+    FrameImage first;      // the image of the first camera; the others follow it
+    BatchPlanes planes;    // of all images
+    ImageCounts* counts;   // of all images; the cut clears them
 
     size_t num_places() const { return size_t(num_cameras) * num_slots; }
 };
