@@ -101,8 +101,8 @@ class Frame {
     // Returns the device memory in bytes, by part.
     std::vector<std::pair<const char*, size_t>> bytes() const;
 
-    // Frees the buffers, so that a smaller frame fits; not if a graph was captured, which
-    // may still use them.
+    // Frees the buffers, so that a smaller frame fits; not if a graph was captured,
+    // which may still use them.
     void release_buffers();
 
     // Returns the tape of the last frame. Precondition: the frame keeps a tape.
@@ -116,8 +116,8 @@ class Frame {
     // Returns the lists in the current buffers.
     FrameLists lists(const FrameBatch& batch) const;
     RecordPlanes records() const;
-    // Enlarges the buffers if an earlier frame that is done exceeded or nearly filled one,
-    // because the next frame is then likely to do so, too. Its drawing may be gone.
+    // Enlarges the buffers if an earlier frame that is done exceeded or nearly filled
+    // one, because the next frame is then likely to do so, too. Its drawing may be gone.
     void check_counts();
     void enlarge(const FrameCounters& counters);
     Slot* take_slot(bool capturing);
@@ -176,9 +176,9 @@ class Drawing {
     // For a captured frame, it returns the counters of the last replay, which must have
     // ended. It throws std::runtime_error if a buffer was too small for that replay.
     const FrameCounters& finish();
-    // Waits for the drawing, and returns whether it was drawn. If a buffer was too small,
-    // enlarges it, for a caller that draws a new frame in place of this one. Throws as
-    // finish() does. Not allowed for a captured frame.
+    // Waits for the drawing, and returns whether it was drawn. If a buffer was too
+    // small, enlarges it, for a caller that draws a new frame in place of this one.
+    // Throws as finish() does. Not allowed for a captured frame.
     bool finish_or_enlarge();
     bool is_captured() const { return is_captured_; }
     FrameTimes times() const;

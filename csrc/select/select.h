@@ -46,8 +46,8 @@ struct SelectInput {
     Span<const Span<uint32_t>> needs = {};
     // state of tolerance_of_budget(), for BudgetPace::in_steps
     uint32_t* last_bin = nullptr;
-    // As runs_of_bundles() returns them, for callers that select many cuts; if empty, each
-    // cut finds them anew.
+    // As runs_of_bundles() returns them, for callers that select many cuts; if empty,
+    // each cut finds them anew.
     Span<const ClusterRuns> runs = {};
 };
 

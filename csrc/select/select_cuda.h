@@ -114,8 +114,8 @@ class Cut {
     // Returns the number of elements that cut_items() needs in items.zeros.
     static size_t num_zeros(const SceneTables& scene, const SelectRule& rule);
 
-    // Writes the clusters that each camera of a batch draws as the items of a frame, with
-    // the decisions of cut_items(). The rule has no budget.
+    // Writes the clusters that each camera of a batch draws as the items of a frame,
+    // with the decisions of cut_items(). The rule has no budget.
     void cut_batch(const SceneTables& scene, const BatchViews& views, const SelectRule& rule,
                    const BatchPlacements& out, const ItemList& items, cudaStream_t stream);
 

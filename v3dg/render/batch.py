@@ -235,20 +235,20 @@ def draw_batch(
     return RenderedBatch(core, cameras, rule.tolerance_px2)
 
 
-def ray_lengths(cameras: CameraBatch, like: Array | None = None) -> Array:
+def ray_lengths(cameras: CameraBatch, depth: Array | None = None) -> Array:
     """Return (B, H, W) or (1, H, W) lengths of the vectors from the eyes through the
     centres of pixels to depth 1, in double precision: on the host, or as a tensor where
-    `like` is."""
+    `depth` is."""
     K: Array = cameras.K
     columns: Array = np.arange(cameras.width) + 0.5
     rows: Array = np.arange(cameras.height) + 0.5
-    if like is not None:
+    if depth is not None:
         import torch
 
         if isinstance(K, np.ndarray):
             K = np.array(K)  # a copy, because torch warns of arrays that are read-only
         K, columns, rows = (
-            torch.as_tensor(array, dtype=torch.float64, device=like.device)
+            torch.as_tensor(array, dtype=torch.float64, device=depth.device)
             for array in (K, columns, rows)
         )
     K = K.reshape(-1, 3, 3)
