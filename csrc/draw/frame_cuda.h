@@ -117,7 +117,8 @@ class Frame {
     FrameLists lists(const FrameBatch& batch) const;
     RecordPlanes records() const;
     // Enlarges the buffers if an earlier frame that is done exceeded or nearly filled
-    // one, because the next frame is then likely to do so, too. Its drawing may be gone.
+    // one, because the next frame is then likely to do so, too. The drawing of the
+    // earlier frame may be gone.
     void check_counts();
     void enlarge(const FrameCounters& counters);
     Slot* take_slot(bool capturing);
