@@ -74,7 +74,7 @@ class ResidentScene:
         # would keep itself alive.
         self.references: tuple[weakref.ref[Bundle], ...] = ()
         # Drawings that may be in progress.
-        self._drawings: weakref.WeakSet[_core.Drawing] = weakref.WeakSet()
+        self._drawings: weakref.WeakSet[_core.Drawing | _core.Batch] = weakref.WeakSet()
         self._lock = threading.Lock()  # guards _drawings
         self.revision = (-1, -1, -1)
 
@@ -131,10 +131,11 @@ class ResidentScene:
                 quaternions,
                 scales,
                 scene.factors,
+                scene.environments,
             )
         self.revision = scene.revision
 
-    def add_drawing(self, drawing: _core.Drawing) -> None:
+    def add_drawing(self, drawing: _core.Drawing | _core.Batch) -> None:
         """Keep track of a frame that may be in progress."""
         if self.device.is_cuda:
             with self._lock:

@@ -42,6 +42,10 @@ struct FrameBatch {
     // Whether depth is drawn in any of the images that get their destination from a
     // Place.
     bool has_depth = true;
+    ImageCounts* image_counts = nullptr;  // see ProjectInput
+    // Whether images that are not drawn, because a buffer is too small, become NaN. All
+    // of them have planes.
+    bool marks_undrawn = false;
 };
 
 // The results of a frame that its backward pass needs. Valid until the next frame is
@@ -98,6 +102,10 @@ class Frame {
     // Returns the device memory in bytes, by part.
     std::vector<std::pair<const char*, size_t>> bytes() const;
 
+    // Frees the buffers, so that a smaller frame fits; not if a graph was captured,
+    // which may still use them.
+    void release_buffers();
+
     // Returns the tape of the last frame. Precondition: the frame keeps a tape.
     FrameTape tape() const;
 
@@ -109,13 +117,18 @@ class Frame {
     // Returns the lists in the current buffers.
     FrameLists lists(const FrameBatch& batch) const;
     RecordPlanes records() const;
+    // Enlarges the buffers if an earlier frame that is done exceeded or nearly filled
+    // one, because the next frame is then likely to do so, too. The drawing of the
+    // earlier frame may be gone.
+    void check_counts();
     void enlarge(const FrameCounters& counters);
     Slot* take_slot(bool capturing);
     template <class T>
     T* room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing);
 
     const Keeps keeps_;
-    Capacity capacity_{64, 4096, 4096, 4096, 4096};
+    static constexpr Capacity kFirstCapacity{64, 4096, 4096, 4096, 4096};
+    Capacity capacity_ = kFirstCapacity;
     DeviceBuffer<DrawItem> items_;
     DeviceBuffer<uint32_t> item_records_, source_, first_slot_, image_of_tile_, order_, blended_;
     DeviceBuffer<float> records_;
@@ -138,7 +151,7 @@ class Frame {
     // Buffers that captured graphs may still use.
     std::vector<std::shared_ptr<void>> retired_;
     bool was_captured_ = false;
-    Drawing* last_ = nullptr;
+    std::vector<Slot*> unchecked_;  // of frames whose counts were not compared with the buffers
     FrameBatch last_batch_{};
     cudaStream_t last_stream_ = nullptr;
     StreamMutex busy_;
@@ -165,6 +178,11 @@ class Drawing {
     // For a captured frame, it returns the counters of the last replay, which must have
     // ended. It throws std::runtime_error if a buffer was too small for that replay.
     const FrameCounters& finish();
+    // Waits for the drawing, and returns whether it was drawn. If a buffer was too
+    // small, enlarges it, for a caller that draws a new frame in place of this one.
+    // Throws as finish() does. Not allowed for a captured frame.
+    bool finish_or_enlarge();
+    bool is_captured() const { return is_captured_; }
     FrameTimes times() const;
     // Returns how often the frame was drawn; more than once if a buffer was too small.
     // Valid after finish().

@@ -52,4 +52,13 @@ struct FrameRequest {
     }
 };
 
+// The request for pictures of one size, each with a cut for its own camera. The rule
+// has no budget.
+struct BatchRequest {
+    SelectRule rule;
+    Shade shade;  // whether depth is drawn follows from the planes
+    int width, height;
+    BatchPlanes planes;
+};
+
 }  // namespace v3dg

@@ -185,6 +185,9 @@ struct FrameLists {
     bool has_depth = true;  // must be true if any image has a depth plane
     // Host memory that receives a copy of the counters; may be null.
     FrameCounters* report = nullptr;
+    // The number of images, all with planes, that become NaN if the counters exceed a
+    // capacity; 0 leaves them as they are.
+    uint32_t num_marked = 0;
 };
 
 // Records over more tiles than this are large: they are processed by rows of tiles.

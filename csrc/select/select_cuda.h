@@ -41,6 +41,58 @@ struct PartlyResident {
     NeedList needs;  // `report` is null if no report is requested
 };
 
+// A camera of a batch on the device. One that is not drawn sees nothing.
+struct BatchCamera {
+    Camera camera;
+    int32_t environment;  // as in EnvironmentTable
+    uint32_t is_drawn;
+};
+
+// The arrays of a batch's cameras on the device.
+struct CameraArrays {
+    const void *viewmats, *intrinsics;  // (B, 4, 4); (B, 3, 3), or (3, 3) for all
+    const void* environments;           // (B,), null if the cameras see all instances
+    bool are_viewmats_double, are_intrinsics_double, shares_intrinsics;  // else float
+    bool are_environments_long;                                          // else 32 bits
+    int width, height;
+    double near_depth;
+};
+
+// What the cameras of a batch are read from.
+enum class CameraSource {
+    arrays,
+    copies,  // for a frame that is drawn again, because the arrays may have changed
+};
+
+// The viewpoints of a batch, and where their instances are placed. The instance in slot
+// s of camera b has place b * num_slots + s. A camera whose numbers are wrong, or whose
+// environment the scene does not have, is not drawn.
+struct BatchViews {
+    CameraArrays arrays;    // of all cameras of the batch
+    uint32_t first_camera;  // of these views
+    uint32_t num_cameras;
+    CameraSource source;
+    BatchCamera* cameras;  // copies of the cameras of these views; written, or read
+    uint32_t num_slots;    // of each camera: batch_slots()
+    size_t most_parts;     // of the tables that one camera sees
+    FrameImage first;      // the image of the first camera; the others follow it
+    BatchPlanes planes;    // of all images
+    ImageCounts* counts;   // of all images; the cut clears them
+
+    size_t num_places() const { return size_t(num_cameras) * num_slots; }
+};
+
+// Returns the number of slots of each camera of a batch, if a camera sees at most this
+// many instances.
+size_t batch_slots(size_t most_instances);
+
+// Memory for the placements of a batch, one element per place.
+struct BatchPlacements {
+    FrameImage* images;  // per camera
+    Placement* placements;
+    InstanceFactors* factors;  // null if the scene has none
+};
+
 // Computes cuts of scenes on the device that is current at construction. It owns the
 // scratch memory of a cut, so only one cut can run at a time. Cuts of one scene are
 // ordered by the lock of that scene, on any threads and streams; the caller must order
@@ -61,6 +113,14 @@ class Cut {
 
     // Returns the number of elements that cut_items() needs in items.zeros.
     static size_t num_zeros(const SceneTables& scene, const SelectRule& rule);
+
+    // Writes the clusters that each camera of a batch draws as the items of a frame,
+    // with the decisions of cut_items(). The rule has no budget.
+    void cut_batch(const SceneTables& scene, const BatchViews& views, const SelectRule& rule,
+                   const BatchPlacements& out, const ItemList& items, cudaStream_t stream);
+
+    // Returns how many zeros cut_batch() needs in items.zeros.
+    static size_t num_batch_zeros(size_t num_places);
 
     // Writes a cut that was selected earlier, and is in device memory, as items for one
     // camera.
@@ -96,6 +156,7 @@ class Cut {
     DeviceBuffer<CameraSides> sides_;
     DeviceBuffer<InstanceView> views_;
     DeviceBuffer<uint8_t> tops_;
+    DeviceBuffer<int32_t> bundle_of_place_;
     DeviceBuffer<CutPart> parts_;
     DeviceBuffer<unsigned long long> states_, zeros_;
     DeviceBuffer<BudgetState> budget_;
