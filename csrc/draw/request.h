@@ -56,7 +56,7 @@ struct FrameRequest {
 // has no budget.
 struct BatchRequest {
     SelectRule rule;
-    Shade shade;  // whether depth is drawn follows from the planes
+    Shade shade;  // ignores `with_depth`: depth is drawn if there are planes for it
     int width, height;
     BatchPlanes planes;
 };
