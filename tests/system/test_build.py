@@ -17,6 +17,7 @@ import pytest
 import scenes
 import v3dg
 from benchmarks.worlds.procedural import make_asset
+from reference import cluster as reference_cluster
 from reference import project as reference_project
 from v3dg import (
     BuildConfig,
@@ -33,6 +34,7 @@ from v3dg._device import CPU, place, resolve
 from v3dg.bundle.codec import codec_of
 from v3dg.levels.leaves import MemoryLeaves
 from v3dg.levels.plan import Plan
+from v3dg.levels.rows import RUN_ROWS
 from v3dg.levels.simplify import Level, LevelTables
 from v3dg.levels.smooth import measured_config
 
@@ -369,6 +371,19 @@ def test_level_zero_is_the_asset(asset, bundle):
     rows = [np.concatenate([getattr(g, n).reshape(len(g), -1) for n in scenes.NAMES], axis=1)
             for g in (asset, bundle.level_gaussians(0))]  # fmt: skip
     np.testing.assert_array_equal(*(r[np.lexsort(r.T)] for r in rows))
+
+
+@pytest.mark.parametrize("codec", ["float32", "quantized"])
+@pytest.mark.parametrize("config", [BuildConfig(steps=2), BuildConfig.paper(steps=2)])
+def test_neighbours_stand_together_in_the_clusters_of_every_level(config, codec, device):
+    # The paper's clusters are split after the fit.
+    config = replace(config, cluster_size=100, group_size=4)
+    asset = make_asset(num_gaussians=1500, seed=3)
+    bundle = build(asset, config, codec=codec, device=device)
+    for first, last in itertools.pairwise(bundle.clusters.offset):
+        runs = reference_cluster.runs(bundle.gaussians.means[first:last], RUN_ROWS)
+        np.testing.assert_array_equal(np.concatenate(runs), np.arange(last - first))
+    assert bundle.config["run_rows"] == RUN_ROWS
 
 
 def test_the_filter_of_an_asset_is_its_own(asset, bundle, device):

@@ -1,5 +1,6 @@
 """Levels refined together: what gets better, what stays, and one step by itself."""
 
+import itertools
 import os
 import subprocess
 import sys
@@ -11,10 +12,12 @@ import pytest
 import v3dg
 from devices import host, on
 from random_bundle import random_bundle
+from reference import cluster as reference_cluster
 from v3dg import BuildConfig, _core
 from v3dg.donut import make_donut
 from v3dg.levels.fit import fit_config
 from v3dg.levels.refined import _without_least
+from v3dg.levels.rows import RUN_ROWS
 from v3dg.metrics import box_downsample, draw_truth
 from v3dg.refine import refine_bundle
 from v3dg.residency import residency
@@ -64,6 +67,22 @@ def test_tables_and_level_0_stay(bundle, device):
         np.testing.assert_array_equal(values[leaves], changed[leaves])
     boxes = _core.bound_by_boxes(refined.gaussians.rows, refined.clusters.offset)
     np.testing.assert_array_equal(refined.clusters.box, boxes)
+
+
+def test_neighbours_stand_together_in_clusters_of_an_earlier_build(bundle, device):
+    """Gaussians move and are dropped, and earlier builds kept the order of the
+    asset."""
+    offset = bundle.clusters.offset
+    rng = np.random.default_rng(1)
+    order = [first + rng.permutation(last - first) for first, last in itertools.pairwise(offset)]
+    gaussians = bundle.gaussians.subset(np.concatenate(order))
+    config = {name: value for name, value in bundle.config.items() if name != "run_rows"}
+    earlier = v3dg.Bundle(bundle.clusters, bundle.groups, gaussians, config)
+    refined = refine_bundle(earlier, steps=5, drop=0.1, device=device, progress=False)
+    assert refined.config["run_rows"] == RUN_ROWS
+    for first, last in itertools.pairwise(refined.clusters.offset):
+        runs = reference_cluster.runs(refined.gaussians.means[first:last], RUN_ROWS)
+        np.testing.assert_array_equal(np.concatenate(runs), np.arange(last - first))
 
 
 def test_a_quantised_bundle_stays_one(bundle, device):

@@ -21,6 +21,7 @@ from v3dg.formats._declared import declared_of
 from v3dg.gaussians import Gaussians, gaussian_bytes
 from v3dg.levels.config import BuildConfig
 from v3dg.levels.digest import digest_of
+from v3dg.levels.rows import RUN_ROWS
 
 Unusable = Literal["drop", "refuse"]
 
@@ -112,6 +113,7 @@ def made_with(
         "seed": seed,
         "asset_gaussians": leaves.asset_gaussians,
         "asset_digest": leaves.digest,
+        "run_rows": RUN_ROWS,
         "dropped": leaves.dropped,
     }
     if codec != Codec.name:

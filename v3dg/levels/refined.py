@@ -19,6 +19,7 @@ from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 from v3dg.levels.config import BuildConfig
 from v3dg.levels.fit import fit_config, run_fit
+from v3dg.levels.rows import RUN_ROWS, in_runs
 from v3dg.residency import residency
 
 _T = TypeVar("_T", covariant=True)
@@ -52,8 +53,10 @@ def refined_bundle(
     if drop > 0:
         bundle = without_unseen(bundle, cameras, drop, seed, device, progress)
     cuts = Cuts(bundle, cameras, seed, device, progress)
-    refined = cuts.refined(steps, default_steps(device))
-    config = {**bundle.config, "refined": record_of(steps, drop, seed, len(cameras))}
+    moved = cuts.refined(steps, default_steps(device))
+    refined = in_runs(moved, bundle.clusters.offset)
+    record = record_of(steps, drop, seed, len(cameras))
+    config = {**bundle.config, "refined": record, "run_rows": RUN_ROWS}
     return Bundle(bundle.clusters.around(refined), bundle.groups, refined, config, bundle.codec)
 
 

@@ -13,6 +13,7 @@ from v3dg.gaussians import Array, Gaussians, empty, put
 from v3dg.levels.config import BuildConfig
 from v3dg.levels.fit import fit_config, run_fit
 from v3dg.levels.plan import LevelPlan, Offsets, Plan
+from v3dg.levels.rows import in_runs
 
 # Number of groups that are initialised together. Ctrl-C has to wait for them, about a
 # second.
@@ -68,7 +69,7 @@ class LevelBuilder:
         """Yield all levels in ascending order, beginning with the leaves as level 0.
         `finished` are levels from level 1 on that need not be built again."""
         plan = self.plan.levels[0]
-        leaves = self.codec.rounded(leaves, plan.offset)
+        leaves = in_runs(self.codec.rounded(leaves, plan.offset), plan.offset)
         ball = _device.to_host(_core.bound_spheres(_spheres(leaves), plan.leaf_offset))
         tables = LevelTables(
             box=_device.to_host(_core.bound_by_boxes(leaves.rows, plan.offset)),
@@ -189,7 +190,7 @@ def _level(
             gaussians.means, plan.group_offset, clusters_made.bit_length() - 1
         )
         gaussians = gaussians.subset(order)
-    gaussians = codec.rounded(gaussians, plan.offset)
+    gaussians = in_runs(codec.rounded(gaussians, plan.offset), plan.offset)
     box = _device.to_host(_core.bound_by_boxes(gaussians.rows, plan.offset))
     return Level(gaussians, LevelTables(box=box, ball=ball, fit_ball=fit_ball, error=error))
 
