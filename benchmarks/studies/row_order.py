@@ -113,8 +113,8 @@ class Drawing:
         self.cameras = [list(views.values())[number] for number in config.cameras]
 
     def frame(self, camera: Camera, tolerance: float) -> tuple[float, float, Any]:
-        """Return the wall-clock time and the device time of a frame in milliseconds,
-        and the picture."""
+        """Return the wall-clock time of a frame and the CPU time of all threads, in
+        milliseconds, and the picture."""
         start = time.perf_counter()
         processors_start = time.process_time()
         image = self.renderer.render(camera, tolerance=tolerance)
