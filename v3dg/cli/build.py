@@ -381,7 +381,8 @@ def _build_file(
     if options.strict:
         unusable = "refuse"
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", AssetWarning)  # the result reports them
+        # The result reports these warnings.
+        warnings.simplefilter("ignore", AssetWarning)
         return build_file(
             paths,
             output,

@@ -30,8 +30,8 @@ from v3dg.scene.columns import (
     up_of_bundle,
 )
 
-# Held during every change of a scene, and during fork(), so that it is never locked in
-# a child process.
+# This lock is held during every change of a scene, and during fork(), so that it is
+# never locked in a child process.
 _lock = threading.RLock()
 os.register_at_fork(
     before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release
