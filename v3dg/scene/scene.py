@@ -222,7 +222,8 @@ class Scene:
         outer = columns_of(
             *parts, importance=importance, opacity=opacity, tint=tint, environment=environment
         )
-        check("position", len(outer.importance) == 1, f"one position, got {len(outer.importance)}")
+        count = len(outer.importance)
+        check("scene", count == 1, f"one pose for the added scene, got {count} poses")
         inner = copy.copy(scene)  # other threads may change the original meanwhile
         if up is not None:
             turned_quaternions = product(outer.quaternions, turn_of(inner, up))
