@@ -169,7 +169,7 @@ struct FrameInput {
     const std::atomic<bool>* stop;
 };
 
-// The inputs of a batch; checked as those of a picture.
+// The inputs of a batch. The bindings check them like the inputs of a picture.
 struct BatchInput {
     const BatchRequest& request;
     const BoundCameras& cameras;
@@ -191,9 +191,9 @@ class Frame {
     // before it is finished or destroyed. A backend whose frames share buffers uses a
     // Turn. A request with a given cut has one eye.
     virtual std::unique_ptr<BoundDrawing> draw(const FrameInput& input) = 0;
-    // Draws a batch of pictures with the frame's own models. As draw(), but the caller
-    // owns the planes, which exist until the drawing is finished. A batch that does not
-    // fit into the memory is drawn in parts.
+    // Draws a batch of pictures with the frame's own models. Like draw(), but the
+    // caller owns the planes, which exist until the drawing is finished. A batch that
+    // does not fit into memory is drawn in parts.
     virtual std::unique_ptr<BoundBatch> draw_batch(const BatchInput& input) = 0;
     // Finds the gaussian with the largest blend weight in the first pixel of the
     // window. Returns false if no gaussian is drawn there. Waits. Called only if

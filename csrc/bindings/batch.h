@@ -17,11 +17,11 @@ struct Reals {
     bool are_double;
 };
 
-// B cameras of one size. The arrays are on the host or on one device, where they are
-// read when a batch is drawn; so they may change in place between batches.
+// B cameras of one size. The arrays are on the host or on one device. They are read
+// when a batch is drawn, so they may change in place between batches.
 class BoundCameras {
   public:
-    // viewmats: (B, 4, 4) world to camera. K: (B, 3, 3), or (3, 3) for all.
+    // viewmats: (B, 4, 4) world to camera. K: (B, 3, 3), or (3, 3) for all cameras.
     // environments: (B,) int32 or int64, or None for cameras that see all instances.
     // Arrays on the host are float64 and int32, and are checked.
     BoundCameras(py::object viewmats, py::object K, int width, int height, double near,
@@ -53,17 +53,17 @@ class BoundCameras {
 // The planes of a batch: arrays that belong to the caller, or new ones.
 class BoundPlanes {
   public:
-    // color: (B, H, W, 3 or 4). alpha, depth: (B, H, W), or None; no alpha beside four
-    // channels.
+    // color: (B, H, W, 3 or 4). alpha, depth: (B, H, W), or None. With four channels,
+    // alpha must be None.
     BoundPlanes(py::object color, py::object alpha, py::object depth);
-    // Makes arrays of three channels, alpha and, if requested, depth.
+    // Makes arrays of colour with three channels, of alpha and, if requested, of depth.
     BoundPlanes(const BoundCameras& cameras, Device device, bool with_depth);
 
     const py::object& color() const { return color_; }
     const py::object& alpha() const { return alpha_; }
     const py::object& depth() const { return depth_; }
     const BatchPlanes& planes() const { return planes_; }
-    // Throws ValueError unless the planes are for these cameras, on this device.
+    // Throws ValueError unless the planes fit these cameras and are on this device.
     void check(const BoundCameras& cameras, Device device) const;
 
   private:
@@ -76,12 +76,14 @@ class BoundPlanes {
 // The statistics of each picture of a batch.
 struct BatchStats {
     std::vector<int64_t> gaussians, in_frustum;
-    std::vector<double> select_ms, draw_ms;    // on a device, of the whole batch in the first
-    std::vector<std::vector<int64_t>> levels;  // on the host: selected gaussians by level
-    int num_parts = 1;                         // in which the batch was drawn
+    // On a device, the first element is for the whole batch.
+    std::vector<double> select_ms, draw_ms;
+    // On the host: selected gaussians of each level.
+    std::vector<std::vector<int64_t>> levels;
+    int num_parts = 1;  // number of parts in which the batch was drawn
 };
 
-// A batch that has been drawn, or enqueued on a device.
+// A batch that was drawn, or that was enqueued on a device.
 class BoundBatch {
   public:
     BoundBatch() = default;
@@ -89,11 +91,11 @@ class BoundBatch {
     BoundBatch(const BoundBatch&) = delete;
     BoundBatch& operator=(const BoundBatch&) = delete;
 
-    // Waits for the pictures.
+    // Waits until the pictures are drawn.
     virtual void finish() {}
-    // Waits for the pictures, and returns their statistics.
+    // Waits until the pictures are drawn, and returns their statistics.
     virtual BatchStats stats() = 0;
-    // Keeps inputs and planes alive as long as this object.
+    // Keeps the inputs and the planes alive as long as this object.
     void keep(py::object kept, const BoundPlanes& planes) {
         kept_ = std::move(kept);
         color = planes.color();

@@ -15,7 +15,7 @@ bool has_dtype(const py::object& array, const char* name) {
     return dtype == name || dtype == std::string("torch.") + name;
 }
 
-// Borrows an array of float64, or on a device of float32.
+// Borrows an array of float64 or, on a device, of float32.
 Reals reals_of(Device device, const py::object& array, const char* name, Shape shape) {
     if (device != kHost && has_dtype(array, "float32"))
         return {.data = span_on<const float>(device, array, name, shape).data, .are_double = false};
@@ -32,8 +32,8 @@ const char* expected_of(CameraFault fault) {
     }
 }
 
-// Returns the index of the first camera that is none, and what was expected of it; None
-// if there is no such camera. The arrays are on the host.
+// Returns the index of the first invalid camera, and what was expected of it. Returns
+// None if all cameras are valid. The arrays are on the host.
 py::object fault_of_cameras(const py::array& viewmats, const py::array& K) {
     const Span<const double> poses = span_of<const double>(viewmats, "viewmats", {-1, 4, 4});
     const auto count = static_cast<py::ssize_t>(poses.size / 16);

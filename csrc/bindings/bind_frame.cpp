@@ -168,8 +168,8 @@ class BoundSceneFrame {
         return drawing;
     }
 
-    // Draws a picture for each camera with the gaussians that were set, into planes of
-    // the caller or new ones.
+    // Draws a picture for each camera with the models that were set, into planes of the
+    // caller or into new planes.
     std::unique_ptr<BoundBatch> draw_batch(const py::object& scene_object,
                                            const py::object& cameras_object, const SelectRule& rule,
                                            const Shade& shade, const BoundPlanes* planes) {
@@ -220,7 +220,8 @@ class BoundSceneFrame {
     }
 
   private:
-    // Throws ValueError if a camera on the host belongs to no environment of the scene.
+    // Throws ValueError if a camera on the host has an environment that the scene does
+    // not have.
     static void check_environments(const BoundCameras& cameras, const EnvironmentTable& table) {
         if (cameras.device() != kHost || cameras.environments() == nullptr) return;
         const auto* environment = static_cast<const int32_t*>(cameras.environments());

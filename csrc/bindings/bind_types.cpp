@@ -95,7 +95,7 @@ int degree_of_bases(py::ssize_t bases, const std::string& shape) {
     int degree = 0;
     while (degree <= 3 && num_sh_bases(degree) != bases) ++degree;
     if (degree > 3)
-        throw py::value_error("sh: expected shape (N, K, 3) with K of 1, 4, 9 or 16, got " + shape);
+        throw py::value_error("sh: expected shape (N, K, 3) with K = 1, 4, 9 or 16, got " + shape);
     return degree;
 }
 

@@ -205,8 +205,9 @@ class EnqueuedBatch final : public BoundBatch {
 
   private:
     const Device device_;
-    const std::shared_ptr<Mutex> turns_;           // belongs to the frame
-    const std::unique_ptr<BatchDrawing> drawing_;  // destroyed before what it uses
+    const std::shared_ptr<Mutex> turns_;  // shared with the frame
+    // Destroyed before the objects that it uses.
+    const std::unique_ptr<BatchDrawing> drawing_;
     bool is_finished_ = false;
 };
 

@@ -139,7 +139,7 @@ BatchStats stats_of(const std::vector<SceneFrameCounts>& counts) {
     return stats;
 }
 
-// A batch that is drawn on return.
+// A batch on the host, which is drawn when draw_batch() returns.
 class DrawnBatch final : public BoundBatch {
   public:
     explicit DrawnBatch(BatchStats stats) : stats_(std::move(stats)) {}
@@ -149,7 +149,7 @@ class DrawnBatch final : public BoundBatch {
     const BatchStats stats_;
 };
 
-// Returns the cameras of arrays on the host, which are float64.
+// Returns the cameras of arrays on the host. The arrays are float64.
 std::vector<Camera> cameras_of(const BoundCameras& arrays) {
     const auto* viewmats = static_cast<const double*>(arrays.viewmats().data);
     const auto* intrinsics = static_cast<const double*>(arrays.intrinsics().data);

@@ -74,8 +74,7 @@ void BoundScene::set_bundles(const py::list& bundles) {
     state_ = std::move(state);
 }
 
-// Returns the environment of each instance; None stands for a scene without
-// environments.
+// Returns the environment of each instance. None means a scene without environments.
 static std::vector<int32_t> environments_of(const py::object& environments, py::ssize_t count) {
     if (environments.is_none()) return std::vector<int32_t>(static_cast<size_t>(count), kShared);
     const Span<const int32_t> given = span_of<const int32_t>(environments, "environments", {count});

@@ -1,8 +1,8 @@
 #pragma once
 
-// Pinhole cameras from the numbers of their poses and intrinsics, on the host and on a
-// device. Sources that call these functions are compiled without contraction, so that
-// both give the same bits.
+// Makes pinhole cameras from the numbers of their poses and intrinsics, on the host and
+// on a device. Sources that call these functions are compiled without floating-point
+// contraction, so that the host and a device compute the same bits.
 
 #include <cfloat>
 
@@ -10,15 +10,15 @@
 
 namespace v3dg {
 
-// The largest deviation of a rotation's rows from orthonormal: matrices are often
-// stored as float32.
+// The largest deviation of a rotation's rows from orthonormal rows. Matrices that were
+// stored as float32 deviate a little.
 constexpr double kRotationTolerance = 1e-4;
 
-// The reason why numbers are not those of a camera.
+// The reason why numbers are not a valid camera.
 enum class CameraFault : int32_t { none, not_finite, no_rotation, last_row, focal_length, skew };
 
-// Returns whether a 3x3 matrix, whose rows are `stride` apart, is a rotation. False if
-// a number is NaN.
+// Returns whether a 3x3 matrix, whose rows are `stride` apart, is a rotation. Returns
+// false if a number is NaN.
 V3DG_HD inline bool is_rotation(const double* m, int stride) {
     const double *x = m, *y = m + stride, *z = m + 2 * stride;
     const auto dot = [](const double* a, const double* b) {
@@ -35,7 +35,7 @@ V3DG_HD inline bool is_rotation(const double* m, int stride) {
     return is_orthonormal && determinant > 0;
 }
 
-// Returns what is wrong with a (4, 4) world-to-camera matrix or with a (3, 3) matrix of
+// Returns the fault of a (4, 4) world-to-camera matrix or of a (3, 3) matrix of
 // intrinsics in px.
 V3DG_HD inline CameraFault fault_of_camera(const double viewmat[16], const double K[9]) {
     bool is_finite = true;
@@ -50,7 +50,7 @@ V3DG_HD inline CameraFault fault_of_camera(const double viewmat[16], const doubl
     return is_plain ? CameraFault::none : CameraFault::skew;
 }
 
-// Returns the camera of these numbers, for its whole image.
+// Returns the camera with this pose and these intrinsics. Its whole image is requested.
 V3DG_HD inline Camera camera_of(const double viewmat[16], const double K[9], int width, int height,
                                 double near_depth) {
     Camera camera;

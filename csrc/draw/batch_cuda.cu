@@ -1,7 +1,7 @@
 // Batches of pictures of a scene on a CUDA device. A batch is one frame with a picture
-// for each camera, or several such frames, one after another, if it is large. The first
-// kernel of a frame copies its cameras, because a frame that is drawn again must not
-// depend on what the caller has written to the arrays since.
+// for each camera. A large batch is several such frames, one after another. The first
+// kernel of a frame copies the cameras. A frame that is drawn again uses the copies,
+// because the caller may have changed the arrays.
 
 #include <algorithm>
 #include <new>
@@ -16,8 +16,8 @@ namespace cuda {
 namespace {
 
 // Limits of a part, which bound its memory. Pictures of few pixels have a few gaussians
-// per pixel; a view of everything that has more is drawn in smaller parts once the
-// memory does not suffice. More pixels are not faster: such a part already takes
+// per pixel. If there are more gaussians and memory does not suffice, smaller parts are
+// drawn. Parts with more pixels are not faster, because a part already takes
 // milliseconds.
 constexpr size_t kMostPixels = size_t(1) << 23;
 constexpr size_t kMostPlaces = size_t(1) << 21;
@@ -34,7 +34,7 @@ const SeenBounds& seen_of(const SceneTables& scene, const CameraArrays& arrays) 
     return arrays.environments == nullptr ? scene.seen_by_all() : scene.seen_in_environment();
 }
 
-// Returns the most cameras of a part, at least 1.
+// Returns the largest number of cameras in a part, at least 1.
 uint32_t cameras_of_part(const BatchRequest& request, const SeenBounds& seen) {
     const size_t pixels = static_cast<size_t>(request.width) * request.height;
     const size_t most = std::min({kMostPixels / pixels, kMostPlaces / batch_slots(seen.instances),
@@ -56,7 +56,7 @@ std::shared_ptr<BatchTables> SceneFrame::tables_for(uint32_t num_cameras, cudaSt
     }
     if (found != tables_.end()) return *found;
     std::erase_if(tables_, [](const auto& tables) { return tables.use_count() == 1; });
-    // There is one more than necessary, because a later capture must not allocate.
+    // Allocates one more than necessary, because a later capture must not allocate.
     for (int k = 0; k < 2; ++k)
         tables_.push_back(std::make_shared<BatchTables>(std::max(num_cameras, 1u), stream));
     return tables_.back();
@@ -151,7 +151,7 @@ void BatchDrawing::enqueue(uint32_t first, uint32_t count) {
             continue;
         } catch (const OutOfMemory&) {
             if (size == 1 || is_captured_) throw;
-        } catch (const std::length_error&) {  // of an earlier batch
+        } catch (const std::length_error&) {  // the error of an earlier batch
             if (size == 1 || is_captured_) throw;
         }
         frame_.halve_parts(size);

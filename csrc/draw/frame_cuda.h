@@ -42,9 +42,9 @@ struct FrameBatch {
     // Whether depth is drawn in any of the images that get their destination from a
     // Place.
     bool has_depth = true;
-    ImageCounts* image_counts = nullptr;  // see ProjectInput
-    // Whether images that are not drawn, because a buffer is too small, become NaN. All
-    // of them have planes.
+    ImageCounts* image_counts = nullptr;  // as in ProjectInput
+    // Whether images become NaN if they are not drawn because a buffer is too small.
+    // All of them have planes.
     bool marks_undrawn = false;
 };
 
@@ -102,8 +102,8 @@ class Frame {
     // Returns the device memory in bytes, by part.
     std::vector<std::pair<const char*, size_t>> bytes() const;
 
-    // Frees the buffers, so that a smaller frame fits; not if a graph was captured,
-    // which may still use them.
+    // Frees the buffers, so that a smaller frame fits. Does nothing if a graph was
+    // captured, because the graph may still use the buffers.
     void release_buffers();
 
     // Returns the tape of the last frame. Precondition: the frame keeps a tape.
@@ -117,9 +117,9 @@ class Frame {
     // Returns the lists in the current buffers.
     FrameLists lists(const FrameBatch& batch) const;
     RecordPlanes records() const;
-    // Enlarges the buffers if an earlier frame that is done exceeded or nearly filled
-    // one, because the next frame is then likely to do so, too. The drawing of the
-    // earlier frame may be gone.
+    // Enlarges the buffers if an earlier, finished frame exceeded or nearly filled one.
+    // The next frame is then likely to exceed it, too. The drawing of the earlier frame
+    // may have been destroyed.
     void check_counts();
     void enlarge(const FrameCounters& counters);
     Slot* take_slot(bool capturing);
@@ -151,7 +151,8 @@ class Frame {
     // Buffers that captured graphs may still use.
     std::vector<std::shared_ptr<void>> retired_;
     bool was_captured_ = false;
-    std::vector<Slot*> unchecked_;  // of frames whose counts were not compared with the buffers
+    // Slots of frames whose counts were not compared with the buffers.
+    std::vector<Slot*> unchecked_;
     FrameBatch last_batch_{};
     cudaStream_t last_stream_ = nullptr;
     StreamMutex busy_;
@@ -179,8 +180,8 @@ class Drawing {
     // ended. It throws std::runtime_error if a buffer was too small for that replay.
     const FrameCounters& finish();
     // Waits for the drawing, and returns whether it was drawn. If a buffer was too
-    // small, enlarges it, for a caller that draws a new frame in place of this one.
-    // Throws as finish() does. Not allowed for a captured frame.
+    // small, enlarges the buffer, so that the caller can draw a new frame instead.
+    // Throws like finish(). Not allowed for a captured frame.
     bool finish_or_enlarge();
     bool is_captured() const { return is_captured_; }
     FrameTimes times() const;

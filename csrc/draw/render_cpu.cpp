@@ -127,8 +127,8 @@ static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_ti
 
 // The approximate bytes of the records and entries of one band. Records are accessed
 // randomly, so smaller bands use caches better; but a band must have tiles for all
-// threads. If there is a `stop` flag, bands have the smallest size, because the flag is
-// rarely checked within a band; also if each thread draws a picture.
+// threads. Bands have the smallest size in two cases: if there is a `stop` flag,
+// because the flag is rarely checked within a band, and if each thread draws a picture.
 constexpr double kLeastBandBytes = 96 << 20, kMostBandBytes = 768 << 20,
                  kThreadBandBytes = 48 << 20;
 static double band_bytes_of(const std::atomic<bool>* stop) {

@@ -30,8 +30,9 @@ struct Shade {
 };
 
 struct FrameRequest {
-    Eyes eyes;        // the camera of each picture
-    SelectRule rule;  // rule of the cut; with `cut`, only the tolerance for `metrics`
+    Eyes eyes;  // the camera of each picture
+    // The rule of the cut. With a given `cut`, only false colours use the rule.
+    SelectRule rule;
     Shade shade;
     FrameLook look = FrameLook::appearance;
     std::optional<GivenCut> cut = {};  // a cut to draw instead of selecting one
@@ -56,7 +57,7 @@ struct FrameRequest {
 // has no budget.
 struct BatchRequest {
     SelectRule rule;
-    Shade shade;  // whether depth is drawn follows from the planes
+    Shade shade;  // ignores `with_depth`: depth is drawn if there are planes for it
     int width, height;
     BatchPlanes planes;
 };

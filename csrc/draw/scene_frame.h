@@ -33,12 +33,12 @@ struct HostScene {
     Span<const ClusterRuns> runs = {};
 };
 
-// The cameras of a batch on the host. All have the size of the request, and belong to
+// The cameras of a batch on the host. They have the size of the request, and belong to
 // environments of the scene.
 struct HostCameras {
     Span<const Camera> camera;        // [B]
     Span<const int32_t> environment;  // [B] as in EnvironmentTable
-    EnvironmentTable environments;    // of the scene's instances
+    EnvironmentTable environments;    // the environments of the scene's instances
 };
 
 // The counts of one frame.
@@ -82,9 +82,10 @@ SceneFrameCounts draw_scene(const HostScene& scene, const FrameRequest& request,
                             const SelectRule& rule, Span<const Picture<float>> pictures,
                             const std::atomic<bool>* stop = nullptr);
 
-// Draws a picture for each camera, with the decisions and the pixels that draw_scene()
-// gives for the instances that the camera sees. Threads process a camera each; the
-// cameras that do not occupy all threads are drawn one after another by all of them.
+// Draws a picture for each camera. The decisions and the pixels are equal to those of
+// draw_scene() for the instances that the camera sees. Each thread draws the pictures
+// of some cameras. If the remaining cameras are fewer than the threads, all threads
+// together draw one picture after another.
 void draw_batch(const HostScene& scene, const BatchRequest& request, const HostCameras& cameras,
                 Span<SceneFrameCounts> counts);
 

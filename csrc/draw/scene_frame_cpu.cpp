@@ -46,7 +46,7 @@ SharedWorkspace& shared_workspace() {
     return shared;
 }
 
-// A workspace on loan from the shared one.
+// The shared workspace, borrowed until this object is destroyed.
 class LentWorkspace {
   public:
     LentWorkspace() : workspace_(shared_workspace().take()) {}
@@ -354,7 +354,7 @@ void cpu::draw_batch(const HostScene& scene, const BatchRequest& request,
     shared.runs = {runs.data(), runs.size()};
     std::vector<Workspace<float>> workspaces(std::min(count, num_threads));
     const auto draw = [&](size_t k) {
-        // Inside of a nested loop, which has one thread, the number of the thread is 0.
+        // A nested parallel loop has one thread, whose number is 0.
         Workspace<float>& workspace = workspaces[omp_get_thread_num()];
         counts[k] = draw_picture(shared, request, cameras, k, workspace);
     };

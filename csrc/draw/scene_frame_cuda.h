@@ -106,9 +106,9 @@ class SceneFrame {
                                   const EyeImages& pictures, cudaStream_t stream,
                                   const Frame::Place& place);
 
-    // Draws a picture for each camera of a batch, in parts if the batch is large. As
-    // draw(), but the planes of the request are written. The cameras are read by the
-    // first kernels.
+    // Draws a picture for each camera of a batch, in parts if the batch is large. Like
+    // draw(), but it writes the planes of the request. The first kernels read the
+    // cameras.
     std::unique_ptr<BatchDrawing> draw_batch(const SceneTables& scene, const BatchRequest& request,
                                              const CameraArrays& arrays, uint32_t num_cameras,
                                              cudaStream_t stream);
@@ -118,12 +118,12 @@ class SceneFrame {
 
   private:
     friend class BatchDrawing;
-    // Returns memory that no other batch in progress has.
+    // Returns memory that no other batch in progress uses.
     std::shared_ptr<BatchTables> tables_for(uint32_t num_cameras, cudaStream_t stream);
     // Draws cameras [first, first + count) of a batch.
     std::unique_ptr<Drawing> draw_part(const BatchDrawing& batch, uint32_t first, uint32_t count,
                                        CameraSource source);
-    // Draws smaller parts from now on.
+    // Halves the number of cameras of all later parts.
     void halve_parts(uint32_t num_cameras);
 
     std::unique_ptr<Drawing> draw_selected(const SceneTables& scene, const Eyes& eyes,
@@ -147,28 +147,29 @@ class SceneFrame {
     DeviceBuffer<CodedGaussians> coded_;
     bool has_packed_ = false, has_coded_ = false;
     DeviceBuffer<Placement> placements_;
-    DeviceBuffer<InstanceFactors> factors_;  // of the places of a batch
+    DeviceBuffer<InstanceFactors> factors_;  // one per place of a batch
     DeviceBuffer<FrameImage> images_;
-    uint32_t most_cameras_ = ~0u;                                // in a part of a batch
-    std::vector<std::shared_ptr<BatchTables>> tables_;           // of batches
-    std::vector<std::shared_ptr<BatchTables>> captured_tables_;  // graphs continue to use these
+    uint32_t most_cameras_ = ~0u;                       // largest number of cameras in a part
+    std::vector<std::shared_ptr<BatchTables>> tables_;  // memory of batches
+    // Memory that captured graphs continue to use.
+    std::vector<std::shared_ptr<BatchTables>> captured_tables_;
     Cut cut_;
     Frame frame_;
 };
 
-// A batch that has been enqueued. The frame, the scene and the planes must outlive it.
+// A batch that was enqueued. The frame, the scene and the planes must outlive it.
 class BatchDrawing {
   public:
-    // Waits until the device has finished the drawing; finish() may still draw parts of
-    // it again.
+    // Waits until the device has finished. finish() may still draw parts of the batch
+    // again.
     void wait() const;
     // Waits until the pictures are drawn. Parts for which a buffer was too small are
-    // drawn again, in smaller parts if the memory does not suffice; throws OutOfMemory
-    // or std::length_error if it does not suffice for a single camera.
+    // drawn again, in smaller parts if memory does not suffice. Throws OutOfMemory or
+    // std::length_error if memory does not suffice for a single camera.
     void finish();
     // Returns the counts of each image. Waits. Call it after finish().
     std::vector<ImageCounts> counts() const;
-    // Returns the sum over all parts; after finish().
+    // Returns the sum over all parts. Call it after finish().
     FrameTimes times() const;
     size_t num_parts() const { return parts_.size(); }
     bool is_captured() const { return is_captured_; }

@@ -27,7 +27,7 @@ struct FrameCounters {
     CutChoice choice;           // valid if the cut has a budget
 };
 
-// Counts of one image of a frame, for frames that report them.
+// The counts of one image, for frames that report counts of images.
 struct ImageCounts {
     unsigned long long gaussians, in_frustum;
 };

@@ -55,19 +55,19 @@ struct Picture {
     // Number of blended gaussians per pixel, drawn instead of depth. May be null.
     T* count = nullptr;
     float min_transmittance = kStopsBefore;
-    // Numbers from one pixel to the next, in `color` and in `alpha`.
+    // The distance between adjacent pixels, in floats, in `color` and in `alpha`.
     int color_step = 3, alpha_step = 1;
 };
 
-// The memory of pictures of one size, one behind the other. With four channels the
-// colour contains alpha, and `alpha` is null.
+// The memory of pictures of one size, one after another. With four channels, the colour
+// contains alpha, and `alpha` is null.
 struct BatchPlanes {
     float* color;  // (B, H, W, channels)
     int channels;  // 3 or 4
     float* alpha;  // (B, H, W), or null
     float* depth;  // (B, H, W), or null
 
-    // Returns the planes that begin at this pixel, which is counted through all
+    // Returns the planes that begin at pixel `pixel`, which is counted over all
     // pictures.
     V3DG_HD BatchPlanes from(size_t pixel) const {
         return {.color = color + channels * pixel,
@@ -95,8 +95,9 @@ constexpr int kFrameTileWidth = 32, kFrameTileHeight = 16;
 // The destination of a picture on CUDA (see Picture<float>). A frame may obtain it
 // after its first stages are enqueued.
 struct PicturePlanes {
-    float *color, *alpha, *depth;  // may be null: all three, or only alpha or depth
-    bool has_four_channels;        // alpha is the fourth channel of `color`
+    // May be null: either all three, only alpha, or only depth.
+    float *color, *alpha, *depth;
+    bool has_four_channels;  // alpha is the fourth channel of `color`
 };
 
 // One picture of a batch.

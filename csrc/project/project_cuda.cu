@@ -133,8 +133,8 @@ __device__ void report_item(const ItemTables<Model>& tables, unsigned item, unsi
                             .columns = static_cast<uint32_t>(tables.image.tile_columns)};
 }
 
-// Adds the counts of an item to those of its image. `num_in_frustum` is that of this
-// lane. Called by the whole warp.
+// Adds the counts of an item to the counts of its image. `num_in_frustum` is the number
+// of this lane. All lanes of the warp must call it.
 template <class Model>
 __device__ void report_image(const ItemTables<Model>& tables, unsigned num_in_frustum,
                              ImageCounts* image_counts) {

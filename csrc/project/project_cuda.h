@@ -35,7 +35,7 @@ struct ProjectInput {
     // the factors at index p modulo num_factors.
     const InstanceFactors* factors;
     uint32_t num_factors;
-    // [images] the kernel adds to them; null if they are not requested.
+    // [images] counts to which the kernel adds; null if not requested
     ImageCounts* image_counts;
 
     // Returns the factors of an item's first placement. In a shared item, the factors

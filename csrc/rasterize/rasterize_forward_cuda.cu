@@ -225,7 +225,7 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
     });
 }
 
-// Fills the marked images with NaN, so that nobody takes old pixels for new ones.
+// Fills the marked images with NaN, so that old pixels are not mistaken for new ones.
 __device__ void mark_undrawn(const FrameLists& lists) {
     for (uint32_t k = blockIdx.x; k < lists.num_marked; k += gridDim.x) {
         const FrameImage& image = lists.images[k];

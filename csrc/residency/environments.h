@@ -1,7 +1,7 @@
 #pragma once
 
-// The environments of a scene. Each instance belongs to one environment or to all, and
-// a camera sees the instances of its environment and the shared ones.
+// The environments of a scene. Each instance belongs to one environment, or is shared
+// by all. A camera sees the instances of its environment and the shared instances.
 
 #include <algorithm>
 #include <cstdint>
@@ -11,19 +11,22 @@
 
 namespace v3dg {
 
-constexpr int32_t kShared = -1;  // as an instance's environment: all see it
+constexpr int32_t kShared = -1;  // value for an instance that all cameras see
 constexpr int32_t kMostEnvironment = (1 << 24) - 1;
-constexpr int32_t kSeesAll = -2;  // as a camera's environment: it sees all instances
+constexpr int32_t kSeesAll = -2;  // value for a camera that sees all instances
 
-// The instances that a camera sees have slots: first the shared ones, then those of its
-// environment, both in ascending order. Instance i has slot i for a camera that sees
-// all. I instances, E environments.
+// The instances that a camera sees have slots. First come the shared instances, then
+// the instances of the camera's environment, each in ascending order. For a camera that
+// sees all instances, instance i has slot i. There are I instances and E environments.
 struct EnvironmentTable {
-    Span<const int32_t> order;  // [I] instances: the shared ones, then those of each environment
-    Span<const int32_t> begin;  // [E + 1] where the instances of each environment begin
+    // [I] the shared instances, then the instances of each environment
+    Span<const int32_t> order;
+    // [E + 1] first index in `order` of each environment, and the end
+    Span<const int32_t> begin;
 
     V3DG_HD int32_t num_environments() const { return static_cast<int32_t>(begin.size) - 1; }
-    // Whether a camera may belong to the environment, or see the shared instances only.
+    // Returns whether a camera may have the value `environment`: an environment of the
+    // scene, kShared for only the shared instances, or kSeesAll.
     V3DG_HD bool has(int32_t environment) const {
         return environment >= kSeesAll && environment < num_environments();
     }
@@ -41,7 +44,7 @@ struct EnvironmentTable {
 // An EnvironmentTable on the host.
 class Environments {
   public:
-    // `environment` is that of each instance, at least kShared.
+    // `environment` has the environment of each instance, at least kShared.
     explicit Environments(Span<const int32_t> environment) : order_(environment.size) {
         int32_t count = 0;
         for (const int32_t e : environment) count = std::max(count, e + 1);

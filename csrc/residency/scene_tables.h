@@ -30,7 +30,7 @@ struct SceneOnDevice {
 constexpr size_t kClustersOfPart = 32 * kClustersOfBounds;
 
 // Bounds on what one camera sees of a scene: its instances, and the parts of
-// kClustersOfPart clusters of their tables.
+// kClustersOfPart clusters of the instances' tables.
 struct SeenBounds {
     size_t instances, parts;
 };
@@ -67,8 +67,8 @@ class SceneTables {
     size_t num_instances() const { return num_instances_; }
     const BundleTables& bundle(size_t b) const { return *bundles_[b]; }
 
-    // Bounds for cameras that see all instances, and for those that belong to an
-    // environment.
+    // Return the bounds for cameras that see all instances, and for cameras that belong
+    // to an environment.
     const SeenBounds& seen_by_all() const { return seen_by_all_; }
     const SeenBounds& seen_in_environment() const { return seen_in_environment_; }
 

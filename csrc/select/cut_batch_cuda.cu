@@ -1,9 +1,10 @@
-// The cut of a batch: each camera has the cut that cut_cuda.cu computes for it alone.
-// There are as many kernels as for a single camera.
+// The cut of a batch. The cut of each camera is equal to the cut that cut_cuda.cu
+// computes for that camera alone. The number of kernels is the same as for a single
+// camera.
 //
-// place_batch_kernel has a thread for each slot of each camera, and its blocks belong
-// to one camera each. Slots are aligned to blocks, so that the lanes of a warp have the
-// instances that they have in the cut of a single camera, and the same neighbours share
+// place_batch_kernel has a thread for each slot of each camera, and each block belongs
+// to one camera. Slots are aligned to blocks. So the lanes of a warp have the same
+// instances as in the cut of a single camera, and the same adjacent instances share
 // items. cut_kernel then tests the parts of all cameras.
 
 #include <algorithm>
@@ -24,7 +25,8 @@ __device__ double number_of(const void* numbers, bool are_double, size_t i) {
                       : static_cast<double>(static_cast<const float*>(numbers)[i]);
 }
 
-// Returns the environment of a camera, or one that no scene has.
+// Returns the environment of a camera. If the number is invalid, returns an environment
+// that no scene has.
 __device__ int32_t environment_of(const CameraArrays& arrays, uint32_t b) {
     if (arrays.environments == nullptr) return kSeesAll;
     if (!arrays.are_environments_long) {

@@ -1,7 +1,7 @@
 #pragma once
 
-// The second kernel of a cut, which tests the clusters of parts and writes those that
-// are drawn.
+// The second kernel of a cut. It tests the clusters of parts, and writes the clusters
+// that are drawn.
 
 #include "base/scan.cuh"
 #include "select/cut_parts.cuh"
@@ -12,8 +12,9 @@
 namespace v3dg {
 namespace cuda {
 
-constexpr unsigned kCutBlocks = 4;     // blocks of cut_kernel per multiprocessor
-constexpr unsigned kPlaceBlocks = 12;  // blocks of place_kernel per multiprocessor
+constexpr unsigned kCutBlocks = 4;  // resident blocks of cut_kernel per multiprocessor
+// Resident blocks of place_kernel per multiprocessor.
+constexpr unsigned kPlaceBlocks = 12;
 
 // Tests and writes clusters. `kTells`: the kernel records which pages are needed.
 template <class Output, bool kTells>
@@ -28,8 +29,7 @@ static __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
     if (num_tickets == 0 && blockIdx.x == 0 && threadIdx.x == 0) output.finish(0, 0);
     if (rule.budget != kNoBudget) rule.tolerance_px2 = choice->tolerance_px2;
     if (!Output::kFades) rule.fade = {};
-    // If there are enough blocks, each of the first blocks processes one ticket and the
-    // others none.
+    // If there is a block for every ticket, each block processes at most one ticket.
     const bool is_enough = num_tickets <= gridDim.x;
     if (is_enough && blockIdx.x >= num_tickets) return;
     for (unsigned ticket = take_ticket(scratch.cut_ticket); ticket < num_tickets;

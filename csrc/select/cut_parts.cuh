@@ -18,9 +18,10 @@ constexpr unsigned kCutThreads = 256, kCutWarps = kCutThreads / 32;
 static_assert(kLaneClusters == 8, "a byte has one bit per cluster of a lane");
 static_assert(kPartSize == kClustersOfPart, "scenes bound the number of parts");
 
-// The work of one warp. If `lanes` is zero: clusters [first, first + kPartSize) of one
-// instance's table. Else each set bit k of `lanes` assigns the instance at place + k to
-// a lane, which processes its top clusters or the last clusters of its table.
+// The work of one warp. If `lanes` is 0, the part is clusters [first, first +
+// kPartSize) of one instance. Otherwise each set bit k of `lanes` means that lane k
+// processes the instance at place + k: its top clusters, or the last clusters of its
+// table.
 struct CutPart {
     uint32_t place, first, lanes;
 };
@@ -31,8 +32,9 @@ __device__ inline uint32_t last_of_table(const ClusterTable& table) {
     return static_cast<uint32_t>(table.num_clusters() - 1) / kLaneClusters * kLaneClusters;
 }
 
-// A scene, and the output of place_kernel about its instances. With one viewpoint, an
-// instance's place is its index; a batch has a place for each instance of each camera.
+// A scene, and what place_kernel writes about its instances. With one viewpoint, the
+// place of an instance is its index. A batch has a place for each instance of each
+// camera.
 struct PlacedScene {
     const BundleOnDevice* bundles;
     InstanceTable instances;
@@ -93,7 +95,7 @@ static_assert(kLaneClusters == 8 && kWhole < 1 << 16, "LaneWeights holds eight w
 // fade.
 struct LaneClusters {
     const BundleOnDevice* bundle;
-    uint32_t place;  // of the instance
+    uint32_t place;  // place of the instance
     uint32_t first;  // index of the first cluster in the table
     // True if each lane has its own instance; false if all lanes have the same
     // instance.
@@ -148,7 +150,7 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
                              Tolerances tolerances, LaneClusters& mine, const Ask& ask) {
     struct Table {
         const BundleOnDevice* bundle;  // null if each lane has another instance
-        // First cluster; if `bundle` is null, place of the first lane's instance.
+        // First cluster; if `bundle` is null, place of the instance of the first lane.
         uint32_t first;
     };
     __shared__ InstanceView views[kCutWarps];

@@ -71,14 +71,14 @@ struct Placed {
 
 // The instance of a thread.
 struct InstanceSlot {
-    bool is_taken;    // whether there is an instance
-    size_t instance;  // its index in the scene
-    size_t place;     // of what is written about it; consecutive in a warp
-    unsigned image;   // of the first eye
+    bool is_taken;    // whether the thread has an instance
+    size_t instance;  // index of the instance in the scene
+    size_t place;     // where the results are written; consecutive in a warp
+    unsigned image;   // image of the first eye
 };
 
-// Places an instance, and writes its view, its placements and its top clusters. All
-// lanes of the warp take part. `sides_of` returns the frustum sides for a bundle. Of n
+// Places an instance: writes its view, its placements and its top clusters. All lanes
+// of the warp must call it. `sides_of` returns the frustum sides for a bundle. With n
 // instances, instance i has the placement n + i in front of a second eye.
 template <class SidesOf>
 __device__ inline Placed place_instance(const PlacedScene& scene, const InstanceSlot& slot,
@@ -106,8 +106,8 @@ __device__ inline Placed place_instance(const PlacedScene& scene, const Instance
             const InstanceAxes axes = axes_of_instance(eyes.camera[0], pose);
             view = view_from_instance(eyes, sides_of(bundle), axes, pose,
                                       scene.instances.importance[i]);
-            // The placement is staged before the instance is known to be visible, so
-            // that its axes occupy no registers until then.
+            // Store the placement now, before it is known whether the instance is
+            // visible. Then its axes need no registers any more.
             if (placements != nullptr)
                 placement_row.set(placement_of(axes, pose, bundle, slot.image));
         }
@@ -152,8 +152,8 @@ __device__ inline Placed place_instance(const PlacedScene& scene, const Instance
 //
 // Consecutive instances form one part if a single lane can process each of them, unless
 // an instance with a full table is between them. The thread of the first instance
-// writes the part. `place` is that of the thread's instance, and `num_instances` the
-// number of instances of its viewpoint.
+// writes the part. `place` is the place of the thread's instance. `num_instances` is
+// the number of instances of its viewpoint.
 __device__ inline unsigned write_parts(const PlacedScene& scene, const Placed& placed, size_t block,
                                        size_t place, size_t num_instances,
                                        const CutScratch& scratch) {

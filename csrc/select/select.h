@@ -46,8 +46,8 @@ struct SelectInput {
     Span<const Span<uint32_t>> needs = {};
     // State of tolerance_of_budget(), for BudgetPace::in_steps.
     uint32_t* last_bin = nullptr;
-    // As runs_of_bundles() returns them, for callers that select many cuts; if empty,
-    // each cut finds them anew.
+    // The result of runs_of_bundles(), for callers that select many cuts. If empty,
+    // each cut computes the runs.
     Span<const ClusterRuns> runs = {};
 };
 
@@ -74,8 +74,8 @@ struct BudgetCut {
     int64_t num_gaussians;  // with all pages resident; of the coarsest cut if none fits
 };
 
-// Returns the runs of each bundle for this number of cuts; empty for bundles with few
-// instances in all cuts together.
+// Returns the runs of each bundle for `num_cuts` cuts. The runs of a bundle are empty
+// if it has few instances in all cuts together.
 std::vector<ClusterRuns> runs_of_bundles(Span<const ClusterTable> bundles,
                                          const InstanceTable& instances, size_t num_cuts);
 

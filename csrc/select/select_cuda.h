@@ -41,7 +41,7 @@ struct PartlyResident {
     NeedList needs;  // `report` is null if no report is requested
 };
 
-// A camera of a batch on the device. One that is not drawn sees nothing.
+// A camera of a batch on the device. A camera that is not drawn sees nothing.
 struct BatchCamera {
     Camera camera;
     int32_t environment;  // as in EnvironmentTable
@@ -50,47 +50,53 @@ struct BatchCamera {
 
 // The arrays of a batch's cameras on the device.
 struct CameraArrays {
-    const void *viewmats, *intrinsics;  // (B, 4, 4); (B, 3, 3), or (3, 3) for all
-    const void* environments;           // (B,), null if the cameras see all instances
-    bool are_viewmats_double, are_intrinsics_double, shares_intrinsics;  // else float
-    bool are_environments_long;                                          // else 32 bits
+    // (B, 4, 4); (B, 3, 3), or (3, 3) for all cameras
+    const void *viewmats, *intrinsics;
+    const void* environments;  // (B,); null if the cameras see all instances
+    // Whether an array has doubles, not floats; whether all cameras share the
+    // intrinsics.
+    bool are_viewmats_double, are_intrinsics_double, shares_intrinsics;
+    bool are_environments_long;  // int64, not int32
     int width, height;
     double near_depth;
 };
 
-// What the cameras of a batch are read from.
+// The source from which the cameras of a batch are read.
 enum class CameraSource {
     arrays,
-    copies,  // for a frame that is drawn again, because the arrays may have changed
+    // Copies; for a frame that is drawn again, because the arrays may have changed.
+    copies,
 };
 
-// The viewpoints of a batch, and where their instances are placed. The instance in slot
-// s of camera b has place b * num_slots + s. A camera whose numbers are wrong, or whose
-// environment the scene does not have, is not drawn.
+// The viewpoints of a batch, and the places of their instances. The instance in slot s
+// of camera b has place b * num_slots + s. A camera is not drawn if its numbers are
+// invalid, or if the scene does not have its environment.
 struct BatchViews {
-    CameraArrays arrays;    // of all cameras of the batch
-    uint32_t first_camera;  // of these views
+    CameraArrays arrays;    // arrays of all cameras of the batch
+    uint32_t first_camera;  // first camera of these views
     uint32_t num_cameras;
     CameraSource source;
-    BatchCamera* cameras;  // copies of the cameras of these views; written, or read
-    uint32_t num_slots;    // of each camera: batch_slots()
-    size_t most_parts;     // of the tables that one camera sees
-    FrameImage first;      // the image of the first camera; the others follow it
-    BatchPlanes planes;    // of all images
-    ImageCounts* counts;   // of all images; the cut clears them
+    // Copies of the cameras of these views, to be written or read.
+    BatchCamera* cameras;
+    uint32_t num_slots;  // result of batch_slots()
+    size_t most_parts;   // largest number of parts of the tables that one camera sees
+    // Image of the first camera; the images of the other cameras follow.
+    FrameImage first;
+    BatchPlanes planes;   // planes of all images
+    ImageCounts* counts;  // counts of all images; the cut clears them
 
     size_t num_places() const { return size_t(num_cameras) * num_slots; }
 };
 
-// Returns the number of slots of each camera of a batch, if a camera sees at most this
-// many instances.
+// Returns the number of slots of each camera of a batch, if a camera sees at most
+// `most_instances` instances.
 size_t batch_slots(size_t most_instances);
 
 // Memory for the placements of a batch, one element per place.
 struct BatchPlacements {
-    FrameImage* images;  // per camera
+    FrameImage* images;  // one per camera
     Placement* placements;
-    InstanceFactors* factors;  // null if the scene has none
+    InstanceFactors* factors;  // null if the scene has no factors
 };
 
 // Computes cuts of scenes on the device that is current at construction. It owns the
@@ -114,12 +120,12 @@ class Cut {
     // Returns the number of elements that cut_items() needs in items.zeros.
     static size_t num_zeros(const SceneTables& scene, const SelectRule& rule);
 
-    // Writes the clusters that each camera of a batch draws as the items of a frame,
-    // with the decisions of cut_items(). The rule has no budget.
+    // Writes the clusters that each camera of a batch draws as items of a frame.
+    // Decisions are equal to the decisions of cut_items(). The rule has no budget.
     void cut_batch(const SceneTables& scene, const BatchViews& views, const SelectRule& rule,
                    const BatchPlacements& out, const ItemList& items, cudaStream_t stream);
 
-    // Returns how many zeros cut_batch() needs in items.zeros.
+    // Returns the number of elements that cut_batch() needs in items.zeros.
     static size_t num_batch_zeros(size_t num_places);
 
     // Writes a cut that was selected earlier, and is in device memory, as items for one
