@@ -93,8 +93,8 @@ Camera on_screen(const Camera& camera, Random& random) {
     return camera.cropped(-left, -above, width, height);
 }
 
-// Returns a window of the picture around a random gaussian. Gaussians are chosen with a
-// probability in proportion to CutPictures::weight.
+// Returns a window of the picture around a random gaussian. CutPictures::weight holds
+// the prefix sums of the probabilities.
 Camera window_of(const Camera& camera, double widest_px, const CutPictures& pictures,
                  Random& random) {
     double at[2] = {camera.width / 2, camera.height / 2};

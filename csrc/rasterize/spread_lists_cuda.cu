@@ -259,8 +259,9 @@ __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t 
         place_buckets<kSpreadThreads>(from, 0, count, buckets, s.bucket, s.warp_sum);
     }
 
-    // Returns the first index of a bucket in the chunk. of_chunk[b] holds the first
-    // index of bucket b + 1.
+    // Returns the index in the chunk at which bucket b begins. Call it only after all
+    // entries are placed: placing them has moved of_chunk[b] from the begin of bucket b
+    // to its end, which is the begin of bucket b + 1.
     const auto begin_of = [&](uint32_t b) { return b > 0 ? of_chunk[b - 1] : 0; };
     for (uint32_t k = 0; k < num_chunks; ++k) {
         const uint32_t first = k * size, last = min(first + size, count);
