@@ -21,10 +21,10 @@ class HashedRead {
   public:
     static constexpr size_t kLargeBytes = size_t(4) << 20;
 
-    // Reads the file from `offset` to its end, and stores the bytes in the message,
-    // starting at message[num_before]. The caller has filled the bytes before; they are
-    // hashed, too. The last bytes of the message are the hash of all preceding bytes.
-    // The memory of the message must outlive this object.
+    // Fills the message from message[num_before] on with the bytes of the file that
+    // start at `offset`. The caller has filled the bytes before; they are hashed, too.
+    // The last bytes of the message are the hash of all preceding bytes. The memory of
+    // the message must outlive this object.
     HashedRead(PosixFile file, size_t offset, Span<uint8_t> message, size_t num_before,
                HashOf hash_of);
     HashedRead(const HashedRead&) = delete;
