@@ -3,6 +3,7 @@ place."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -132,6 +133,7 @@ class CameraBatch:
         Raises:
             ValueError: There is no camera, or a size or a near plane differs.
         """
+        check_type("cameras", cameras, Iterable, "a CameraBatch or a sequence of Cameras")
         cameras = list(cameras)
         check("cameras", cameras, "at least one, got none")
         for number, camera in enumerate(cameras):

@@ -332,6 +332,8 @@ def test_wrong_arguments_of_a_batch_are_refused(scene, device):
         renderer.render_batch(cameras, out=BatchPlanes(fits, fits[..., 0]))
     with pytest.raises(ValueError, match="out: expected planes with depth"):
         renderer.render_batch(cameras, depth=True, out=BatchPlanes(fits))
+    with pytest.raises(TypeError, match="cameras: expected a CameraBatch or a sequence"):
+        renderer.render_batch(3)
     with pytest.raises(TypeError, match="out: expected a BatchPlanes"):
         renderer.render_batch(cameras, out=fits)
     with pytest.raises(ValueError, match="tolerance"):
