@@ -694,7 +694,11 @@ def test_an_address_is_checked_once_more_when_a_connection_is_made(web, monkeypa
             ValueError,
             "clusters: expected at most 39268534564 clusters for the size of its pages",
         ),
-        ("forged tables of 2 TB", ValueError, "tables: expected at most 1073741824 bytes for a file at a URL"),
+        (
+            "forged tables of 2 TB",
+            ValueError,
+            "tables: expected at most 1073741824 bytes for a file at a URL",
+        ),
         ("unknown size without end", ValueError, "expected at most 1048576 bytes, got more"),
         ("asset without end", ValueError, r"expected at most \d+ bytes, got more"),
     ],
