@@ -123,7 +123,7 @@ def test_empty_assets_are_edited():
         (lambda a: v3dg.crop_box(a, (0, 0, np.nan), (1, 1, 1)), "low: expected three numbers"),
         (
             lambda a: v3dg.crop_box(a, (2, 0, 0), (1, 1, 1)),
-            "low, high: expected no coordinate",
+            "low, high: expected high to be at least low",
         ),
         (lambda a: v3dg.crop_box(a, (0, 0, 0), (1, 1, 1), keep="both"), "keep: expected 'inside'"),
         (lambda a: v3dg.crop_sphere(a, (0, 0, np.inf), 1), "center: expected finite numbers"),

@@ -68,7 +68,7 @@ def test_sizes_beyond_the_limits_are_refused():
     pictures.check_size("size", pictures.MOST_SIDE, 1)
     with pytest.raises(ValueError, match=r"size: expected a picture of at most 65,500 px a side"):
         pictures.check_size("size", pictures.MOST_SIDE + 1, 1)
-    with pytest.raises(ValueError, match=r"at most .* px in all, got 1000 x 1001"):
+    with pytest.raises(ValueError, match=r"at most .* px in total, got 1000 x 1001"):
         pictures.check_size("size", 1000, 1001, most_pixels=1_000_000)
 
 

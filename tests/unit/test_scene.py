@@ -100,7 +100,9 @@ def test_add_refuses_what_is_not_a_bundle():
     for wrong in (Scene(), [BUNDLE, Scene()]):
         with pytest.raises(TypeError, match="bundle: expected a Bundle, got Scene"):
             Scene().add(wrong, positions=np.zeros((2, 3)))
-    with pytest.raises(ValueError, match="bundle: expected one for all or 3, got 2"):
+    with pytest.raises(
+        ValueError, match="bundle: expected one for all instances or a list of 3, got 2"
+    ):
         Scene().add([BUNDLE, OTHER], positions=np.zeros((3, 3)))
 
 
@@ -282,13 +284,13 @@ def matrix_with(row, column, value):
             np.diag([1.0, 1, 2, 1]),
             r"matrix: .*, got different scales: 1 1 2; instances cannot",
         ),
-        (np.diag([1.0, 1, -1, 1]), "matrix: .*, got a mirror"),
-        (np.diag([-2.0, -2, -2, 1]), "matrix: .*, got a mirror"),
+        (np.diag([1.0, 1, -1, 1]), "matrix: .*, got a reflection"),
+        (np.diag([-2.0, -2, -2, 1]), "matrix: .*, got a reflection"),
         (matrix_with(0, 1, 0.3), "matrix: .*, got a shear"),
         (np.diag([0.0, 0, 0, 1]), "matrix: .*, got a scale of 0;"),
         (np.diag([1.0, 1, 0, 1]), "matrix: .*, got a scale of 0 along an axis"),
         (matrix_with(3, 0, 0.5), "matrix: .*, got the last row 0.5 0 0 1"),
-        (np.stack([np.eye(4), np.diag([1.0, 1, -1, 1])]), r"matrix\[1\]: .*, got a mirror"),
+        (np.stack([np.eye(4), np.diag([1.0, 1, -1, 1])]), r"matrix\[1\]: .*, got a reflection"),
         (np.eye(3), r"matrix: expected shape \(4, 4\)"),
         (matrix_with(0, 0, np.nan), "matrix: expected finite numbers"),
     ],
