@@ -74,6 +74,23 @@ py::object order_along_curve(const py::array& means) {
     return order.object;
 }
 
+py::object order_of_chunks(const py::array& means, int64_t chunk_size) {
+    const auto values = span_of<const float>(means, "means", {-1, 3});
+    const Span<const Point> points{reinterpret_cast<const Point*>(values.data), values.size / 3};
+    check_finite(values);
+    if (points.size > 0xffffffffu)
+        throw py::value_error("means: expected fewer than 2^32 rows, got " +
+                              std::to_string(points.size));
+    if (chunk_size < 1)
+        throw py::value_error("chunk_size: expected at least 1, got " + std::to_string(chunk_size));
+    const NewArray<int64_t> order({}, {static_cast<py::ssize_t>(points.size)});
+    {
+        const Unlocked unlocked;
+        chunk_order(points, static_cast<size_t>(chunk_size), order.span);
+    }
+    return order.object;
+}
+
 py::object bound_spheres(const py::object& spheres, const py::array& offset) {
     const Device device = device_of(spheres, "spheres");
     const Span<const float> rows = span_on<const float>(device, spheres, "spheres", {-1, 4});
@@ -170,6 +187,9 @@ void bind_cluster(py::module_& m) {
     m.def("morton_order", &order_along_curve, "means"_a,
           "Returns the order (N,) of points on the host along a Morton curve, which keeps "
           "neighbours together.");
+    m.def("chunk_order", &order_of_chunks, "means"_a, "chunk_size"_a,
+          "Returns an order (N,) of points on the host in which each chunk of chunk_size has "
+          "neighbours: a median split between whole chunks.");
     m.def("bound_spheres", &bound_spheres, "spheres"_a, "offset"_a,
           "Returns a ball (S, 4) around each segment of spheres (N, 4), with the margin that keeps "
           "balls nested.");

@@ -20,6 +20,16 @@ int num_halvings(size_t n, size_t cluster_size);
 // offset: [S + 1], ascending from 0. leaf_offset: [S * 2^depth + 1].
 void halve_segments(Span<const int64_t> offset, int depth, Span<int64_t> leaf_offset);
 
+// Sorts points so that each chunk of chunk_size (>= 1) has neighbours; only the last
+// chunk may be smaller.
+//
+// Nodes are split between whole chunks, at the median chunk along the longest axis of
+// their points' bounding box, with ties as in median_split. Indices ascend in each
+// chunk. The result does not depend on the number of threads.
+//
+// means: [N], on the host, finite, N < 2^32. order: [N], the index at each position.
+void chunk_order(Span<const Point> means, size_t chunk_size, Span<int64_t> order);
+
 // Sorts the points of each segment so that each cluster of a perfect binary tree is
 // contiguous.
 //

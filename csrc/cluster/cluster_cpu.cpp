@@ -59,24 +59,51 @@ void move_median(IndexedPoint* first, IndexedPoint* middle, IndexedPoint* last) 
     });
 }
 
+// Moves points first .. last so that those before `middle` have the lowest coordinates
+// along the longest axis.
+void move_along_longest(IndexedPoint* first, IndexedPoint* middle, IndexedPoint* last) {
+    const int axis = longest_axis(first, last);
+    const auto move = axis == 0 ? move_median<0> : axis == 1 ? move_median<1> : move_median<2>;
+    move(first, middle, last);
+}
+
+void write_leaf(const IndexedPoint* points, ptrdiff_t first, ptrdiff_t last, int64_t* order) {
+    for (ptrdiff_t i = first; i < last; ++i) order[i] = points[i].index;
+    std::sort(order + first, order + last);
+}
+
 // Splits points first .. last into the node's 2^depth leaves. The arguments are plain
 // values because LLVM's OpenMP, which replaces GCC's for the thread sanitizer
 // (.ci/sanitize), does not copy other types into a task that runs immediately.
 void split_node(IndexedPoint* points, ptrdiff_t first, ptrdiff_t last, int depth, int64_t* order) {
     if (depth == 0) {
-        for (ptrdiff_t i = first; i < last; ++i) order[i] = points[i].index;
-        std::sort(order + first, order + last);
+        write_leaf(points, first, last, order);
         return;
     }
     const ptrdiff_t middle = first + (last - first + 1) / 2;
-    if (middle < last) {
-        const int axis = longest_axis(points + first, points + last);
-        const auto move = axis == 0 ? move_median<0> : axis == 1 ? move_median<1> : move_median<2>;
-        move(points + first, points + middle, points + last);
-    }
+    if (middle < last) move_along_longest(points + first, points + middle, points + last);
 #pragma omp task if (last - first > kTaskSize)
     split_node(points, first, middle, depth - 1, order);
     split_node(points, middle, last, depth - 1, order);
+}
+
+// Splits points first .. last into chunks; the left part gets ceil(n / 2) of n chunks.
+void split_chunks(IndexedPoint* points, ptrdiff_t first, ptrdiff_t last, ptrdiff_t chunk_size,
+                  int64_t* order) {
+    if (last - first <= chunk_size) {
+        write_leaf(points, first, last, order);
+        return;
+    }
+    const ptrdiff_t num_chunks = (last - first + chunk_size - 1) / chunk_size;
+    const ptrdiff_t middle = first + (num_chunks + 1) / 2 * chunk_size;
+    move_along_longest(points + first, points + middle, points + last);
+#pragma omp task if (last - first > kTaskSize)
+    split_chunks(points, first, middle, chunk_size, order);
+    split_chunks(points, middle, last, chunk_size, order);
+}
+
+IndexedPoint indexed(const Point& mean, size_t index) {
+    return {{mean.axis[0], mean.axis[1], mean.axis[2]}, uint32_t(index)};
 }
 
 size_t farthest(const Center& center, const Ball* spheres, size_t count, double* distance) {
@@ -145,10 +172,24 @@ void cpu::median_split(Span<const Point> means, Span<const int64_t> offset, int 
     {
 #pragma omp for
         for (ptrdiff_t i = 0; i < count; ++i)
-            points[i] = {{means[i].axis[0], means[i].axis[1], means[i].axis[2]}, uint32_t(i)};
+            points[i] = indexed(means[i], i);
 #pragma omp for schedule(dynamic, 1)
         for (ptrdiff_t s = 0; s < num_segments; ++s)
             split_node(points.data(), offset[s], offset[s + 1], depth, order.data);
+    }
+}
+
+void chunk_order(Span<const Point> means, size_t chunk_size, Span<int64_t> order) {
+    assert(order.size == means.size);
+    std::vector<IndexedPoint> points(means.size);
+    const ptrdiff_t count = static_cast<ptrdiff_t>(means.size);
+    const ptrdiff_t size = static_cast<ptrdiff_t>(chunk_size);
+#pragma omp parallel if (count > kTaskSize) num_threads(most_threads())
+    {
+#pragma omp for
+        for (ptrdiff_t i = 0; i < count; ++i) points[i] = indexed(means[i], i);
+#pragma omp single
+        split_chunks(points.data(), 0, count, size, order.data);
     }
 }
 

@@ -15,11 +15,31 @@ def median_split(means: np.ndarray, cluster_size: int) -> list[list[int]]:
     return [sorted(leaf) for leaf in leaves]
 
 
+def chunk_order(means: np.ndarray, chunk_size: int) -> list[int]:
+    """Indices by chunks: halve between whole chunks along the longest axis."""
+    return _chunked(means, list(range(len(means))), chunk_size)
+
+
+def _chunked(means: np.ndarray, indices: list[int], chunk_size: int) -> list[int]:
+    if len(indices) <= chunk_size:
+        return sorted(indices)
+    ranked = _ranked(means, indices)
+    num_chunks = -(-len(indices) // chunk_size)
+    num_left = (num_chunks + 1) // 2 * chunk_size
+    left = _chunked(means, ranked[:num_left], chunk_size)
+    return left + _chunked(means, ranked[num_left:], chunk_size)
+
+
 def _halves(means: np.ndarray, indices: list[int]) -> tuple[list[int], list[int]]:
     if not indices:
         return [], []
-    points = means[indices]
-    axis = int(np.argmax(points.max(axis=0) - points.min(axis=0)))  # the first of equals
-    ranked = sorted(indices, key=lambda i: (float(means[i, axis]), i))
+    ranked = _ranked(means, indices)
     num_left = (len(ranked) + 1) // 2
     return ranked[:num_left], ranked[num_left:]
+
+
+def _ranked(means: np.ndarray, indices: list[int]) -> list[int]:
+    """Indices in order along the longest axis; ties: lower axis, lower index."""
+    points = means[indices]
+    axis = int(np.argmax(points.max(axis=0) - points.min(axis=0)))  # the first of equals
+    return sorted(indices, key=lambda i: (float(means[i, axis]), i))

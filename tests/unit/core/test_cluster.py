@@ -239,3 +239,40 @@ def test_number_of_threads_changes_nothing():
         for threads in ("1", "2", "3")
     ]
     assert len(set(digests)) == 1
+
+
+@given(means=st.one_of(coarse_means, any_means), chunk_size=st.integers(1, 9))
+def test_chunks_agree_with_reference(means, chunk_size):
+    order = _core.chunk_order(means, chunk_size)
+    np.testing.assert_array_equal(order, reference.chunk_order(means, chunk_size))
+
+
+def test_chunks_do_not_depend_on_the_number_of_threads():
+    """Enough points for several tasks."""
+    means = np.random.default_rng(0).normal(size=(100_000, 3)).astype(np.float32)
+    order = _core.chunk_order(means, 256)
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(means)))
+    extents = [
+        np.ptp(means[rows], axis=0).max() for rows in np.split(order, range(256, 99_999, 256))
+    ]
+    assert np.median(extents) < 1
+    code = (
+        "import sys, numpy as np; from v3dg import _core; "
+        "means = np.random.default_rng(0).normal(size=(100_000, 3)).astype(np.float32); "
+        "sys.stdout.buffer.write(_core.chunk_order(means, 256).tobytes())"
+    )
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True)
+    assert done.stdout == order.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("means", "chunk_size", "message"),
+    [
+        ([[0, 0, 0], [0, np.inf, 0]], 4, "means: expected finite values, got inf in row 1"),
+        ([[0, 0, 0]], 0, "chunk_size: expected at least 1, got 0"),
+    ],
+)
+def test_bad_chunks_are_refused(means, chunk_size, message):
+    with pytest.raises(ValueError, match=message):
+        _core.chunk_order(np.array(means, np.float32), chunk_size)
