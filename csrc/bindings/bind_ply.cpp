@@ -58,6 +58,7 @@ class BoundPlyFile {
     int sh_degree() const {
         return static_cast<int>(std::lround(std::sqrt(ply_.layout.num_sh))) - 1;
     }
+    std::string prefix() const { return printable(ply_.layout.prefix); }
     py::list used() const {
         py::list names;
         for (const PlyField& field : ply_.layout.fields)
@@ -159,6 +160,8 @@ void bind_ply(py::module_& m) {
         .def_property_readonly("sh_degree", &BoundPlyFile::sh_degree)
         .def_property_readonly("used", &BoundPlyFile::used,
                                "Names of the properties that are read.")
+        .def_property_readonly("prefix", &BoundPlyFile::prefix,
+                               "What the names of properties have before those of trainers.")
         .def("read", &BoundPlyFile::read, "first"_a, "last"_a);
     m.def("ply_header", &ply_header, "path"_a,
           "Returns the encoding, the bytes of the header, and the elements: name, count, and names "

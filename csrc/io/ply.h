@@ -55,6 +55,7 @@ struct PlyLayout {
     bool has_base_colors = false;
     bool has_filter = false;
     double color_scale[3] = {1, 1, 1};  // from a stored base colour to one of 0 to 1
+    std::string prefix;                 // of the names of properties, before trainers' names
     std::vector<PlyField> fields;       // of each PlySlot
 };
 

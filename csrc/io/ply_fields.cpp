@@ -15,6 +15,34 @@ namespace {
 
 constexpr size_t kMaxNames = 8;  // of properties in a message
 
+// The prefixes that programs put before the names of properties other than positions,
+// normals and colours: CloudCompare, 3dgsconverter, and both.
+constexpr const char* kPrefixes[] = {"scalar_", "scal_", "scalar_scal_"};
+
+// The prefix of the names of a gaussian's properties; none for trainers' names.
+std::string prefix_of(const PlyElement& vertex) {
+    std::unordered_set<std::string> names;
+    for (const PlyProperty& property : vertex.properties) names.insert(property.name);
+    if (names.count("opacity")) return "";
+    for (const char* prefix : kPrefixes)
+        if (names.count(std::string(prefix) + "opacity")) return prefix;
+    return "";
+}
+
+// The element with trainers' names of properties. A name stays if another property has
+// it without the prefix.
+PlyElement without_prefix(PlyElement vertex, const std::string& prefix) {
+    if (prefix.empty()) return vertex;
+    std::unordered_set<std::string> names;
+    for (const PlyProperty& property : vertex.properties) names.insert(property.name);
+    for (PlyProperty& property : vertex.properties) {
+        if (property.name.rfind(prefix, 0) != 0) continue;
+        const std::string name = property.name.substr(prefix.size());
+        if (!names.count(name)) property.name = name;
+    }
+    return vertex;
+}
+
 // The fields of a vertex's properties by their names, without those of lists.
 struct Fields {
     std::unordered_map<std::string, PlyField> field_from_name;
@@ -127,10 +155,12 @@ std::string missing_text(const PlyElement& vertex, const Fields& fields,
 
 }  // namespace
 
-PlyLayout layout_of(const PlyElement& vertex) {
+PlyLayout layout_of(const PlyElement& stored) {
+    PlyLayout layout;
+    layout.prefix = prefix_of(stored);
+    const PlyElement vertex = without_prefix(stored, layout.prefix);
     const Fields fields = fields_of(vertex);
     const size_t num_stored = num_stored_sh(vertex);
-    PlyLayout layout;
     layout.num_sh = std::min<size_t>(num_stored, kMaxShBases);
     layout.is_flat = fields.has("scale_0") && fields.has("scale_1") && !fields.has("scale_2") &&
                      !fields.lists.count("scale_2") && fields.has("rot_0");

@@ -21,7 +21,7 @@ constexpr size_t kPlyChunkBytes = size_t(1) << 22;
 enum PlySlot : size_t { kMean = 0, kQuat = 3, kScale = 7, kOpacity = 10, kFilter = 11, kSh = 12 };
 
 // Throws PlyError if a property is missing, there twice or a list.
-PlyLayout layout_of(const PlyElement& vertex);
+PlyLayout layout_of(const PlyElement& stored);
 
 // The smallest number whose square a double represents with full precision.
 constexpr double kLeastSquared = 1e-140;
