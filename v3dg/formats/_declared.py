@@ -19,12 +19,14 @@ class Declared:
             the rasterizer; None if the file does not say.
         notes: What is in the file and was not understood, or was read otherwise than it
             is written; each is one sentence without the name of the file.
+        up_is_guessed: Whether `up` is only what the gaussians themselves show.
     """
 
     up: Axis | None = None
     up_reason: str = ""
     antialiased: bool | None = None
     notes: tuple[str, ...] = ()
+    up_is_guessed: bool = False
 
 
 NOTHING = Declared()
