@@ -101,16 +101,6 @@ def opacity_bytes(opacities: Floats) -> NDArray[np.uint32]:
     return np.where(opacities < _LEAST_VISIBLE_OPACITY, 0, to_integers(opacities * 255.0, 255))
 
 
-def file_order(gaussians: Gaussians) -> NDArray[np.int64]:
-    """The order (N,) of a format that keeps that of the gaussians."""
-    return np.arange(len(gaussians))
-
-
-def curve_order(gaussians: Gaussians) -> NDArray[np.int64]:
-    """The order (N,) along a Morton curve, so that neighbours follow one another."""
-    return _core.morton_order(gaussians.means)
-
-
 def check_writable(gaussians: Gaussians) -> Gaussians:
     """Return the gaussians on the host; the ValueError names the first value that a
     quantised format cannot hold."""
