@@ -27,7 +27,7 @@ void check_finite(Span<const float> means) {
                                   " in row " + std::to_string(i / 3));
 }
 
-py::tuple median_split(const py::object& means, const py::array& offset, int depth) {
+py::tuple median_split(const py::object& means, const py::array& offset, int depth, int64_t unit) {
     constexpr int kDeepest = 32;  // splits up to 2^32 points
     const Device device = device_of(means, "means");
     const Span<const float> values = span_on<const float>(device, means, "means", {-1, 3});
@@ -38,6 +38,7 @@ py::tuple median_split(const py::object& means, const py::array& offset, int dep
     const Span<const int64_t> offsets = offsets_of(offset, points.size);
     if (depth < 0 || depth > kDeepest)
         throw py::value_error("depth: expected 0 to 32, got " + std::to_string(depth));
+    if (unit < 1) throw py::value_error("unit: expected at least 1, got " + std::to_string(unit));
     const Work work(device);
     if (work.backend().traits.host_reads_arrays) check_finite(values);
     const NewArray<int64_t> order(device, {static_cast<py::ssize_t>(points.size)});
@@ -45,7 +46,8 @@ py::tuple median_split(const py::object& means, const py::array& offset, int dep
         {}, {static_cast<py::ssize_t>(((offsets.size - 1) << depth) + 1)});
     {
         const Unlocked unlocked;
-        work.backend().median_split(points, offsets, depth, order.span, leaf_offset.span, work);
+        work.backend().median_split(points, offsets, depth, static_cast<size_t>(unit), order.span,
+                                    leaf_offset.span, work);
     }
     return py::make_tuple(order.object, leaf_offset.object);
 }
@@ -70,23 +72,6 @@ py::object order_along_curve(const py::array& means) {
     {
         const Unlocked unlocked;
         morton_order(points, order.span);
-    }
-    return order.object;
-}
-
-py::object order_of_chunks(const py::array& means, int64_t chunk_size) {
-    const auto values = span_of<const float>(means, "means", {-1, 3});
-    const Span<const Point> points{reinterpret_cast<const Point*>(values.data), values.size / 3};
-    check_finite(values);
-    if (points.size > 0xffffffffu)
-        throw py::value_error("means: expected fewer than 2^32 rows, got " +
-                              std::to_string(points.size));
-    if (chunk_size < 1)
-        throw py::value_error("chunk_size: expected at least 1, got " + std::to_string(chunk_size));
-    const NewArray<int64_t> order({}, {static_cast<py::ssize_t>(points.size)});
-    {
-        const Unlocked unlocked;
-        chunk_order(points, static_cast<size_t>(chunk_size), order.span);
     }
     return order.object;
 }
@@ -181,15 +166,13 @@ void bind_cluster(py::module_& m) {
           "that can be drawn.");
     m.def("num_halvings", &halvings, "count"_a, "cluster_size"_a,
           "Returns how often points are halved until no part has more than cluster_size.");
-    m.def("median_split", &median_split, "means"_a, "offset"_a, "depth"_a,
+    m.def("median_split", &median_split, "means"_a, "offset"_a, "depth"_a, "unit"_a = 1,
           "Sorts the points of each segment into the leaves of a perfect binary tree: returns "
-          "order (N,) int64, and leaf_offset (L + 1,) int64 on the host.");
+          "order (N,) int64, and leaf_offset (L + 1,) int64 on the host. The left part of a node "
+          "has half of its points, rounded up to a multiple of unit.");
     m.def("morton_order", &order_along_curve, "means"_a,
           "Returns the order (N,) of points on the host along a Morton curve, which keeps "
           "neighbours together.");
-    m.def("chunk_order", &order_of_chunks, "means"_a, "chunk_size"_a,
-          "Returns an order (N,) of points on the host in which each chunk of chunk_size has "
-          "neighbours: a median split between whole chunks.");
     m.def("bound_spheres", &bound_spheres, "spheres"_a, "offset"_a,
           "Returns a ball (S, 4) around each segment of spheres (N, 4), with the margin that keeps "
           "balls nested.");

@@ -70,7 +70,7 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
         const Camera camera = measured.camera(picture);
         const auto width = static_cast<size_t>(camera.width),
                    height = static_cast<size_t>(camera.height);
-        const Colors truth(leaves, enlarged(camera, FirstSelected::kSamples), own),
+        const Colors truth(leaves, camera.scaled(FirstSelected::kSamples), own),
             by_leaves(leaves, camera, own), by_level(level, camera, coarse);
         const NewArray<float> losses({}, {py::ssize_t(height), py::ssize_t(width), 3});
         {

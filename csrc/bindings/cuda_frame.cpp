@@ -214,12 +214,12 @@ class BackendFrame final : public backend::Frame {
         std::vector<std::shared_ptr<const DevicePalette>> colors;
         for (const std::shared_ptr<const backend::Palette>& palette : palettes)
             colors.push_back(static_cast<const BackendPalette&>(*palette).palette);
+        const Turn turn(*turns_);
         frame_.set_models(std::move(on_device), std::move(colors), stream_of(work));
         models_ = std::move(models);
     }
 
     std::unique_ptr<BoundDrawing> draw(const backend::FrameInput& input) override {
-        const Turn turn(*turns_);
         const FrameRequest& request = input.request;
         if (request.cut) return enqueue(input, request.rule);
         return in_steps(input.steps, request.rule, request.choosing_eyes(), input.state,
@@ -231,7 +231,7 @@ class BackendFrame final : public backend::Frame {
     }
 
     std::vector<std::pair<const char*, size_t>> memory() const override {
-        std::vector<std::pair<const char*, size_t>> parts = frame_.bytes();
+        std::vector<std::pair<const char*, size_t>> parts = bytes_of_frame();
         const PoolBytes pool = pool_bytes();
         parts.emplace_back("pool, reserved", pool.reserved);
         parts.emplace_back("pool, used", pool.used);
@@ -242,6 +242,7 @@ class BackendFrame final : public backend::Frame {
     std::unique_ptr<BoundDrawing> enqueue(const backend::FrameInput& input,
                                           const SelectRule& paced) {
         const FrameRequest& request = input.request;
+        const Turn turn(*turns_);
         const Work work(device_);
         NewPictures pictures;
         const EyeImages images = new_images(request.eyes, request.shade, pictures);
@@ -258,12 +259,17 @@ class BackendFrame final : public backend::Frame {
                                                  std::move(drawing), reported, pages);
     }
 
+    std::vector<std::pair<const char*, size_t>> bytes_of_frame() const {
+        const Turn turn(*turns_);
+        return frame_.bytes();
+    }
+
     const Device device_;
     // Shared with drawings, which may be finished after the frame is destroyed.
     const std::shared_ptr<Mutex> turns_ = std::make_shared<Mutex>();
-    // own the memory that the frame reads
-    std::vector<std::shared_ptr<const backend::Model>> models_;
-    SceneFrame frame_;
+    // Own the memory that the frame reads.
+    std::vector<std::shared_ptr<const backend::Model>> models_ V3DG_GUARDED_BY(*turns_);
+    SceneFrame frame_ V3DG_GUARDED_BY(*turns_);
 };
 
 class BackendAssetFrame final : public backend::AssetFrame {
@@ -292,7 +298,7 @@ class BackendAssetFrame final : public backend::AssetFrame {
     const std::shared_ptr<Mutex> turns_ = std::make_shared<Mutex>();
     const std::shared_ptr<const backend::Model> model_;
     const Appearance<float> appearance_;
-    ModelFrame frame_;
+    ModelFrame frame_ V3DG_GUARDED_BY(*turns_);
 };
 
 class DeviceTape final : public Tape {

@@ -17,9 +17,7 @@
 //    model. Such a struct satisfies CameraModel itself, so kernels do not change.
 // 4. Let users create the model: extend bindings/bind_types.cpp, v3dg/cameras.py and,
 //    if camera files can name the model, v3dg/camera_file.py. The code in fit_group/
-//    draws its own pictures with pinholes and needs no change. The code in
-//    levels/cut_views.cpp, levels/first_selected.cpp and levels/refine_cuts_math.h
-//    accesses the fields of pinholes, and must reject other models.
+//    and levels/ draws its own pictures with pinholes and needs no change.
 // 5. Reject Footprint::paper for the model: it is defined only for pinholes
 //    (select/footprint.h).
 //
@@ -37,6 +35,9 @@
 // - width, height: size of the image, px.
 // - near_depth: depth of the near plane; positive. Nothing nearer is drawn.
 // - rounded_to<U>(): the same camera with scalar type U.
+// - scale(factor): multiplies the resolution.
+// - crop(left, top, width, height): makes this rectangle of the image, px, the whole
+//   image. It may extend beyond the old one.
 //
 // Projection
 // - depth_of(p): the depth of a point in view space. Gaussians are sorted by depth. A
@@ -96,8 +97,34 @@ struct Camera : CameraPose, Intrinsics<double>, ImagePart {
     V3DG_HD Intrinsics<T> intrinsics() const {
         return rounded_to<T>();
     }
+    // Returns the same view with `factor` times the resolution.
+    V3DG_HD Camera scaled(double factor) const {
+        Camera camera = *this;
+        camera.scale(factor);
+        camera.x0 *= factor;
+        camera.y0 *= factor;
+        camera.x1 *= factor;
+        camera.y1 *= factor;
+        return camera;
+    }
+    // Returns a camera whose whole image is this rectangle of the image, px.
+    V3DG_HD Camera cropped(double left, double top, double new_width, double new_height) const {
+        Camera camera = *this;
+        camera.crop(left, top, new_width, new_height);
+        camera.x0 = 0;
+        camera.y0 = 0;
+        camera.x1 = new_width;
+        camera.y1 = new_height;
+        return camera;
+    }
 };
 static_assert(sizeof(Camera) == 26 * sizeof(double), "nothing but its numbers is compared");
+
+// Returns a camera with this projection, whose whole image is requested. The caller
+// sets its pose.
+inline Camera with_projection(const Intrinsics<double>& projection) {
+    return {CameraPose{}, projection, ImagePart{0, 0, projection.width, projection.height}};
+}
 
 // The viewpoint for which a cut is selected: one camera, or the two eyes of a stereo
 // camera. The rotations of the two eyes are equal.
@@ -128,6 +155,10 @@ concept ProjectingModel =
         { camera.height } -> std::convertible_to<typename C::Scalar>;
         { camera.near_depth } -> std::convertible_to<typename C::Scalar>;
         camera.template rounded_to<float>();
+        requires requires(C changed, typename C::Scalar px) {
+            changed.scale(px);
+            changed.crop(px, px, px, px);
+        };
         { camera.depth_of(numbers) } -> std::same_as<typename C::Scalar>;
         { camera.limits() } -> std::same_as<typename C::Limits>;
         {

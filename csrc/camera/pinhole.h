@@ -69,6 +69,22 @@ struct Pinhole {
                 .near_depth = U(near_depth)};
     }
 
+    V3DG_HD void scale(T factor) {
+        fx *= factor;
+        fy *= factor;
+        cx *= factor;
+        cy *= factor;
+        width *= factor;
+        height *= factor;
+    }
+
+    V3DG_HD void crop(T left, T top, T new_width, T new_height) {
+        cx -= left;
+        cy -= top;
+        width = new_width;
+        height = new_height;
+    }
+
     template <class V>
     V3DG_HD V3DG_INLINE V depth_of(const V p[3]) const {
         return p[2];
