@@ -192,8 +192,8 @@ def check_bundle_name(path: str | os.PathLike[str]) -> None:
 def open_regular(path: str | os.PathLike[str]) -> int:
     """Open a file for reading and return its descriptor; raise ValueError for a
     directory, a device or a pipe."""
-    # With O_NONBLOCK, opening a pipe does not wait for a writer; regular files ignore
-    # it.
+    # With O_NONBLOCK, opening a pipe does not wait for a writer. The flag has no effect
+    # on regular files.
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)

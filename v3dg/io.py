@@ -130,8 +130,8 @@ def read_asset(path: AnyPath) -> Gaussians:
       splatfacto and of the code of the 3DGS paper and 2DGS. Only tensors are read; no
       code of the pickle is run.
 
-    If the content of a file is recognised as another of these formats than its name
-    says, the content decides.
+    If the content of a file has another of these formats than its name, the content
+    determines the format.
 
     If the file declares whether the gaussians were trained with antialiasing,
     `Gaussians.antialiased` of the result has that value.

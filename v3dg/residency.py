@@ -356,8 +356,8 @@ class Residency:
             for key in [
                 key for key in entries if isinstance(key, tuple) and key[0] in _NOT_INHERITED
             ]:
-                # These entries are never destroyed, because destroying them would wait
-                # for threads that do not exist in the child.
+                # Entries of the parent are never destroyed, because destroying them
+                # would wait for threads that do not exist in the child.
                 self._abandoned.append(entries.pop(key))
 
 

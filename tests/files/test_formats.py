@@ -946,7 +946,7 @@ HOSTILE_HIER = {
         lambda c: struct.pack("<i", 2**31 - 1) + c[4:],
         "expected 2147483647 gaussians, got",
     ),
-    "cut off": (lambda c: c[:1000], "expected 71 gaussians, got 1000 bytes"),
+    "cut off": (lambda c: c[:1000], "expected 71 gaussians, got a file of 1000 bytes"),
     "many nodes": (
         lambda c: c[: 4 + 71 * 236] + struct.pack("<i", 2**31 - 1) + c[8 + 71 * 236 :],
         "expected exactly 2147483647 nodes, got",

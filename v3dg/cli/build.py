@@ -133,7 +133,7 @@ def _executor_at(address: str | None) -> Iterator[Executor | None]:
         yield None
         return
     distributed = _extras.load("distributed")
-    # The command itself reports errors, once.
+    # dask must not log errors, because the command reports them.
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     _greet(address)

@@ -241,8 +241,8 @@ def _distances(means: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _shells(distances: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Return the shell (N,) of each distance: 0 up to the radius of the inner shell, and
-    one more for each factor `_SHELL_GROWTH` of that radius."""
+    """Return the shell (N,) of each distance: 0 up to the radius of the inner shell,
+    and one more for each factor `_SHELL_GROWTH` of that radius."""
     radius = 0.0
     if len(distances):
         radius = _INNER_FACTOR * float(np.quantile(distances, _INNER_SHARE))

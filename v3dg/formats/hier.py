@@ -40,12 +40,13 @@ def open_file(path: AnyPath) -> AssetFile:
     dtypes = [np.dtype(("<f4", _WIDTHS[0])), *(np.dtype((kind, width)) for width in _WIDTHS[1:])]
     column_starts = 4 + np.cumsum([0, *(count * dtype.itemsize for dtype in dtypes)])
     columns_end = int(column_starts[-1])
-    check(path, columns_end + 4 <= file.num_bytes, f"{count} gaussians, got {file.num_bytes} bytes")
+    size = f"a file of {file.num_bytes} bytes"
+    check(path, columns_end + 4 <= file.num_bytes, f"{count} gaussians, got {size}")
     num_nodes = int(file.rows(_INT, columns_end, 1)[0])
-    # Including the box of the node, which is not read.
+    # The size includes the box of the node, which is not read.
     node_bytes = node.itemsize + 8 * np.dtype(kind).itemsize
     fits = num_nodes * node_bytes == file.num_bytes - columns_end - 4
-    check(path, fits, f"exactly {num_nodes} nodes, got {file.num_bytes} bytes")
+    check(path, fits, f"exactly {num_nodes} nodes, got {size}")
     leaves = _leaves(path, file.rows(node, columns_end + 4, num_nodes), count)
 
     def read(first: int, last: int) -> Gaussians:

@@ -398,7 +398,8 @@ def _sections_of_gzip(path: AnyPath, content: bytes, claims: Claims) -> _Content
         # A limit of 0 would mean no limit; this one is always positive.
         body = stream.decompress(stream.unconsumed_tail, total + _MAX_TRAILER)
         if not stream.eof and len(body) >= total:
-            # This reads the checksum if nothing else follows.
+            # One more byte is requested, so that the checksum is read if nothing else
+            # follows.
             stream.decompress(stream.unconsumed_tail, 1)
     is_whole = len(body) >= total and stream.eof
     check(

@@ -26,8 +26,8 @@ _T = TypeVar("_T", covariant=True)
 # Step sizes of a refinement as a fraction of those of a fit. It is small because
 # refinement starts from fitted levels.
 _RATE = 0.2
-# Default share of the visibility of a level that may be dropped, together with the
-# least visible gaussians.
+# Default share of a level's visibility that may be lost by dropping its least visible
+# gaussians.
 DROP = 0.02
 # Number of pictures that measure how visible each gaussian is.
 _NUM_WEIGHING_PICTURES = 2_000

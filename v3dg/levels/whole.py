@@ -35,8 +35,8 @@ from v3dg.levels.simplify import Level, LevelBuilder, LevelTables, Show
 from v3dg.levels.smooth import measured_config
 from v3dg.levels.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
 
-# Number of leaves in a unit: enough to keep a GPU busy, at little memory. The last bits
-# of a bundle depend on it.
+# Number of leaves in a unit: enough to keep a GPU busy, with little memory. The last
+# bits of a bundle depend on this number.
 UNIT_LEAVES = 1 << 20
 # Factor by which the balls of level 1 grow if a smooth asset is too large to be
 # measured. Level 1 is then selected at half the size (docs/levels.md).

@@ -186,7 +186,7 @@ def _still_frame(
     subject: Subject, color_by: ColorBy, device: Device, memory: int | Literal["auto"] | None
 ) -> FrameSource:
     """Return the frame for single pictures of a subject. The frame of a scene or of a
-    bundle is stored with it.
+    bundle is stored with the subject.
 
     Frames that differ only in `color_by` share a pool. If the size of the pool is
     given, only the last pool is kept.

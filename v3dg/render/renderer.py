@@ -169,5 +169,5 @@ class Renderer:
         """
         real(timeout, "timeout", "seconds, at least 0", 0)
         cut = CutRequest(tolerance, budget, min_level, fade)
-        cut.rule  # noqa: B018 - which checks it
+        cut.rule  # noqa: B018 - the property checks the values
         self._frame.chosen(self._subject).settle(self._subject, camera, cut, timeout)

@@ -31,7 +31,7 @@ class SceneFrame:
 
     Attributes:
         device: The device that draws.
-        memory: None, because it has no pool.
+        memory: None, because this frame has no pool.
         num_bundles: Number of the scene's bundles whose gaussians are on the device. A
             scene never removes bundles.
     """

@@ -78,7 +78,7 @@ def composed(outer: Columns, inner: Columns) -> Columns:
     pose."""
     size = outer.scales[0]
     rotation = rotation_from_quaternion(outer.quaternions[0])
-    # Columns_of() rejects invalid results.
+    # `columns_of` rejects invalid results.
     with np.errstate(over="ignore", under="ignore"):
         return columns_of(
             positions=size * inner.positions @ rotation.T + outer.positions,
@@ -117,7 +117,7 @@ def parts_of(matrix: Array | npt.ArrayLike, *parts: Array | npt.ArrayLike | None
 
 
 def turned(quaternions: Array, bundles: Sequence[Bundle], up: Axis) -> Array:
-    """Return the rotations (I, 4) of instances after turning the up axis of their
+    """Return the rotations (I, 4) of instances after rotating the up axis of their
     bundles to another axis. `bundles` has one bundle for all instances, or I."""
     one_of(up, "up", AXES)
     turns = {bundle: turn_between(up_of_bundle(bundle), up) for bundle in set(bundles)}

@@ -51,9 +51,8 @@ class _State(NamedTuple):
 
 
 class Scene:
-    """A set of instances of bundles. Each bundle is stored once; an instance transforms
-    its points by p -> scale
-    * rotation p + position.
+    """A set of instances of bundles. Each bundle is stored once. An instance transforms
+    its points p to scale * rotation p + position.
 
     Instances are numbered from 0 in the order in which they were added; after `remove`,
     the remaining ones are renumbered. Changes are visible in the next picture. Several
@@ -141,7 +140,7 @@ class Scene:
                 quaternions and scales: transforms of column vectors, composed of
                 rotation, translation and uniform scale.
             up: The axis that points up in the scene. The up axis of the bundle
-                (declared in its file, otherwise -y) is turned to this axis before the
+                (declared in its file, otherwise -y) is rotated to this axis before the
                 pose is applied. If the scene's `up` is None, it is set to this axis.
             opacity: (I,), or one number for all instances, 0 to 1: factor of the
                 opacities of gaussians. Instances with opacity 0 are skipped.
@@ -220,7 +219,8 @@ class Scene:
         return self._append(bundles, composed(outer, columns), up)
 
     def _append(self, bundles: Sequence[Bundle], rows: Columns, up: Axis | None) -> range:
-        """Append instances of one bundle, or of one bundle each; return their ids."""
+        """Append instances; `bundles` has one bundle for all of them, or one for each.
+        Return their ids."""
         count = len(rows.importance)
         with _lock:
             self._take_up(up)
@@ -279,7 +279,7 @@ class Scene:
             matrix: (M, 4, 4), or (4, 4) for one instance, instead of positions,
                 quaternions and scales.
             up: As in `add`; requires new quaternions or matrices. The up axis of the
-                bundles is turned to this axis before the new rotation is applied.
+                bundles is rotated to this axis before the new rotation is applied.
 
         Raises:
             IndexError: There is no such instance.
@@ -313,15 +313,18 @@ class Scene:
     def set_importance(
         self, importance: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None
     ) -> None:
-        """Change the importance of instances, see `add`; if ``ids`` is None, of all."""
+        """Change the importance of instances (see `add`); of all instances if ``ids``
+        is None."""
         self._set("importance", importance, ids)
 
     def set_opacity(self, opacity: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None) -> None:
-        """Change the opacity of instances, see `add`; if ``ids`` is None, of all."""
+        """Change the opacity of instances (see `add`); of all instances if ``ids`` is
+        None."""
         self._set("opacity", opacity, ids)
 
     def set_tint(self, tint: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None) -> None:
-        """Change the tint of instances, see `add`; if ``ids`` is None, of all."""
+        """Change the tint of instances (see `add`); of all instances if ``ids`` is
+        None."""
         self._set("tint", tint, ids)
 
     def _set(self, name: str, values: npt.ArrayLike, ids: Array | npt.ArrayLike | None) -> None:
@@ -463,8 +466,8 @@ class Scene:
 
 
 def turn_of(subject: Scene | Bundle, up: Axis) -> Floats:
-    """Return the quaternion (4,) w x y z that turns the up axis of a scene or a bundle
-    to another axis; raise ValueError for an invalid axis."""
+    """Return the quaternion (4,) w x y z that rotates the up axis of a scene or a
+    bundle to another axis; raise ValueError for an invalid axis."""
     one_of(up, "up", AXES)
     if isinstance(subject, Bundle):
         return turn_between(up_of_bundle(subject), up)
