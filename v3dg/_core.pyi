@@ -109,6 +109,9 @@ class PlyFile:
     @property
     def used(self) -> list[str]:
         """Names of the properties that are used."""
+    @property
+    def prefix(self) -> str:
+        """Prefix of the property names, before the names that trainers write."""
 
     def read(self, first: int, last: int) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
 

@@ -30,8 +30,8 @@ from v3dg.cameras import (
 
 # COLMAP's camera models that are pinholes if their distortion is zero, which is checked
 # separately.
-_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL", "RADIAL")
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _UNDISTORT = (
     "undistort the pictures first, or ignore the distortion: distortion='ignore' in Python, "
     "--distortion ignore in a command"

@@ -20,6 +20,12 @@ OUTLIER_DISTANCE = 20.0
 """Distance from the median position, as a multiple of the median distance, beyond which
 a gaussian counts as an outlier: sky, a floater or a mistake."""
 
+# Positions are coarse if float32 has steps above this share of the longest scale, for
+# at least this share of the gaussians.
+_COARSE_STEP = 0.25
+_COARSE_SHARE = 0.5
+_MOST_SAMPLES = 100_000
+
 # Kinds of gaussians that cannot be drawn, in the order of the core's bits, with their
 # descriptions.
 _TEXT = {
@@ -131,3 +137,25 @@ def ball_of_most(points: npt.NDArray[np.floating]) -> tuple[npt.NDArray[np.float
     """
     low, high = np.percentile(points, (1, 99), axis=0)
     return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+
+
+def coarse_note(gaussians: Gaussians) -> str | None:
+    """Return a sentence about gaussians on the host that lie so far from zero that
+    float32 rounds their positions visibly; None if they do not.
+
+    Such numbers come from coordinates of the Earth and from placements far away.
+    """
+    stride = max(1, len(gaussians) // _MOST_SAMPLES)
+    reach = np.abs(gaussians.means[::stride]).max(axis=1, initial=0.0)
+    longest = gaussians.scales[::stride].max(axis=1, initial=0.0)
+    is_valid = np.isfinite(reach) & np.isfinite(longest)
+    steps = np.spacing(reach[is_valid])
+    is_coarse = steps > _COARSE_STEP * longest[is_valid]
+    if not len(steps) or is_coarse.mean() < _COARSE_SHARE:
+        return None
+    return (
+        f"Positions are rounded to steps of up to {steps[is_coarse].max():.2g}, because float32 "
+        f"is no finer {reach[is_valid][is_coarse].max():.2g} from zero; that is coarse for the "
+        f"scales of {is_coarse.mean():.0%} of the gaussians. Keep the asset near zero, and place "
+        "its bundle in a scene."
+    )

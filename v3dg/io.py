@@ -10,13 +10,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Literal, TypeAlias, TypeVar, get_args
 
-import numpy as np
-from numpy.typing import NDArray
-
 from v3dg._numbers import check, check_type, one_of
 from v3dg._urls import FileAtUrl, beside, folder_of, in_parts, reading, shown
 from v3dg.cameras import AXES, Axis
-from v3dg.cleaning import AssetWarning
+from v3dg.cleaning import AssetWarning, coarse_note
 from v3dg.formats import (
     _axes,
     checkpoint,
@@ -33,7 +30,7 @@ from v3dg.formats import (
 )
 from v3dg.formats._declared import declare
 from v3dg.formats._losses import Losses, losses
-from v3dg.formats._packing import Limits, curve_order, file_order
+from v3dg.formats._packing import Limits
 from v3dg.formats._reading import AnyPath, AssetFile, bytes_of
 from v3dg.formats.content import content_of
 from v3dg.formats.ply import PlyEncoding
@@ -56,7 +53,8 @@ _READERS: dict[str, _Reader] = {
     "meta.json": sog.open_file,
     **dict.fromkeys((".ckpt", ".pt", ".pth"), checkpoint.open_file),
 }
-_WRITERS: dict[str, Callable[..., None]] = {
+# Writers by the same; those of packed formats return the gaussians in the file's order.
+_WRITERS: dict[str, Callable[..., Gaussians | None]] = {
     ".compressed.ply": ply.write_compressed,
     ".ply": ply.write,
     ".spz": spz.write,
@@ -75,12 +73,11 @@ _FILES: dict[str, Callable[[pathlib.Path], list[pathlib.Path]]] = {
     "": lambda path: [path],
 }
 
-# For ends of file names of quantised formats: the ranges of values, and the order of
-# gaussians in the file.
-_PACKED: dict[str, tuple[Limits, Callable[[Gaussians], NDArray[np.int64]]]] = {
-    ".compressed.ply": (compressed_ply.LIMITS, compressed_ply.chunk_order),
-    ".spz": (spz.LIMITS, file_order),
-    ".sog": (Limits(), curve_order),
+# For ends of file names of quantised formats: the ranges of values.
+_PACKED: dict[str, Limits] = {
+    ".compressed.ply": compressed_ply.LIMITS,
+    ".spz": spz.LIMITS,
+    ".sog": Limits(),
 }
 
 # Checkpoints of gsplat (one for each GPU) and of nerfstudio, and the files that the
@@ -155,9 +152,13 @@ def read_asset(path: AnyPath) -> Gaussians:
     """
     file = open_asset(path)
     gaussians = file.read(0, file.num_gaussians)
-    for note in file.declared.notes:
+    declared = file.declared
+    coarse = coarse_note(gaussians)
+    if coarse is not None:
+        declared = replace(declared, notes=(*declared.notes, coarse))
+    for note in declared.notes:
         warnings.warn(f"{shown(path)}: {note}", AssetWarning, stacklevel=2)
-    return declare(gaussians.trained(antialiased=file.declared.antialiased), file.declared)
+    return declare(gaussians.trained(antialiased=declared.antialiased), declared)
 
 
 def loaded(asset: Gaussians | AnyPath) -> Gaussians:
@@ -305,6 +306,36 @@ def write_asset(
     check_type("gaussians", gaussians, Gaussians, "Gaussians")
     if antialiased is not None:
         gaussians = gaussians.trained(antialiased=antialiased)
+    _write(path, gaussians, up, encoding, version)
+
+
+def write_measured(
+    path: AnyPath,
+    gaussians: Gaussians,
+    *,
+    up: Axis = _axes.MEMORY_UP,
+    version: Literal[2, 3, 4] | None = None,
+) -> Losses | None:
+    """Write an asset as `write_asset` does, read it back, and return what the file
+    lacks of it; None for formats of float32 numbers, which lose nothing."""
+    written = _write(path, gaussians, up, "binary_little_endian", version)
+    limits = _of_name(path, _PACKED)
+    if written is None or limits is None:
+        return None
+    if turned_up(path) is not None:
+        written = _axes.turned(written, _axes.axes_of_up(up), _axes.MEMORY)
+    file = open_asset(path)
+    return losses(written, file.read(0, file.num_gaussians), limits)
+
+
+def _write(
+    path: AnyPath,
+    gaussians: Gaussians,
+    up: Axis,
+    encoding: PlyEncoding,
+    version: Literal[2, 3, 4] | None,
+) -> Gaussians | None:
+    """Write an asset; returns the gaussians of a packed file in its order."""
     write = _by_name(path, _WRITERS)
     if version is not None:
         check(
@@ -325,32 +356,13 @@ def write_asset(
     one_of(up, "up", AXES)
     if turned_up(path) is not None:
         write = partial(write, up=up)
-    write(path, gaussians)
+    return write(path, gaussians)
 
 
 def turned_up(path: AnyPath) -> Axis | None:
     """Return the axis that points up in a file that `write_asset` writes, by the file's
     name; None for formats without defined axes."""
     return _of_name(path, _UP)
-
-
-def losses_of(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) -> Losses | None:
-    """Read back a file written by `write_asset`, and return how its gaussians differ
-    from the original ones; None for lossless formats.
-
-    Args:
-        up: The value that was passed to `write_asset`.
-    """
-    packed = _of_name(path, _PACKED)
-    if packed is None:
-        return None
-    limits, order = packed
-    written = gaussians.numpy()
-    if turned_up(path) is not None:
-        written = _axes.turned(written, _axes.axes_of_up(up), _axes.MEMORY)
-    written = written.subset(order(written))
-    file = open_asset(path)
-    return losses(written, file.read(0, file.num_gaussians), limits)
 
 
 def _of_name(path: AnyPath, formats: Mapping[str, Format]) -> Format | None:

@@ -2,6 +2,7 @@
 or by convention."""
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,20 @@ _NEAR_AN_AXIS = 0.9
 # Largest thickness of a ground plane relative to its smaller extent, both as standard
 # deviations.
 _FLAT = 0.55
+
+
+class FoundUp(NamedTuple):
+    """The axis that is up in a subject.
+
+    Attributes:
+        axis: The axis.
+        reason: Why, as a phrase.
+        is_guessed: Whether it is only what gaussians or cameras themselves show.
+    """
+
+    axis: Axis
+    reason: str
+    is_guessed: bool = False
 
 
 def direction_of(axis: Axis) -> tuple[float, float, float]:
@@ -55,29 +70,41 @@ def up_of(
         declared: What the file of an asset declares. None uses the declarations of the
             file from which `read_asset` read the asset.
     """
+    axis, reason, _ = found_up(subject, cameras, declared=declared)
+    return axis, reason
+
+
+def found_up(
+    subject: Subject,
+    cameras: Mapping[str, Camera] | None = None,
+    *,
+    declared: Declared | None = None,
+) -> FoundUp:
+    """Return what `up_of` does, and whether it is guessed."""
     recorded: object = None
     if isinstance(subject, Scene):
         recorded = subject.up
     elif isinstance(subject, Bundle):
         recorded = subject.config.get("up")
     if isinstance(recorded, str) and recorded in AXES:
-        return recorded, "as its file says"
+        return FoundUp(recorded, "as its file says")
     tops = np.array([-camera.viewmat[1, :3] for camera in (cameras or {}).values()]).reshape(-1, 3)
     if len(tops) >= _MIN_CAMERAS:
         top = tops.mean(axis=0)
         heights = [float(np.dot(top, direction_of(axis))) for axis in AXES]
         if max(heights) > _NEAR_AN_AXIS * max(float(np.linalg.norm(top)), 0.5):
-            return AXES[int(np.argmax(heights))], f"guessed from {len(tops)} cameras"
+            axis = AXES[int(np.argmax(heights))]
+            return FoundUp(axis, f"guessed from {len(tops)} cameras", is_guessed=True)
     if isinstance(subject, Scene):
-        return "z", "as in most scenes"
+        return FoundUp("z", "as in most scenes")
     if declared is None and isinstance(subject, Gaussians):
         declared = declared_of(subject)
     if declared is not None and declared.up is not None:
-        return declared.up, declared.up_reason
+        return FoundUp(declared.up, declared.up_reason, is_guessed=declared.up_is_guessed)
     flat = _flat_axis(_middles(subject))
-    if flat is not None:
-        return flat, "guessed from the plane of its gaussians"
-    return "-y", ASSUMED
+    if flat is None:
+        return FoundUp("-y", ASSUMED)
+    return FoundUp(flat, "guessed from the plane of its gaussians", is_guessed=True)
 
 
 def turned_upright(gaussians: Gaussians, up: Axis) -> Gaussians:

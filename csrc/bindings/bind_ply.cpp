@@ -59,6 +59,7 @@ class BoundPlyFile {
     int sh_degree() const {
         return static_cast<int>(std::lround(std::sqrt(ply_.layout.num_sh))) - 1;
     }
+    std::string prefix() const { return printable(ply_.layout.prefix); }
     py::list used() const {
         py::list names;
         for (const PlyField& field : ply_.layout.fields)
@@ -161,6 +162,8 @@ void bind_ply(py::module_& m) {
         .def_property_readonly("sh_degree", &BoundPlyFile::sh_degree)
         .def_property_readonly("used", &BoundPlyFile::used,
                                "The names of the properties that are read.")
+        .def_property_readonly("prefix", &BoundPlyFile::prefix,
+                               "The prefix of property names, before those of trainers.")
         .def("read", &BoundPlyFile::read, "first"_a, "last"_a);
     m.def("ply_header", &ply_header, "path"_a,
           "Returns the encoding, the bytes of the header, and the elements: their names, counts,"

@@ -57,6 +57,7 @@ struct PlyLayout {
     bool has_base_colors = false;
     bool has_filter = false;
     double color_scale[3] = {1, 1, 1};  // factor from stored base colours to [0, 1]
+    std::string prefix;                 // of property names, before those of trainers
     std::vector<PlyField> fields;       // one per PlySlot
 };
 

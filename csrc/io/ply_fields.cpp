@@ -15,6 +15,35 @@ namespace {
 
 constexpr size_t kMaxNames = 8;  // most property names in an error text
 
+// Prefixes of property names other than positions, normals and colours: those of
+// CloudCompare, of 3dgsconverter, and of both.
+constexpr const char* kPrefixes[] = {"scalar_", "scal_", "scalar_scal_"};
+
+// Returns the prefix of the property names of gaussians; empty for the names that
+// trainers write.
+std::string prefix_of(const PlyElement& vertex) {
+    std::unordered_set<std::string> names;
+    for (const PlyProperty& property : vertex.properties) names.insert(property.name);
+    if (names.count("opacity")) return "";
+    for (const char* prefix : kPrefixes)
+        if (names.count(std::string(prefix) + "opacity")) return prefix;
+    return "";
+}
+
+// Returns the element with the property names that trainers write. A name is kept if
+// another property has it without the prefix.
+PlyElement without_prefix(PlyElement vertex, const std::string& prefix) {
+    if (prefix.empty()) return vertex;
+    std::unordered_set<std::string> names;
+    for (const PlyProperty& property : vertex.properties) names.insert(property.name);
+    for (PlyProperty& property : vertex.properties) {
+        if (property.name.rfind(prefix, 0) != 0) continue;
+        const std::string name = property.name.substr(prefix.size());
+        if (!names.count(name)) property.name = name;
+    }
+    return vertex;
+}
+
 // The numbers in a vertex, by name. `lists` are the names of its lists.
 struct Fields {
     std::unordered_map<std::string, PlyField> field_from_name;
@@ -128,10 +157,12 @@ std::string missing_text(const PlyElement& vertex, const Fields& fields,
 
 }  // namespace
 
-PlyLayout layout_of(const PlyElement& vertex) {
+PlyLayout layout_of(const PlyElement& stored) {
+    PlyLayout layout;
+    layout.prefix = prefix_of(stored);
+    const PlyElement vertex = without_prefix(stored, layout.prefix);
     const Fields fields = fields_of(vertex);
     const size_t num_stored = num_stored_sh(vertex);
-    PlyLayout layout;
     layout.num_sh = std::min<size_t>(num_stored, kMaxShBases);
     layout.is_flat = fields.has("scale_0") && fields.has("scale_1") && !fields.has("scale_2") &&
                      !fields.lists.count("scale_2") && fields.has("rot_0");

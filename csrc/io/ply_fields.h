@@ -21,7 +21,7 @@ enum PlySlot : size_t { kMean = 0, kQuat = 3, kScale = 7, kOpacity = 10, kFilter
 
 // Returns the layout of a vertex. Throws PlyError if a property is missing, occurs
 // twice, or is a list.
-PlyLayout layout_of(const PlyElement& vertex);
+PlyLayout layout_of(const PlyElement& stored);
 
 // The limits of numbers whose squares a double represents with full precision.
 constexpr double kLeastSquared = 1e-140;

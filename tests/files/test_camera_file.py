@@ -91,7 +91,7 @@ def test_applied_transform_is_undone_on_request(tmp_path):
     np.testing.assert_allclose(2 * (undone.viewmat @ [*point, 1])[:3], seen[:3], atol=1e-14)
 
 
-@pytest.mark.parametrize("name", ["k1", "k3", "p2"])
+@pytest.mark.parametrize("name", ["k1", "k3", "k6", "p2"])
 def test_distortion_is_refused_or_ignored(tmp_path, name):
     path = put(tmp_path, {**CAPTURE, name: 0.01})
     with pytest.raises(
@@ -102,6 +102,14 @@ def test_distortion_is_refused_or_ignored(tmp_path, name):
     np.testing.assert_array_equal(
         ignored.K, read_cameras(put(tmp_path, CAPTURE))["images/frame_1.png"].K
     )
+
+
+def test_a_lens_of_opencv_with_all_coefficients_zero_is_a_pinhole(tmp_path):
+    coefficients = dict.fromkeys(("k3", "k4", "k5", "k6"), 0.0)
+    full = {**CAPTURE, "camera_model": "FULL_OPENCV", **coefficients}
+    found = read_cameras(put(tmp_path, full))["images/frame_1.png"]
+    wanted = read_cameras(put(tmp_path, CAPTURE))["images/frame_1.png"]
+    np.testing.assert_array_equal(found.K, wanted.K)
 
 
 @pytest.mark.parametrize("frame", [{"file_path": "images/frame_2.png"}, {}])
@@ -201,8 +209,8 @@ BAD = {
     "principal point of another kind": ({**CAPTURE, "cx": True}, "cx: expected a number, got true"),
     "fisheye": (
         {**CAPTURE, "camera_model": "OPENCV_FISHEYE"},
-        "camera_model: expected a pinhole camera (PINHOLE, SIMPLE_PINHOLE, OPENCV, SIMPLE_RADIAL, "
-        "RADIAL), "
+        "camera_model: expected a pinhole camera (PINHOLE, SIMPLE_PINHOLE, OPENCV, FULL_OPENCV, "
+        "SIMPLE_RADIAL, RADIAL), "
         'got "OPENCV_FISHEYE"; undistort the pictures first',
     ),
     "fisheye of instant-ngp": (

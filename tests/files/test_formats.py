@@ -385,6 +385,48 @@ def test_a_far_background_costs_a_compressed_ply_nothing(tmp_path, num_far):
         assert visibility[order[num_whole:3000]].max() <= least
 
 
+def errors_of_positions(folder, asset):
+    """Distances (N,) of positions in a compressed .ply from those of the asset."""
+    write_asset(folder / "a.compressed.ply", asset)
+    found = read_asset(folder / "a.compressed.ply")
+    order = compressed_ply.chunk_order(asset)
+    return np.linalg.norm(found.means - asset.means[order].astype(np.float64), axis=1)
+
+
+def test_chunks_of_a_wide_flat_scene_are_small(tmp_path):
+    """Each is about as wide as it is long, and none cuts the thin axis."""
+    asset = random_gaussians(20_000, 0)
+    rng = np.random.default_rng(1)
+    asset.means[:] = rng.uniform(0, 1, asset.means.shape) * (1000, 2, 600)
+    errors = errors_of_positions(tmp_path, asset)
+    # The side of a chunk of 256, over twice the 2,047 steps of x and z, in both.
+    expected = np.sqrt(256 / 20_000 * 1000 * 600) / 2 / 2047
+    assert np.quantile(errors, 0.98) < 2 * expected
+
+
+def test_a_stray_gaussian_costs_no_more_than_a_chunk(tmp_path):
+    asset = random_gaussians(20_000, 0)
+    rng = np.random.default_rng(1)
+    asset.means[:] = rng.uniform(-1, 1, asset.means.shape)
+    asset.means[7] = (1e4, -1e4, 1e4)
+    errors = errors_of_positions(tmp_path, asset)
+    assert (errors > 3e-4).sum() < 256
+    assert errors.max() < 1e4 / 100
+
+
+def test_the_innermost_of_the_next_shell_fill_a_chunk(tmp_path):
+    """So that its range is no wider than it needs to be."""
+    near = random_gaussians(3000, 0)
+    near.means[:] = np.random.default_rng(1).uniform(-1, 1, near.means.shape)
+    far = random_gaussians(400, 0)
+    far.means[:] = 0
+    far.means[:, 0] = np.linspace(1000, 1500, 400)[::-1]
+    order = compressed_ply.chunk_order(v3dg.Gaussians.concatenate([near, far]))
+    shared = np.sort(order[2816:3072])
+    assert set(shared[shared < 3000]) == set(range(3000)) - set(order[:2816])
+    np.testing.assert_array_equal(shared[shared >= 3000], np.arange(3400 - 72, 3400))
+
+
 @pytest.mark.parametrize("count", [0, 1, 300])
 def test_equal_positions_are_written(tmp_path, count):
     asset = random_gaussians(count, 0)

@@ -16,7 +16,8 @@ from gltf_files import FLOAT, NAME, GltfFile, glb_bytes
 from random_bundle import random_gaussians
 from v3dg import Gaussians
 from v3dg._core import sh_bases
-from v3dg.formats import spz
+from v3dg.cleaning import AssetWarning
+from v3dg.formats import _axes, gltf, spz
 from v3dg.formats._gltf_document import Document
 from v3dg.formats._gltf_scene import Scene
 from v3dg.io import asset_bytes, open_asset
@@ -655,7 +656,8 @@ SPZ_NAMES = [
 @pytest.mark.parametrize("name", SPZ_NAMES)
 def test_spz_in_a_primitive_is_read(tmp_path, name):
     (tmp_path / "a.spz").write_bytes(b"".join(spz.encode(ASSET, 2)))
-    alone = spz.decode(tmp_path / "a.spz", (tmp_path / "a.spz").read_bytes(), claims_of(tmp_path))
+    content = (tmp_path / "a.spz").read_bytes()
+    alone = spz.decode(tmp_path / "a.spz", content, claims_of(tmp_path), "LUF", "LUF")
     file = GltfFile()
     primitive = packed(file, ASSET, name)
     file.nodes({"mesh": file.mesh(primitive), "translation": [1, 2, 3]})
@@ -669,6 +671,45 @@ def test_spz_in_a_primitive_is_read(tmp_path, name):
         v3dg.read_asset(file.write(path))
     del primitive["attributes"]
     assert len(read(file.write(path))) == 20
+
+
+@pytest.mark.parametrize("axes", ["", "RUB", "LUF", "RDF", "RBU"])
+@pytest.mark.parametrize("released", [True, False])
+def test_the_axes_of_a_spz_in_a_primitive(tmp_path, axes, released):
+    """Those that it records, or else those of .spz, if the primitive has the properties
+    that the release of the extension requires; drafts have those of glTF."""
+    content = b"".join(spz.encode(ASSET, 3, axes=axes))
+    stored = spz.decode(tmp_path, b"".join(spz.encode(ASSET, 3)), claims_of(tmp_path), "LUF", "LUF")
+    file = GltfFile()
+    extension = {"extensions": {SPZ_NAMES[0]: {"bufferView": file.view(content)}}}
+    if released:
+        extension |= {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    attributes = {"POSITION": file.bare_accessor(ASSET.means)}
+    primitive = {"mode": 0, "attributes": attributes, "extensions": {NAME: extension}}
+    file.document["extensionsUsed"].append(SPZ_NAMES[0])
+    file.nodes({"mesh": file.mesh(primitive)})
+    path = file.write(tmp_path / "a.glb")
+    source = axes or {True: "RUB", False: "LUF"}[released]
+    assert_same(read(path), _axes.turned(stored, source, "LUF"))
+    turned = [note for note in notes_of(path) if "CesiumJS does not turn it" in note]
+    assert len(turned) == released
+
+
+def test_what_is_written_for_cesium_reads_back_as_it_stands(tmp_path):
+    content = gltf.encode(ASSET, compressed=True)
+    (tmp_path / "a.glb").write_bytes(content)
+    found = read(tmp_path / "a.glb")
+    np.testing.assert_allclose(found.means, ASSET.means, atol=1e-3)
+    assert notes_of(tmp_path / "a.glb") == []
+
+
+def test_a_placement_where_float32_is_coarse_is_told(tmp_path):
+    file = GltfFile()
+    mesh = file.mesh(ASSET)
+    file.nodes({"mesh": mesh, "translation": [4.2e6, 1.1e6, -4.7e6]})
+    path = file.write(tmp_path / "a.glb")
+    with pytest.warns(AssetWarning, match=r"a\.glb: Positions are rounded to steps of up to 0\.5"):
+        v3dg.read_asset(path)
 
 
 def claims_of(folder):

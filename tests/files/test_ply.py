@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from v3dg import Gaussians, read_asset, write_asset
+from v3dg.cleaning import AssetWarning
 from v3dg.io import open_asset
 
 NAMES = ("means", "quats", "scales", "opacities", "sh")
@@ -761,3 +762,40 @@ def test_reading_needs_the_result_and_writing_next_to_nothing(tmp_path):
     assert read_bytes < file_bytes + 16 * 2**20 < 1.2 * file_bytes
     assert write_bytes < 16 * 2**20
     assert (tmp_path / "copy.ply").stat().st_size == file_bytes
+
+
+@pytest.mark.parametrize("prefix", ["scalar_", "scal_", "scalar_scal_"])
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_what_cloudcompare_saves_is_read(tmp_path, prefix, encoding):
+    """It puts a prefix before names that it does not know, and so does 3dgsconverter
+    before it; positions may become doubles, and colours stand beside them."""
+    columns = random_columns(20, 1)
+    kept = ("x", "y", "z")
+    named = {name if name in kept else prefix + name: v for name, v in columns.items()}
+    named |= {name: named[name].astype(np.float64) for name in kept}
+    named["red"] = np.arange(20, dtype=np.uint8)
+    named[f"{prefix}curvature"] = np.zeros(20, np.float32)
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(ply_bytes([Element("vertex", named)], encoding))
+    with pytest.warns(AssetWarning) as told:
+        found = read_asset(path)
+    assert_close(found, expected_gaussians(columns), scale_error=READ_SCALE_ERROR)
+    texts = " ".join(str(warning.message) for warning in told)
+    assert f"The names of its properties begin with {prefix}, as CloudCompare writes them" in texts
+    assert "'red', 'curvature'" in texts or "red, curvature" in texts
+    write_asset(tmp_path / "own.ply", found)
+    assert b"property float f_dc_0" in (tmp_path / "own.ply").read_bytes()
+
+
+def test_a_name_with_a_prefix_does_not_hide_one_without(tmp_path):
+    columns = random_columns(5, 0)
+    more = {"scalar_x": np.ones(5, np.float32), "scalar_opacity": np.ones(5, np.float32)}
+    path = tmp_path / "a.ply"
+    path.write_bytes(ply_bytes([Element("vertex", columns | more)], "ascii"))
+    with pytest.warns(AssetWarning, match="scalar_x.*scalar_opacity"):
+        found = read_asset(path)
+    assert_close(found, expected_gaussians(columns), scale_error=READ_SCALE_ERROR)
+    prefixed = {f"scalar_{name}": values for name, values in columns.items()}
+    path.write_bytes(ply_bytes([Element("vertex", columns | prefixed)], "ascii"))
+    with pytest.warns(AssetWarning, match="scalar_x"):
+        assert_close(read_asset(path), expected_gaussians(columns), scale_error=READ_SCALE_ERROR)

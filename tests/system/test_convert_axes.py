@@ -107,6 +107,13 @@ def test_moves_are_those_of_transform(folder, asset):
     np.testing.assert_allclose(found.means, asset.transform(turn).means, atol=1e-5)
 
 
+def test_a_move_to_where_float32_is_coarse_is_told(folder):
+    moved = run("convert", "town.ply", "far.ply", "--translate", "4e7", "0", "0", cwd=folder)
+    assert "far.ply: Positions are rounded to steps of up to 4" in moved.stderr
+    made = run("build", "far.ply", "--device", "cpu", "--json", cwd=folder)
+    assert "far.v3dg: Positions are rounded to steps" in made.stderr
+
+
 def test_who_turns_an_asset_is_not_turned_again(folder, asset):
     """The guess is made anew, of what is written."""
     _, found = convert(folder, "town.ply", "up.glb", "--rotate", "x:90")

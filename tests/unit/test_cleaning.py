@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 import scenes
 from devices import on
 from v3dg import rasterize
-from v3dg.cleaning import SMALLEST_OPACITY, describe, examine, outliers
+from v3dg.cleaning import SMALLEST_OPACITY, coarse_note, describe, examine, outliers
 
 CAMERA = scenes.camera()
 
@@ -91,3 +91,25 @@ def test_outliers_are_the_same_wherever_and_however_large(seed, scale, shift, fa
 def test_few_or_equal_positions_have_no_outliers(num):
     assert not outliers(np.zeros((num, 3), np.float32)).any()
     assert not outliers(np.random.default_rng(0).normal(size=(num, 3)).astype(np.float32)).any()
+
+
+@pytest.mark.parametrize(
+    ("distance", "scale", "expected"),
+    [
+        (1e3, 0.01, None),
+        (4e6, 10.0, None),
+        (4e6, 0.01, "steps of up to 0.25, because float32 is no finer 4e+06 from zero"),
+        (np.nan, 0.01, None),
+    ],
+)
+def test_positions_that_float32_cannot_tell_apart_are_told(distance, scale, expected):
+    means = np.full((40, 3), distance)
+    note = coarse_note(scenes.gaussians(means, scales=np.full((40, 3), scale)))
+    assert note == expected or expected in note
+
+
+def test_some_strays_make_no_asset_coarse():
+    means = np.zeros((100, 3))
+    means[:40] = 1e7
+    assert coarse_note(scenes.gaussians(means)) is None
+    assert coarse_note(scenes.gaussians(np.zeros((0, 3)))) is None

@@ -20,7 +20,7 @@ from v3dg._numbers import check
 from v3dg._urls import beside, cleaned, shown
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis
-from v3dg.cleaning import AssetWarning, describe
+from v3dg.cleaning import AssetWarning, coarse_note, describe
 from v3dg.cli import _common
 from v3dg.cli._views import ask_up, is_at_terminal
 from v3dg.gaussians import Gaussians
@@ -333,6 +333,9 @@ def _build(
     with _resume_advised(output):
         bundle, is_built = _build_file(options, paths, output, executor)
     notes = _notes(options, paths)
+    coarse = coarse_note(_sample_of(bundle))
+    if coarse is not None:
+        notes.append(f"{output}: {coarse}")
     for note in notes:
         _common.tell(note)
     asset: str | list[str] = [shown(path) for path in paths]
@@ -355,6 +358,16 @@ def _build(
         "seconds": time.perf_counter() - start,
         "notes": notes,
     }
+
+
+def _sample_of(bundle: Bundle) -> Gaussians:
+    """Return gaussians of some clusters of level 0; all of a bundle without
+    clusters."""
+    if not bundle.num_levels:
+        return bundle.gaussians
+    clusters = bundle.level_range(0)
+    stride = max(1, len(clusters) // _NUM_SAMPLES)
+    return Gaussians.concatenate([bundle.cluster_gaussians(c) for c in clusters[::stride]])
 
 
 def _notes(options: Build, paths: Sequence[Path]) -> list[str]:

@@ -15,7 +15,7 @@ from v3dg._progress import waiting
 from v3dg._urls import shown
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Camera
-from v3dg.cleaning import AssetWarning
+from v3dg.cleaning import AssetWarning, coarse_note
 from v3dg.cli import _common
 from v3dg.cli._editing import EditOptions, Editor, Edits
 from v3dg.cli._faults import FaultOptions, Faults, checked
@@ -23,11 +23,11 @@ from v3dg.cli._moving import MoveOptions, Moves
 from v3dg.cli._views import ViewOptions, choose_cameras
 from v3dg.formats._declared import declared_of
 from v3dg.gaussians import Gaussians
-from v3dg.io import WRITE_SUFFIXES, losses_of, turned_up, write_asset
+from v3dg.io import WRITE_SUFFIXES, turned_up, write_measured
 from v3dg.scene import Scene, Subject
 from v3dg.scene.file import is_scene
 from v3dg.select import select
-from v3dg.upright import ASSUMED, turned_upright, up_of
+from v3dg.upright import ASSUMED, found_up, turned_upright, up_of
 
 
 @dataclass
@@ -133,25 +133,28 @@ def _written(
     gaussians = part.gaussians
     if gaussians.antialiased:
         notes.append(f"{name}: trained with antialiasing")
-    up, reason = up_of(subject)
+    up, reason, is_guessed = found_up(subject)
     if options.view.up is not None:
         gaussians = turned_upright(gaussians, options.view.up)
         reason = f"rotated from {options.view.up}, as requested by --up"
         up = "-y"
+        is_guessed = False
     gaussians = options.moves.moved(editor.joined(gaussians))
-    if options.moves.rotate is not None and "guessed" in reason:
+    if options.moves.rotate is not None and is_guessed:
         up, reason = up_of(gaussians)
     notes += _lines_of_up(name, output, up, reason)
     remaining = checked(options.faults, editor.trimmed(gaussians), options.subject, output)
     if remaining.note:
         notes.append(remaining.note)
     gaussians = remaining.gaussians
+    coarse = coarse_note(gaussians.numpy())
+    if coarse is not None:
+        notes.append(f"{output}: {coarse}")
     with waiting(f"writing {output}", show=not options.quiet):
         try:
-            write_asset(output, gaussians, up=up, version=options.spz_version)
+            losses = write_measured(output, gaussians, up=up, version=options.spz_version)
         except ValueError as error:
             raise ValueError(f"{name}: cannot be written to {output}: {error}") from None
-        losses = losses_of(output, gaussians, up=up)
     description: dict[str, object] = dict(part.description)
     description |= {"up": up, "up_reason": reason, "dropped": remaining.dropped}
     if losses is not None:

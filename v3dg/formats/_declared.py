@@ -19,12 +19,14 @@ class Declared:
             for the filter of the rasterizer; None if the file does not declare it.
         notes: Sentences about content of the file that was ignored or converted,
             without the name of the file.
+        up_is_guessed: Whether `up` was only inferred from the gaussians.
     """
 
     up: Axis | None = None
     up_reason: str = ""
     antialiased: bool | None = None
     notes: tuple[str, ...] = ()
+    up_is_guessed: bool = False
 
 
 NOTHING = Declared()

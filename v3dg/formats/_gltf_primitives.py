@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from v3dg import _core
 from v3dg._json import Node
 from v3dg._numbers import Floats
-from v3dg.formats import spz
+from v3dg.formats import _axes, spz
 from v3dg.formats._gltf_accessors import column, count_of, has_data, indices
 from v3dg.formats._gltf_document import Document, name_text
 from v3dg.formats._packing import SH_C0, assemble
@@ -108,7 +108,11 @@ class Primitive:
             gaussians = self._read_attributes()
         else:
             content = bytes(self._packed.content)
-            gaussians = spz.decode(self._document.path, content, self._document.claims)
+            document = self._document
+            axes = _axes.GLTF
+            if self._is_released:
+                axes = _axes.OPENGL
+            gaussians = spz.decode(document.path, content, document.claims, axes, _axes.GLTF)
         if self._node.has("indices"):
             accessor = self._document.item("accessors", self._node.field("indices"))
             gaussians = gaussians.subset(indices(self._document, accessor, len(gaussians)))
@@ -122,6 +126,17 @@ class Primitive:
         if self._packed is None:
             return 0
         return len(self._packed.content)
+
+    @property
+    def _is_released(self) -> bool:
+        """Whether it has the properties that the release requires, and drafts lack.
+
+        In a draft, the `.spz` has the axes of glTF: so Cesium ion writes it, and so
+        CesiumJS takes it. Since then, "you must specify a Left-Up-Front (LUF)
+        coordinate system" to the library of `.spz`, which turns gaussians from there to
+        its own axes: KHR_gaussian_splatting_compression_spz_2, Conformance.
+        """
+        return any(self._extension.has(name) for name in ("kernel", "colorSpace"))
 
     @property
     def _color_space(self) -> object:
@@ -290,9 +305,18 @@ class Primitive:
         if self._packed is None:
             notes += self._attribute_notes()
         else:
-            notes += spz.flag_notes(self._packed.header)
+            notes += self._packed_notes(self._packed)
         if self._node.has("targets"):
             notes.append("Morph targets are not read.")
+        return notes
+
+    def _packed_notes(self, packed: _Packed) -> list[str]:
+        notes = list(spz.flag_notes(packed.header))
+        if self._is_released:
+            notes.append(
+                f"Its .spz was turned from the axes of .spz to those of glTF, as {SPZ} says; "
+                "CesiumJS does not turn it."
+            )
         return notes
 
     def _attribute_notes(self) -> list[str]:

@@ -105,17 +105,6 @@ def opacity_bytes(opacities: Floats) -> NDArray[np.uint32]:
     return np.where(opacities < _LEAST_VISIBLE_OPACITY, 0, to_integers(opacities * 255.0, 255))
 
 
-def file_order(gaussians: Gaussians) -> NDArray[np.int64]:
-    """Return the order (N,) for a format that keeps the order of the gaussians."""
-    return np.arange(len(gaussians))
-
-
-def curve_order(gaussians: Gaussians) -> NDArray[np.int64]:
-    """Return the order (N,) along a Morton curve, in which neighbours in space are
-    close."""
-    return _core.morton_order(gaussians.means)
-
-
 def check_writable(gaussians: Gaussians) -> Gaussians:
     """Return the gaussians on the host; raise a ValueError that names the first value
     that a quantised format cannot store."""

@@ -9,6 +9,7 @@ for each value). Element `sh` has one byte for each coefficient, for values from
 4, channel by channel. See docs/formats.md.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
@@ -23,11 +24,15 @@ from v3dg.formats._reading import AnyPath, AssetFile, File, check, listed
 from v3dg.gaussians import Gaussians
 
 _CHUNK = 256
-# The radius of the inner shell is four times the distance from the median position that
-# a tenth of the gaussians do not exceed. It contains all of a compact asset, or the
-# dense part of an asset with far gaussians.
+# The radius of the inner shell is eight times the distance from the median position
+# that a tenth of the gaussians do not exceed. It contains all of a compact asset, or
+# the dense part of an asset with far gaussians.
 _INNER_SHARE = 0.1
-_INNER_FACTOR = 4.0
+_INNER_FACTOR = 8.0
+_SHELL_GROWTH = 4.0  # ratio of the radii of a shell and of the one inside it
+# Weights of the extents of a chunk: y has half as many steps as x and z. No weight is
+# above 1, so that coordinates do not overflow.
+_STEP_WEIGHTS = np.array([0.5, 1.0, 0.5], np.float32)
 _MAX_LOG_SCALE = 20.0
 LIMITS = _packing.Limits(log_scale=(-20.0, _MAX_LOG_SCALE), harmonic=(-4.0, 4.0))
 """The ranges of values in the format."""
@@ -140,18 +145,18 @@ def _decoded(
     return means, quats, scales, rgba[:, 3], sh
 
 
-def write(path: AnyPath, gaussians: Gaussians) -> None:
-    """Write a `.compressed.ply` file. Gaussians are reordered so that neighbours in
-    space are close in the file."""
+def write(path: AnyPath, gaussians: Gaussians) -> Gaussians:
+    """Write a `.compressed.ply` file. Gaussians are reordered so that each chunk
+    contains neighbours in space; returns them in the order of the file."""
     host = _packing.check_writable(gaussians)
-    order = chunk_order(host)
+    host = host.subset(chunk_order(host))
     count = len(host)
     num_rest = 3 * (host.sh.shape[1] - 1)
     num_chunks = -(-count // _CHUNK)
     values = {
-        "": host.means[order].astype(np.float64),
-        "scale_": np.minimum(_packing.log_scales(host.scales[order]), _MAX_LOG_SCALE),
-        "color": host.sh[order, 0].astype(np.float64) * SH_C0 + 0.5,
+        "": host.means.astype(np.float64),
+        "scale_": np.minimum(_packing.log_scales(host.scales), _MAX_LOG_SCALE),
+        "color": host.sh[:, 0].astype(np.float64) * SH_C0 + 0.5,
     }
     starts = np.arange(num_chunks) * _CHUNK
     ranges = []
@@ -168,22 +173,22 @@ def write(path: AnyPath, gaussians: Gaussians) -> None:
     with _files.replacing(path) as temporary, open(temporary, "wb") as file:
         file.write(_header(host, num_chunks))
         file.write(np.concatenate(ranges, axis=1).astype("<f4").tobytes())
-        for block in _packing.blocks(count):
-            rows = order[block]
+        for rows in _packing.blocks(count):
             three, largest = _packing.three_of_quats(host.quats[rows])
-            words = np.empty((len(rows), 4), "<u4")
-            words[:, 0] = _word(fractions[""][block], _XYZ)
+            words = np.empty((len(three), 4), "<u4")
+            words[:, 0] = _word(fractions[""][rows], _XYZ)
             words[:, 1] = _word(three / SQRT2 + 0.5, _THREE) | (largest.astype("u4") << 30)
-            words[:, 2] = _word(fractions["scale_"][block], _XYZ)
-            rgb = _word(fractions["color"][block], _RGBA[:3])
+            words[:, 2] = _word(fractions["scale_"][rows], _XYZ)
+            rgb = _word(fractions["color"][rows], _RGBA[:3])
             words[:, 3] = rgb | _packing.opacity_bytes(host.opacities[rows])
             file.write(words.tobytes())
         if num_rest:
-            for block in _packing.blocks(count):
-                higher = host.sh[order[block], 1:].transpose(0, 2, 1).astype(np.float64)
+            for rows in _packing.blocks(count):
+                higher = host.sh[rows, 1:].transpose(0, 2, 1).astype(np.float64)
                 file.write(
                     np.clip(np.floor((higher / 8 + 0.5) * 256), 0, 255).astype(np.uint8).tobytes()
                 )
+    return host
 
 
 def chunk_order(gaussians: Gaussians) -> NDArray[np.int64]:
@@ -191,40 +196,74 @@ def chunk_order(gaussians: Gaussians) -> NDArray[np.int64]:
 
     The range of a chunk is divided into 1,024 or 2,048 steps, so a chunk with far
     gaussians would be too coarse for near ones. Therefore the file contains one shell
-    around the median position after another, each along its own Morton curve. If a
-    chunk contains the end of one shell and the beginning of the next, that end has the
-    least visible gaussians of its shell.
+    around the median position after another, each in chunks of a median split. The
+    gaussians of a shell that do not fill a chunk are its least visible ones; they share
+    a chunk with the innermost gaussians of the next shells.
     """
-    shells = _shells(gaussians.means)
-    order = np.argsort(shells, kind="stable")
+    distances = _distances(gaussians.means)
+    shells = _shells(distances)
     scales = np.sort(gaussians.scales.astype(np.float64), axis=1)
     visibility = gaussians.opacities * scales[:, 1] * scales[:, 2]  # opacity times area
+    by_shell = np.argsort(shells, kind="stable")
     ends = np.cumsum(np.bincount(shells))
-    start = 0
-    for end in ends:
-        rows = order[start:end]
-        num_whole = end // _CHUNK * _CHUNK - start
-        if end < len(order) and num_whole > 0:
-            rows = rows[np.argsort(-visibility[rows], kind="stable")]
-        parts = np.split(rows, [max(num_whole, 0)])
-        curves = [part[_core.morton_order(gaussians.means[part])] for part in parts]
-        order[start:end] = np.concatenate(curves)
-        start = end
-    return order
+    parts = []
+    remaining = by_shell[:0]  # less than a chunk, from the shells inside
+    for rows in np.split(by_shell, ends[:-1]):
+        is_inner = _lowest(distances[rows], -len(remaining) % _CHUNK)
+        remaining = np.concatenate([remaining, rows[is_inner]])
+        outer = rows[~is_inner]
+        if not len(outer):
+            continue
+        parts.append(remaining)
+        remaining = outer[:0]
+        if shells[outer[0]] != shells[by_shell[-1]]:
+            is_rest = _lowest(visibility[outer], len(outer) % _CHUNK)
+            remaining = outer[is_rest]
+            outer = outer[~is_rest]
+        parts.append(outer[_split(gaussians.means[outer])])
+    return np.concatenate([*parts, remaining])
 
 
-def _shells(means: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Return the shell (N,) of each position: 0 up to the radius of the inner shell,
-    and one more for each doubling of that radius."""
-    if not len(means):
-        return np.zeros(0, np.intp)
+def _split(means: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return the order (N,) in which each chunk contains neighbours."""
+    depth = _core.num_halvings(-(-len(means) // _CHUNK), 1)
+    order, _ = _core.median_split(means * _STEP_WEIGHTS, np.array([0, len(means)]), depth, _CHUNK)
+    return np.asarray(order, np.int64)
+
+
+def _distances(means: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the distance (N,) of each position from the median position along the axis
+    on which it is largest."""
     positions = means.astype(np.float64)
-    distance = np.abs(positions - np.median(positions, axis=0)).max(axis=1)
-    radius = _INNER_FACTOR * np.quantile(distance, _INNER_SHARE)
+    if not len(positions):
+        return np.zeros(0)
+    return np.asarray(np.abs(positions - np.median(positions, axis=0)).max(axis=1))
+
+
+def _shells(distances: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the shell (N,) of each distance: 0 up to the radius of the inner shell,
+    and one more for each factor `_SHELL_GROWTH` of that radius."""
+    radius = 0.0
+    if len(distances):
+        radius = _INNER_FACTOR * float(np.quantile(distances, _INNER_SHARE))
     if radius == 0:
-        return np.zeros(len(means), np.intp)
-    shells: NDArray[np.intp] = np.ceil(np.log2(np.maximum(distance / radius, 1.0))).astype(np.intp)
+        return np.zeros(len(distances), np.intp)
+    growth = np.log(np.maximum(distances / radius, 1.0)) / math.log(_SHELL_GROWTH)
+    shells: NDArray[np.intp] = np.ceil(growth).astype(np.intp)
     return shells
+
+
+def _lowest(values: NDArray[np.floating], count: int) -> NDArray[np.bool_]:
+    """Return whether each value (N,) is among the ``count`` lowest, in order of value
+    and then of index; all are if there are no more."""
+    if count >= len(values):
+        return np.ones(len(values), bool)
+    if count == 0:
+        return np.zeros(len(values), bool)
+    highest = np.partition(values, count - 1)[count - 1]
+    is_lowest = values < highest
+    is_lowest[np.flatnonzero(values == highest)[: count - is_lowest.sum()]] = True
+    return np.asarray(is_lowest)
 
 
 def _header(host: Gaussians, num_chunks: int) -> bytes:

@@ -61,7 +61,8 @@ def write(path: AnyPath, gaussians: Gaussians, *, up: Axis = _axes.MEMORY_UP) ->
 
 def encode(host: Gaussians, *, compressed: bool = False) -> bytes:
     """Return the content of a `.glb` file. The gaussians are on the host, have the axes
-    of the file, and contain only values that the format can store."""
+    of the file, and contain only values that the format can store. If compressed, the
+    file has the form of the draft that CesiumJS reads."""
     columns = _columns(host, compressed=compressed)
     if compressed:
         parts = [b"".join(spz.encode(host))]
@@ -73,7 +74,11 @@ def encode(host: Gaussians, *, compressed: bool = False) -> bytes:
         if compressed:
             view = None
         accessors.append(_accessor(name, values, view))
-    extension: JsonObject = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    extension: JsonObject = {}
+    if not compressed:
+        # With them, readers that follow the release would turn the `.spz`; CesiumJS,
+        # for which it is, never does.
+        extension |= {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     if host.antialiased is not None:
         extension["extras"] = {"antialiased": host.antialiased}
     document: JsonObject = {"asset": {"version": "2.0", "generator": f"v3dg {__version__}"}}

@@ -118,13 +118,14 @@ def open_file(path: AnyPath) -> AssetFile:
     all gaussians."""
     claims = Claims()
     content = _expanded(path, claims.read(path), claims)
-    axes, reason = _axes_of(path, content)
+    axes, reason, is_guessed = _axes_of(path, content)
 
     def read(_: AnyPath) -> Gaussians:
         return _axes.turned(_decode(content), axes, _axes.MEMORY)
 
     header = content.header
-    declared = Declared(_axes.MEMORY_UP, reason, header.antialiased, _notes(content))
+    notes = _notes(content)
+    declared = Declared(_axes.MEMORY_UP, reason, header.antialiased, notes, is_guessed)
     return whole_file(path, header.num_gaussians, header.sh_degree, read, declared=declared)
 
 
@@ -138,10 +139,11 @@ def header_of(path: AnyPath, start: bytes | memoryview, claims: Claims) -> Heade
     return _checked_header(path, header, claims)
 
 
-def decode(path: AnyPath, content: bytes, claims: Claims) -> Gaussians:
-    """Return the gaussians of a `.spz` file with this content, in the axes of the
-    file."""
-    return _decode(_expanded(path, content, claims))
+def decode(path: AnyPath, content: bytes, claims: Claims, axes: str, target: str) -> Gaussians:
+    """Return the gaussians of a `.spz` file with this content in the axes ``target``.
+    The file has the axes that it records; without a record, it has ``axes``."""
+    expanded = _expanded(path, content, claims)
+    return _axes.turned(_decode(expanded), _recorded_axes(path, expanded) or axes, target)
 
 
 def _expanded(path: AnyPath, content: bytes, claims: Claims) -> _Content:
@@ -156,17 +158,20 @@ def _expanded(path: AnyPath, content: bytes, claims: Claims) -> _Content:
 
 def write(
     path: AnyPath, gaussians: Gaussians, version: int = 3, *, up: Axis = _axes.MEMORY_UP
-) -> None:
+) -> Gaussians:
     """Write a `.spz` file of version 2, 3 or 4, in the order of the gaussians. `up` is
-    the axis of the gaussians that points up."""
+    the axis of the gaussians that points up. Returns the gaussians on the host, in
+    their own axes."""
     check("version", version in (2, 3, 4), f"2, 3 or 4 for a .spz file, got {version}")
-    host = _axes.turned(_packing.check_writable(gaussians), _axes.axes_of_up(up), _axes.OPENGL)
+    written = _packing.check_writable(gaussians)
+    host = _axes.turned(written, _axes.axes_of_up(up), _axes.OPENGL)
     with _files.replacing(path) as temporary, open(temporary, "wb") as file:
         for part in encode(host, version, axes=_axes.OPENGL):
             file.write(part)
         # Readers reject files that are too small for the number of their gaussians, and
         # ignore zeros at the end.
         file.write(bytes(max(0, least_bytes(len(host)) - file.tell())))
+    return written
 
 
 def encode(host: Gaussians, version: int = 3, *, axes: str = "") -> Iterator[bytes]:
@@ -270,9 +275,29 @@ def _means(content: _Content, rows: slice) -> Floats:
     return ((fixed ^ 0x800000) - 0x800000) / float(1 << content.header.fraction_bits)
 
 
-def _axes_of(path: AnyPath, content: _Content) -> tuple[str, str]:
-    """Return the axes of the stored gaussians, and the source of that knowledge as a
+class _StoredAxes(NamedTuple):
+    """The axes of the stored gaussians, and the source of that knowledge as a
     phrase."""
+
+    axes: str
+    reason: str
+    is_guessed: bool = False
+
+
+def _axes_of(path: AnyPath, content: _Content) -> _StoredAxes:
+    recorded = _recorded_axes(path, content)
+    if recorded:
+        return _StoredAxes(recorded, f"as its record of axes says ({recorded})")
+    stride = max(1, content.header.num_gaussians // _MOST_POINTS)
+    up = _axes.up_of_ground(_means(content, slice(None, None, stride)))
+    if up is None:
+        return _StoredAxes(_axes.OPENGL, "as specified for .spz, with y up")
+    reason = f"guessed from its ground, which shows that {up} is up in the file"
+    return _StoredAxes(_STORED_AXES[up], reason, is_guessed=True)
+
+
+def _recorded_axes(path: AnyPath, content: _Content) -> str:
+    """Return the axes that a file records; empty without a record."""
     for kind, payload in _records(content.extensions):
         if kind == _AXES_EXTENSION:
             number = int.from_bytes(payload, "little")
@@ -283,12 +308,8 @@ def _axes_of(path: AnyPath, content: _Content) -> tuple[str, str]:
             )
             check(path, is_known, expected)
             if _AXES[number]:
-                return _AXES[number], f"as its record of axes says ({_AXES[number]})"
-    stride = max(1, content.header.num_gaussians // _MOST_POINTS)
-    up = _axes.up_of_ground(_means(content, slice(None, None, stride)))
-    if up is None:
-        return _axes.OPENGL, "as specified for .spz, with y up"
-    return _STORED_AXES[up], f"guessed from its ground, which shows that {up} is up in the file"
+                return _AXES[number]
+    return ""
 
 
 def _records(extensions: bytes) -> Iterator[tuple[int, bytes]]:
