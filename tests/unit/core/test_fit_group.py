@@ -247,7 +247,16 @@ def test_wrong_pictures_are_refused(picture, target):
 # ---- steps
 
 
-@pytest.mark.parametrize("weights", [(1.0, 0.0, 0.5), (0.8, 0.2, 0.1), (0.0, 1.0, 0.0)])
+@pytest.mark.parametrize(
+    "weights",
+    [
+        (1.0, 0.0, 0.5, 0.0),
+        (0.8, 0.2, 0.1, 0.0),
+        (0.0, 1.0, 0.0, 0.0),
+        (1.0, 0.0, 0.5, 1.0),
+        (0.5, 0.2, 1.0, 3.0),
+    ],
+)
 @pytest.mark.parametrize("views_per_step", [1, 3])
 def test_steps_are_those_of_adam(device, weights, views_per_step):
     """A ball that looks the same from everywhere, fitted by torch.optim.Adam on
@@ -256,7 +265,7 @@ def test_steps_are_those_of_adam(device, weights, views_per_step):
     config = replace(
         PLAIN,
         **FROZEN | {"step_logit": 0.05, "step_sh0": 0.03},
-        **dict(zip(("loss_l1", "loss_dssim", "loss_alpha"), weights, strict=True)),
+        **dict(zip(("loss_l1", "loss_dssim", "loss_alpha", "loss_cells"), weights, strict=True)),
         steps=steps,
         views_per_step=views_per_step,
     )
