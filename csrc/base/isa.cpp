@@ -1,4 +1,4 @@
-// Chooses the instruction set once per process.
+// Chooses the instruction set, once per process.
 
 #include "base/isa.h"
 
@@ -20,8 +20,7 @@ const char* isa_name(Isa isa) {
 
 static Isa widest_isa() {
 #if defined(__x86_64__)
-    // These are the extensions that the compiler may use with -march=x86-64-v4 and
-    // -march=x86-64-v3.
+    // The extensions that compilers use with -march=x86-64-v3 and -march=x86-64-v4.
     __builtin_cpu_init();
     const bool v3 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
                     __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2") &&
@@ -42,8 +41,8 @@ static Isa choose_isa() {
     for (const Isa isa : {Isa::baseline, Isa::avx2, Isa::avx512}) {
         if (std::strcmp(wanted, isa_name(isa)) != 0) continue;
         if (isa > widest)
-            throw std::runtime_error(std::string("V3DG_ISA: this processor has no ") + wanted +
-                                     ", its widest is " + isa_name(widest));
+            throw std::runtime_error(std::string("V3DG_ISA: this processor does not support ") +
+                                     wanted + "; use at most " + isa_name(widest));
         return isa;
     }
     throw std::runtime_error(std::string("V3DG_ISA: expected baseline, avx2 or avx512, got ") +

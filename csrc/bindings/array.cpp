@@ -1,4 +1,4 @@
-// Arrays of the host: checks and memory. The functions for other devices call the
+// Arrays on the host: checks and allocation. For other devices, the functions call the
 // device's backend.
 
 #include "bindings/array.h"
@@ -52,7 +52,7 @@ std::vector<py::ssize_t> shape_of(const py::handle& array, const char* name) {
 py::object cuda_interface_of(const py::handle& array) {
     PyObject* found = PyObject_GetAttrString(array.ptr(), kInterface);
     if (found != nullptr) return py::reinterpret_steal<py::object>(found);
-    // The error may also be an interrupt, which must not be swallowed.
+    // Do not swallow other errors, such as KeyboardInterrupt.
     if (!PyErr_ExceptionMatches(PyExc_AttributeError)) throw py::error_already_set();
     PyErr_Clear();
     return py::none();
@@ -64,8 +64,7 @@ Device device_of(const py::handle& array, const char* name) {
     if (backend != nullptr) {
         if (const std::optional<Device> device = backend->device_of(array)) return *device;
     } else if (!cuda_interface_of(array).is_none()) {
-        throw std::runtime_error(std::string(name) +
-                                 ": expected a NumPy array, got one on a CUDA device, and " +
+        throw std::runtime_error(std::string(name) + ": this array is on a CUDA device, but " +
                                  kWithoutCuda);
     }
     refuse_kind(name, "a NumPy array or an array on a CUDA device", array);

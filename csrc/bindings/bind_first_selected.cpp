@@ -1,5 +1,5 @@
-// Computes how much larger the balls of level 1 have to be: draws pictures of both
-// levels and compares them.
+// Bindings that compute how much the balls of level 1 must grow. They draw pictures of
+// levels 0 and 1, and compare them.
 
 #include <algorithm>
 
@@ -26,7 +26,7 @@ struct Colors {
                                     {py::ssize_t(camera.height), py::ssize_t(camera.width), 3})) {}
 };
 
-// Returns the gaussians in black, of SH degree 0.
+// Returns the gaussians with black colour, of SH degree 0.
 Rows blackened(const Rows& gaussians) {
     const NewArray<float> sh({}, {py::ssize_t(gaussians.size()), 1, 3});
     std::fill(sh.span.begin(), sh.span.end(), 0.0f);
@@ -47,7 +47,8 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
     const auto num_groups = static_cast<py::ssize_t>(of_level.size) - 1;
     if (num_groups < 1 || of_leaves.size != of_level.size)
         throw py::value_error(
-            "leaf_offset, group_offset: expected boundaries of the same number of groups");
+            "leaf_offset, group_offset: expected boundaries of the same groups, got " +
+            std::to_string(of_leaves.size) + " and " + std::to_string(of_level.size) + " numbers");
     const Span<const float> balls = span_of<const float>(ball, "ball", {num_groups, 4});
     const py::object means = backend.to_host(leaves.arrays()[0]);
     FirstSelected measured(span_of<const float>(means, "means", {num_leaves, 3}),
@@ -70,7 +71,7 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
         const Camera camera = measured.camera(picture);
         const auto width = static_cast<size_t>(camera.width),
                    height = static_cast<size_t>(camera.height);
-        const Colors truth(leaves, enlarged(camera, FirstSelected::kSamples), own),
+        const Colors truth(leaves, camera.scaled(FirstSelected::kSamples), own),
             by_leaves(leaves, camera, own), by_level(level, camera, coarse);
         const NewArray<float> losses({}, {py::ssize_t(height), py::ssize_t(width), 3});
         {
@@ -78,9 +79,9 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
             losses_of_pixels({by_leaves.span, by_level.span, truth.span}, width, height,
                              losses.span);
         }
-        // The sum of the losses, weighted by the leaves' blend weights, is
-        // differentiated by the leaves' colours; the gradient is each leaf's share of
-        // the losses.
+        // Distribute the losses of pixels over the leaves in proportion to their blend
+        // weights. The sum of loss * colour, differentiated with respect to the leaves'
+        // colours, is this distribution.
         const Rasterized seen = rasterize(black, {{}, camera}, in_black, false, true);
         const Gradients gradients =
             seen.tape->backward(backend.from_host(losses.object, device), py::none(), py::none(),
@@ -92,8 +93,8 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
     return py::array_t<float>(num_groups, growth.data());
 }
 
-// Returns the balls of all levels after those of level 1 have grown: the levels above
-// grow to contain them. Balls of level 0 do not change.
+// Grows the balls of level 1 by `growth`, and the balls of higher levels so that they
+// contain the balls below. Returns the balls of all levels. Level 0 does not change.
 py::list grown_balls(const py::list& balls, const py::array& growth) {
     py::list grown;
     std::vector<Ball> below;
@@ -114,7 +115,7 @@ py::list grown_balls(const py::list& balls, const py::array& growth) {
             if (here.size == 0 || below.size() % here.size != 0)
                 throw py::value_error(
                     "balls: expected a count that divides the count of the level below, got " +
-                    std::to_string(here.size) + " over " + std::to_string(below.size()));
+                    std::to_string(here.size) + " and " + std::to_string(below.size()));
             std::vector<int64_t> offset;
             for (size_t g = 0; g <= here.size; ++g)
                 offset.push_back(static_cast<int64_t>(g * (below.size() / here.size)));
@@ -133,11 +134,11 @@ void bind_first_selected(py::module_& m) {
     m.def("first_selected", &first_selected, "leaves"_a, "level"_a, "leaf_offset"_a,
           "group_offset"_a, "ball"_a, "leaf_filter_px2"_a, "leaf_antialiased"_a,
           "level_filter_px2"_a,
-          "Returns the factors by which the balls of level 1 have to grow so that its groups are "
-          "selected only where they look no worse than their leaves at one sample per pixel.");
-    m.def(
-        "grown_balls", &grown_balls, "balls"_a, "growth"_a,
-        "Returns the balls of each level after those of level 1 were multiplied by these factors.");
+          "Returns the factors by which the balls of level 1 must grow. Then its groups are "
+          "selected only where they look as good as their leaves at one sample per pixel.");
+    m.def("grown_balls", &grown_balls, "balls"_a, "growth"_a,
+          "Multiplies the radii of the balls of level 1 by the factors, and enlarges the balls of "
+          "higher levels to contain them. Returns the balls of all levels.");
 }
 
 }  // namespace v3dg

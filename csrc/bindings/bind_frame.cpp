@@ -1,4 +1,4 @@
-// Frames for Python: checks of their inputs, and calls of their backend.
+// Bindings of frames: they check the inputs and call the backend.
 
 #include <algorithm>
 #include <memory>
@@ -14,7 +14,7 @@ namespace v3dg {
 
 namespace {
 
-// Asks work in progress, from any thread, to end early.
+// A flag that asks work in progress to end early. Any thread may set it.
 class Stop {
   public:
     void request() { requested_.store(true, std::memory_order_relaxed); }
@@ -42,12 +42,12 @@ Eyes eyes_of(const py::object& camera) {
     return camera.cast<const BoundEyes&>().eyes;
 }
 
-// A cut that was selected earlier. The arrays must be on the frame's device, which is
+// A cut that was selected earlier. The arrays must be on the frame's device; this is
 // checked when the frame draws.
 struct BoundGivenCut {
     py::object instance_ids, cluster_ids, weights;
 
-    // Borrows from the arrays. Weights are from 0 to 1, or None if all are 1.
+    // Borrows the arrays. Weights are from 0 to 1, or None if all are 1.
     GivenCut read(Device device) const {
         GivenCut given{span_on<const int32_t>(device, instance_ids, "instance_ids", {-1}), {}, {}};
         const auto size = static_cast<py::ssize_t>(given.instance.size);
@@ -58,24 +58,24 @@ struct BoundGivenCut {
     }
 };
 
-// The content of a picture other than the gaussians' own colours, and the cut that it
-// shows.
+// The optional parts of a request: false colours, and another camera for the cut.
 struct BoundLook {
     FrameLook look = FrameLook::appearance;
-    py::list cluster_colors;  // (C, 3) per bundle, or none
+    py::list cluster_colors;  // (C, 3) colours for each bundle, or empty
     std::optional<Eyes> chooser;
     bool is_aside = false;
 };
 
-// A request, without the parts that only a frame can check: the given cut, and colours
-// of clusters.
+// A request. The given cut and the colours of clusters are separate, because only a
+// frame can check them.
 struct BoundRequest {
     FrameRequest plain;
     std::optional<BoundGivenCut> cut;
-    py::object cluster_colors;  // see BoundLook; null without a look
+    py::object cluster_colors;  // see BoundLook; null if there is none
 
-    // The camera is a Camera or an Eyes. The constructor tests which it is, because
-    // overloads or implicit conversions would take longer than everything else here.
+    // `camera` is a Camera or an Eyes. A test in the constructor is faster than
+    // overloads or implicit conversions, which would take most of the constructor's
+    // time.
     BoundRequest(const py::object& camera, const SelectRule* rule, const Shade* shade,
                  const BoundGivenCut* given, const BoundLook* look)
         : plain{.eyes = eyes_of(camera),
@@ -101,7 +101,9 @@ struct BoundRequest {
         const py::list arrays(cluster_colors);
         for (size_t b = 0; b < scene.tables.size(); ++b) {
             if (b >= arrays.size())
-                throw py::value_error("colors: expected none, or colours of every bundle");
+                throw py::value_error("colors: expected none, or one array for each of " +
+                                      std::to_string(scene.tables.size()) + " bundles, got " +
+                                      std::to_string(arrays.size()));
             const auto clusters = static_cast<py::ssize_t>(scene.tables[b].num_clusters());
             const auto colors = arrays[b].cast<py::array>();
             request.cluster_colors.push_back(
@@ -111,7 +113,8 @@ struct BoundRequest {
     }
 };
 
-// Draws scenes with the same bundles, or with the first ones of them, on one device.
+// Draws scenes on one device. The frame's models belong to the bundles of the scenes,
+// in order; a scene may have fewer bundles.
 class BoundSceneFrame {
   public:
     explicit BoundSceneFrame(int device) : device_{device} {
@@ -119,11 +122,13 @@ class BoundSceneFrame {
         frame_ = work.backend().make_frame(work);
     }
 
-    // Sets the gaussians of each bundle and, unless empty, the colours of their
-    // clusters.
+    // Sets the gaussians of each bundle and, unless `palettes` is empty, the colours of
+    // their clusters.
     void set_models(const py::list& models, const py::list& palettes) {
         if (!palettes.empty() && palettes.size() != models.size())
-            throw py::value_error("palettes: expected none, or one for each model");
+            throw py::value_error("palettes: expected none, or one for each of " +
+                                  std::to_string(models.size()) + " models, got " +
+                                  std::to_string(palettes.size()));
         std::vector<std::shared_ptr<const backend::Model>> model_handles;
         std::vector<std::shared_ptr<const backend::Palette>> palette_handles;
         std::vector<size_t> num_gaussians;
@@ -143,9 +148,9 @@ class BoundSceneFrame {
         num_gaussians_ = std::move(num_gaussians);
     }
 
-    // Draws the gaussians that were set, or the resident part of a pool, after bringing
-    // in pages that are ready. `steps`: pacing state of a sequence of pictures; null
-    // for a single one.
+    // Draws the models that were set. With a pool, it brings in pages that are ready,
+    // then draws the resident part of the pool. `steps` is the state of a sequence of
+    // pictures; null for a single picture.
     std::unique_ptr<BoundDrawing> draw(const py::object& scene_object,
                                        const py::object& request_object,
                                        const py::object& pool_object, BudgetSteps* steps,
@@ -163,8 +168,8 @@ class BoundSceneFrame {
         return drawing;
     }
 
-    // Returns the gaussian with the largest weight in the first pixel of the window, or
-    // nothing.
+    // Returns the gaussian with the largest blend weight in the first pixel of the
+    // window, or None.
     std::optional<ScenePick> pick(const py::object& scene_object, const py::object& request_object,
                                   const py::object& pool_object) {
         check_is_on_host(device_, "pick", "expected a frame on the CPU, got one on a CUDA device");
@@ -177,8 +182,8 @@ class BoundSceneFrame {
         return picked;
     }
 
-    // Returns the bytes that the frame holds on its device by part, and the bytes of
-    // the memory pool.
+    // Returns the device memory of the frame in bytes, by part, and the bytes of the
+    // memory pool.
     py::dict memory() const {
         py::dict parts;
         const Work work(device_);
@@ -187,8 +192,8 @@ class BoundSceneFrame {
     }
 
   private:
-    // Checks that the scene, the request and the pool are consistent, then calls body()
-    // with them.
+    // Checks that the scene, the request and the pool fit each other, then calls
+    // body(input).
     template <class Body>
     void with_input(const py::object& scene_object, const py::object& request_object,
                     const py::object& pool_object, const Body& body) const {
@@ -202,11 +207,11 @@ class BoundSceneFrame {
         if (!bound.is_complete()) completed = bound.completed(device_, *state);
         const FrameRequest& request = completed ? *completed : bound.plain;
         if (has_pool && request.cut)
-            throw py::value_error("cut: a pool selects its own cut; leave out the given one");
+            throw py::value_error("cut: a pool selects its own cut; leave out `cut`");
         if (backend_of(device_).traits.draws_only_plainly && !request.is_plain())
             throw py::value_error(
-                "shows, colors, chooser, aside: these work only on the CPU; leave them out on a "
-                "CUDA device");
+                "shows, colors, chooser, aside: these are supported only on the CPU; leave "
+                "them out on a CUDA device");
         body(backend::FrameInput{.request = request,
                                  .scene = scene.handle(),
                                  .state = state,
@@ -219,7 +224,8 @@ class BoundSceneFrame {
         const auto& scene = held<BoundScene>(scene_object, "scene");
         auto& pool = held<BoundPool>(pool_object, "pool");
         if (scene.device() != device_ || pool.device() != device_)
-            throw py::value_error("scene, pool: expected both on the frame's device");
+            throw py::value_error(
+                "scene, pool: expected both on the frame's device, got another device");
         pool.check_scene(*scene.state());
         return pool;
     }
@@ -227,27 +233,29 @@ class BoundSceneFrame {
     const BoundScene& checked(const py::object& scene_object) const {
         const auto& scene = held<BoundScene>(scene_object, "scene");
         if (scene.device() != device_)
-            throw py::value_error("scene: expected a scene on the frame's device");
+            throw py::value_error(
+                "scene: expected a scene on the frame's device, got one on another device");
         const std::vector<size_t>& of_scene = scene.state()->num_gaussians;
         if (of_scene.size() > num_gaussians_.size() ||
             !std::equal(of_scene.begin(), of_scene.end(), num_gaussians_.begin()))
             throw py::value_error(
-                "scene: expected a scene of the bundles whose gaussians the frame has");
+                "scene: expected a scene of the bundles that the frame draws, got other bundles");
         return scene;
     }
 
     void check_device(Device device, const char* name) const {
         if (device != device_)
-            throw py::value_error(std::string(name) +
-                                  ": expected objects on the frame's device, got others");
+            throw py::value_error(
+                std::string(name) +
+                ": expected objects on the frame's device, got some on another device");
     }
 
     Device device_;
-    std::vector<size_t> num_gaussians_;  // per bundle
+    std::vector<size_t> num_gaussians_;  // number of gaussians of each bundle
     std::unique_ptr<backend::Frame> frame_;
 };
 
-// Draws the gaussians of one asset, which have no levels.
+// Draws the gaussians of one asset, which has no levels.
 class BoundAssetFrame {
   public:
     BoundAssetFrame(const py::object& model_object, float filter_px2, bool antialiased) {
@@ -273,7 +281,9 @@ class BoundAssetFrame {
 }  // namespace
 
 void bind_frame(py::module_& m) {
-    py::class_<Stop>(m, "Stop", "Asks, from any thread, that a picture in progress be abandoned.")
+    py::class_<Stop>(m, "Stop",
+                     "A flag that asks work in progress to end early. Any thread may "
+                     "set it.")
         .def(py::init<>())
         .def("request", &Stop::request)
         .def_property_readonly("is_requested", &Stop::is_requested);
@@ -296,7 +306,7 @@ void bind_frame(py::module_& m) {
                  [](const std::array<double, 3>& background, float min_transmittance,
                     bool with_depth) { return Shade{background, min_transmittance, with_depth}; }),
              py::kw_only(), "background"_a, "min_transmittance"_a, "with_depth"_a);
-    py::class_<NewPicture>(m, "Picture", "The planes of a picture.")
+    py::class_<NewPicture>(m, "Picture", "A drawn picture: arrays of colour, alpha and depth.")
         .def_readonly("color", &NewPicture::color)
         .def_readonly("alpha", &NewPicture::alpha)
         .def_readonly("depth", &NewPicture::depth);
@@ -307,7 +317,7 @@ void bind_frame(py::module_& m) {
         .def_property_readonly("right", &BoundDrawing::right,
                                "The picture of the right eye, if there are two eyes.")
         .def("finish", &BoundDrawing::finish, py::return_value_policy::copy,
-             "Waits for the picture.");
+             "Waits until the pictures are drawn, and returns the statistics.");
     py::class_<BoundGivenCut>(m, "GivenCut", "A cut that was selected earlier; borrows the arrays.")
         .def(py::init([](const py::object& instance_ids, const py::object& cluster_ids,
                          const py::object& weights) {
@@ -316,8 +326,7 @@ void bind_frame(py::module_& m) {
              }),
              "instance_ids"_a, "cluster_ids"_a, "weights"_a = py::none());
     py::class_<BoundLook>(
-        m, "Look",
-        "What a picture shows instead of the gaussians' own colours, and the cut that it shows.")
+        m, "Look", "Optional parts of a request: false colours, and another camera for the cut.")
         .def(py::init([](const std::string& shows, const py::list& colors, const BoundEyes* chooser,
                          bool aside) {
                  BoundLook look{.look = look_of(shows), .cluster_colors = colors, .chooser = {}};
@@ -332,7 +341,7 @@ void bind_frame(py::module_& m) {
                       const BoundLook*>(),
              "camera"_a, "rule"_a = nullptr, "shade"_a = nullptr, "cut"_a = nullptr,
              "look"_a = nullptr);
-    py::class_<ScenePick>(m, "Pick", "The gaussian with the largest weight in a pixel.")
+    py::class_<ScenePick>(m, "Pick", "The gaussian with the largest blend weight in a pixel.")
         .def_readonly("instance", &ScenePick::instance)
         .def_readonly("cluster", &ScenePick::cluster)
         .def_readonly("weight", &ScenePick::weight)
@@ -344,8 +353,8 @@ void bind_frame(py::module_& m) {
              "steps"_a = nullptr, "stop"_a = nullptr)
         .def("pick", &BoundSceneFrame::pick, "scene"_a, "request"_a, "pool"_a = py::none())
         .def("memory", &BoundSceneFrame::memory,
-             "Returns the bytes that it holds on a CUDA device by part, and the bytes of the "
-             "memory pool that all frames there share.");
+             "Returns the bytes of the frame on a CUDA device, by part, and the bytes of the "
+             "memory pool that all frames on the device share.");
     py::class_<BoundAssetFrame>(m, "AssetFrame", "Draws gaussians without levels on their device.")
         .def(py::init<py::object, float, bool>(), "model"_a, py::kw_only(), "filter_px2"_a = 0.0f,
              "antialiased"_a = false)

@@ -1,4 +1,4 @@
-// Pages of files: reading, verifying and hashing, for Python.
+// Bindings that read, verify and hash the pages of files.
 
 #include <algorithm>
 #include <cerrno>
@@ -8,6 +8,7 @@
 #include <system_error>
 #include <utility>
 
+#include "bindings/backend.h"
 #include "bindings/codes.h"
 #include "bindings/operations.h"
 #include "io/hashed_read.h"
@@ -17,12 +18,12 @@ namespace v3dg {
 
 namespace {
 
-// Neighbouring pages of a file, with the arrays that locate them.
+// A range of adjacent pages of a file, and the arrays with their locations.
 struct BoundPageRun {
     size_t first_page;
     py::array first_cluster, offset, places;
 
-    // Borrows from the arrays; `hashes` has the hashes of these pages.
+    // Borrows the arrays. `hashes` has one hash per page.
     PageRun read(const py::array& hashes) const {
         constexpr size_t kMost = size_t(1) << 62;
         PageRun run{.first_page = first_page,
@@ -33,15 +34,15 @@ struct BoundPageRun {
         run.first_cluster = boundaries_of(first_cluster, "first_cluster", run.offset.size - 1);
         if (run.first_cluster.size != run.places.size)
             throw py::value_error("places: expected " + std::to_string(run.first_cluster.size) +
-                                  ", got " + std::to_string(run.places.size));
+                                  " numbers, got " + std::to_string(run.places.size));
         run.hashes =
             span_of<const uint8_t>(hashes, "hashes", {static_cast<py::ssize_t>(run.size()), 16});
         return run;
     }
 };
 
-// Calls body() without Python's lock. An error about a page gets the file's name, which
-// may not be valid text.
+// Calls body() without the GIL. If it throws a PageError, adds the name of the file,
+// which need not be valid UTF-8.
 template <class Body>
 void naming_file(const py::object& path, const Body& body) {
     try {
@@ -64,9 +65,10 @@ void read_rows(const py::object& path, int descriptor, const PageRun& run, PageC
                const Rows& out) {
     const GaussianRows<float> rows = out.write();
     const auto count = static_cast<size_t>(run.offset[run.offset.size - 1] - run.offset[0]);
-    if (out.device() != kHost || rows.size != count)
-        throw py::value_error("out: expected " + std::to_string(count) +
-                              " gaussians on the host, got others");
+    check_is_on_host(out.device(), "out", "expected arrays on the host, got arrays on a device");
+    if (rows.size != count)
+        throw py::value_error("out: expected " + std::to_string(count) + " gaussians, got " +
+                              std::to_string(rows.size));
     const bool is_quantized = codec == PageCodec::quantized;
     for (size_t page = 0; page < run.size(); ++page) {
         const Span<const int64_t> clusters = run.clusters(page);
@@ -74,8 +76,8 @@ void read_rows(const py::object& path, int descriptor, const PageRun& run, PageC
         const size_t needed = is_quantized ? page_bytes(size, clusters.size - 1, rows.sh_degree)
                                            : sizeof(float) * (11 + rows.num_sh()) * size;
         if (run.num_bytes(page) < needed)
-            throw py::value_error("places: expected " + std::to_string(needed) +
-                                  " bytes of a page, got " + std::to_string(run.num_bytes(page)));
+            throw py::value_error("places: expected at least " + std::to_string(needed) +
+                                  " bytes for a page, got " + std::to_string(run.num_bytes(page)));
     }
     naming_file(path, [&] {
         const PosixFile file = PosixFile::duplicate(descriptor);
@@ -86,15 +88,15 @@ void read_rows(const py::object& path, int descriptor, const PageRun& run, PageC
 void read_words(const py::object& path, int descriptor, const PageRun& run, const py::array& out) {
     const int64_t num_bytes = run.places[run.size()] - run.places[0];
     if (num_bytes % 4 != 0)
-        throw py::value_error("places: expected a multiple of 4 bytes, got " +
+        throw py::value_error("places: expected pages of a multiple of 4 bytes, got " +
                               std::to_string(num_bytes));
     const Span<int32_t> words =
         span_of<int32_t>(out, "out", {static_cast<py::ssize_t>(num_bytes / 4)});
     naming_file(path, [&] { read_codes(PosixFile::duplicate(descriptor), run, words); });
 }
 
-// Reads pages to `out`: either rows, into which gaussians are decoded, or an array of
-// integers, which receives the codes as they are.
+// Reads a range of pages to `out`. If `out` is Rows, it receives decoded gaussians. If
+// it is an array of integers, it receives the codes.
 void read_run(const py::object& path, int descriptor, const py::object& out,
               const std::string& codec, const py::array& hashes, const BoundPageRun& bound) {
     const PageRun run = bound.read(hashes);
@@ -119,7 +121,7 @@ std::vector<py::bytes> hash_messages(const std::vector<py::array>& arrays) {
     return digests;
 }
 
-// A read together with the array that it reads to and hashes.
+// A read in progress, and the array that receives the bytes.
 class BoundHashedRead {
   public:
     BoundHashedRead(const py::object& path, int descriptor, size_t offset,
@@ -159,12 +161,12 @@ class BoundReader {
     }
 
   private:
-    // Returns memory that is aligned to eight bytes.
+    // Returns memory that is aligned to 8 bytes.
     py::array_t<uint8_t> take(size_t num_bytes) {
         const size_t size = (num_bytes + 7) / 8 * 8;
         if (size > left_) {
-            // The first small part gets memory of its own, so that a single one does
-            // not allocate a whole block.
+            // The first small part gets its own memory, so that reading a single small
+            // part does not allocate a whole block.
             const bool is_small = size < HashedRead::kLargeBytes && piece_.size() > 0;
             left_ = is_small ? size * kFilesOfPiece : size;
             piece_ = py::array_t<uint64_t>(static_cast<py::ssize_t>(left_ / 8));
@@ -176,7 +178,7 @@ class BoundReader {
 
     static constexpr size_t kFilesOfPiece = 8;
     py::array piece_;
-    size_t left_ = 0;  // bytes left in the block
+    size_t left_ = 0;  // unused bytes of the block
 };
 
 py::array BoundHashedRead::wait() {
@@ -202,22 +204,26 @@ void bind_pages(py::module_& m) {
     py::class_<BoundHashedRead>(m, "HashedRead",
                                 "A part of a file that is read and hashed at the same time.")
         .def("wait", &BoundHashedRead::wait,
-             "Returns the bytes once all are read; raises ValueError if the file has fewer.")
+             "Waits until all bytes are read, and returns them. Raises ValueError if the file is"
+             " shorter.")
         .def("is_sound", &BoundHashedRead::is_sound,
-             "Returns whether the bytes end with their hash.");
+             "Waits until all bytes are hashed. Returns whether the bytes end with their hash.");
     py::class_<BoundReader>(m, "HashedReader",
-                            "Reads parts of several files; small parts share memory.")
+                            "Reads and hashes parts of several files. Small parts share blocks "
+                            "of memory.")
         .def(py::init<>())
         .def("read", &BoundReader::read, "path"_a, "descriptor"_a, "before"_a, "offset"_a,
              "num_bytes"_a, "in_pieces"_a,
-             "Reads bytes of a file that end with a BLAKE2b-128 hash: of `before` and the bytes, "
-             "or of the hashes of their pieces. The bytes are aligned to eight if the size of "
-             "`before` is a multiple of eight.");
+             "Starts to read bytes of a file that end with a BLAKE2b-128 hash. The hash is of "
+             "`before` followed by the bytes, or of the hashes of their pieces. The bytes are "
+             "aligned to 8 if the size of `before` is a multiple of 8.");
     m.def("blake2b", &hash_messages, "messages"_a,
-          "Returns the BLAKE2b-128 of several messages, which are hashed in parallel.");
+          "Returns the BLAKE2b-128 hashes of several messages, computed in parallel.");
     m.attr("DAMAGED") = kDamaged;
     m.attr("HASH_PIECE_BYTES") = kHashPieceBytes;
-    py::class_<BoundPageRun>(m, "PageRun", "Neighbouring pages of a file; borrows the arrays.")
+    py::class_<BoundPageRun>(m, "PageRun",
+                             "A range of adjacent pages of a file. It borrows the "
+                             "arrays.")
         .def(py::init([](size_t first_page, const py::array& first_cluster, const py::array& offset,
                          const py::array& places) {
                  return BoundPageRun{.first_page = first_page,
@@ -228,8 +234,8 @@ void bind_pages(py::module_& m) {
              py::kw_only(), "first_page"_a, "first_cluster"_a, "offset"_a, "places"_a);
     m.def("read_pages", &read_run, "path"_a, "descriptor"_a, "out"_a, "codec"_a, "hashes"_a,
           "run"_a,
-          "Reads a run of pages with these hashes (n, 16): decodes their gaussians into rows, or "
-          "copies the pages unchanged into an array (W,) int32.");
+          "Reads and verifies a range of pages; `hashes` is (n, 16). Decodes the gaussians to "
+          "rows, or copies the pages unchanged to an array (W,) int32.");
 }
 
 }  // namespace v3dg

@@ -1,4 +1,4 @@
-// Reading and writing of .ply files for Python; io/ply_*.h do the work.
+// Bindings that read and write .ply files, by means of io/ply_*.h.
 
 #include <cerrno>
 #include <cmath>
@@ -12,14 +12,15 @@ namespace v3dg {
 
 namespace {
 
-// Returns a name as printable text, with question marks for bytes that are not ASCII.
+// Returns a name as printable ASCII; other bytes become question marks.
 std::string printable(std::string name) {
     for (char& c : name)
         if (c < ' ' || c > '~') c = '?';
     return name;
 }
 
-// The name of a file, as the system needs it and as messages show it.
+// The name of a file: in the encoding of the system, and in the form that messages
+// show.
 struct Path {
     explicit Path(py::object path) : shown(path) {
         PyObject* bytes = nullptr;
@@ -30,7 +31,7 @@ struct Path {
     py::bytes encoded;
 };
 
-// Calls body(path) without Python's lock, and adds the file's name to errors.
+// Calls body(path) without the GIL, and adds the name of the file to errors.
 template <class Body>
 auto with_path(const Path& path, const Body& body) {
     const char* name = PyBytes_AS_STRING(path.encoded.ptr());
@@ -48,7 +49,7 @@ auto with_path(const Path& path, const Body& body) {
     }
 }
 
-// A file that is read in runs of rows; it remembers where the last run ended.
+// A .ply file that is read in runs of rows. It remembers where the last run ended.
 class BoundPlyFile {
   public:
     explicit BoundPlyFile(const py::object& path)
@@ -77,7 +78,8 @@ class BoundPlyFile {
             opacities({}, {n}), sh({}, {n, k, 3});
         const PlyGaussians<float> out = {means.span, quats.span, scales.span, opacities.span,
                                          sh.span};
-        // Read and written with Python's lock held, so that several threads may read.
+        // `next_` is accessed with the GIL held, so several threads may read
+        // concurrently.
         const PlyPlace known = next_;
         next_ = with_path(path_, [&](const char*) {
             return read_ply(ply_, static_cast<size_t>(first), known, out);
@@ -132,7 +134,8 @@ void ply_write(const py::object& path, const py::array& means, const py::array& 
                const std::string& encoding, const std::vector<std::string>& comments) {
     for (const std::string& comment : comments)
         if (comment.find_first_of("\r\n") != std::string::npos)
-            throw py::value_error("comments: expected lines, got " + quoted(comment));
+            throw py::value_error("comments: expected text without line breaks, got " +
+                                  quoted(comment));
     const PlyEncoding chosen = encoding_of(encoding);
     const py::ssize_t n = means.ndim() > 0 ? means.shape(0) : 0;
     const py::ssize_t k = sh.ndim() > 1 ? sh.shape(1) : 0;
@@ -157,11 +160,11 @@ void bind_ply(py::module_& m) {
         .def_property_readonly("num_gaussians", &BoundPlyFile::num_gaussians)
         .def_property_readonly("sh_degree", &BoundPlyFile::sh_degree)
         .def_property_readonly("used", &BoundPlyFile::used,
-                               "Names of the properties that are read.")
+                               "The names of the properties that are read.")
         .def("read", &BoundPlyFile::read, "first"_a, "last"_a);
     m.def("ply_header", &ply_header, "path"_a,
-          "Returns the encoding, the bytes of the header, and the elements: name, count, and names "
-          "and types of properties.");
+          "Returns the encoding, the bytes of the header, and the elements: their names, counts,"
+          " and the names and types of their properties.");
     m.def("ply_comments", &ply_comments, "path"_a, "Returns the comments of the header, in order.");
     m.def("ply_write", ply_write, "path"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a,
           "encoding"_a, "comments"_a = std::vector<std::string>());

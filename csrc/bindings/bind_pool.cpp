@@ -1,4 +1,4 @@
-// Page pools and their sources for Python; residency/page_pool.h implements the pool.
+// Bindings of page pools and their sources (residency/page_pool.h).
 
 #include <algorithm>
 #include <thread>
@@ -11,10 +11,9 @@ namespace v3dg {
 
 namespace {
 
-// At most this fraction of a pool's memory is for pages that are being read.
+// Pages that are being read may use up to 1 / kBlockShare of a pool's memory.
 constexpr size_t kBlockShare = 8;
-// Reading threads do not only wait for the disk but also hash, so machines with more
-// cores get more of them.
+// The limit on threads that read pages. They also compute hashes, so more cores help.
 constexpr unsigned kMostThreads = 16;
 
 [[noreturn]] void raise(const PageError& error) {
@@ -22,14 +21,14 @@ constexpr unsigned kMostThreads = 16;
     throw py::error_already_set();
 }
 
-// The file of a bundle, with the arrays that locate its pages.
+// The file of a bundle, and the arrays with the locations and hashes of its pages.
 struct BoundFileSource {
     std::string name;
     int descriptor;
     PageCodec codec;
     int sh_degree;
     py::array places, hashes;
-    py::object fetch;  // callable that fetches parts of the file, or None
+    py::object fetch;  // a function that fetches parts of the file, or None
 };
 
 PageCodec codec_of(const std::string& name) {
@@ -38,16 +37,17 @@ PageCodec codec_of(const std::string& name) {
     throw py::value_error("codec: expected float32 or quantized, got " + name);
 }
 
-// The origin of a source's pages, borrowed from Python objects.
+// The source of the pages of a bundle, borrowed from Python objects. Either `rows` or
+// `file` is set.
 struct GivenSource {
     const Rows* rows = nullptr;             // pages in memory, or null
-    const BoundFileSource* file = nullptr;  // else the file
+    const BoundFileSource* file = nullptr;  // pages in a file, or null
     Fetch fetch = {};
     Span<const int64_t> places = {};
     Span<const uint8_t> hashes = {};
 };
 
-// Returns the text of the current Python error and clears it. Requires Python's lock.
+// Returns the text of the current Python error, and clears the error. Requires the GIL.
 std::string text_of_error() {
     PyObject *type = nullptr, *value = nullptr, *trace = nullptr;
     PyErr_Fetch(&type, &value, &trace);
@@ -60,10 +60,9 @@ std::string text_of_error() {
     return problem.empty() ? "the fetch failed" : problem;
 }
 
-// Calls a Python function that fetches parts of a file. Returns the text of the error
-// that it raises, or an empty string. The caller holds Python's lock. No object here
-// may have a destructor that needs the lock, because Python may end the thread inside
-// the function.
+// Calls a Python function that fetches parts of a file. Returns the text of its error,
+// or an empty string. Requires the GIL. Local objects must not have destructors that
+// need the GIL, because Python may end the thread during the call.
 std::string told_by(PyObject* function, Span<const int64_t> places) {
     PyObject* const list = PyList_New(static_cast<py::ssize_t>(places.size / 2));
     for (size_t k = 0; list != nullptr && k < places.size / 2; ++k)
@@ -77,9 +76,10 @@ std::string told_by(PyObject* function, Span<const int64_t> places) {
     return done == nullptr ? text_of_error() : std::string();
 }
 
-// Wraps a Python function for threads that Python does not know. They acquire Python's
-// lock for the call; so a thread that waits for them must have released it. The
-// function is never released, because a pool may leave threads behind that call it.
+// Wraps a Python function for threads that Python did not start. Such a thread acquires
+// the GIL for the call. A thread that waits for such a thread must therefore release
+// the GIL first. The function is never released, because a pool may leave threads
+// behind that call it.
 Fetch fetch_by(const py::object& function) {
     if (function.is_none()) return {};
     PyObject* const kept = function.inc_ref().ptr();
@@ -179,14 +179,16 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
 
 BoundPool::~BoundPool() {
     on_device_.reset();
-    const Unlocked unlocked;  // threads that are ending may be about to call Python for a page
+    // Threads that are ending may be waiting for the GIL to call Python.
+    const Unlocked unlocked;
     pool_.reset();
 }
 
 void BoundPool::check_scene(const SceneState& scene) const {
     bool fits = scene.bundles.size() == tables_.size();
     for (size_t b = 0; fits && b < tables_.size(); ++b) fits = tables_[b].is(scene.bundles[b]);
-    if (!fits) throw py::value_error("scene: expected a scene of the pool's bundles");
+    if (!fits)
+        throw py::value_error("scene: expected a scene of the pool's bundles, got other bundles");
 }
 
 SettlingStep BoundPool::settle_step(const py::object& scene_object, const BoundEyes& camera,
@@ -213,13 +215,15 @@ void bind_pool(py::module_& m) {
         .def_readonly("least_tolerance_px2", &PoolStatus::least_tolerance_px2)
         .def_readonly("error", &PoolStatus::error)
         .def_readonly("is_damage", &PoolStatus::is_damage);
-    py::class_<SettlingStep>(m, "SettlingStep", "The result of a step towards a settled view.")
+    py::class_<SettlingStep>(m, "SettlingStep",
+                             "The result of one step towards a view whose "
+                             "pages are all resident.")
         .def_readonly("tolerance_px2", &SettlingStep::tolerance_px2)
         .def_property_readonly("is_decided",
                                [](const SettlingStep& step) { return step.noted.is_decided; })
         .def_property_readonly("num_absent",
                                [](const SettlingStep& step) { return step.noted.num_absent; });
-    py::class_<BoundFileSource>(m, "FileSource", "The file that contains the pages of a bundle.")
+    py::class_<BoundFileSource>(m, "FileSource", "The file that has the pages of a bundle.")
         .def(py::init([](const std::string& name, int descriptor, const std::string& codec,
                          int sh_degree, const py::array& places, const py::array& hashes,
                          const py::object& fetch) {
@@ -234,27 +238,27 @@ void bind_pool(py::module_& m) {
              py::kw_only(), "name"_a, "descriptor"_a, "codec"_a, "sh_degree"_a, "places"_a,
              "hashes"_a, "fetch"_a = py::none());
     py::class_<BoundPool>(m, "PagePool",
-                          "Pages of bundles in memory of a fixed size on one device.")
+                          "A pool of pages of bundles, in memory of a fixed size on one device.")
         .def(py::init<py::list, py::list, int, size_t, unsigned>(), "tables"_a, "sources"_a,
              "device"_a, "num_bytes"_a, "num_threads"_a)
         .def("settle_step", &BoundPool::settle_step, "scene"_a, "camera"_a, "rule"_a, "begins"_a,
-             "Makes all pages resident that were read, and determines which pages a view needs.")
+             "Makes all pages resident that were read, and requests the pages that a view needs.")
         .def("status", &BoundPool::status)
         .def("resident", &resident_pages, "bundle"_a,
              "Returns which pages of a bundle are resident: (P,) bool.")
         .def("arrived", &arrived_pages, "bundle"_a,
-             "Returns for how many of eight frames each page of a bundle has been fading in: (P,) "
-             "int32.")
+             "Returns how many frames each page of a bundle has been fading in: (P,) int32, 0 to"
+             " 8.")
         .def(
             "raise_tolerance",
             [](BoundPool& p, float from) { return p.pool().raise_tolerance_at_once(from); },
             "from_px2"_a,
-            "Raises the least tolerance unless the needs of the last view fit; returns whether it "
-            "did.")
+            "Raises the smallest tolerance unless the pages of the last view fit. Returns "
+            "whether it did.")
         .def(
             "wait", [](BoundPool& p, double seconds) { return p.pool().wait(seconds); },
             "seconds"_a, py::call_guard<Unlocked>(),
-            "Waits for pages; returns whether there are any to make resident.")
+            "Waits for pages that were read. Returns whether any can become resident.")
         .def(
             "read_one", [](BoundPool& p) { return p.pool().read_one(); },
             py::call_guard<Unlocked>());

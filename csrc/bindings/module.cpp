@@ -1,4 +1,5 @@
-// The compiled module: its requirements on the process, and its parts in order.
+// The definition of the compiled module: what it requires of the process, then the
+// bindings of each part.
 
 #include <dlfcn.h>
 #include <omp.h>
@@ -14,11 +15,11 @@
 #include "math/gaussian.h"
 #include "residency/cluster_table.h"
 
-// GNU's OpenMP keeps idle threads for the next parallel loop. A child of fork() has no
-// such threads, but would wait for them forever. So the forking thread ends its idle
-// threads before the fork; the next loop starts new ones in both processes. LLVM's
-// OpenMP, which may replace GNU's, handles forks itself and then holds locks that this
-// call would wait for.
+// Ends the idle threads of GNU's OpenMP (libgomp) before a fork(). The child would have
+// no such threads, but would wait for them for ever. The next parallel loop starts new
+// threads, in the parent as in the child. LLVM's OpenMP, which may replace libgomp,
+// handles fork() itself. With LLVM's OpenMP, this call would wait for ever for locks
+// that LLVM's own fork handler holds.
 static void let_threads_go() { omp_pause_resource_all(omp_pause_hard); }
 static bool must_let_threads_go() {
     Dl_info found;
@@ -31,9 +32,9 @@ static int num_cuda_devices() {
     return backend == nullptr ? 0 : backend->num_devices();
 }
 
-// Refuses objects that were made by `__new__` alone, which hold no value. If such an
-// object is passed to a function, pybind11 asks its class for memory of the value's
-// size and would use it uninitialised.
+// Refuses objects that were made by `__new__` alone, which have no C++ value. When such
+// an object is passed to a function, pybind11 asks its class to allocate the value, and
+// would use it uninitialised.
 static void* refuse_unmade(size_t) {
     throw v3dg::py::type_error(
         "self: this object was made by __new__ alone and has no value; call the class instead");
@@ -51,16 +52,16 @@ PYBIND11_MODULE(_core, m) {
     if (must_let_threads_go() && pthread_atfork(&let_threads_go, nullptr, nullptr) != 0)
         throw std::bad_alloc();
     v3dg::watch_end_of_python();
-    m.doc() = "Compiled operations of v3dg; the public interface is the package v3dg.";
+    m.doc() = "The compiled operations of v3dg. The package v3dg is the public interface.";
     m.attr("min_alpha") = v3dg::kMinAlpha;
     m.attr("fade_filter_px2") = v3dg::kFadeFilterPx2;
     m.attr("sh_base0") = v3dg::kShBase0;
     m.attr("has_cuda") = v3dg::device_backend() != nullptr;
     m.def(
         "isa", [] { return v3dg::isa_name(v3dg::active_isa()); },
-        "Instruction set that operations on the CPU use.");
+        "The instruction set that operations on the CPU use.");
     m.def("num_cuda_devices", &num_cuda_devices,
-          "Number of CUDA devices; 0 without CUDA or a driver.");
+          "Returns the number of CUDA devices; 0 without CUDA or a driver.");
     v3dg::bind_types(m);
     v3dg::bind_ply(m);
     v3dg::bind_cluster(m);

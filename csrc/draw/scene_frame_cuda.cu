@@ -1,4 +1,4 @@
-// Frames of a scene on a CUDA device: they choose the cut that writes the items, and
+// Implements scene_frame_cuda.h: enqueues the cut that writes a frame's items, and sets
 // the models of the batch.
 
 #include "draw/scene_frame_cuda.h"
@@ -130,7 +130,7 @@ FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures
             .has_depth = false};
 }
 
-// The rule for drawing a frame again whose buffers were too small.
+// Returns the rule for drawing a frame again after a buffer was too small.
 static SelectRule drawn_again(SelectRule rule) {
     if (rule.pace == BudgetPace::in_steps) rule.pace = BudgetPace::again;
     return rule;
@@ -179,8 +179,8 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
             cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items,
                            on, &resident);
             next = drawn_again(next);
-            // A frame that is drawn again reports no needs, because another frame may
-            // be reporting its own.
+            // A frame that is drawn again reports no page requests, because the next
+            // frame may already be reporting its own.
             if (resident.needs.report != nullptr) pages.end_frame(on);
             resident.needs = {};
         },

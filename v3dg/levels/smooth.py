@@ -18,10 +18,12 @@ from v3dg.levels.simplify import LevelBuilder
 # Opacities below this are faint: with the opacity that compensates for a filter, much
 # of such a gaussian is below the least alpha that is drawn, 1/255.
 _FAINT_OPACITY = 0.1
-# Number of groups of level 1 that are fitted with this filter and without a filter.
+# Number of groups of level 1 that are fitted twice: with a filter of this variance, and
+# without a filter.
 _GROUPS = 32
 _FILTER_PX2 = 0.05
-# Largest number of leaves in such a group; larger groups would take too long.
+# Maximum number of leaves in one of these groups; fitting larger ones would take too
+# long.
 _MOST_LEAVES = 1 << 15
 # An asset needs the filter if its loss without the filter is larger by this factor
 # (docs/levels.md).
@@ -49,8 +51,8 @@ def measured_config(
     sample = Gaussians.concatenate(parts)
     if _is_faint(sample):
         return replace(config, filter_px2=0.0)
-    # The sample consists of the groups that were read. Each has two clusters, whatever
-    # the group size of the build is.
+    # The sample consists of the groups that were read. Each is divided into two
+    # clusters, for any group size of the build.
     sample_config = replace(
         config,
         init="merge",
