@@ -508,7 +508,7 @@ def test_what_is_fitted_has_to_be_where_its_target_is():
         (178, 356, 0, {"image_size": 0, "supersample": 4, "filter_px2": 0.05, "views_per_step": 2}),
         (178, 356, 1, {"num_views": 0, "loss_dssim": 0.2}),
         (300, 400, 0, {"image_size": 0, "views_per_step": 2}),
-        (40, 60, 0, {"image_size": 50, "loss_dssim": 0.2}),
+        (200, 60, 0, {"image_size": 50, "loss_dssim": 0.2}),
         (3000, 4000, 3, {"image_size": 64, "num_views": 0, "loss_dssim": 0.2}),
     ],
 )
