@@ -762,6 +762,7 @@ class FitConfig:
         loss_l1: float,
         loss_dssim: float,
         loss_alpha: float,
+        loss_cells: float,
         step_position: float,
         step_log_scale: float,
         step_quat: float,

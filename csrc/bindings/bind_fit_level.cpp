@@ -198,10 +198,10 @@ py::tuple weigh_cuts_arrays(const FitConfig& config, const Rows& gaussians,
 
 FitConfig make_config(int steps, int views_per_step, int num_views, int supersample, int image_size,
                       float px2_per_gaussian, float distance, float filter_px2, bool antialiased,
-                      float loss_l1, float loss_dssim, float loss_alpha, float step_position,
-                      float step_log_scale, float step_quat, float step_logit, float step_sh0,
-                      float step_sh_rest, bool position_in_world, float final_step, float beta2,
-                      uint64_t seed) {
+                      float loss_l1, float loss_dssim, float loss_alpha, float loss_cells,
+                      float step_position, float step_log_scale, float step_quat, float step_logit,
+                      float step_sh0, float step_sh_rest, bool position_in_world, float final_step,
+                      float beta2, uint64_t seed) {
     return {.steps = steps,
             .views_per_step = views_per_step,
             .num_views = num_views,
@@ -211,7 +211,7 @@ FitConfig make_config(int steps, int views_per_step, int num_views, int supersam
             .distance = distance,
             .filter_px2 = filter_px2,
             .antialiased = antialiased,
-            .loss = {loss_l1, loss_dssim, loss_alpha},
+            .loss = {loss_l1, loss_dssim, loss_alpha, loss_cells},
             .step_position = step_position,
             .step_log_scale = step_log_scale,
             .step_quat = step_quat,
@@ -262,9 +262,9 @@ void bind_fit_level(py::module_& m) {
     py::class_<FitConfig>(m, "FitConfig", "The settings of a fit. All of them are required.")
         .def(py::init(&make_config), py::kw_only(), "steps"_a, "views_per_step"_a, "num_views"_a,
              "supersample"_a, "image_size"_a, "px2_per_gaussian"_a, "distance"_a, "filter_px2"_a,
-             "antialiased"_a, "loss_l1"_a, "loss_dssim"_a, "loss_alpha"_a, "step_position"_a,
-             "step_log_scale"_a, "step_quat"_a, "step_logit"_a, "step_sh0"_a, "step_sh_rest"_a,
-             "position_in_world"_a, "final_step"_a, "beta2"_a, "seed"_a);
+             "antialiased"_a, "loss_l1"_a, "loss_dssim"_a, "loss_alpha"_a, "loss_cells"_a,
+             "step_position"_a, "step_log_scale"_a, "step_quat"_a, "step_logit"_a, "step_sh0"_a,
+             "step_sh_rest"_a, "position_in_world"_a, "final_step"_a, "beta2"_a, "seed"_a);
     py::class_<FitProgress>(m, "FitProgress",
                             "The progress of a fit. Any thread may read it and cancel the fit.")
         .def(py::init<>())

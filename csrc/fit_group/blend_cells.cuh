@@ -76,6 +76,14 @@ __device__ CellRecords records_at(const Fit& fit, const CellList<Fit>& list, uin
     return out;
 }
 
+// Sums a value over the pixels of the lane's cell, in every lane.
+__device__ inline float cell_sum(float x) {
+#pragma unroll
+    for (int offset = kCellPixels / 2; offset > 0; offset /= 2)
+        x += __shfl_xor_sync(kAllLanes, x, offset);
+    return x;
+}
+
 // The contributions of kAtOnce gaussians to a pixel, front to back.
 struct Blended {
     float alpha[kAtOnce], before[kAtOnce], weight[kAtOnce];
@@ -218,13 +226,19 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
         return;
     }
 
+    const LossWeights& loss = fit.in.config.loss;
+    const float pixels = static_cast<float>(num_pixels);
+    const float weights[4] = {loss.l1 / (3 * pixels), loss.l1 / (3 * pixels),
+                              loss.l1 / (3 * pixels), loss.alpha / pixels};
+    float of_cell[4] = {0, 0, 0, 0};
+    if (loss.cells > 0) {
+        // Pixels outside of the picture have no difference.
+        for (int k = 0; k < 4; ++k)
+            of_cell[k] = cell_slope(loss, cell_sum(difference[k]), weights[k]);
+    }
     float d[4] = {0, 0, 0, 0};
     if (p.inside) {
-        const LossWeights& loss = fit.in.config.loss;
-        const float pixels = static_cast<float>(num_pixels);
-        const float d_color = loss.l1 / (3 * pixels), d_alpha = loss.alpha / pixels;
-        for (int c = 0; c < 3; ++c) d[c] = l1_vjp(difference[c], d_color);
-        d[3] = l1_vjp(difference[3], d_alpha);
+        for (int k = 0; k < 4; ++k) d[k] = l1_vjp(difference[k], weights[k]) + of_cell[k];
         if (targets.d_dssim != nullptr)
             for (int c = 0; c < 3; ++c) d[c] += targets.d_dssim[(3 * b + c) * num_pixels + pixel];
     }

@@ -74,8 +74,8 @@ class Comparison {
         return count;
     }
 
-    // Computes the L1 parts of the loss in one tile. Adds them to `error`. Unless
-    // `grad` is null, also computes the gradients of the tile's pixels.
+    // Computes the L1 parts of the loss in one tile. Adds those of pixels to `error`.
+    // Unless `grad` is null, also computes the gradients of the tile's pixels.
     void compare(int t, const FitView& view, const FitImage& target, TileGradient<float>* grad,
                  double error[2]) {
         using V = Vec<float>;
@@ -109,9 +109,36 @@ class Comparison {
                 alpha_sum += magnitude(difference);
                 if (grad != nullptr) store(grad->d_weight + p, l1_vjp(difference, d_alpha));
             }
+            if (inside && grad != nullptr && config_.loss.cells > 0)
+                add_cell_slopes(block, tile, planes, d_color, d_alpha, *grad);
         }
         error[0] += sum_of(color_sum) / (3 * num_pixels);
         error[1] += sum_of(alpha_sum) / num_pixels;
+    }
+
+    // Adds the gradient of the mean differences of a block, which is a cell of the
+    // loss.
+    void add_cell_slopes(int block, const TilePlanes<float>& tile, const float* planes,
+                         float d_color, float d_alpha, TileGradient<float>& grad) {
+        using V = Vec<float>;
+        const int first = block * kBlockPixels, last = first + kBlockPixels;
+        for (int c = 0; c < 3; ++c) {
+            V sum = V{};
+            for (int p = first; p < last; p += kLanes<float>)
+                sum += load(tile.color[c] + p) - load(planes + c * kTilePixels + p);
+            const float slope = cell_slope(config_.loss, sum_of(sum), d_color);
+            for (int p = first; p < last; p += kLanes<float>)
+                store(grad.d_color[c] + p, load(grad.d_color[c] + p) + slope);
+        }
+        V sum = V{};
+        for (int p = first; p < last; p += kLanes<float>) {
+            const V transmittance = load(tile.transmittance + p);
+            const V covered = 1 - (transmittance < V{} ? -transmittance : transmittance);
+            sum += covered - load(planes + 3 * kTilePixels + p);
+        }
+        const float slope = cell_slope(config_.loss, sum_of(sum), d_alpha);
+        for (int p = first; p < last; p += kLanes<float>)
+            store(grad.d_weight + p, load(grad.d_weight + p) + slope);
     }
 
     // Adds the gradient of the D-SSIM part of the loss.

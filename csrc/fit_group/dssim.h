@@ -11,6 +11,10 @@ struct LossWeights {
     float l1;     // |difference| of premultiplied colour
     float dssim;  // 1 - SSIM of premultiplied colour
     float alpha;  // |difference| of alpha
+    // Weight of the |mean difference| of cells of 4 x 4 px, relative to `l1` and
+    // `alpha`. The |difference| of pixels alone is least at a median, which is smaller
+    // than the mean where gaussians are sparse.
+    float cells;
 };
 
 // Temporary memory of dssim().

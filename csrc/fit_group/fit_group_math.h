@@ -241,6 +241,18 @@ V3DG_HD inline float position_step(const FitConfig& config, const FitGroup& grou
     return config.position_in_world ? step.position / group.radius : step.position;
 }
 
+// The loss of a cell is quadratic in smaller mean differences, so that rounding does
+// not decide the sign of its slope.
+constexpr float kLeastMean = 1e-4f;
+
+// Returns the slope of the loss of a cell at each of its 4 x 4 pixels. `sum` is the sum
+// of their differences, `weight` the slope of the |difference| of one pixel.
+V3DG_HD V3DG_INLINE float cell_slope(const LossWeights& loss, float sum, float weight) {
+    const float relative = sum / (16 * kLeastMean);
+    // In this order the result is finite for NaN, too.
+    return loss.cells * weight * max_of(min_of(relative, 1.0f), -1.0f);
+}
+
 // Returns the loss by which the initial values and the result are compared. `error` has
 // the mean |difference| of colour and of alpha.
 V3DG_HD inline double residual_loss(const LossWeights& loss, const double error[2]) {

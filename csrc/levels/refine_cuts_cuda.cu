@@ -313,8 +313,9 @@ class StepsAhead {
             worker.windows.slope[w] = canvases_.slope(w);
             add_window(pictures_.table, view.view.window, view.cuts[plan.cut], canvases_.picture(w),
                        worker.windows);
-            step.blocks_per_window = std::max(step.blocks_per_window,
-                                              blocks_for(num_pixels(view.view.window), kThreads));
+            step.blocks_per_window =
+                std::max(step.blocks_per_window,
+                         blocks_for(num_pixels_of_cells(view.view.window), kThreads));
         }
         step.windows.cut(table_, worker.windows, Shown::cuts, stream);
         step.made.record(stream);

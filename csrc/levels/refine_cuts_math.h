@@ -43,16 +43,32 @@ struct ReadPlanes {
     }
 };
 
+// Side, px, of the cells whose mean differences are part of the loss.
+constexpr size_t kCellSide = 4;
+
+// Returns the number of cells along a side.
+V3DG_HD inline size_t num_cells(size_t side) { return (side + kCellSide - 1) / kCellSide; }
+
+// Returns the number of pixels of all cells of a camera's picture, including those that
+// are beyond its border.
+inline size_t num_pixels_of_cells(const Camera& camera) {
+    return num_cells(static_cast<size_t>(camera.width)) *
+           num_cells(static_cast<size_t>(camera.height)) * kCellSide * kCellSide;
+}
+
 // Replaces the differences between two pictures at a pixel by the gradients of the
-// loss, as if the picture's weight were 1. Returns the pixel's loss.
-V3DG_HD inline float put_slopes(const LossWeights& loss, PixelValues& pixel) {
-    float sum = 0;
+// loss, as if the picture's weight were 1. `sum` has the differences of the pixel's
+// cell. Returns the pixel's loss, without the part of the cell.
+V3DG_HD inline float put_slopes(const LossWeights& loss, const PixelValues& sum,
+                                PixelValues& pixel) {
+    float pixel_loss = 0;
     for (int k = 0; k < 4; ++k) {
         const float weight = k < 3 ? loss.l1 / 3 : loss.alpha;
-        sum += weight * ::fabsf(pixel.value[k]);
+        pixel_loss += weight * ::fabsf(pixel.value[k]);
         pixel.value[k] = l1_vjp(pixel.value[k], weight);
+        if (loss.cells > 0) pixel.value[k] += cell_slope(loss, sum.value[k], weight);
     }
-    return sum;
+    return pixel_loss;
 }
 
 // Returns the weight of a picture: one over its loss. So the sum over pictures measures

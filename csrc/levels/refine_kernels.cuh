@@ -40,6 +40,32 @@ struct WindowPixel {
     __device__ bool is_in_window() const { return pixel < width * height; }
 };
 
+// A pixel of a window, for kernels in which kCellSide x kCellSide neighbouring threads
+// have a cell.
+struct CellPixel {
+    size_t width, x, y;
+    bool is_in_window;
+
+    __device__ explicit CellPixel(const FrameImage& image)
+        : width(static_cast<size_t>(image.width)) {
+        constexpr size_t kOfCell = kCellSide * kCellSide;
+        const size_t thread = size_t(blockIdx.x) * kThreads + threadIdx.x;
+        const size_t cell = thread / kOfCell, place = thread % kOfCell, across = num_cells(width);
+        x = cell % across * kCellSide + place % kCellSide;
+        y = cell / across * kCellSide + place / kCellSide;
+        is_in_window = x < width && y < static_cast<size_t>(image.height);
+    }
+    __device__ size_t pixel() const { return y * width + x; }
+
+    // Sums a value over the threads of the cell, in each of them.
+    __device__ static float sum(float value) {
+#pragma unroll
+        for (int offset = kCellSide * kCellSide / 2; offset > 0; offset /= 2)
+            value += __shfl_xor_sync(kAllLanes, value, offset);
+        return value;
+    }
+};
+
 // Computes the gradients of pixels as if all windows had the weight 1, and the loss of
 // each block. One thread per pixel. `planes` has room for `most_pixels` pixels per
 // window.
@@ -47,17 +73,22 @@ __global__ void __launch_bounds__(kThreads)
     compare_kernel(const WindowTables* windows, LossWeights loss, size_t most_pixels, float* planes,
                    double* loss_of_block) {
     const unsigned w = blockIdx.y;
-    const WindowPixel p(*windows, w);
+    const FrameImage& image = windows->image[w];
+    const CellPixel p(image);
+    PixelValues pixel{};
+    if (p.is_in_window) {
+        const PixelValues wanted = windows->target[w].at(p.pixel());
+        pixel = ReadPlanes{image.planes.color, image.planes.alpha}.at(p.pixel());
+        for (int k = 0; k < 4; ++k) pixel.value[k] -= wanted.value[k];
+    }
+    PixelValues of_cell{};
+    for (int k = 0; k < 4; ++k) of_cell.value[k] = CellPixel::sum(pixel.value[k]);
     double pixel_loss = 0;
-    if (p.is_in_window()) {
-        const ReadPlanes drawn{p.image.planes.color, p.image.planes.alpha};
-        PixelValues values = drawn.at(p.pixel);
-        const PixelValues wanted = windows->target[w].at(p.pixel);
-        for (int k = 0; k < 4; ++k) values.value[k] -= wanted.value[k];
-        pixel_loss = put_slopes(loss, values);
+    if (p.is_in_window) {
+        pixel_loss = put_slopes(loss, of_cell, pixel);
         const PicturePlanes slopes = planes_of_window(planes, most_pixels, w);
-        for (size_t k = 0; k < 3; ++k) slopes.color[3 * p.pixel + k] = values.value[k];
-        slopes.alpha[p.pixel] = values.value[3];
+        for (size_t k = 0; k < 3; ++k) slopes.color[3 * p.pixel() + k] = pixel.value[k];
+        slopes.alpha[p.pixel()] = pixel.value[3];
     }
     __shared__ double of_warp[kThreads / 32];
     pixel_loss = warp_sum(pixel_loss);

@@ -416,7 +416,7 @@ def planned_views(pictures, num_windows):
 
 
 def loss_of_window(window, drawn, leaves, samples, camera):
-    """The loss of a window relative to its own value, as torch computes it."""
+    """The loss of a window relative to that of its pixels, as torch computes it."""
     import torch
 
     shape = replace(camera, K=window.K, width=window.width, height=window.height)
@@ -425,8 +425,18 @@ def loss_of_window(window, drawn, leaves, samples, camera):
         torch.tensor(box_downsample(array, samples).astype(np.float64))
         for array in (larger.color, larger.alpha)
     )
-    loss = (drawn.color - color).abs().mean() + 0.5 * (drawn.alpha - alpha).abs().mean()
-    return loss / (loss.detach() + 1e-4)
+    differences = torch.cat([drawn.color - color, (drawn.alpha - alpha)[..., None]], dim=-1)
+    weights = torch.tensor([1 / 3, 1 / 3, 1 / 3, 0.5], dtype=torch.float64)
+    of_pixels = (differences.abs() @ weights).mean()
+    border = (0, -window.width % 4, 0, -window.height % 4)
+    padded = torch.nn.functional.pad(differences.permute(2, 0, 1), border)
+    means = torch.nn.functional.avg_pool2d(padded, 4)
+    of_each = torch.nn.functional.smooth_l1_loss(
+        means, torch.zeros_like(means), reduction="none", beta=1e-4
+    )
+    of_cells = 16 * of_each.sum((1, 2)) @ weights
+    loss = of_pixels + of_cells / (window.width * window.height)
+    return loss / (of_pixels.detach() + 1e-4)
 
 
 class Slopes:

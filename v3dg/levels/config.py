@@ -78,7 +78,8 @@ class BuildConfig:
             at half the size if there are more than a million leaves. With "measured",
             and if levels are fitted with a filter, a measurement decides: some groups
             of level 1 are fitted with 0.05 px² and without a filter, and the asset is
-            smooth if the filter hardly improves it.
+            smooth if the filter hardly improves it. An asset of mostly faint gaussians
+            then has no filter, either, because it would lose alpha.
         asset_filter_px2: The filter of level 0. None means no filter, or the filter of
             the training if the asset is antialiased. The filter used for training (0.3
             for the original 3DGS) suits pictures of the size of the photographs;
@@ -88,6 +89,9 @@ class BuildConfig:
             for its filter. None uses the asset's own value (`Gaussians.antialiased`),
             or False if that is None.
         loss_l1, loss_dssim, loss_alpha: Weights of the parts of the loss.
+        loss_cells: Weight of the L1 distances between means of cells of 4 x 4 px,
+            relative to those between pixels. A fit by pixels alone leads to medians,
+            which thin out what is faint or sparse.
         step_position: Step size of positions, in radii of the group, or in world units
             if `position_in_world`. `step_log_scale`, `step_quat`, `step_logit`,
             `step_sh0` and `step_sh_rest` are the step sizes of log scales, quaternions,
@@ -133,6 +137,7 @@ class BuildConfig:
     loss_l1: _Weight = 1.0
     loss_dssim: _Weight = 0.0
     loss_alpha: _Weight = 0.5
+    loss_cells: _Weight = 1.0
     step_position: _StepSize = 0.0028
     position_in_world: bool = False
     step_log_scale: _StepSize = 0.032
@@ -311,6 +316,7 @@ class BuildConfig:
             loss_l1=0.8,
             loss_dssim=0.2,
             loss_alpha=0.1,
+            loss_cells=0.0,
             step_position=1.6e-5,
             position_in_world=True,
             step_log_scale=5e-3,

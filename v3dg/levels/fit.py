@@ -30,6 +30,7 @@ def fit_config(config: BuildConfig, seed: int, level: int) -> _core.FitConfig:
         loss_l1=config.loss_l1,
         loss_dssim=config.loss_dssim,
         loss_alpha=config.loss_alpha,
+        loss_cells=config.loss_cells,
         step_position=config.step_position,
         step_log_scale=config.step_log_scale,
         step_quat=config.step_quat,

@@ -1,7 +1,10 @@
-"""Measures whether an asset is smooth: its gaussians are about as wide as the distances
-between them, so that no filter is needed."""
+"""Measures whether an asset needs the filter of coarser levels. A smooth one does not,
+because its gaussians are about as wide as the distances between them; a faint one loses
+alpha by it."""
 
 from dataclasses import replace
+
+import numpy as np
 
 from v3dg import _device
 from v3dg._device import Device
@@ -12,6 +15,9 @@ from v3dg.levels.leaves import Leaves
 from v3dg.levels.plan import Plan
 from v3dg.levels.simplify import LevelBuilder
 
+# Opacities below this are faint: with the opacity that compensates for a filter, much
+# of such a gaussian is below the least alpha that is drawn, 1/255.
+_FAINT_OPACITY = 0.1
 # Number of groups of level 1 that are fitted twice: with a filter of this variance, and
 # without a filter.
 _GROUPS = 32
@@ -28,7 +34,7 @@ def measured_config(
     config: BuildConfig, plan: Plan, leaves: Leaves, seed: int, codec: Codec, device: Device
 ) -> BuildConfig:
     """Return the config that levels are built with: "measured" becomes "yes" if the
-    asset is smooth."""
+    asset is smooth; a faint asset has no filter."""
     smooth = replace(config, smooth="yes", filter_px2=0.0)
     if config.smooth == "yes":
         return smooth
@@ -43,6 +49,8 @@ def measured_config(
     first_leaves = level_1.leaf_offset[stride // 2 : -1 : stride].tolist()
     parts = [_device.place(leaves.read(first, first + size), device) for first in first_leaves]
     sample = Gaussians.concatenate(parts)
+    if _is_faint(sample):
+        return replace(config, filter_px2=0.0)
     # The sample consists of the groups that were read. Each is divided into two
     # clusters, for any group size of the build.
     sample_config = replace(
@@ -63,3 +71,11 @@ def measured_config(
     if losses[1] < _NEEDED * losses[0]:
         return smooth
     return config
+
+
+def _is_faint(gaussians: Gaussians) -> bool:
+    """Whether faint gaussians have most of the area, weighted by opacity."""
+    host = gaussians.numpy()
+    scales = np.sort(host.scales.astype(np.float64), axis=1)
+    weight = scales[:, 1] * scales[:, 2] * host.opacities
+    return bool(weight[host.opacities < _FAINT_OPACITY].sum() > weight.sum() / 2)

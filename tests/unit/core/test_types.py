@@ -40,7 +40,7 @@ FIT = {
         ("steps", "views_per_step", "num_views", "supersample", "image_size", "seed"), 1
     ),
     **dict.fromkeys(("px2_per_gaussian", "distance", "filter_px2", "final_step", "beta2"), 1.0),
-    **dict.fromkeys(("loss_l1", "loss_dssim", "loss_alpha"), 1.0),
+    **dict.fromkeys(("loss_l1", "loss_dssim", "loss_alpha", "loss_cells"), 1.0),
     **dict.fromkeys(("step_position", "step_log_scale", "step_quat"), 1.0),
     **dict.fromkeys(("step_logit", "step_sh0", "step_sh_rest"), 1.0),
     **dict.fromkeys(("antialiased", "position_in_world"), True),

@@ -1,0 +1,81 @@
+"""Cuts keep the total alpha and colour of what is faint."""
+
+import numpy as np
+import pytest
+
+import v3dg
+from devices import host
+from v3dg import BuildConfig
+
+SAMPLES = 8
+DISTANCE = 14.0
+
+
+@pytest.fixture(scope="module")
+def faint_cloud():
+    """3,000 faint gaussians around the origin."""
+    rng = np.random.default_rng(1)
+    count = 3_000
+    return v3dg.Gaussians(
+        means=rng.normal(size=(count, 3)).astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        scales=rng.uniform(0.02, 0.07, (count, 3)).astype(np.float32),
+        opacities=rng.uniform(0.02, 0.08, count).astype(np.float32),
+        sh=rng.uniform(-0.5, 1.5, (count, 1, 3)).astype(np.float32),
+    )
+
+
+def cameras(width):
+    """Views of the cloud from all sides, this many px wide."""
+    rng = np.random.default_rng(2)
+    for _ in range(24):
+        eye = rng.normal(size=3)
+        eye *= DISTANCE / np.linalg.norm(eye)
+        yield v3dg.Camera.look_at(
+            eye, (0, 0, 0), rng.normal(size=3), 0.6, width=width, height=width
+        )
+
+
+def totals(image):
+    """Sums of colour and alpha over a picture, (4,)."""
+    planes = [host(image.color), host(image.alpha)[..., None]]
+    return np.concatenate(planes, axis=-1).sum((0, 1), dtype=np.float64)
+
+
+def ratios(asset, bundle, width, device):
+    """Total colour and alpha of the cut at the default tolerance over those of the
+    asset at many samples a pixel, (4,)."""
+    of_cuts = np.zeros(4)
+    of_asset = np.zeros(4)
+    for camera in cameras(width):
+        of_cuts += totals(v3dg.render(bundle, camera, device=device))
+        of_asset += totals(v3dg.rasterize(asset, camera.scaled(SAMPLES))) / SAMPLES**2
+    return of_cuts / of_asset
+
+
+def test_cuts_of_a_faint_asset_keep_its_alpha_and_colour(faint_cloud, device):
+    bundle = v3dg.build_bundle(faint_cloud, device=device, progress=False)
+    for width in (14, 20):
+        np.testing.assert_allclose(ratios(faint_cloud, bundle, width, device), 1, atol=0.02)
+
+
+def test_a_fit_by_pixels_alone_loses_alpha(faint_cloud):
+    """Medians of sparse pixels are below their means."""
+    config = BuildConfig(loss_cells=0.0, smooth="no")
+    bundle = v3dg.build_bundle(faint_cloud, config=config, device="cpu", progress=False)
+    assert (ratios(faint_cloud, bundle, 14, "cpu") < 0.96).all()
+
+
+def test_a_faint_asset_has_no_filter(faint_cloud):
+    opaque = v3dg.Gaussians(
+        faint_cloud.means,
+        faint_cloud.quats,
+        faint_cloud.scales / 4,
+        np.full_like(faint_cloud.opacities, 0.9),
+        faint_cloud.sh,
+    )
+    for asset, filter_px2 in ((faint_cloud, 0), (opaque, 0.05)):
+        config = BuildConfig(first_steps=20, steps=20)
+        bundle = v3dg.build_bundle(asset, config=config, device="cpu", progress=False)
+        first = bundle.level_range(1).start
+        np.testing.assert_allclose(bundle.clusters.filter_px2[first], filter_px2, rtol=1e-6)
