@@ -27,8 +27,9 @@ struct FrameBatch {
     // See ProjectInput.
     const PackedPlanes* packed = nullptr;
     const CodedGaussians* coded = nullptr;
-    bool has_shared_items = false;           // whether any may be shared; never with a tape
-    float min_transmittance = kStopsBefore;  // of the images
+    bool has_shared_items = false;  // whether any may be shared; never with a tape
+    // Of the images; kStopsByCut only with a budget.
+    float min_transmittance = kStopsBefore;
     // Whether any may be faded; only items of scenes, which are not shared.
     bool has_faded_items = false;
     const InstanceFactors* factors = nullptr;  // [num_factors], or null

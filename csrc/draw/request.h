@@ -31,7 +31,7 @@ struct Shade {
 
 struct FrameRequest {
     Eyes eyes;        // the cameras of the pictures
-    SelectRule rule;  // of the cut; with a given cut, the tolerance to compare metrics with
+    SelectRule rule;  // of the cut; of a given cut, only the tolerance
     Shade shade;
     FrameLook look = FrameLook::appearance;
     std::optional<GivenCut> cut = {};  // drawn instead of a selected cut

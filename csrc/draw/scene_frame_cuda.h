@@ -104,9 +104,9 @@ class SceneFrame {
                                            const Eyes& eyes, SelectRule& rule,
                                            const EyeImages& pictures, cudaStream_t stream,
                                            const Frame::Place& place);
-    std::unique_ptr<Drawing> draw_given(const SceneTables& scene, const Camera& camera,
-                                        const GivenCut& given, const EyeImages& pictures,
-                                        cudaStream_t stream, const Frame::Place& place);
+    std::unique_ptr<Drawing> draw_given(const SceneTables& scene, const FrameRequest& request,
+                                        const EyeImages& pictures, cudaStream_t stream,
+                                        const Frame::Place& place);
     // Returns the batch for the models that were set.
     FrameBatch batch(const SceneTables& scene, const EyeImages& pictures, const SelectRule& rule,
                      cudaStream_t stream);

@@ -165,8 +165,10 @@ struct FrameLists {
     uint32_t* plan_counts;
     // Plans claimed beyond the first of each block of spread_kernel; initially zero.
     unsigned* taken;
-    uint32_t num_plans;       // num_tiles, or most_plans() if tiles may be in parts
-    float min_transmittance;  // shared by all images
+    uint32_t num_plans;  // num_tiles, or most_plans() if tiles may be in parts
+    // Shared by all images; kStopsByCut for a cut by a budget, whose tolerance is in
+    // the counters.
+    float min_transmittance;
     // The destinations of images without one of their own: of the first and of the
     // second.
     PicturePlanes planes[2] = {};

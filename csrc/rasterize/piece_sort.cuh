@@ -87,7 +87,7 @@ struct BlendShared {
     ListWindow window[3];
     uint32_t lowest, highest;  // range of depths in the piece
     uint32_t crowded;          // number of sampled entries in crowded buckets
-    float stops_behind;        // StopsBehind::transmittance
+    float stops_behind;        // StopsBehind::transmittance, or kStopsBefore
     SpreadLevel level[kMostSpreadLevels];
     // Sums of weight * depth, in the order of TilePixels. Frames without depth do not
     // allocate this member.
