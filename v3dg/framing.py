@@ -17,11 +17,12 @@ import numpy.typing as npt
 
 from v3dg._numbers import Floats
 from v3dg.bundle import Bundle
-from v3dg.cameras import Camera, VectorLike
+from v3dg.cameras import Axis, Camera, VectorLike
 from v3dg.cleaning import examine
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import rotation_from_quaternion
 from v3dg.scene import Scene, Subject
+from v3dg.upright import direction_of
 
 DEFAULT_ELEVATION = math.radians(20)
 """Height of the first camera above the horizon, in radians, for a subject that is seen
@@ -56,6 +57,9 @@ _DIRECTIONS = [step for step in itertools.product((-1, 0, 1), repeat=3) if any(s
 _CLOSED = 0.75
 _CLEARANCE = 0.1 * _VOXELS
 _LEAST_FREE = 0.1
+# Cosine of the angle to the zenith below which a direction counts if a place is open
+# above.
+_SKYWARD = 0.5
 # Share of what blocks that stands free of the outer walls.
 _LEAST_CONTENT = 0.02
 _WALL_VOXELS = 3
@@ -90,6 +94,23 @@ class Framing:
     radius: float
     points: Floats
     _places: "_Places | None" = None
+
+    @property
+    def places(self) -> Floats:
+        """(N, 3) places inside a subject that surrounds its viewer; none for other
+        subjects."""
+        if self._places is None:
+            return np.zeros((0, 3))
+        return self._places.places
+
+    @property
+    def outer_share(self) -> float:
+        """Of a subject that surrounds its viewer: the share of what is seen of it from
+        outside that stands far from all places inside, such as a roof and a garden; 0
+        for other subjects."""
+        if self._places is None:
+            return 0.0
+        return self._places.outer_share
 
     @property
     def is_inside(self) -> bool:
@@ -223,6 +244,19 @@ def frame_subject(subject: Subject) -> Framing:
     center = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = max(float(np.linalg.norm(np.ptp(points, axis=0))) / 2, 1e-6)
     return Framing(center, radius, points, _places(sample))
+
+
+def open_places(subject: Subject, up: Axis) -> Floats:
+    """Return the (N, 3) places with a ground, a free sky and walls around, such as in a
+    street or a yard; none if there are no such places."""
+    grid = _grid(_sample(subject))
+    if grid is None:
+        return np.zeros((0, 3))
+    zenith = np.array(direction_of(up))
+    heights = np.array([zenith @ step / np.linalg.norm(step) for step in _DIRECTIONS])
+    is_blocked = np.isfinite(grid.distances)
+    has_ground = is_blocked[heights.argmin()] & ~is_blocked[heights.argmax()]
+    return _free_places(grid, grid.distances[heights < _SKYWARD], has_ground)
 
 
 def _sample(subject: Subject) -> _Sample:
@@ -425,12 +459,13 @@ class _Grid(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class _Places:
     """Places inside a room: (N, 3), with gaussians (M, 3) that are to be seen from
-    them, and the size of the room."""
+    them, the size of the room, and its `Framing.outer_share`."""
 
     places: Floats
     means: Floats
     weights: Floats
     size: float
+    outer_share: float
     _best: dict[tuple[float, ...], tuple[Floats, float]] = field(default_factory=dict)
 
     def best(self, up: Floats) -> tuple[Floats, float]:
@@ -482,26 +517,53 @@ def _places(sample: _Sample) -> _Places | None:
     grid = _grid(sample)
     if grid is None:
         return None
-    is_blocked = np.isfinite(grid.distances)
-    blocked = is_blocked.mean(axis=0)
-    clearance = np.where(is_blocked, grid.distances, _VOXELS).min(axis=0)
-    is_solid = grid.is_solid
-    places = np.argwhere(~is_solid & (blocked > _CLOSED) & (clearance >= _CLEARANCE))
-    solid = np.argwhere(is_solid)
-    if not len(places) or not len(solid):
-        return None
-    middle = np.prod(np.ptp(solid, axis=0) + 1) * 0.343
-    is_open = ~is_solid & (blocked < 0.6)
-    near_outside = _grown(is_open, _WALL_VOXELS)
-    weight = np.where(is_solid, grid.density, 0.0)
-    content = weight[~near_outside].sum() / max(weight.sum(), 1e-12)
-    if len(places) < _LEAST_FREE * middle or content < _LEAST_CONTENT:
+    places = _free_places(grid, grid.distances, ~grid.is_solid)
+    if not len(places):
         return None
     size = grid.side * _VOXELS
     low = grid.origin
     is_inside = ((sample.means >= low) & (sample.means <= low + size)).all(axis=1)
     rows = np.flatnonzero(is_inside)[:: max(int(is_inside.sum()) // 5000, 1)]
-    return _Places(grid.center(places), sample.means[rows], sample.weights[rows], size)
+    return _Places(places, sample.means[rows], sample.weights[rows], size, _outer_share(grid))
+
+
+def _outer_share(grid: _Grid) -> float:
+    """Return the share of what is seen from outside that is farther than a wall from
+    all voxels that are closed on nearly all sides."""
+    is_blocked = np.isfinite(grid.distances)
+    is_closed = ~grid.is_solid & (is_blocked.mean(axis=0) > _CLOSED)
+    is_inner = _grown(is_closed, _WALL_VOXELS, beyond=False)
+    visible = np.where(grid.is_solid & ~is_blocked.all(axis=0), grid.density, 0.0)
+    return float(visible[~is_inner].sum() / max(visible.sum(), 1e-300))
+
+
+def _free_places(
+    grid: _Grid, distances: npt.NDArray[np.float32], is_possible: npt.NDArray[np.bool_]
+) -> Floats:
+    """Return the (N, 3) free places that are closed on nearly all sides; none if they
+    have too small a share of the middle, or nothing stands among them.
+
+    Args:
+        distances: (D, V, V, V) those of the grid in the directions that count.
+        is_possible: (V, V, V) whether a voxel may be such a place.
+    """
+    is_blocked = np.isfinite(distances)
+    blocked = is_blocked.mean(axis=0)
+    clearance = np.where(is_blocked, distances, _VOXELS).min(axis=0)
+    is_solid = grid.is_solid
+    is_place = is_possible & ~is_solid & (blocked > _CLOSED) & (clearance >= _CLEARANCE)
+    places = np.argwhere(is_place)
+    solid = np.argwhere(is_solid)
+    if not len(places) or not len(solid):
+        return np.zeros((0, 3))
+    middle = np.prod(np.ptp(solid, axis=0) + 1) * 0.343
+    is_open = ~is_solid & (blocked <= _CLOSED)
+    near_outside = _grown(is_open, _WALL_VOXELS, beyond=True)
+    weight = np.where(is_solid, grid.density, 0.0)
+    content = weight[~near_outside].sum() / max(weight.sum(), 1e-12)
+    if len(places) < _LEAST_FREE * middle or content < _LEAST_CONTENT:
+        return np.zeros((0, 3))
+    return grid.center(places)
 
 
 def _grid(sample: _Sample) -> _Grid | None:
@@ -553,10 +615,10 @@ def _shifted(step: int) -> slice:
     return slice(max(step, 0), _VOXELS + min(step, 0))
 
 
-def _grown(mask: npt.NDArray[np.bool_], count: int) -> npt.NDArray[np.bool_]:
-    """Return a mask that is grown by `count` voxels; all voxels outside of the grid
-    belong to it."""
-    grown = np.pad(mask, count, constant_values=True)
+def _grown(mask: npt.NDArray[np.bool_], count: int, *, beyond: bool) -> npt.NDArray[np.bool_]:
+    """Return a mask that is grown by `count` voxels; `beyond` says whether the voxels
+    outside of the grid belong to it."""
+    grown = np.pad(mask, count, constant_values=beyond)
     for _ in range(count):
         wider = grown.copy()
         for axis in range(3):

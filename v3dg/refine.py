@@ -3,14 +3,16 @@ each other."""
 
 import os
 from collections.abc import Iterable, Mapping
+from typing import get_args
 
 from v3dg import _device
 from v3dg._device import Device
-from v3dg._numbers import check_type, real, whole
+from v3dg._numbers import check_type, one_of, real, refuse, whole
 from v3dg._progress import Progress
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.levels.refined import DROP, refined_bundle
+from v3dg.levels.viewpoints import SeenFrom
 from v3dg.opening import File
 
 
@@ -18,6 +20,7 @@ def refine_bundle(
     bundle: Bundle | File,
     *,
     cameras: Iterable[Camera] | Mapping[str, Camera] = (),
+    seen_from: SeenFrom = "auto",
     steps: int = 30_000,
     drop: float = DROP,
     seed: int = 0,
@@ -41,9 +44,14 @@ def refine_bundle(
     Args:
         bundle: A bundle of `build_bundle`, or its file. The function takes about six
             times the bundle's memory.
-        cameras: Views of the asset, also by name: for a room, those of its photographs.
-            Views from elsewhere may get worse. Without cameras, pictures are taken from
-            all around.
+        cameras: Views of the asset, also by name, such as those of its photographs.
+            Views from elsewhere may get worse.
+        seen_from: Where pictures are taken without cameras. "outside": from all around.
+            "inside": from up to 96 eyes in the free space that the asset surrounds.
+            "both". "auto" finds out: inside if the asset surrounds a free place with
+            something in it, as a room does; both if it is open above, as a street is,
+            or if most that is seen from outside is not seen from inside; else outside.
+            The config of the result says which.
         steps: Number of pictures that are compared. A GPU takes sixteen for each step
             of its gradients, and rounds up.
         drop: Share of a level's visibility, 0 to 0.5, up to which its least visible
@@ -55,7 +63,8 @@ def refine_bundle(
 
     Raises:
         TypeError: ``bundle`` is not a bundle, or a camera is not a camera.
-        ValueError: There are no steps, or the share or the seed is out of range.
+        ValueError: There are no steps, the share or the seed is out of range, or the
+            asset surrounds no place and is said to be seen from inside.
         RuntimeError: The device is "cuda" and cannot be used.
         KeyboardInterrupt: Ctrl-C was pressed; threads have stopped.
     """
@@ -67,6 +76,9 @@ def refine_bundle(
     cameras = list(cameras)
     for number, camera in enumerate(cameras):
         check_type(f"cameras[{number}]", camera, Camera, "a Camera")
+    one_of(seen_from, "seen_from", get_args(SeenFrom))
+    if seen_from != "auto" and cameras:
+        refuse("seen_from", f"auto with cameras, got {seen_from}")
     steps = whole(steps, "steps", "1 step or more", 1, 1_000_000)
     drop = real(drop, "drop", "a share of 0 to 0.5", 0, 0.5)
     seed = whole(seed, "seed", "0 to 2^58 - 1", 0, (1 << 58) - 1)
@@ -74,6 +86,7 @@ def refine_bundle(
     return refined_bundle(
         bundle,
         cameras=cameras,
+        seen_from=seen_from,
         steps=steps,
         drop=drop,
         seed=seed,

@@ -51,7 +51,7 @@ def memory():
 def kinds_of(gaussians):
     """Return the float32 bundle as built, its codes, and a float32 bundle of the
     decoded codes."""
-    built = v3dg.build_bundle(gaussians, device=DEVICE, progress=False)
+    built = v3dg.build_bundle(gaussians, device=DEVICE, progress=False, quality="draft")
     codes = Bundle(built.clusters, built.groups, built.gaussians, codec="quantized")
     rows = Bundle(codes.clusters, codes.groups, codes.gaussians)
     return {"float32": built, "quantized": codes, "decoded": rows}

@@ -12,13 +12,23 @@ from v3dg.bundle import Bundle
 from v3dg.gaussians import Gaussians
 from v3dg.io import loaded
 from v3dg.levels.config import BuildConfig
+from v3dg.levels.default_quality import DraftWarning, chosen_quality
 from v3dg.levels.files import build_file, levels_path
 from v3dg.levels.leaves import MemoryLeaves
+from v3dg.levels.memory import free_bytes
 from v3dg.levels.quality import Quality
 from v3dg.levels.unfinished import discard_levels
+from v3dg.levels.viewpoints import SeenFrom
 from v3dg.levels.whole import build_into, devices_for
 
-__all__ = ["BuildConfig", "build_bundle", "build_file", "discard_levels", "levels_path"]
+__all__ = [
+    "BuildConfig",
+    "DraftWarning",
+    "build_bundle",
+    "build_file",
+    "discard_levels",
+    "levels_path",
+]
 
 
 def build_bundle(
@@ -32,7 +42,8 @@ def build_bundle(
     unusable: Literal["drop", "refuse"] = "drop",
     executor: Executor | None = None,
     codec: Literal["float32", "quantized"] = "float32",
-    quality: Quality = "draft",
+    quality: Quality | None = None,
+    seen_from: SeenFrom = "auto",
 ) -> Bundle:
     """Build all levels of one asset (V3DG, algorithm 1; docs/levels.md lists the
     differences).
@@ -71,9 +82,13 @@ def build_bundle(
         quality: "draft" leaves the levels as they are built. "standard" then refines
             them together (`v3dg.refine_bundle`) with 20,000 pictures and one more for
             every 50 gaussians, at most 100,000: seconds on a GPU, minutes on a CPU.
-            "best" uses five times as many. The levels at `resume_path` stay unrefined,
-            and the refined bundle is in memory. A place that is seen from inside needs
-            `v3dg.refine_bundle` with cameras instead.
+            "best" uses five times as many. docs/levels.md has the time and the gain of
+            each. None means "standard" on a GPU and "draft" on a CPU, and for a config
+            without steps. An asset of more than 4,000,000 gaussians, or whose
+            refinement does not fit in the free memory, is then a draft, too, with a
+            `v3dg.levels.DraftWarning`. The levels at `resume_path` stay unrefined, and
+            the refined bundle is in memory.
+        seen_from: From where a refinement takes its pictures, see `v3dg.refine_bundle`.
 
     Raises:
         ValueError: The asset has no gaussian that can be drawn, or a setting is wrong.
@@ -95,6 +110,7 @@ def build_bundle(
     has_place = executor is None or resume_path is not None
     check("resume_path", has_place, "a file that all workers of the executor reach, got None")
     config = leaves.settings(config)
+    quality = chosen_quality(quality, config, leaves, devices[0], free_bytes())
     return build_into(
         resume_path,
         leaves,
@@ -104,5 +120,6 @@ def build_bundle(
         progress,
         codec=codec,
         quality=quality,
+        seen_from=seen_from,
         executor=executor,
     )

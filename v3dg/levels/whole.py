@@ -34,6 +34,7 @@ from v3dg.levels.scheduler import Watch, completed, watch_over
 from v3dg.levels.simplify import Level, LevelBuilder, LevelTables, Show
 from v3dg.levels.smooth import measured_config
 from v3dg.levels.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
+from v3dg.levels.viewpoints import SeenFrom
 
 # The number of leaves in a unit. It keeps a GPU busy and needs little memory. The last
 # bits of a bundle depend on it.
@@ -68,7 +69,8 @@ def build_into(
     progress: Progress,
     *,
     codec: str,
-    quality: Quality = "draft",
+    quality: Quality,
+    seen_from: SeenFrom = "auto",
     bundle_path: Path | None = None,
     most_units: int | None = None,
     executor: Executor | None = None,
@@ -83,7 +85,7 @@ def build_into(
     units = plan.units(UNIT_LEAVES)
     page_codec = codec_of(codec, leaves.sh_degree)
     file = BundlePlan(plan.layout, page_codec, made_with(leaves, config, seed, codec, up))
-    refinement = refinement_of(quality, leaves.num_gaussians, file.config["seed"])
+    refinement = refinement_of(quality, leaves.num_gaussians, file.config["seed"], seen_from)
     parts = _parts(plan, units, file)
     opened = _opened(path, file, parts, devices[0], bundle_path)
     with _device.memory_errors(), opened as store:
