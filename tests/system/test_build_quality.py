@@ -323,6 +323,7 @@ def test_a_build_of_a_room_says_from_where_it_is_seen(
     short, tmp_path, monkeypatch, capsys, seen_from
 ):
     """And is kept when it goes on."""
+    monkeypatch.setattr("v3dg.cli.build.BuildConfig", lambda: QUICK)
     file = tmp_path / "room.ply"
     v3dg.write_asset(file, room())
     options = {"up": "-y", "device": "cpu", "quality": "standard", "seen_from": seen_from}

@@ -13,6 +13,7 @@ stop at a thousandth of the light, and by the tolerance of their cut.
 from __future__ import annotations
 
 import contextlib
+import json
 import statistics
 import tempfile
 import time
@@ -33,7 +34,7 @@ from v3dg._judges import Judges
 from v3dg.levels.quality import Quality
 from v3dg.metrics import draw_truth
 from v3dg.pictures import Picture, to_8bit
-from v3dg.scene import read_scene
+from v3dg.scene.file import read_scene
 
 Row = JsonObject
 
@@ -113,13 +114,19 @@ def measured(
     return bundles
 
 
+def scene_of(layout: Path, donut: v3dg.Bundle) -> tuple[v3dg.Scene, dict[str, v3dg.Camera]]:
+    """The scene of a layout of donuts, and its cameras."""
+    name = json.loads(layout.read_text())["asset"]
+    return read_scene(layout, bundles={name: donut})
+
+
 def scene_pictures(
     config: Config, layout: Path, bundles: dict[Quality, v3dg.Bundle]
 ) -> Iterator[tuple[Row, Picture, Picture]]:
     for camera_number in config.cameras:
         truth: Picture | None = None
         for quality, bundle in bundles.items():
-            scene, cameras = read_scene(layout, {"donut": bundle})
+            scene, cameras = scene_of(layout, bundle)
             camera = list(cameras.values())[camera_number]
             if truth is None:
                 truth = draw_truth(scene, camera, config.device)
@@ -156,7 +163,7 @@ def compare_scenes(
 def frame_times(config: Config, layout: Path, bundle: v3dg.Bundle) -> Iterator[Row]:
     """Yield the times of frames that stop at a thousandth, and by their tolerance, in
     turn."""
-    scene, cameras = read_scene(layout, {"donut": bundle})
+    scene, cameras = scene_of(layout, bundle)
     renderer = v3dg.Renderer(scene, device=config.device)
     of_layout = [list(cameras.values())[number] for number in config.cameras]
     for tolerance in _STOPPED:
