@@ -1,6 +1,6 @@
 #pragma once
 
-// Produces items on background threads before they are needed.
+// Computes items ahead of time, on background threads.
 
 #include <omp.h>
 
@@ -16,9 +16,9 @@
 
 namespace v3dg {
 
-// Produces items 0 to count - 1, which are consumed in that order. Thread i %
-// num_threads produces item i, with a single OpenMP thread. Item i is stored in slot i
-// % num_places until it has been consumed.
+// Computes items 0 to count - 1, which are used in this order. Thread i % num_threads
+// computes item i, with a single OpenMP thread. Item i occupies slot i % num_places
+// until it has been used.
 class Ahead {
   public:
     Ahead(uint64_t count, unsigned num_threads, unsigned num_places,
@@ -39,15 +39,15 @@ class Ahead {
     Ahead(const Ahead&) = delete;
     Ahead& operator=(const Ahead&) = delete;
 
-    // Waits for the next item and returns its slot. Rethrows an exception thrown while
-    // the item was produced.
+    // Waits for the next item, and returns its slot. Rethrows the exception of the
+    // computation, if any.
     size_t wait_for_next() {
         const MutexLock lock(busy_);
         while (!is_made_[used_ % num_places_] && !error_) changed_.wait(busy_);
         if (error_) std::rethrow_exception(error_);
         return used_ % num_places_;
     }
-    // Releases the slot of the next item for reuse.
+    // Frees the slot of the next item.
     void next_is_used() {
         const MutexLock lock(busy_);
         is_made_[used_++ % num_places_] = false;
@@ -70,14 +70,14 @@ class Ahead {
             changed_.notify_all();
         }
     }
-    // Waits until the slot of an item is free. Returns false if items are no longer
-    // wanted.
+    // Waits until the slot of an item is free. Returns false if no more items are
+    // needed.
     bool wait_for_slot(uint64_t item) {
         const MutexLock lock(busy_);
         while (item >= used_ + num_places_ && !is_over_) changed_.wait(busy_);
         return !is_over_;
     }
-    // Clang does not check handlers of exceptions, so the lock is not in the handler.
+    // Not in the catch block, which Clang's thread-safety analysis skips.
     void fail(const std::exception_ptr& error) noexcept {
         const MutexLock lock(busy_);
         error_ = error;

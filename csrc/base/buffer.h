@@ -1,7 +1,7 @@
 #pragma once
 
-// Memory on the host that loses its contents when it grows. The counterpart on a device
-// is DeviceBuffer (device.h).
+// Host memory that loses its contents when it grows. The counterpart on devices is
+// DeviceBuffer (device.h).
 
 #include <sys/mman.h>
 
@@ -13,9 +13,9 @@
 
 namespace v3dg {
 
-// Returns memory that begins at a cache line, or null. Large blocks are in huge pages
-// where the system has them, because scattered reads would otherwise wait for the page
-// table.
+// Returns memory that is aligned to a cache line, or null. Large blocks use huge pages
+// if the system supports them, because scattered reads would otherwise wait for the
+// page table.
 inline void* allocate_pages(size_t bytes) {
     constexpr size_t kHugePage = size_t(2) << 20;
     const size_t alignment = bytes < 2 * kHugePage ? 64 : kHugePage;
@@ -27,7 +27,7 @@ inline void* allocate_pages(size_t bytes) {
     return memory;
 }
 
-// Owns elements of a plain type, not initialised. Growing loses the contents.
+// An array of a plain type, not initialised. When it grows, the contents are lost.
 template <class T>
 class Buffer {
   public:
@@ -43,7 +43,7 @@ class Buffer {
     }
     ~Buffer() { std::free(data_); }
 
-    // Makes room for `size` elements; throws std::bad_alloc when there is none.
+    // Makes room for `size` elements. Throws std::bad_alloc.
     T* reserve(size_t size) {
         if (size > capacity_) {
             std::free(data_);

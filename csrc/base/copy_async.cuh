@@ -1,14 +1,14 @@
 #pragma once
 
-// Asynchronous copies from device to shared memory, which use no registers.
+// Asynchronous copies from device memory to shared memory, which use no registers.
 
 #include <cuda_runtime.h>
 
 namespace v3dg {
 namespace cuda {
 
-// Copies 16 or 8 bytes from device to shared memory. The copies are complete once the
-// thread has called wait_for_copies().
+// Copies 16 or 8 bytes from device memory to shared memory. The copies of a thread are
+// complete when wait_for_copies() returns in that thread.
 __device__ inline void copy_async(float4* shared, const float4* from) {
 #ifdef __CUDA_ARCH__
     asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(

@@ -11,7 +11,8 @@ namespace v3dg {
 namespace cuda {
 
 [[noreturn]] static void fail(cudaError_t error, const char* what) {
-    cudaGetLastError();  // a later call must not report this error again
+    // clear the error, so that a later call does not report it again
+    cudaGetLastError();
     throw std::runtime_error(std::string("cuda: ") + what +
                              " failed: " + cudaGetErrorString(error));
 }
@@ -65,7 +66,7 @@ void allow_shared_memory(const void* kernel, size_t bytes, const char* name) {
 }
 
 bool can_start_early(const void* kernel) {
-    // The first architecture whose kernels can wait for their predecessor.
+    // The first compute capability that supports cudaGridDependencySynchronize().
     constexpr int kFirst = 90;
     static Mutex mutex;
     static std::map<std::pair<int, const void*>, bool> known V3DG_GUARDED_BY(mutex);
@@ -81,8 +82,7 @@ bool can_start_early(const void* kernel) {
     return found->second;
 }
 
-// The package has its own pool, so that no other library decides how long memory is
-// kept.
+// A separate pool, so that no other library determines how long memory is kept.
 static cudaMemPool_t pool_of_current_device() {
     static Mutex mutex;
     static std::vector<cudaMemPool_t> pools V3DG_GUARDED_BY(mutex);
@@ -96,8 +96,8 @@ static cudaMemPool_t pool_of_current_device() {
         properties.location.id = device;
         cudaMemPool_t pool;
         check(cudaMemPoolCreate(&pool, &properties), "cudaMemPoolCreate");
-        // Freed memory stays in the pool until an allocation fails, because mapping it
-        // again costs milliseconds.
+        // The pool keeps up to 1 GiB of freed memory, because mapping it again takes
+        // milliseconds.
         uint64_t keep = uint64_t(1) << 30;
         check(cudaMemPoolSetAttribute(pool, cudaMemPoolAttrReleaseThreshold, &keep),
               "cudaMemPoolSetAttribute");
@@ -114,8 +114,8 @@ void* allocate(size_t bytes, cudaStream_t stream) {
     void* pointer = nullptr;
     cudaError_t error = cudaMallocFromPoolAsync(&pointer, bytes, pool, stream);
     if (error == cudaErrorMemoryAllocation) {
-        // The free memory of the pool may be fragmented, and pending work on other
-        // streams may soon free more.
+        // Try again. The pool's free memory may be fragmented, and work on other
+        // streams may free more.
         cudaGetLastError();
         check(cudaDeviceSynchronize(), "cudaDeviceSynchronize");
         check(cudaMemPoolTrimTo(pool, 0), "cudaMemPoolTrimTo");
@@ -137,7 +137,8 @@ void release(void* pointer, int device, cudaStream_t stream) noexcept {
     int current = device;
     const bool is_elsewhere = cudaGetDevice(&current) == cudaSuccess && current != device &&
                               cudaSetDevice(device) == cudaSuccess;
-    // At exit the driver may already be unloaded, which has freed the memory.
+    // Ignore errors: at exit, the driver may be unloaded already, which frees the
+    // memory.
     if (cudaFreeAsync(pointer, stream) != cudaSuccess) cudaGetLastError();
     if (is_elsewhere && cudaSetDevice(current) != cudaSuccess) cudaGetLastError();
 }
@@ -171,12 +172,12 @@ StreamMutex::StreamMutex() {
 
 StreamMutex::~StreamMutex() {
     if (cudaEventDestroy(done_) != cudaSuccess)
-        cudaGetLastError();  // the driver may be unloaded at exit
+        cudaGetLastError();  // ignore: at exit, the driver may be unloaded already
 }
 
 void StreamMutex::wait() const noexcept {
     if (cudaEventSynchronize(done_) != cudaSuccess)
-        cudaGetLastError();  // the driver may be unloaded at exit
+        cudaGetLastError();  // ignore: at exit, the driver may be unloaded already
 }
 
 void StreamMutex::acquire(cudaStream_t stream, bool is_captured) {
@@ -192,12 +193,13 @@ void StreamMutex::release(cudaStream_t stream, bool is_captured) noexcept {
     if (!is_captured) {
         last_ = stream;
         if (cudaEventRecord(done_, stream) != cudaSuccess)
-            cudaGetLastError();  // the next lock reports it
+            cudaGetLastError();  // the next lock reports the error
     }
     busy_.unlock();
 }
 
-// Clang checks no constructors and destructors, so these only call functions.
+// Only call functions: Clang's thread-safety analysis skips constructors and
+// destructors.
 StreamLock::StreamLock(StreamMutex& mutex, cudaStream_t stream)
     : mutex_(mutex), stream_(stream), is_captured_(is_capturing(stream)) {
     mutex.acquire(stream, is_captured_);

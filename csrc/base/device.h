@@ -1,9 +1,9 @@
 #pragma once
 
-// Memory and errors of the CUDA half. A DeviceBuffer frees itself into a pool of its
-// device; trim_pool() returns the pool's free memory to the driver.
-// docs/architecture.md, "Memory on the GPU", says who owns what and when it is freed.
-// Sources that include this header are built only with CUDA.
+// Device memory and error handling for CUDA. A DeviceBuffer returns its memory to a
+// pool of the device; trim_pool() returns free memory of the pool to the driver.
+// docs/architecture.md, "Memory on the GPU", describes who owns memory and when it is
+// freed. Only sources that are built with CUDA include this header.
 
 #include <cuda_runtime.h>
 
@@ -18,7 +18,7 @@
 namespace v3dg {
 namespace cuda {
 
-// Reports that the device has no room; what() states the requested and the free bytes.
+// The error for a lack of device memory. what() has the requested and the free bytes.
 // Like every std::bad_alloc, it becomes a MemoryError in Python.
 class OutOfMemory : public std::bad_alloc {
   public:
@@ -29,8 +29,8 @@ class OutOfMemory : public std::bad_alloc {
     std::string text_;
 };
 
-// Throws std::runtime_error with CUDA's error text unless the call succeeded; `what`
-// names the call.
+// Throws std::runtime_error with CUDA's error text if `error` is an error. `what` names
+// the call.
 void check(cudaError_t error, const char* what);
 
 // Returns the number of devices; 0 without a driver.
@@ -39,47 +39,45 @@ int current_device();
 // Returns the number of multiprocessors of the current device.
 unsigned num_multiprocessors();
 
-// Returns the bytes of shared memory of one multiprocessor.
+// Returns the bytes of shared memory of a multiprocessor.
 size_t shared_memory_of_multiprocessor();
 
-// Allows the kernel `bytes` of dynamic shared memory on the current device. This is
-// necessary if these bytes and the kernel's static shared memory together exceed 48
-// KiB. The driver has one limit for all threads, so it is only ever raised: a lower one
-// could be set between another thread's request and its launch. `name` is used in error
-// messages.
+// Allows a kernel to use `bytes` of dynamic shared memory on the current device. This
+// is required if its dynamic and static shared memory together exceed 48 KiB. All
+// threads share one limit per kernel, so it is never lowered: another thread may be
+// about to launch the kernel. `name` is for error texts.
 void allow_shared_memory(const void* kernel, size_t bytes, const char* name);
 
-// Returns whether the kernel, compiled for the current device, waits for its
-// predecessor.
+// Returns whether the kernel, as compiled for the current device, waits for the kernel
+// before it (launch_early()).
 bool can_start_early(const void* kernel);
 
-// Returns stream-ordered memory of the current device, from a pool that keeps released
-// memory for the next caller. Throws OutOfMemory.
+// Returns stream-ordered memory of the current device. The pool keeps freed memory for
+// later calls. Throws OutOfMemory.
 void* allocate(size_t bytes, cudaStream_t stream);
-// Releases memory of `device` on one of its streams, whichever device is current.
+// Frees memory of `device` on a stream of that device. Any device may be current.
 void release(void* pointer, int device, cudaStream_t stream) noexcept;
-// Waits for the stream, and returns the pool's free memory to the driver.
+// Waits for the stream, then returns free memory of the pool to the driver.
 void trim_pool(cudaStream_t stream);
 
-// The memory that the pool of the current device has reserved from the driver, and the
-// part of it that is in use.
+// The memory that the pool of the current device holds, and how much of it is in use.
 struct PoolBytes {
     size_t reserved, used;
 };
 PoolBytes pool_bytes();
 
 bool is_capturing(cudaStream_t stream);
-// Throws std::runtime_error while the stream is being captured, because memory
-// allocated by a graph is freed with the graph.
+// Throws std::runtime_error if the stream is being captured. Memory that a graph
+// allocates is freed with the graph.
 void refuse_capture(cudaStream_t stream);
 
-// Guards memory that several threads and streams use in turn.
+// A mutex for memory that several threads and streams use in turn.
 class StreamMutex {
   public:
     StreamMutex();
     ~StreamMutex();
     // Waits until the device has finished the work that was enqueued under the last
-    // lock, and therefore all work before it.
+    // lock, and thus all earlier work.
     void wait() const noexcept;
     StreamMutex(const StreamMutex&) = delete;
     StreamMutex& operator=(const StreamMutex&) = delete;
@@ -94,10 +92,9 @@ class StreamMutex {
     cudaStream_t last_ V3DG_GUARDED_BY(busy_) = nullptr;
 };
 
-// Holds a StreamMutex. Meanwhile the memory belongs to one thread, and work that this
-// thread enqueues on the stream runs after the work that was enqueued under the
-// previous lock. The lock does not order captured work; the code that replays the graph
-// has to do so.
+// Holds a StreamMutex. No other thread can hold it meanwhile. Work that this thread
+// enqueues on `stream` runs after the work that was enqueued under the previous lock.
+// Captured work is not ordered; the code that replays the graph must do that.
 class V3DG_SCOPED_CAPABILITY StreamLock {
   public:
     StreamLock(StreamMutex& mutex, cudaStream_t stream) V3DG_ACQUIRE(mutex.busy_);
@@ -111,9 +108,9 @@ class V3DG_SCOPED_CAPABILITY StreamLock {
     bool is_captured_;
 };
 
-// Owns elements of a plain type, not initialised, on the device that is current when
-// the buffer grows. Growing loses the contents. Code that uses a buffer on several
-// streams orders them itself.
+// An array of a plain type, not initialised, on the device that is current when it
+// grows. When it grows, the contents are lost. Users of several streams must order
+// their work.
 template <class T>
 class DeviceBuffer {
   public:
@@ -127,7 +124,7 @@ class DeviceBuffer {
     }
     ~DeviceBuffer() { release(data_, device_, stream_); }
 
-    // Makes room for `size` elements; memory is allocated and released in the order of
+    // Makes room for `size` elements. Memory is allocated and freed in the order of
     // `stream`.
     T* reserve(size_t size, cudaStream_t stream) {
         if (size > capacity_) {
@@ -142,7 +139,7 @@ class DeviceBuffer {
         stream_ = stream;
         return data_;
     }
-    // Copies elements from the host, whose memory may be reused on return.
+    // Copies elements from the host. The caller may reuse host memory on return.
     T* copy_from(Span<const T> host, cudaStream_t stream) {
         reserve(host.size, stream);
         if (host.size > 0)

@@ -1,14 +1,14 @@
 #pragma once
 
-// Switches the current device of a thread for the duration of a scope.
+// Changes the current device of a thread within a scope.
 
 #include "base/device.h"
 
 namespace v3dg {
 namespace cuda {
 
-// Makes a device the current one of this thread while the guard exists. Streams used
-// meanwhile must belong to that device.
+// Makes a device current in this thread during its lifetime. Streams that are used
+// meanwhile must belong to the device.
 class DeviceGuard {
   public:
     explicit DeviceGuard(int device) : device_(device), before_(current_device()) {

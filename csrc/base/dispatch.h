@@ -1,6 +1,6 @@
 #pragma once
 
-// The device on which an operation runs. bindings/backend.h chooses the backend for it.
+// The device on which an operation runs. bindings/backend.h selects the backend for it.
 
 #include "base/stream.h"
 
@@ -10,7 +10,7 @@
 
 namespace v3dg {
 
-// The host, or a CUDA device with its index.
+// The host (number < 0), or a CUDA device by its index.
 struct Device {
     int number = -1;
 

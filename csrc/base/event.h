@@ -18,15 +18,14 @@ class Event {
     Event(const Event&) = delete;
     Event& operator=(const Event&) = delete;
 
-    // Marks the end of the work enqueued on `stream` so far.
+    // Marks the end of the work that was enqueued on `stream` so far.
     void record(cudaStream_t stream) { check(cudaEventRecord(event_, stream), "cudaEventRecord"); }
-    // Makes work that is enqueued on `stream` from now on wait for the event. The host
-    // does not wait.
+    // Makes later work on `stream` wait for the event. The host does not wait.
     void hold_back(cudaStream_t stream) const {
         check(cudaStreamWaitEvent(stream, event_, 0), "cudaStreamWaitEvent");
     }
-    // Returns at once. If a kernel before the event failed, the error names it as
-    // `work`.
+    // Returns whether the device has reached the event, without waiting. If earlier
+    // work failed, it throws an error with `work` as its name.
     bool has_happened(const char* work) const {
         const cudaError_t state = cudaEventQuery(event_);
         if (state == cudaErrorNotReady) return false;

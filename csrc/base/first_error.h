@@ -1,6 +1,6 @@
 #pragma once
 
-// Exceptions of parallel loops.
+// The transport of exceptions out of parallel loops.
 
 #include <cstddef>
 #include <exception>
@@ -9,8 +9,8 @@
 
 namespace v3dg {
 
-// Carries an exception out of a parallel loop: if several were thrown, the one with the
-// lowest index.
+// Carries an exception out of a parallel loop. If there are several, the one with the
+// lowest index counts.
 class FirstError {
   public:
     template <class Body>
@@ -21,14 +21,14 @@ class FirstError {
             keep_lowest(index, std::current_exception());
         }
     }
-    // Called after the loop.
+    // Rethrows the exception, if any. To be called after the loop.
     void rethrow() {
         const MutexLock lock(mutex_);
         if (error_) std::rethrow_exception(error_);
     }
 
   private:
-    // Clang does not check handlers of exceptions, so the lock is not in the handler.
+    // Not in the catch block, which Clang's thread-safety analysis skips.
     void keep_lowest(size_t index, const std::exception_ptr& error) noexcept {
         const MutexLock lock(mutex_);
         if (error_ && index >= index_) return;

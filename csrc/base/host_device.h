@@ -1,6 +1,6 @@
 #pragma once
 
-// V3DG_HD marks a function that is compiled for the host and, by nvcc, for the device.
+// V3DG_HD marks a function that is compiled for the host and, by nvcc, for devices.
 #ifdef __CUDACC__
 #define V3DG_HD __host__ __device__
 #else

@@ -1,4 +1,4 @@
-// Chooses the instruction set once per process.
+// Chooses the instruction set, once per process.
 
 #include "base/isa.h"
 
@@ -20,8 +20,7 @@ const char* isa_name(Isa isa) {
 
 static Isa widest_isa() {
 #if defined(__x86_64__)
-    // These are the extensions that the compiler may use with -march=x86-64-v4 and
-    // -march=x86-64-v3.
+    // The extensions that compilers use with -march=x86-64-v3 and -march=x86-64-v4.
     __builtin_cpu_init();
     const bool v3 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
                     __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2") &&

@@ -1,22 +1,23 @@
 #pragma once
 
-// Sources that are compiled once for each instruction set, and the choice between their
-// versions.
+// Sources that are compiled once per instruction set, and the choice between the
+// results.
 
 namespace v3dg {
 
-// The instruction sets that the sources in V3DG_SIMD_SOURCES are compiled for.
+// The instruction sets for which the sources in V3DG_SIMD_SOURCES are compiled.
 enum class Isa { baseline, avx2, avx512 };
 
-// Returns the widest instruction set that this processor has, or the one that the
-// environment variable V3DG_ISA names, which is read once. Throws std::runtime_error
-// when the variable names an instruction set that the processor lacks.
+// Returns the widest instruction set of this processor, or the one that the environment
+// variable V3DG_ISA names. The variable is read once. Throws std::runtime_error if the
+// variable is wrong, or the processor lacks the instruction set.
 Isa active_isa();
 const char* isa_name(Isa isa);
 
 }  // namespace v3dg
 
-// Repeats a declaration in each instruction set's namespace.
+// V3DG_DECLARE_PER_ISA repeats a declaration in the namespace of each instruction set.
+// V3DG_DISPATCH_ISA calls the function of the active one.
 #if defined(__x86_64__)
 #define V3DG_DECLARE_PER_ISA(...)           \
     namespace isa_baseline { __VA_ARGS__; } \

@@ -1,7 +1,6 @@
 #pragma once
 
-// Launches kernels, and provides the helpers for blocks and warps that most kernels
-// use.
+// Launches kernels. Also the helpers for blocks and warps that most kernels use.
 
 #include "base/device.h"
 
@@ -10,8 +9,8 @@ namespace cuda {
 
 constexpr unsigned kAllLanes = 0xffffffffu;
 
-// Launches `kernel` and checks for errors; `name` is used in the error message. Does
-// nothing for a grid without blocks.
+// Launches `kernel` and checks for errors. `name` is for error texts. Does nothing if
+// the grid has no blocks.
 template <class... P, class... A>
 void launch(const char* name, void (*kernel)(P...), dim3 grid, dim3 block, size_t shared_bytes,
             cudaStream_t stream, A&&... arguments) {
@@ -22,9 +21,9 @@ void launch(const char* name, void (*kernel)(P...), dim3 grid, dim3 block, size_
     check(cudaGetLastError(), name);
 }
 
-// As launch(), for a kernel in which every block first calls await_kernel_before(). If
-// the device supports it, the kernel starts before the writes of its predecessor are
-// visible, and waits for them itself.
+// Like launch(), for a kernel whose blocks first call await_kernel_before(). If the
+// device supports it, the blocks start before the preceding kernel has ended, which
+// hides latency.
 template <class... P, class... A>
 void launch_early(const char* name, void (*kernel)(P...), dim3 grid, dim3 block,
                   size_t shared_bytes, cudaStream_t stream, A&&... arguments) {
@@ -44,15 +43,15 @@ void launch_early(const char* name, void (*kernel)(P...), dim3 grid, dim3 block,
     check(cudaLaunchKernelEx(&config, kernel, static_cast<P>(arguments)...), name);
 }
 
-// Waits for all writes of the previous kernel, and therefore of all kernels before
-// that.
+// Waits until the writes of the preceding kernel, and of all kernels before it, are
+// visible.
 __device__ inline void await_kernel_before() {
 #if __CUDA_ARCH__ >= 900
     cudaGridDependencySynchronize();
 #endif
 }
 
-// Returns the number of blocks of `size` threads that cover `count` elements.
+// Returns the number of blocks of `size` threads for `count` elements.
 V3DG_HD inline unsigned blocks_for(size_t count, unsigned size) {
     return static_cast<unsigned>((count + size - 1) / size);
 }
@@ -63,15 +62,15 @@ __device__ inline unsigned char* shared_memory() {
     return bytes;
 }
 
-// Returns, in lane 0, the index of the work item that a warp claims next. The first
-// `dealt` items were assigned statically; `taken` counts the others from 0. Call it
-// early, because the atomic operation has a long latency.
+// Returns, in lane 0, the index of the next work item of a warp. The first `dealt`
+// items are assigned statically; `taken` counts the others, from 0. To be called early,
+// because the atomic operation has a long latency.
 __device__ inline unsigned take_next(unsigned* taken, unsigned dealt) {
     return threadIdx.x % 32 == 0 ? dealt + atomicAdd(taken, 1u) : 0;
 }
 
-// Reduce over the lanes of a whole warp; every lane gets the result. The order of the
-// additions is fixed.
+// Return the sum, and the minimum, over the lanes of a warp, in every lane. The order
+// of additions is fixed. All lanes of the warp must call them.
 template <class T>
 __device__ inline T warp_sum(T x) {
 #pragma unroll

@@ -1,7 +1,7 @@
 #pragma once
 
-// The standard library's mutex, locks and condition variable, with the annotations that
-// clang needs to check their use (base/thread_annotations.h).
+// The mutex, locks and condition variable of the standard library, with the annotations
+// of base/thread_annotations.h.
 
 #include <chrono>
 #include <condition_variable>
@@ -26,11 +26,11 @@ class V3DG_CAPABILITY("mutex") Mutex {
     std::mutex mutex_;
 };
 
-// Holds a mutex for the rest of a scope.
+// Holds a mutex until the end of the scope.
 class V3DG_SCOPED_CAPABILITY MutexLock {
   public:
     explicit MutexLock(Mutex& mutex) V3DG_ACQUIRE(mutex) : mutex_(mutex) { mutex.lock(); }
-    // The caller already holds the mutex, which is released at the end of the scope.
+    // Takes over a mutex that the caller holds; releases it at the end of the scope.
     MutexLock(Mutex& mutex, std::adopt_lock_t) V3DG_REQUIRES(mutex) : mutex_(mutex) {}
     ~MutexLock() V3DG_RELEASE() { mutex_.unlock(); }
     MutexLock(const MutexLock&) = delete;
@@ -41,7 +41,7 @@ class V3DG_SCOPED_CAPABILITY MutexLock {
 };
 
 // Releases a mutex that the caller holds, and acquires it again at the end of the
-// scope, whichever way that is left.
+// scope, also after an exception.
 class V3DG_SCOPED_CAPABILITY MutexUnlock {
   public:
     explicit MutexUnlock(Mutex& mutex) V3DG_RELEASE(mutex) : mutex_(mutex) { mutex.unlock(); }
@@ -53,8 +53,9 @@ class V3DG_SCOPED_CAPABILITY MutexUnlock {
     Mutex& mutex_;
 };
 
-// Waits may end without a notification. Callers test their condition in a loop, so that
-// clang checks the accesses in it, too.
+// A condition variable. Waits may end without a notification. There is no wait with a
+// predicate: callers test their condition in a loop, so that clang checks its accesses,
+// too.
 class Condition {
   public:
     using Time = std::chrono::steady_clock::time_point;

@@ -1,20 +1,19 @@
 #pragma once
 
-// A stream that belongs to one object.
+// A CUDA stream that one object owns.
 
 #include "base/device.h"
 
 namespace v3dg {
 namespace cuda {
 
-// Owns a stream that does not wait for the default stream.
+// Owns a stream that does not synchronise with the default stream.
 class OwnStream {
   public:
     OwnStream() {
         check(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking), "cudaStreamCreate");
     }
-    // Waits for the work on the stream, which reads memory of the caller, even if a
-    // step has failed.
+    // Waits for the stream: its work may read memory of the owner, also after an error.
     ~OwnStream() {
         cudaStreamSynchronize(stream_);
         cudaStreamDestroy(stream_);

@@ -11,9 +11,9 @@
 
 namespace v3dg {
 
-// Calls body(i) for every i < count on all threads; each thread claims `chunk`
-// neighbours at a time. Results must not depend on which thread runs a body. Exceptions
-// of bodies, mostly for lack of memory, are rethrown to the caller.
+// Calls body(i) for every i < count on all threads. Each thread claims `chunk`
+// consecutive indices at a time. Results must not depend on which thread calls body.
+// Exceptions of body, mostly out of memory, are rethrown.
 template <class Body>
 void parallel_for(size_t count, size_t chunk, const Body& body) {
     FirstError error;
@@ -24,8 +24,8 @@ void parallel_for(size_t count, size_t chunk, const Body& body) {
         });
     };
     if (most_threads() == 1) {
-        // No team of threads is started, because OpenMP ends the process if it has no
-        // memory for one.
+        // Without an OpenMP region, because OpenMP ends the process if it has no memory
+        // for one.
         for (size_t first = 0; first < count; first += chunk) run(first);
     } else {
 #pragma omp parallel for schedule(dynamic, 1) if (count > chunk) num_threads(most_threads())

@@ -1,6 +1,6 @@
 #pragma once
 
-// Random numbers that are the same on every device.
+// Random numbers that are equal on every device.
 
 #include <cstdint>
 
@@ -8,10 +8,9 @@
 
 namespace v3dg {
 
-// Returns random bits by counter: the same (seed, stream, counter) gives the same
-// number everywhere.
+// Returns random bits that depend only on seed, stream and counter.
 V3DG_HD inline uint64_t random_bits(uint64_t seed, uint64_t stream, uint64_t counter) {
-    // There are three rounds of the splitmix64 finaliser, one for each argument.
+    // Three rounds of the splitmix64 finaliser, one per argument.
     uint64_t x = seed;
     const uint64_t more[3] = {stream, counter, 0};
     for (const uint64_t m : more) {

@@ -1,15 +1,15 @@
 #pragma once
 
 // Prefix sums over the lanes of a warp, over the threads of a block, and over parts
-// that any number of blocks process one after another.
+// that blocks process in order.
 
 #include "base/launch.cuh"
 
 namespace v3dg {
 namespace cuda {
 
-// Returns the sum of x over the lanes up to and including this one, in each group of
-// kWidth lanes. Called by a whole warp.
+// Returns the sum of x over the lanes up to and including this one, within each group
+// of kWidth lanes. All lanes of the warp must call it.
 template <unsigned kWidth = 32, class T>
 __device__ inline T warp_prefix(T x) {
 #pragma unroll
@@ -20,8 +20,8 @@ __device__ inline T warp_prefix(T x) {
     return x;
 }
 
-// Returns the sum of x over the threads before this one; `total` becomes the sum over
-// all threads. Called by every thread of a block of whole warps.
+// Returns the sum of x over the threads before this one. `total` becomes the sum over
+// all threads. All threads of a block of whole warps must call it.
 template <class T>
 __device__ inline T block_prefix(T x, T& total) {
     __shared__ T warp_total[32];
@@ -35,12 +35,12 @@ __device__ inline T block_prefix(T x, T& total) {
         if (w < warp) before += warp_total[w];
         total += warp_total[w];
     }
-    __syncthreads();  // the next call may write again
+    __syncthreads();  // the next call overwrites warp_total
     return before + sum - x;
 }
 
-// Returns the next value of a counter that starts at 0, the same value for the whole
-// block.
+// Returns the next value of a counter, which starts at 0. All threads of the block must
+// call it, and get the same value.
 __device__ inline unsigned take_ticket(unsigned* counter) {
     __shared__ unsigned ticket;
     if (threadIdx.x == 0) ticket = atomicAdd(counter, 1u);
@@ -50,16 +50,17 @@ __device__ inline unsigned take_ticket(unsigned* counter) {
     return taken;
 }
 
-// Returns the sum of the parts before `part`, whose own sum is `sum` (below 2^62).
-// Called by a whole warp, once per part. `state` has one integer per part, initially
-// zero. Parts must be started in ascending order, which take_ticket() ensures.
+// Returns the sum of all parts before `part`. `sum` is the sum of this part, below
+// 2^62. One warp must call it once per part. `state` has one integer per part,
+// initially zero. Parts must be started in ascending order, as by take_ticket().
 //
 // Source: Merrill and Garland, Single-pass Parallel Prefix Scan with Decoupled
 // Look-back, 2016.
 __device__ inline unsigned long long prefix_of_part(unsigned long long* state, size_t part,
                                                     unsigned long long sum) {
     constexpr unsigned long long kOwn = 1ull << 62, kAll = 2ull << 62, kValue = kOwn - 1;
-    constexpr unsigned kEach = 4;  // parts that a lane reads together, to hide the latency of reads
+    // parts that a lane reads together, to hide the latency
+    constexpr unsigned kEach = 4;
     volatile unsigned long long* word = state;
     const unsigned lane = threadIdx.x % 32;
     if (part == 0) {
@@ -75,14 +76,15 @@ __device__ inline unsigned long long prefix_of_part(unsigned long long* state, s
             is_ready = true;
 #pragma unroll
             for (unsigned k = 0; k < kEach; ++k) {
-                const unsigned back = kEach * lane + k;  // no part precedes the first one
+                // before the first part, all sums are 0
+                const unsigned back = kEach * lane + k;
                 seen[k] = back < end ? word[end - 1 - back] : kAll;
             }
 #pragma unroll
             for (unsigned k = 0; k < kEach; ++k) is_ready = is_ready && seen[k] >= kOwn;
         } while (!is_ready);
-        // Each lane sums its parts back to the nearest one that has published the sum
-        // of all parts before it.
+        // Add up the parts of this lane, backwards to the nearest one that has
+        // published the sum of all parts up to it.
 #pragma unroll
         for (unsigned k = 0; k < kEach; ++k) {
             of_lane += knows_all ? 0 : seen[k] & kValue;

@@ -1,6 +1,6 @@
 #pragma once
 
-// Spans of elements, on the host or a device.
+// Spans of elements, on the host or on a device.
 
 #include <cassert>
 #include <cstddef>
@@ -9,7 +9,7 @@
 
 namespace v3dg {
 
-// Borrows contiguous elements.
+// A reference to contiguous elements that it does not own.
 template <class T>
 struct Span {
     T* data = nullptr;

@@ -1,6 +1,6 @@
 #pragma once
 
-// CUDA's stream type, for headers that are also included by sources without CUDA.
+// CUDA's stream type, for headers that sources without CUDA include, too.
 
 struct CUstream_st;
 

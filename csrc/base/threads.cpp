@@ -1,4 +1,4 @@
-// The number of threads that OpenMP can safely start.
+// The largest number of threads that OpenMP can safely start.
 
 #include "base/threads.h"
 
@@ -13,13 +13,15 @@ namespace v3dg {
 namespace {
 
 constexpr int kMostThreads = 1024;
-// Limits of a thread's stack size. The median split overflows 64 KiB. Machines with
-// many processors lack the address space for more than the upper limit.
+// The limits of a thread's stack size. The median split overflows a stack of 64 KiB. On
+// machines with many processors, the address space is too small for more than the upper
+// limit.
 constexpr double kLeastStackBytes = double(256 << 10);
 constexpr double kMostStackBytes = double(1 << 30);
 
-// Returns the bytes in a text of OpenMP such as "512", "64 k" or "2M", where a number
-// without a letter means KiB. Returns 0 for other texts, which OpenMP ignores.
+// Returns the bytes of a stack size in OpenMP's notation, such as "512", "64 k" or
+// "2M". A number without a unit is in KiB. Returns 0 for other texts, which OpenMP
+// ignores.
 double stack_bytes_of(const char* text) {
     char* end = nullptr;
     const double value = std::strtod(text, &end);

@@ -1,8 +1,8 @@
 #pragma once
 
-// Arrays of the caller: NumPy's on the host and, on a device, arrays that its backend
-// accepts, such as torch's tensors. They are borrowed after checks of kind, dtype,
-// shape and layout, and never copied.
+// Arrays that Python passes: NumPy arrays on the host and, on a device, arrays that its
+// backend accepts, such as torch tensors. The bindings check kind, dtype, shape and
+// layout, and then use the memory of the array without a copy ("borrow").
 
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
@@ -24,16 +24,16 @@ namespace v3dg {
 namespace py = pybind11;
 using namespace py::literals;
 
-// An expected shape; -1 stands for any length.
+// An expected shape; -1 means any length.
 using Shape = std::initializer_list<py::ssize_t>;
 std::string shape_text(Shape shape);
 std::string shape_text(const py::handle& array);
 
-// Throws TypeError: the argument is a different kind of object than expected.
+// Throws TypeError with the text "name: expected ..., got ...".
 [[noreturn]] void refuse_kind(const char* name, const std::string& expected, const py::handle& got);
 
-// Returns the C++ value of a Python object; throws TypeError if its class is another
-// one.
+// Returns the C++ value of a Python object. Throws TypeError if the object has another
+// class.
 template <class T>
 T& held(const py::handle& object, const char* name) {
     if (!py::isinstance<T>(object))
@@ -41,10 +41,11 @@ T& held(const py::handle& object, const char* name) {
     return object.cast<T&>();
 }
 
-// Returns the shape of an array on any device; throws TypeError if the object has none.
+// Returns the shape of an array on any device. Throws TypeError if the object has no
+// shape.
 std::vector<py::ssize_t> shape_of(const py::handle& array, const char* name);
 
-// The type of elements, in the notation of NumPy and of __cuda_array_interface__.
+// The dtype of elements, in the notation of NumPy and of __cuda_array_interface__.
 struct Element {
     py::dtype (*dtype)();
     const char* typestr;
@@ -59,7 +60,7 @@ constexpr Element element_of() {
     if constexpr (std::is_same_v<T, uint8_t>) return {&py::dtype::of<T>, "|u1"};
 }
 
-// Memory borrowed from an array; sizes count elements.
+// Memory that belongs to an array. `size` is the number of elements.
 struct Borrowed {
     void* data;
     size_t size;
@@ -67,12 +68,11 @@ struct Borrowed {
 
 constexpr Device kHost{};
 
-// Returns the device of an array. Throws TypeError if the array is neither NumPy's nor
-// a device's, and RuntimeError if its backend was not compiled.
+// Returns the device of an array. Throws TypeError if the array is neither a NumPy
+// array nor on a device, and RuntimeError if the device's backend was not compiled.
 Device device_of(const py::handle& array, const char* name);
 
-// Returns the description of an array on a CUDA device, __cuda_array_interface__, or
-// None if it has none.
+// Returns the attribute __cuda_array_interface__ of an array, or None if there is none.
 py::object cuda_interface_of(const py::handle& array);
 
 bool fits_shape(const std::vector<py::ssize_t>& got, Shape wanted);
@@ -84,12 +84,12 @@ bool fits_shape(const std::vector<py::ssize_t>& got, Shape wanted);
 Borrowed borrow_on_host(const py::handle& array, const char* name, const Element& element,
                         Shape shape, bool is_written);
 
-// Borrows an array after checks of its device, dtype and shape. The caller keeps the
-// array alive and orders its stream.
+// Borrows an array after checks of its device, dtype and shape. The caller must keep
+// the array alive, and order its work on the array's stream.
 Borrowed borrow(Device device, const py::handle& array, const char* name, const Element& element,
                 Shape shape, bool is_written);
 
-// Borrows an array on the host; T is const if it is only read.
+// Borrows a NumPy array. A const T means that the array is only read.
 template <class T>
 Span<T> span_of(const py::handle& array, const char* name, Shape shape) {
     const Borrowed borrowed = borrow_on_host(array, name, element_of<std::remove_const_t<T>>(),
@@ -97,7 +97,7 @@ Span<T> span_of(const py::handle& array, const char* name, Shape shape) {
     return {static_cast<T*>(borrowed.data), borrowed.size};
 }
 
-// Borrows an array that must be on the same device as others.
+// Borrows an array, which must be on this device.
 template <class T>
 Span<T> span_on(Device device, const py::handle& array, const char* name, Shape shape) {
     const Borrowed borrowed = borrow(device, array, name, element_of<std::remove_const_t<T>>(),
@@ -105,15 +105,15 @@ Span<T> span_on(Device device, const py::handle& array, const char* name, Shape 
     return {static_cast<T*>(borrowed.data), borrowed.size};
 }
 
-// A new, uninitialised array and its memory. Throws MemoryError if there is too little
-// memory.
+// A new, uninitialised array, and its memory. make_array() throws MemoryError if there
+// is not enough memory.
 struct MadeArray {
     py::object object;
     void* data;
 };
 MadeArray make_array(Device device, const Element& element, const std::vector<py::ssize_t>& shape);
 
-// A new array, borrowed to be filled in.
+// A new, uninitialised array, to be filled through `span`.
 template <class T>
 struct NewArray {
     py::object object;
@@ -130,9 +130,9 @@ struct NewArray {
 
 class Backend;
 
-// Runs work on a device, on torch's current stream there, and makes the device current
-// meanwhile. It is constructed and destroyed with Python's lock held; the work itself
-// runs without it. Throws RuntimeError if there is no such device.
+// A scope in which work runs on a device: the device is current, and work is enqueued
+// on torch's current stream. The constructor and the destructor require the GIL; the
+// work itself does not. Throws RuntimeError if the device does not exist.
 class Work {
   public:
     explicit Work(Device device);
@@ -142,7 +142,7 @@ class Work {
 
     Device device() const { return device_; }
     const Backend& backend() const { return backend_; }
-    // Returns the backend's stream; null on the host.
+    // Returns the stream of the backend; null on the host.
     void* stream() const { return stream_; }
 
   private:

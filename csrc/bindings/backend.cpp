@@ -1,5 +1,5 @@
-// The mapping from devices to backends. It contains the only #if of the bindings that
-// depends on a backend.
+// Maps devices to backends. The only #if of the bindings that depends on a backend is
+// here.
 
 #include "bindings/backend.h"
 

@@ -1,4 +1,4 @@
-// Clusters: splits, bounds, and checks of a bundle's tables.
+// Bindings of clustering: median split, bounds, and checks of a bundle's tables.
 
 #include <cmath>
 #include <map>
@@ -28,7 +28,7 @@ void check_finite(Span<const float> means) {
 }
 
 py::tuple median_split(const py::object& means, const py::array& offset, int depth) {
-    constexpr int kDeepest = 32;  // enough for 2^32 points
+    constexpr int kDeepest = 32;  // splits up to 2^32 points
     const Device device = device_of(means, "means");
     const Span<const float> values = span_on<const float>(device, means, "means", {-1, 3});
     const Span<const Point> points{reinterpret_cast<const Point*>(values.data), values.size / 3};

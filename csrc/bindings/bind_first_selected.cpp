@@ -1,5 +1,5 @@
-// Computes how much larger the balls of level 1 have to be: draws pictures of both
-// levels and compares them.
+// Bindings that compute how much the balls of level 1 must grow. They draw pictures of
+// levels 0 and 1, and compare them.
 
 #include <algorithm>
 
@@ -26,7 +26,7 @@ struct Colors {
                                     {py::ssize_t(camera.height), py::ssize_t(camera.width), 3})) {}
 };
 
-// Returns the gaussians in black, of SH degree 0.
+// Returns the gaussians with black colour, of SH degree 0.
 Rows blackened(const Rows& gaussians) {
     const NewArray<float> sh({}, {py::ssize_t(gaussians.size()), 1, 3});
     std::fill(sh.span.begin(), sh.span.end(), 0.0f);
@@ -70,7 +70,7 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
         const Camera camera = measured.camera(picture);
         const auto width = static_cast<size_t>(camera.width),
                    height = static_cast<size_t>(camera.height);
-        const Colors truth(leaves, enlarged(camera, FirstSelected::kSamples), own),
+        const Colors truth(leaves, camera.scaled(FirstSelected::kSamples), own),
             by_leaves(leaves, camera, own), by_level(level, camera, coarse);
         const NewArray<float> losses({}, {py::ssize_t(height), py::ssize_t(width), 3});
         {
@@ -78,9 +78,9 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
             losses_of_pixels({by_leaves.span, by_level.span, truth.span}, width, height,
                              losses.span);
         }
-        // The sum of the losses, weighted by the leaves' blend weights, is
-        // differentiated by the leaves' colours; the gradient is each leaf's share of
-        // the losses.
+        // Distribute the losses of pixels over the leaves in proportion to their blend
+        // weights. The sum of loss * colour, differentiated with respect to the leaves'
+        // colours, is this distribution.
         const Rasterized seen = rasterize(black, {{}, camera}, in_black, false, true);
         const Gradients gradients =
             seen.tape->backward(backend.from_host(losses.object, device), py::none(), py::none(),
@@ -92,8 +92,9 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
     return py::array_t<float>(num_groups, growth.data());
 }
 
-// Returns the balls of all levels after those of level 1 have grown: the levels above
-// grow to contain them. Balls of level 0 do not change.
+// Returns the balls of all levels after those of level 1 have grown by `growth`. The
+// balls of higher levels grow so that they contain the balls below. Level 0 does not
+// change.
 py::list grown_balls(const py::list& balls, const py::array& growth) {
     py::list grown;
     std::vector<Ball> below;

@@ -1,5 +1,5 @@
-// Fits for Python: of the groups of one level, and of all levels together by pictures
-// of their cuts.
+// Bindings of fits: of the groups of one level, and of all levels together to pictures
+// of cuts.
 
 #include <algorithm>
 #include <memory>
@@ -14,18 +14,19 @@ namespace v3dg {
 
 namespace {
 
-// The gaussians that groups are fitted to, on their backend.
+// The gaussians that groups are fitted to.
 class BoundTarget {
   public:
     BoundTarget(const Rows& rows, float filter_px2, bool antialiased)
         : device_(rows.device()), size_(rows.size()), sh_degree_(rows.sh_degree()) {
-        static_cast<void>(rows.read<float>());  // which checks the precision
+        static_cast<void>(rows.read<float>());  // checks that they are float32
         target_ = backend_of(device_).make_target(rows, filter_px2, antialiased);
     }
 
     size_t size() const { return size_; }
     const backend::Target& handle() const { return *target_; }
-    // Throws unless the gaussians can be fitted to this target.
+    // Throws ValueError unless `gaussians` have the device and the SH degree of the
+    // target.
     void check_alike(const Rows& gaussians) const {
         if (gaussians.device() != device_ || gaussians.sh_degree() != sh_degree_)
             throw py::value_error(
@@ -39,7 +40,8 @@ class BoundTarget {
     std::unique_ptr<backend::Target> target_;
 };
 
-// The groups that index `num_targets` and `num_rows` gaussians.
+// Returns the groups after checks of their ranges. Target ranges must be within
+// `num_targets` gaussians, the others within `num_rows`.
 std::vector<FitGroup> groups_of(const py::array& target_range, const py::array& range,
                                 const py::array& ball, const py::array& stream, size_t num_targets,
                                 size_t num_rows) {
@@ -94,7 +96,7 @@ py::object fit_level_arrays(const FitConfig& config, const BoundTarget& target,
     return error.object;
 }
 
-// Pictures of cuts, with what they borrow from.
+// Pictures of cuts, and the arrays that they borrow from.
 class BoundPictures {
   public:
     BoundPictures(const BoundTable& table, const Rows& asset,
@@ -117,7 +119,7 @@ class BoundPictures {
             py::array_t<int32_t>(static_cast<py::ssize_t>(clusters.size()), clusters.data()),
             view.samples);
     }
-    // Throws unless these are the gaussians of the table.
+    // Throws ValueError unless there are as many gaussians as in the table.
     void check_all(const Rows& gaussians) const {
         if (gaussians.size() > UINT32_MAX)
             throw py::value_error("gaussians: expected fewer than 2^32, got " +

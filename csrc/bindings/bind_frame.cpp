@@ -1,4 +1,4 @@
-// Frames for Python: checks of their inputs, and calls of their backend.
+// Bindings of frames: they check the inputs and call the backend.
 
 #include <algorithm>
 #include <memory>
@@ -14,7 +14,7 @@ namespace v3dg {
 
 namespace {
 
-// Asks work in progress, from any thread, to end early.
+// A flag that asks work in progress to end early. Any thread may set it.
 class Stop {
   public:
     void request() { requested_.store(true, std::memory_order_relaxed); }
@@ -42,12 +42,12 @@ Eyes eyes_of(const py::object& camera) {
     return camera.cast<const BoundEyes&>().eyes;
 }
 
-// A cut that was selected earlier. The arrays must be on the frame's device, which is
+// A cut that was selected earlier. The arrays must be on the frame's device; this is
 // checked when the frame draws.
 struct BoundGivenCut {
     py::object instance_ids, cluster_ids, weights;
 
-    // Borrows from the arrays. Weights are from 0 to 1, or None if all are 1.
+    // Borrows the arrays. Weights are from 0 to 1, or None if all are 1.
     GivenCut read(Device device) const {
         GivenCut given{span_on<const int32_t>(device, instance_ids, "instance_ids", {-1}), {}, {}};
         const auto size = static_cast<py::ssize_t>(given.instance.size);
@@ -58,24 +58,23 @@ struct BoundGivenCut {
     }
 };
 
-// The content of a picture other than the gaussians' own colours, and the cut that it
-// shows.
+// The optional parts of a request: false colours, and another camera for the cut.
 struct BoundLook {
     FrameLook look = FrameLook::appearance;
-    py::list cluster_colors;  // (C, 3) per bundle, or none
+    py::list cluster_colors;  // (C, 3) colours for each bundle, or empty
     std::optional<Eyes> chooser;
     bool is_aside = false;
 };
 
-// A request, without the parts that only a frame can check: the given cut, and colours
-// of clusters.
+// A request. The given cut and the colours of clusters are separate, because only a
+// frame can check them.
 struct BoundRequest {
     FrameRequest plain;
     std::optional<BoundGivenCut> cut;
-    py::object cluster_colors;  // see BoundLook; null without a look
+    py::object cluster_colors;  // see BoundLook; null if there is none
 
-    // The camera is a Camera or an Eyes. The constructor tests which it is, because
-    // overloads or implicit conversions would take longer than everything else here.
+    // `camera` is a Camera or an Eyes. Testing this here is faster than overloads or
+    // implicit conversions, which would dominate the time of this constructor.
     BoundRequest(const py::object& camera, const SelectRule* rule, const Shade* shade,
                  const BoundGivenCut* given, const BoundLook* look)
         : plain{.eyes = eyes_of(camera),
@@ -111,7 +110,8 @@ struct BoundRequest {
     }
 };
 
-// Draws scenes with the same bundles, or with the first ones of them, on one device.
+// Draws scenes on one device. The frame's models belong to the bundles of the scenes,
+// in order; a scene may have fewer bundles.
 class BoundSceneFrame {
   public:
     explicit BoundSceneFrame(int device) : device_{device} {
@@ -119,8 +119,8 @@ class BoundSceneFrame {
         frame_ = work.backend().make_frame(work);
     }
 
-    // Sets the gaussians of each bundle and, unless empty, the colours of their
-    // clusters.
+    // Sets the gaussians of each bundle and, unless `palettes` is empty, the colours of
+    // their clusters.
     void set_models(const py::list& models, const py::list& palettes) {
         if (!palettes.empty() && palettes.size() != models.size())
             throw py::value_error("palettes: expected none, or one for each model");
@@ -143,9 +143,9 @@ class BoundSceneFrame {
         num_gaussians_ = std::move(num_gaussians);
     }
 
-    // Draws the gaussians that were set, or the resident part of a pool, after bringing
-    // in pages that are ready. `steps`: pacing state of a sequence of pictures; null
-    // for a single one.
+    // Draws the models that were set. With a pool, it brings in pages that are ready,
+    // then draws the resident part of the pool. `steps` is the state of a sequence of
+    // pictures; null for a single picture.
     std::unique_ptr<BoundDrawing> draw(const py::object& scene_object,
                                        const py::object& request_object,
                                        const py::object& pool_object, BudgetSteps* steps,
@@ -163,8 +163,8 @@ class BoundSceneFrame {
         return drawing;
     }
 
-    // Returns the gaussian with the largest weight in the first pixel of the window, or
-    // nothing.
+    // Returns the gaussian with the largest blend weight in the first pixel of the
+    // window, or None.
     std::optional<ScenePick> pick(const py::object& scene_object, const py::object& request_object,
                                   const py::object& pool_object) {
         check_is_on_host(device_, "pick", "expected a frame on the CPU, got one on a CUDA device");
@@ -177,8 +177,8 @@ class BoundSceneFrame {
         return picked;
     }
 
-    // Returns the bytes that the frame holds on its device by part, and the bytes of
-    // the memory pool.
+    // Returns the device memory of the frame in bytes, by part, and the bytes of the
+    // memory pool.
     py::dict memory() const {
         py::dict parts;
         const Work work(device_);
@@ -187,8 +187,8 @@ class BoundSceneFrame {
     }
 
   private:
-    // Checks that the scene, the request and the pool are consistent, then calls body()
-    // with them.
+    // Checks that the scene, the request and the pool fit each other, then calls
+    // body(input).
     template <class Body>
     void with_input(const py::object& scene_object, const py::object& request_object,
                     const py::object& pool_object, const Body& body) const {
@@ -243,11 +243,11 @@ class BoundSceneFrame {
     }
 
     Device device_;
-    std::vector<size_t> num_gaussians_;  // per bundle
+    std::vector<size_t> num_gaussians_;  // number of gaussians of each bundle
     std::unique_ptr<backend::Frame> frame_;
 };
 
-// Draws the gaussians of one asset, which have no levels.
+// Draws the gaussians of one asset, which has no levels.
 class BoundAssetFrame {
   public:
     BoundAssetFrame(const py::object& model_object, float filter_px2, bool antialiased) {

@@ -9,7 +9,8 @@ namespace v3dg {
 
 namespace {
 
-// Checks the requested clusters, each of which has rows of its instance's bundle.
+// Checks the requested clusters: their instances exist, and their rows are in the
+// instances' bundles.
 void check_clusters(const GatherInput& in) {
     if (in.offset[0] != 0) throw py::value_error("offset: expected boundaries from 0");
     for (size_t s = 0; s < in.instance.size; ++s) {
@@ -65,7 +66,7 @@ py::tuple gather(const std::vector<std::reference_wrapper<const Rows>>& bundles,
     return gathered(in, Device{device}, sh_degree);
 }
 
-// Transforms all gaussians of a bundle, as one cluster of one instance.
+// Transforms all gaussians of a bundle, as a single cluster of a single instance.
 py::tuple transform(const Rows& rows, const py::array& quaternion, const py::array& position,
                     double scale) {
     const GaussianRows<const float> bundle = rows.read<float>();

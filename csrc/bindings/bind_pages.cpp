@@ -1,4 +1,4 @@
-// Pages of files: reading, verifying and hashing, for Python.
+// Bindings that read, verify and hash the pages of files.
 
 #include <algorithm>
 #include <cerrno>
@@ -17,12 +17,12 @@ namespace v3dg {
 
 namespace {
 
-// Neighbouring pages of a file, with the arrays that locate them.
+// A range of adjacent pages of a file, and the arrays with their locations.
 struct BoundPageRun {
     size_t first_page;
     py::array first_cluster, offset, places;
 
-    // Borrows from the arrays; `hashes` has the hashes of these pages.
+    // Borrows the arrays. `hashes` are the hashes of these pages.
     PageRun read(const py::array& hashes) const {
         constexpr size_t kMost = size_t(1) << 62;
         PageRun run{.first_page = first_page,
@@ -40,8 +40,8 @@ struct BoundPageRun {
     }
 };
 
-// Calls body() without Python's lock. An error about a page gets the file's name, which
-// may not be valid text.
+// Calls body() without the GIL. If it throws a PageError, adds the name of the file,
+// which need not be valid UTF-8.
 template <class Body>
 void naming_file(const py::object& path, const Body& body) {
     try {
@@ -93,8 +93,8 @@ void read_words(const py::object& path, int descriptor, const PageRun& run, cons
     naming_file(path, [&] { read_codes(PosixFile::duplicate(descriptor), run, words); });
 }
 
-// Reads pages to `out`: either rows, into which gaussians are decoded, or an array of
-// integers, which receives the codes as they are.
+// Reads a range of pages to `out`. If `out` is Rows, it receives decoded gaussians. If
+// it is an array of integers, it receives the codes.
 void read_run(const py::object& path, int descriptor, const py::object& out,
               const std::string& codec, const py::array& hashes, const BoundPageRun& bound) {
     const PageRun run = bound.read(hashes);
@@ -119,7 +119,7 @@ std::vector<py::bytes> hash_messages(const std::vector<py::array>& arrays) {
     return digests;
 }
 
-// A read together with the array that it reads to and hashes.
+// A read in progress, and the array that receives the bytes.
 class BoundHashedRead {
   public:
     BoundHashedRead(const py::object& path, int descriptor, size_t offset,
@@ -159,12 +159,12 @@ class BoundReader {
     }
 
   private:
-    // Returns memory that is aligned to eight bytes.
+    // Returns memory that is aligned to 8 bytes.
     py::array_t<uint8_t> take(size_t num_bytes) {
         const size_t size = (num_bytes + 7) / 8 * 8;
         if (size > left_) {
-            // The first small part gets memory of its own, so that a single one does
-            // not allocate a whole block.
+            // The first small part gets its own memory, so that reading a single small
+            // part does not allocate a whole block.
             const bool is_small = size < HashedRead::kLargeBytes && piece_.size() > 0;
             left_ = is_small ? size * kFilesOfPiece : size;
             piece_ = py::array_t<uint64_t>(static_cast<py::ssize_t>(left_ / 8));
@@ -176,7 +176,7 @@ class BoundReader {
 
     static constexpr size_t kFilesOfPiece = 8;
     py::array piece_;
-    size_t left_ = 0;  // bytes left in the block
+    size_t left_ = 0;  // unused bytes of the block
 };
 
 py::array BoundHashedRead::wait() {

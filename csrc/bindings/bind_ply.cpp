@@ -1,4 +1,4 @@
-// Reading and writing of .ply files for Python; io/ply_*.h do the work.
+// Bindings that read and write .ply files, by means of io/ply_*.h.
 
 #include <cerrno>
 #include <cmath>
@@ -12,14 +12,14 @@ namespace v3dg {
 
 namespace {
 
-// Returns a name as printable text, with question marks for bytes that are not ASCII.
+// Returns a name as printable ASCII; other bytes become question marks.
 std::string printable(std::string name) {
     for (char& c : name)
         if (c < ' ' || c > '~') c = '?';
     return name;
 }
 
-// The name of a file, as the system needs it and as messages show it.
+// The name of a file: encoded for the system, and as messages show it.
 struct Path {
     explicit Path(py::object path) : shown(path) {
         PyObject* bytes = nullptr;
@@ -30,7 +30,7 @@ struct Path {
     py::bytes encoded;
 };
 
-// Calls body(path) without Python's lock, and adds the file's name to errors.
+// Calls body(path) without the GIL, and adds the name of the file to errors.
 template <class Body>
 auto with_path(const Path& path, const Body& body) {
     const char* name = PyBytes_AS_STRING(path.encoded.ptr());
@@ -48,7 +48,7 @@ auto with_path(const Path& path, const Body& body) {
     }
 }
 
-// A file that is read in runs of rows; it remembers where the last run ended.
+// A .ply file that is read in runs of rows. It remembers where the last run ended.
 class BoundPlyFile {
   public:
     explicit BoundPlyFile(const py::object& path)
@@ -77,7 +77,8 @@ class BoundPlyFile {
             opacities({}, {n}), sh({}, {n, k, 3});
         const PlyGaussians<float> out = {means.span, quats.span, scales.span, opacities.span,
                                          sh.span};
-        // Read and written with Python's lock held, so that several threads may read.
+        // `next_` is accessed with the GIL held, so several threads may read
+        // concurrently.
         const PlyPlace known = next_;
         next_ = with_path(path_, [&](const char*) {
             return read_ply(ply_, static_cast<size_t>(first), known, out);

@@ -1,4 +1,4 @@
-// Page pools and their sources for Python; residency/page_pool.h implements the pool.
+// Bindings of page pools and their sources (residency/page_pool.h).
 
 #include <algorithm>
 #include <thread>
@@ -11,10 +11,9 @@ namespace v3dg {
 
 namespace {
 
-// At most this fraction of a pool's memory is for pages that are being read.
+// Pages that are being read may use up to 1 / kBlockShare of a pool's memory.
 constexpr size_t kBlockShare = 8;
-// Reading threads do not only wait for the disk but also hash, so machines with more
-// cores get more of them.
+// The limit on threads that read pages. They also compute hashes, so more cores help.
 constexpr unsigned kMostThreads = 16;
 
 [[noreturn]] void raise(const PageError& error) {
@@ -22,14 +21,14 @@ constexpr unsigned kMostThreads = 16;
     throw py::error_already_set();
 }
 
-// The file of a bundle, with the arrays that locate its pages.
+// The file of a bundle, and the arrays with the locations and hashes of its pages.
 struct BoundFileSource {
     std::string name;
     int descriptor;
     PageCodec codec;
     int sh_degree;
     py::array places, hashes;
-    py::object fetch;  // callable that fetches parts of the file, or None
+    py::object fetch;  // a function that fetches parts of the file, or None
 };
 
 PageCodec codec_of(const std::string& name) {
@@ -38,16 +37,17 @@ PageCodec codec_of(const std::string& name) {
     throw py::value_error("codec: expected float32 or quantized, got " + name);
 }
 
-// The origin of a source's pages, borrowed from Python objects.
+// Where a pool gets the pages of a bundle from, borrowed from Python objects. Either
+// `rows` or `file` is set.
 struct GivenSource {
     const Rows* rows = nullptr;             // pages in memory, or null
-    const BoundFileSource* file = nullptr;  // else the file
+    const BoundFileSource* file = nullptr;  // pages in a file, or null
     Fetch fetch = {};
     Span<const int64_t> places = {};
     Span<const uint8_t> hashes = {};
 };
 
-// Returns the text of the current Python error and clears it. Requires Python's lock.
+// Returns the text of the current Python error, and clears the error. Requires the GIL.
 std::string text_of_error() {
     PyObject *type = nullptr, *value = nullptr, *trace = nullptr;
     PyErr_Fetch(&type, &value, &trace);
@@ -60,10 +60,9 @@ std::string text_of_error() {
     return problem.empty() ? "the fetch failed" : problem;
 }
 
-// Calls a Python function that fetches parts of a file. Returns the text of the error
-// that it raises, or an empty string. The caller holds Python's lock. No object here
-// may have a destructor that needs the lock, because Python may end the thread inside
-// the function.
+// Calls a Python function that fetches parts of a file. Returns the text of its error,
+// or an empty string. Requires the GIL. Local objects must not have destructors that
+// need the GIL, because Python may end the thread during the call.
 std::string told_by(PyObject* function, Span<const int64_t> places) {
     PyObject* const list = PyList_New(static_cast<py::ssize_t>(places.size / 2));
     for (size_t k = 0; list != nullptr && k < places.size / 2; ++k)
@@ -77,8 +76,8 @@ std::string told_by(PyObject* function, Span<const int64_t> places) {
     return done == nullptr ? text_of_error() : std::string();
 }
 
-// Wraps a Python function for threads that Python does not know. They acquire Python's
-// lock for the call; so a thread that waits for them must have released it. The
+// Wraps a Python function for threads that Python did not start. Such a thread acquires
+// the GIL for the call, so a thread that waits for it must have released the GIL. The
 // function is never released, because a pool may leave threads behind that call it.
 Fetch fetch_by(const py::object& function) {
     if (function.is_none()) return {};
@@ -179,7 +178,8 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
 
 BoundPool::~BoundPool() {
     on_device_.reset();
-    const Unlocked unlocked;  // threads that are ending may be about to call Python for a page
+    // threads that are ending may be waiting for the GIL to call Python
+    const Unlocked unlocked;
     pool_.reset();
 }
 

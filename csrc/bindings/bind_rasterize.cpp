@@ -1,4 +1,4 @@
-// Draws gaussians without levels on their device, and computes gradients.
+// Bindings that draw gaussians without levels on their device, and compute gradients.
 
 #include "bindings/backend.h"
 #include "bindings/operations.h"
@@ -7,14 +7,14 @@ namespace v3dg {
 
 namespace {
 
-// A picture for Python; the tape is a separate object.
+// A drawn picture for Python. `tape` is for the backward pass, or None.
 struct BoundRasterized {
     py::object color, alpha, depth;
     std::optional<RenderCounts> counts;
     py::object tape;
 };
 
-// Projected gaussians on the image.
+// The ellipses of projected gaussians, for Python.
 struct BoundEllipses {
     py::object centers, depths, conics, opacities, radii;
 };

@@ -1,4 +1,4 @@
-// Resident objects, and false colours.
+// Bindings of resident objects (models, palettes, scenes) and of false colours.
 
 #include "bindings/operations.h"
 #include "bindings/resident.h"
@@ -8,7 +8,7 @@ namespace v3dg {
 
 namespace {
 
-// Returns (..., 3) colours of values.
+// Returns the colours color(0) to color(count - 1) as an array of `shape` + (3,).
 template <class Color>
 py::array_t<float> colors_of(std::vector<py::ssize_t> shape, size_t count, const Color& color) {
     shape.push_back(3);

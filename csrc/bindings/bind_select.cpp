@@ -1,4 +1,4 @@
-// Tables of bundles, and selections on the host without a resident scene.
+// Bindings of bundle tables, and of selection on the host without a resident scene.
 
 #include <functional>
 
@@ -24,7 +24,7 @@ py::array_t<T> array_of(const std::vector<T>& values) {
 
 using Tables = std::vector<std::reference_wrapper<const BoundTable>>;
 
-// The arguments of one selection on the host; `tables` and `input` borrow from them.
+// The input of a selection on the host. It borrows from the arguments.
 struct Arguments {
     std::vector<ClusterTable> tables;
     SelectInput input;
@@ -37,8 +37,8 @@ struct Arguments {
     }
 };
 
-// Returns the first index of each instance's values, if bundle b has counts[b] values,
-// and their total number at the end.
+// Returns where the values of each instance begin, and the total at the end. An
+// instance of bundle b has counts[b] values.
 NewArray<int64_t> offset_of_instances(Span<const int32_t> bundle,
                                       const std::vector<size_t>& counts) {
     NewArray<int64_t> offset({}, {static_cast<py::ssize_t>(bundle.size + 1)});

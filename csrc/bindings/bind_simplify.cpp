@@ -13,7 +13,7 @@ Span<const int64_t> segments_of(const py::array& offset, const char* name, py::s
     return s;
 }
 
-// The numbers of gaussians before and after simplification, segment by segment.
+// The numbers of gaussians before and after simplification, as segment boundaries.
 struct Segments {
     Span<const int64_t> in, out;
 

@@ -1,4 +1,4 @@
-// Values that Python passes to the core: cameras, rules, instances and rows.
+// Bindings of the values that Python passes: cameras, rules, instances and rows.
 
 #include <algorithm>
 #include <cmath>

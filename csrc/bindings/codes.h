@@ -12,7 +12,7 @@ inline void check_sh_degree(int sh_degree) {
         throw py::value_error("sh_degree: expected 0 to 3, got " + std::to_string(sh_degree));
 }
 
-// Returns an array as ascending boundaries from 0 to `last`.
+// Returns the values of an array, which must not decrease and be from 0 to `count`.
 inline Span<const int64_t> boundaries_of(const py::array& array, const char* name, size_t count) {
     const Span<const int64_t> values = span_of<const int64_t>(array, name, {-1});
     bool good =
@@ -24,14 +24,14 @@ inline Span<const int64_t> boundaries_of(const py::array& array, const char* nam
     return values;
 }
 
-// All pages of a bundle, with the arrays that they borrow from.
+// All coded pages of a bundle, and the arrays that they borrow from.
 class BoundCodes {
   public:
     BoundCodes(py::array pages, py::array first_cluster, py::array offset, int sh_degree)
         : arrays_{std::move(pages), std::move(first_cluster), std::move(offset)} {
         check_sh_degree(sh_degree);
         const Span<const int32_t> words = span_of<const int32_t>(arrays_[0], "pages", {-1});
-        // Addresses of codes, in units of 8 bytes, have 32 bits, and so do rows.
+        // Indices of rows, and of 8-byte units of codes, have 32 bits.
         constexpr size_t kMostWords = size_t(1) << 33;
         if (words.size > kMostWords)
             throw py::value_error(

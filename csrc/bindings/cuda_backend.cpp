@@ -1,6 +1,6 @@
-// The backend of CUDA devices. It accepts arrays with __cuda_array_interface__, returns
-// new ones as torch tensors, and queues work on torch's current stream. It is compiled
-// only with CUDA; its frames and pools are in cuda_frame.cpp.
+// The backend of CUDA devices, compiled only with CUDA. It accepts arrays with
+// __cuda_array_interface__, returns new arrays as torch tensors, and enqueues work on
+// torch's current stream. Its frames and pools are in cuda_frame.cpp.
 
 #include <pybind11/gil_safe_call_once.h>
 
@@ -37,10 +37,11 @@ Borrowed borrow_anywhere(const py::handle& array, const char* name, const Elemen
 
 namespace {
 
-// The functions of torch that every frame needs, looked up once. The object lives to
-// the end of the process, which may outlive Python.
+// The functions of torch that every frame needs. They are looked up once. The object is
+// never destroyed, because Python may end before the process.
 struct Torch {
-    py::object empty, current_stream;  // current_stream returns the stream as a number
+    // current_stream returns the stream as an integer
+    py::object empty, current_stream;
 
     static const Torch& get() {
         PYBIND11_CONSTINIT static py::gil_safe_call_once_and_store<Torch> known;
@@ -63,8 +64,8 @@ struct Torch {
           int32_(py::module_::import("torch").attr("int32")),
           uint8_(py::module_::import("torch").attr("uint8")) {}
 
-    // Returns torch after it has initialised CUDA, for callers that do not do so
-    // themselves.
+    // Returns the module torch after initialising CUDA. For callers that do not
+    // initialise CUDA otherwise.
     static py::module_ initialised_cuda() {
         py::module_::import("torch.cuda").attr("init")();
         return py::module_::import("torch");
@@ -73,7 +74,7 @@ struct Torch {
     py::object float32_, int64_, int32_, uint8_;
 };
 
-// ValueError where memory is another CUDA device's.
+// Throws ValueError if the memory is on another CUDA device.
 void check_is_on(Device device, const void* memory, const char* name) {
     cudaPointerAttributes attributes{};
     if (cudaPointerGetAttributes(&attributes, memory) != cudaSuccess)
@@ -109,7 +110,7 @@ class BackendTarget final : public backend::Target {
     bool antialiased_;
 };
 
-// Kernels read four floats at a time.
+// row_alignment is 16, because kernels read four floats at once.
 constexpr BackendTraits kTraits{.host_reads_arrays = false,
                                 .computes_doubles = false,
                                 .row_alignment = 16,
@@ -132,8 +133,8 @@ class CudaBackend final : public Backend {
             attributes.type == cudaMemoryTypeDevice)
             return Device{attributes.device};
         cudaGetLastError();
-        // An array of no elements has no memory. A torch tensor still knows its device; any other
-        // array is taken to be on the current device.
+        // An array without elements has no memory, and thus no device. A torch tensor
+        // names its device; any other array counts as being on the current device.
         const py::object index =
             py::getattr(py::getattr(array, "device", py::none()), "index", py::none());
         if (py::isinstance<py::int_>(index)) return Device{index.cast<int>()};
@@ -283,7 +284,7 @@ class CudaBackend final : public Backend {
 }  // namespace
 }  // namespace cuda
 
-// It lives to the end of the process, which may outlive Python.
+// Never destroyed, because Python may end before the process.
 const Backend& cuda_backend() {
     static const Backend& backend = *new cuda::CudaBackend;
     return backend;

@@ -1,6 +1,6 @@
-// Models, scenes, pools and frames on CUDA devices. Pictures are enqueued on torch's
-// current stream with Python's lock held, because torch allocates their memory
-// meanwhile. A Turn keeps other threads from using a frame's buffers.
+// Models, scenes, pools and frames on CUDA devices. Frames are enqueued on torch's
+// current stream. The GIL is held meanwhile, because torch allocates the pictures. A
+// Turn keeps other threads from using the buffers of a frame.
 
 #include "bindings/cuda_frame.h"
 
@@ -33,7 +33,7 @@ class BackendModel final : public backend::Model {
     }
 
   private:
-    std::optional<Rows> rows_;  // the packed model reads these rows
+    std::optional<Rows> rows_;  // memory that the packed model reads
     DeviceModel on_device_;
 };
 
@@ -160,9 +160,10 @@ class EnqueuedDrawing final : public BoundDrawing {
 
   private:
     const Device device_;
-    const std::shared_ptr<Mutex> turns_;      // belongs to the frame
-    const std::unique_ptr<Drawing> drawing_;  // destroyed before the objects that it uses
-    DevicePages* const pages_;                // the pool that it draws from; null: none
+    const std::shared_ptr<Mutex> turns_;  // shared with the frame
+    // destroyed before the objects that it uses
+    const std::unique_ptr<Drawing> drawing_;
+    DevicePages* const pages_;  // the pool that provides the gaussians; may be null
     const SelectRule rule_;
 };
 
@@ -178,7 +179,7 @@ PicturePlanes planes_of(NewPicture& picture, Device device) {
     return {planes.color, planes.alpha, planes.depth};
 }
 
-// Returns the pictures of the eyes on the device, without memory yet.
+// Returns the pictures of the eyes, without memory yet.
 EyeImages new_images(const Eyes& eyes, const Shade& shade, NewPictures& pictures) {
     FrameImage image[2]{};
     for (int k = 0; k < eyes.count(); ++k) {
@@ -192,8 +193,8 @@ EyeImages new_images(const Eyes& eyes, const Shade& shade, NewPictures& pictures
                         : EyeImages{{image[0], {}}, 1, stop};
 }
 
-// Allocates the planes through torch; slow, so called after the first kernels are
-// queued.
+// Returns a function that allocates the pictures through torch. It is called after the
+// first kernels are enqueued, because it is slow.
 cuda::Frame::Place place_of(NewPictures& pictures, Device device) {
     return [&pictures, device](PicturePlanes planes[2]) {
         for (size_t k = 0; k < pictures.size(); ++k) planes[k] = planes_of(pictures[k], device);
@@ -213,12 +214,12 @@ class BackendFrame final : public backend::Frame {
         std::vector<std::shared_ptr<const DevicePalette>> colors;
         for (const std::shared_ptr<const backend::Palette>& palette : palettes)
             colors.push_back(static_cast<const BackendPalette&>(*palette).palette);
+        const Turn turn(*turns_);
         frame_.set_models(std::move(on_device), std::move(colors), stream_of(work));
         models_ = std::move(models);
     }
 
     std::unique_ptr<BoundDrawing> draw(const backend::FrameInput& input) override {
-        const Turn turn(*turns_);
         const FrameRequest& request = input.request;
         if (request.cut) return enqueue(input, request.rule);
         return in_steps(input.steps, request.rule, request.choosing_eyes(), input.state,
@@ -230,7 +231,7 @@ class BackendFrame final : public backend::Frame {
     }
 
     std::vector<std::pair<const char*, size_t>> memory() const override {
-        std::vector<std::pair<const char*, size_t>> parts = frame_.bytes();
+        std::vector<std::pair<const char*, size_t>> parts = bytes_of_frame();
         const PoolBytes pool = pool_bytes();
         parts.emplace_back("pool, reserved", pool.reserved);
         parts.emplace_back("pool, used", pool.used);
@@ -241,6 +242,7 @@ class BackendFrame final : public backend::Frame {
     std::unique_ptr<BoundDrawing> enqueue(const backend::FrameInput& input,
                                           const SelectRule& paced) {
         const FrameRequest& request = input.request;
+        const Turn turn(*turns_);
         const Work work(device_);
         NewPictures pictures;
         const EyeImages images = new_images(request.eyes, request.shade, pictures);
@@ -250,18 +252,24 @@ class BackendFrame final : public backend::Frame {
         std::unique_ptr<Drawing> drawing =
             frame_.draw(tables_of(input.scene), pages, request, used, images, stream_of(work),
                         place_of(pictures, device_));
-        // Without a pool, the drawing reports the tolerance of the request, else the
-        // one in `used`.
+        // The tolerance to report: without a pool, that of the request; with a pool,
+        // the one that the pool may have raised.
         const SelectRule& reported = pages == nullptr ? request.rule : used;
         return std::make_unique<EnqueuedDrawing>(std::move(pictures), device_, turns_,
                                                  std::move(drawing), reported, pages);
     }
 
+    std::vector<std::pair<const char*, size_t>> bytes_of_frame() const {
+        const Turn turn(*turns_);
+        return frame_.bytes();
+    }
+
     const Device device_;
-    // Drawings share it, because they may finish after the frame's last drawing began.
+    // Shared with drawings, which may be finished after the frame is destroyed.
     const std::shared_ptr<Mutex> turns_ = std::make_shared<Mutex>();
-    std::vector<std::shared_ptr<const backend::Model>> models_;  // with the rows that they read
-    SceneFrame frame_;
+    // Own the memory that the frame reads.
+    std::vector<std::shared_ptr<const backend::Model>> models_ V3DG_GUARDED_BY(*turns_);
+    SceneFrame frame_ V3DG_GUARDED_BY(*turns_);
 };
 
 class BackendAssetFrame final : public backend::AssetFrame {
@@ -290,12 +298,12 @@ class BackendAssetFrame final : public backend::AssetFrame {
     const std::shared_ptr<Mutex> turns_ = std::make_shared<Mutex>();
     const std::shared_ptr<const backend::Model> model_;
     const Appearance<float> appearance_;
-    ModelFrame frame_;
+    ModelFrame frame_ V3DG_GUARDED_BY(*turns_);
 };
 
 class DeviceTape final : public Tape {
   public:
-    // Keeps the arrays, which backward() reads again.
+    // Keeps the gaussians alive, because backward() reads them again.
     DeviceTape(const Rows& gaussians, std::unique_ptr<DifferentiableFrame> frame,
                py::ssize_t height, py::ssize_t width)
         : gaussians_(gaussians), frame_(std::move(frame)), height_(height), width_(width) {}

@@ -1,17 +1,17 @@
 #pragma once
 
-// Models, scenes, pools and frames on CUDA devices. Only sources of the CUDA backend
-// include this file.
+// Models, scenes, pools and frames on CUDA devices. Only source files of the CUDA
+// backend include this file.
 
 #include "bindings/resident.h"
 #include "draw/scene_frame_cuda.h"
 
 namespace v3dg::cuda {
 
-// Returns the stream of Work as a cudaStream_t.
+// Returns the stream of a Work as a cudaStream_t.
 inline cudaStream_t stream_of(const Work& work) { return static_cast<cudaStream_t>(work.stream()); }
 
-// Borrows an array on any CUDA device.
+// Borrows an array that is on any CUDA device.
 Borrowed borrow_anywhere(const py::handle& array, const char* name, const Element& element,
                          Shape shape);
 
@@ -24,7 +24,8 @@ class BackendTables final : public backend::Tables {
     const BundleTables tables;
 };
 
-// Returns the tables of a bundle, which exist as long as the result.
+// Returns the tables of a bundle on the device. They exist as long as the returned
+// pointer.
 std::shared_ptr<const BundleTables> tables_on(const BoundTable& table, const Work& work);
 
 std::shared_ptr<const backend::Model> make_model(const Rows& rows, const Work& work);
@@ -38,7 +39,7 @@ std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const back
                                                       Appearance<float> appearance,
                                                       const Work& work);
 
-// As Backend::rasterize().
+// Implements Backend::rasterize().
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,
                      bool with_depth, bool keep_tape);
 

@@ -1,6 +1,6 @@
 #pragma once
 
-// The result of drawing a frame for Python: pictures and statistics.
+// The result of drawing a frame, for Python: pictures and statistics.
 
 #include <atomic>
 #include <memory>
@@ -13,10 +13,10 @@
 
 namespace v3dg {
 
-// A Turn gives one thread exclusive use of a frame until the Turn is destroyed.
-// Python's lock does not suffice, because torch releases that lock during allocations.
-// The constructor waits without Python's lock, which the other thread may need to
-// finish. Used by backends whose frames share buffers.
+// A Turn gives one thread exclusive use of a frame until the Turn is destroyed. The GIL
+// does not suffice, because torch releases it during allocations. The constructor
+// releases the GIL while it waits, because the other thread may need it to finish. For
+// backends whose frames share buffers.
 class V3DG_SCOPED_CAPABILITY Turn {
   public:
     explicit Turn(Mutex& mutex) V3DG_ACQUIRE(mutex) : mutex_(mutex) { wait_for(mutex); }
@@ -25,7 +25,8 @@ class V3DG_SCOPED_CAPABILITY Turn {
     Turn& operator=(const Turn&) = delete;
 
   private:
-    // Clang checks no constructors, so the lock is not in the constructor.
+    // Not in the constructor, because Clang's thread-safety analysis skips
+    // constructors.
     static void wait_for(Mutex& mutex) V3DG_ACQUIRE(mutex) {
         if (mutex.try_lock()) return;
         const Unlocked unlocked;
@@ -35,20 +36,23 @@ class V3DG_SCOPED_CAPABILITY Turn {
     Mutex& mutex_;
 };
 
-// The statistics of a frame; times are in milliseconds.
+// The statistics of a frame. Times are in milliseconds.
 struct FrameStats {
-    int64_t gaussians;  // selected gaussians; if the budget is exceeded, those of the coarsest cut
+    // selected gaussians; if exceeds_budget, those of the coarsest cut
+    int64_t gaussians;
     uint64_t in_frustum, records, entries, items;
     float tolerance_px2;
     bool exceeds_budget;
     double select_ms, draw_ms;
-    std::vector<int64_t> levels;  // on the host: selected gaussians by level
-    // Above 1 if buffers on a device were too small, so that the frame was drawn again.
+    // selected gaussians of each level; set on the host only
+    std::vector<int64_t> levels;
+    // How often the frame was drawn. More than once if a buffer on the device was too
+    // small.
     int num_draws = 1;
 };
 
-// A frame that has been drawn, or enqueued on a device, with its inputs and outputs. A
-// backend that returns before the frame is drawn uses a derived class.
+// A frame that was drawn, or that was enqueued on a device. A backend that returns
+// before the frame is drawn uses a derived class.
 class BoundDrawing {
   public:
     BoundDrawing(NewPictures pictures, const FrameStats& stats)
@@ -62,10 +66,10 @@ class BoundDrawing {
 
     // Returns whether the device may still be drawing.
     virtual bool is_under_way() const { return false; }
-    // Keeps an input alive as long as this object: the frame, which may have to draw
-    // again, and what the frame reads.
+    // Keeps a Python object alive as long as this drawing: the inputs of the frame,
+    // which may be drawn again.
     void keep(py::object kept) { kept_ = std::move(kept); }
-    // Waits for the pictures.
+    // Waits until the pictures are drawn.
     virtual const FrameStats& finish() { return stats_; }
 
   protected:

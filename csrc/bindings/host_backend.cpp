@@ -1,5 +1,5 @@
-// The backend of the host, which is always compiled. Arrays are NumPy's, there is no
-// stream, and all work is done when a call returns. Its frames and pools are in
+// The backend of the host, which is always compiled. Arrays are NumPy arrays, there are
+// no streams, and all work is done when a function returns. Its frames and pools are in
 // host_frame.cpp.
 
 #include "bindings/backend.h"
@@ -14,7 +14,8 @@ namespace host {
 
 namespace {
 
-// Selection reads the host arrays of the state, so the handle has no data.
+// A scene on the host. It has no data, because selection reads the arrays of
+// SceneState.
 class HostScene final : public backend::Scene {
   public:
     void set_bundles(const SceneState&, const Work&) override {}
@@ -67,7 +68,7 @@ class HostTarget final : public backend::Target {
     std::unique_ptr<::v3dg::Model<float>> model_;
 };
 
-// Every processor that runs Python can read float32 at any address.
+// row_alignment is 1: processors that run Python read float32 at any address.
 constexpr BackendTraits kTraits{.host_reads_arrays = true,
                                 .computes_doubles = true,
                                 .row_alignment = 1,
@@ -135,7 +136,7 @@ class HostBackend final : public Backend {
         v3dg::weigh_cuts(config, gaussians, pictures, seen, progress);
     }
 
-    // Selection on the host reads the tables where they are.
+    // Returns null, because selection on the host reads the original tables.
     std::shared_ptr<const backend::Tables> make_tables(const BoundTable&,
                                                        const Work&) const override {
         return nullptr;
@@ -156,8 +157,7 @@ class HostBackend final : public Backend {
         return std::make_unique<HostScene>();
     }
     PoolDemands pool_demands(int max_sh_degree) const override {
-        // Indices of coefficients have 32 bits here, and each degree has its own index
-        // range.
+        // The host uses 32-bit indices for SH codes, separately for each degree.
         const size_t most_coded_rows = UINT32_MAX / static_cast<size_t>(std::max(1, max_sh_degree));
         return {.most_block_bytes = size_t(64) << 20,
                 .row_bytes = sizeof(float) * (11 + 3 * num_sh_bases(max_sh_degree)),
@@ -191,7 +191,7 @@ class HostBackend final : public Backend {
 }  // namespace
 }  // namespace host
 
-// It lives to the end of the process, which may outlive Python.
+// Never destroyed, because Python may end before the process.
 const Backend& host_backend() {
     static const Backend& backend = *new host::HostBackend;
     return backend;

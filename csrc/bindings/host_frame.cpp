@@ -1,5 +1,5 @@
-// Frames and pools on the host. Everything is drawn on return, in NumPy's memory and
-// without Python's lock. Frames share no buffers, so they need no Turn.
+// Frames and pools on the host. Pictures are in NumPy's memory and are drawn when
+// draw() returns, without the GIL. Frames share no buffers, so they need no Turn.
 
 #include "bindings/host_frame.h"
 
@@ -13,20 +13,22 @@ namespace v3dg::host {
 
 namespace {
 
-// The kinds of frames of a pool. `flight` is one of a sequence. `first_look` and `look`
-// are steps of settling a view. `aside` uses the resident pages of the last frame,
-// unchanged, and neither brings pages in nor requests any.
+// The kinds of frames of a pool. `flight` is a frame of a sequence. `first_look` and
+// `look` are steps of settling a view. `aside` draws with the pages that the last frame
+// used, and neither brings in pages nor requests any.
 enum class PoolFrame { flight, first_look, look, aside };
 
 class HostPool final : public backend::Pool {
   public:
     explicit HostPool(PagePool& pool) : pool_(pool), pages_(pool), needs_(pool.num_bundles()) {}
 
-    // Brings pages, calls cut(tables, rule, needs), which returns the tolerance that it
-    // used, and notes the needs of the cut. Called without Python's lock.
+    // Draws a frame: brings in pages, calls cut(tables, rule, needs), and passes the
+    // page requests to the pool. cut() returns the tolerance that it used. Called
+    // without the GIL.
     template <class Cut>
     NotedView frame(const SceneState& scene, SelectRule rule, PoolFrame kind, const Cut& cut) {
-        pool_.check_process();  // In a child of fork() the mutex may be locked forever.
+        // In a child of fork(), `busy_` could be locked for ever.
+        pool_.check_process();
         const MutexLock lock(busy_);
         if (kind == PoolFrame::first_look) pool_.begin_settling();
         const bool is_aside = kind == PoolFrame::aside && has_begun_;
@@ -72,7 +74,7 @@ class HostPool final : public backend::Pool {
         return step;
     }
 
-    // Returns the gaussians of each bundle, in the requested colours.
+    // Returns the gaussians of each bundle, with the colours that the request asks for.
     std::vector<SceneModel> models(const SceneState& scene, const FrameRequest& request) const {
         std::vector<SceneModel> models;
         for (size_t b = 0; b < scene.tables.size(); ++b) {
@@ -107,7 +109,8 @@ class HostPool final : public backend::Pool {
     HostPages pages_;
     Mutex busy_;
     bool has_begun_ V3DG_GUARDED_BY(busy_) = false;  // whether any frame has begun
-    std::vector<std::vector<uint32_t>> needs_ V3DG_GUARDED_BY(busy_);  // per bundle
+    // [page] per bundle
+    std::vector<std::vector<uint32_t>> needs_ V3DG_GUARDED_BY(busy_);
 };
 
 FrameStats stats_of(const SceneFrameCounts& counts) {
@@ -152,8 +155,8 @@ struct HostPictures {
     Span<const Picture<float>> span() const { return {pictures.data(), pictures.size()}; }
 };
 
-// The models of a frame, without the scene's tables. The object never changes, so a
-// frame in progress keeps it while another thread sets other models.
+// The models of a frame. The object is immutable. A frame in progress keeps it, while
+// another thread sets new models.
 struct HostModels {
     std::vector<std::shared_ptr<const backend::Model>> models;
     std::vector<std::shared_ptr<const backend::Palette>> palettes;
@@ -219,8 +222,9 @@ class HostFrame final : public backend::Frame {
         return std::make_unique<BoundDrawing>(std::move(out.made), stats_of(counts));
     }
 
-    // Calls body(scene, rule) without Python's lock: with the models that were set, or
-    // with the resident part of the pool. body() returns the tolerance that it used.
+    // Calls body(scene, rule) without the GIL. The scene has the models that were set
+    // or, with a pool, the resident part of the pool. body() returns the tolerance that
+    // it used.
     template <class Body>
     void with_scene(const backend::FrameInput& input, const SelectRule& rule, PoolFrame kind,
                     uint32_t* last_bin, const Body& body) const {

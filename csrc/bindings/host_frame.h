@@ -1,14 +1,14 @@
 #pragma once
 
-// Frames and pools on the host.
+// Models, palettes, pools and frames on the host.
 
 #include "bindings/resident.h"
 #include "draw/model.h"
 
 namespace v3dg::host {
 
-// The gaussians that host frames read: planes owned by this object, or the codes of a
-// bundle, which are borrowed.
+// The gaussians that frames on the host read: either planes, which this object owns, or
+// the codes of a bundle, which it borrows.
 class HostModel final : public backend::Model {
   public:
     explicit HostModel(const GaussianRows<const float>& rows);
@@ -27,7 +27,7 @@ class HostModel final : public backend::Model {
   private:
     size_t size_ = 0;
     std::unique_ptr<::v3dg::Model<float>> planes_;
-    py::object codes_object_;  // owner of the memory of `codes_`
+    py::object codes_object_;  // owns the memory of `codes_`
     Codes codes_{};
 };
 
@@ -47,7 +47,7 @@ std::unique_ptr<backend::Frame> make_frame();
 std::unique_ptr<backend::AssetFrame> make_asset_frame(std::shared_ptr<const backend::Model> model,
                                                       Appearance<float> appearance);
 
-// As Backend::rasterize(), for float32 or float64.
+// Implements Backend::rasterize() for float32 and float64.
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,
                      bool with_depth, bool keep_tape);
 

@@ -1,4 +1,5 @@
-// The compiled module: its requirements on the process, and its parts in order.
+// The definition of the compiled module: what it requires of the process, then the
+// bindings of each part.
 
 #include <dlfcn.h>
 #include <omp.h>
@@ -14,11 +15,10 @@
 #include "math/gaussian.h"
 #include "residency/cluster_table.h"
 
-// GNU's OpenMP keeps idle threads for the next parallel loop. A child of fork() has no
-// such threads, but would wait for them forever. So the forking thread ends its idle
-// threads before the fork; the next loop starts new ones in both processes. LLVM's
-// OpenMP, which may replace GNU's, handles forks itself and then holds locks that this
-// call would wait for.
+// Ends the idle threads of GNU's OpenMP (libgomp) before a fork(). The child would have
+// no such threads, but would wait for them for ever. The next parallel loop starts new
+// threads, in the parent as in the child. LLVM's OpenMP, which may replace libgomp,
+// handles fork() itself; this call would wait for locks that it holds.
 static void let_threads_go() { omp_pause_resource_all(omp_pause_hard); }
 static bool must_let_threads_go() {
     Dl_info found;
@@ -31,9 +31,9 @@ static int num_cuda_devices() {
     return backend == nullptr ? 0 : backend->num_devices();
 }
 
-// Refuses objects that were made by `__new__` alone, which hold no value. If such an
-// object is passed to a function, pybind11 asks its class for memory of the value's
-// size and would use it uninitialised.
+// Refuses objects that were made by `__new__` alone, which have no C++ value. When such
+// an object is passed to a function, pybind11 asks its class to allocate the value, and
+// would use it uninitialised.
 static void* refuse_unmade(size_t) {
     throw v3dg::py::type_error(
         "self: this object was made by __new__ alone and has no value; call the class instead");

@@ -1,6 +1,6 @@
 #pragma once
 
-// New planes of a picture, on the device of its gaussians.
+// The memory of a new picture.
 
 #include "bindings/types.h"
 
@@ -13,7 +13,7 @@ struct NewPlanes {
 
 struct NewPicture {
     py::ssize_t height, width;
-    py::object color, alpha, depth;  // depth is None unless requested
+    py::object color, alpha, depth;  // `depth` is None if not requested
     bool with_depth;
 
     NewPicture(const Window& window, bool with_depth)
@@ -22,7 +22,7 @@ struct NewPicture {
           depth(py::none()),
           with_depth(with_depth) {}
 
-    // Allocates the planes.
+    // Allocates the arrays.
     template <class T>
     NewPlanes<T> allocate(Device device) {
         const NewArray<T> color_plane(device, {height, width, 3});
@@ -40,7 +40,7 @@ struct NewPicture {
     }
 };
 
-// The pictures of a frame: one for a camera; for two eyes, left first.
+// The pictures of a frame: one for a camera, two for a stereo camera, left first.
 using NewPictures = std::vector<NewPicture>;
 
 }  // namespace v3dg

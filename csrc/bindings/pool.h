@@ -1,6 +1,6 @@
 #pragma once
 
-// The resident part of bundles, in memory of a fixed size.
+// A page pool on one device: the resident part of bundles, in memory of a fixed size.
 
 #include <memory>
 #include <vector>
@@ -11,7 +11,7 @@ namespace v3dg {
 
 class BoundPool {
   public:
-    // `sources` has for each table either the arrays of gaussians in memory (Rows), or
+    // `sources` has one element per table: either the gaussians in memory (Rows), or
     // the file of the bundle (FileSource).
     BoundPool(const py::list& tables, const py::list& sources, int device, size_t num_bytes,
               unsigned num_threads);
@@ -23,7 +23,7 @@ class BoundPool {
     backend::Pool& handle() { return *on_device_; }
     void check_scene(const SceneState& scene) const;
 
-    // As backend::Pool::settle_step().
+    // See backend::Pool::settle_step().
     SettlingStep settle_step(const py::object& scene_object, const BoundEyes& camera,
                              const SelectRule& rule, bool begins);
 

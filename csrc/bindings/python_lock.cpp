@@ -12,9 +12,8 @@ namespace {
 
 namespace py = pybind11;
 
-// Serialises threads that register with Python. Registration uses state that the
-// interpreter destroys at some point of its end, so no thread may start it once the end
-// is near.
+// Serialises the registration of threads with Python. Registration uses state that the
+// ending interpreter destroys, so it is closed before that.
 struct Entrance {
     std::mutex busy;
     bool is_closed = false;
@@ -27,12 +26,14 @@ Entrance& entrance() {
 }
 
 void close_entrance() {
-    const Unlocked unlocked;  // a thread in the entrance waits for Python's lock
+    // a thread that holds the mutex may be waiting for the GIL
+    const Unlocked unlocked;
     const std::lock_guard<std::mutex> lock(entrance().busy);
     entrance().is_closed = true;
 }
 
-// A child of fork() has none of the threads that may hold the mutex.
+// Replaces the mutex in the child of a fork(), where the thread that held it does not
+// exist.
 void renew_entrance() { new (&entrance().busy) std::mutex; }
 
 }  // namespace
@@ -49,8 +50,8 @@ bool call_with_lock(const std::function<void()>& body) {
         return !entrance().is_closed;
     });
     if (!is_open) return false;
-    // This is not a destructor, because a thread that Python has ended would release a
-    // lock that it does not hold.
+    // Not by a destructor: when Python ends the thread, the destructor would release a
+    // lock that the thread does not hold.
     try {
         staying_if_ended(body);
     } catch (...) {

@@ -1,14 +1,13 @@
 #pragma once
 
-// Python's lock: released for work and acquired again, and acquired by threads that
-// Python did not start.
+// Releases and acquires the GIL (Python's global interpreter lock), also for threads
+// that Python did not start.
 //
-// Up to Python 3.13, a thread that requests the lock while the interpreter ends is
-// ended by pthread_exit(), which unwinds its stack. That aborts the process at the
-// first frame that must not throw, such as a destructor, and runs other destructors
-// without the lock that they need. Therefore such a thread never returns to this code:
-// it sleeps until the process ends, which does not wait for it. Python 3.14 and later
-// do the same.
+// Up to Python 3.13, a thread that requests the GIL while the interpreter ends is ended
+// by pthread_exit(), which unwinds its stack. Unwinding aborts the process at the first
+// function that must not throw, such as a destructor, and runs other destructors
+// without the GIL. Therefore such a thread never returns to this code: it sleeps until
+// the process ends, which does not wait for it. Python 3.14 and later do the same.
 
 #include <cxxabi.h>
 #include <pybind11/pybind11.h>
@@ -20,8 +19,8 @@ namespace v3dg {
 // Sleeps until the process ends.
 [[noreturn]] void sleep_for_ever() noexcept;
 
-// Calls body(), in which Python may end the thread. No object between here and Python
-// may have a destructor that needs the lock.
+// Calls body(), during which Python may end the thread. Objects on the stack between
+// this call and Python must not have destructors that need the GIL.
 template <class Body>
 auto staying_if_ended(const Body& body) {
     try {
@@ -31,7 +30,7 @@ auto staying_if_ended(const Body& body) {
     }
 }
 
-// Releases Python's lock while it exists.
+// Releases the GIL during its lifetime.
 class Unlocked {
   public:
     Unlocked() : thread_(PyEval_SaveThread()) {}
@@ -45,12 +44,12 @@ class Unlocked {
     PyThreadState* thread_;
 };
 
-// Calls body() with Python's lock on a thread that Python did not start. Returns false,
-// without a call, if the interpreter is about to end or has ended.
+// Calls body() with the GIL, on a thread that Python did not start. Returns false,
+// without calling it, if the interpreter is ending or has ended.
 bool call_with_lock(const std::function<void()>& body);
 
-// Makes call_with_lock() refuse calls before the interpreter ends. Called once, when
-// the module is loaded.
+// Makes call_with_lock() refuse calls when the interpreter ends. To be called once,
+// when the module is loaded.
 void watch_end_of_python();
 
 }  // namespace v3dg

@@ -1,4 +1,4 @@
-// Models, palettes and scenes: checks, and calls of their handles.
+// Models, palettes and scenes: they check arguments and call the backend.
 
 #include "bindings/resident.h"
 
@@ -7,7 +7,7 @@
 namespace v3dg {
 
 BoundModel::BoundModel(const Rows& rows) : device_(rows.device()), size_(rows.size()) {
-    static_cast<void>(rows.read<float>());  // this checks the precision
+    static_cast<void>(rows.read<float>());  // checks that they are float32
     const Work work(device_);
     model_ = work.backend().make_model(rows, work);
 }

@@ -1,7 +1,7 @@
 #pragma once
 
-// Objects that stay on one device from frame to frame: gaussians, palettes and scenes.
-// Each has a handle that was made by its device's backend.
+// Objects that stay on one device between frames: models, palettes and scenes. Each has
+// a handle from the device's backend.
 
 #include <memory>
 #include <vector>
@@ -11,7 +11,7 @@
 
 namespace v3dg {
 
-// The gaussians of a bundle or an asset in the layout of one device's frames.
+// The gaussians of a bundle or an asset, in the layout that frames on one device read.
 class BoundModel {
   public:
     explicit BoundModel(const Rows& rows);
@@ -23,8 +23,8 @@ class BoundModel {
     size_t bytes() const { return model_->bytes(); }
     const std::shared_ptr<const backend::Model>& handle() const { return model_; }
 
-    // Returns the gaussians of clusters of a coded model: means, quats, scales,
-    // opacities, sh.
+    // Returns the gaussians of some clusters of a coded model as arrays: means, quats,
+    // scales, opacities, sh.
     py::tuple decode(const py::array& cluster_ids) const;
 
   private:
@@ -32,11 +32,11 @@ class BoundModel {
     size_t size_ = 0;
     bool is_coded_ = false;
     int sh_degree_ = 0;
-    std::vector<uint32_t> num_gaussians_;  // size of each cluster of a coded model
+    std::vector<uint32_t> num_gaussians_;  // gaussians per cluster of a coded model
     std::shared_ptr<const backend::Model> model_;
 };
 
-// The colours of the clusters of one bundle on one device.
+// The colours of the clusters of one bundle, on one device.
 class BoundPalette {
   public:
     BoundPalette(const py::object& table, const py::array& sh, int device);
@@ -49,20 +49,20 @@ class BoundPalette {
     std::shared_ptr<const backend::Palette> palette_;
 };
 
-// The host's view of a scene. It never changes: a frame that draws it keeps it, and
-// every change makes another object.
+// A scene on the host. It is immutable: each change creates a new object, and a frame
+// in progress keeps the old one.
 struct SceneState {
     py::list bundles;
-    // Bundle, importance, positions, quaternions, scales and factors of the instances.
+    // Per instance: bundle, importance, positions, quaternions, scales, factors.
     py::tuple arrays;
     std::vector<ClusterTable> tables;
-    std::vector<size_t> num_gaussians;  // per bundle
-    InstanceTable instances;            // with poses only if the host can read the arrays
+    std::vector<size_t> num_gaussians;  // gaussians of each bundle
+    InstanceTable instances;            // has poses only if the host can read the arrays
 
     const BoundTable& bundle(size_t b) const { return held<BoundTable>(bundles[b], "tables"); }
 };
 
-// The tables of a scene that selection reads, on one device.
+// The part of a scene that selection reads, on one device.
 class BoundScene {
   public:
     explicit BoundScene(int device);
@@ -71,7 +71,7 @@ class BoundScene {
     std::shared_ptr<const SceneState> state() const { return state_; }
     const backend::Scene& handle() const { return *scene_; }
 
-    // Replaces all bundles; the caller sets instances next.
+    // Replaces all bundles. The caller then sets the instances.
     void set_bundles(const py::list& bundles);
     void set_instances(const py::array& bundle, const py::array& importance,
                        const py::object& positions, const py::object& quaternions,
@@ -80,9 +80,10 @@ class BoundScene {
     void set_poses(const py::object& positions, const py::object& quaternions,
                    const py::object& scales);
 
-    // `steps`: pacing state of a sequence of pictures; null for a single one.
+    // `steps` is the state of a sequence of cuts; null for a single cut.
     BoundCut select(const BoundEyes& camera, const SelectRule& rule, BudgetSteps* steps);
-    // Returns the priorities of the pages of each bundle, on the host.
+    // Returns the priority of each page, (pages,) float32 for each bundle; 0 if the cut
+    // does not need the page. The scene must be on the host.
     py::list page_needs(const BoundCamera& camera, const SelectRule& rule) const;
 
   private:

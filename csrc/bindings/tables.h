@@ -1,6 +1,6 @@
 #pragma once
 
-// Tables of bundles, and cuts of them.
+// The tables of bundles, and cuts, for Python.
 
 #include <map>
 #include <memory>
@@ -13,7 +13,7 @@ namespace v3dg {
 
 namespace backend { class Tables; }
 
-// The tables of one bundle, with the arrays that they borrow from.
+// The tables of one bundle, and the arrays that they borrow from.
 class BoundTable {
   public:
     BoundTable(py::array ball, py::array weight, py::array level, py::array own_group,
@@ -27,11 +27,11 @@ class BoundTable {
         return static_cast<size_t>(table().offset[table().offset.size - 1]);
     }
 
-    // Returns the memory of the tables on a device.
+    // Returns the memory in bytes of the tables on a device.
     size_t bytes_on(int device) const;
 
-    // Returns the tables on a device, which all scenes there share; makes them if no
-    // scene has them.
+    // Returns the tables on a device. All scenes on the device share them; they are
+    // created if no scene has them yet.
     std::shared_ptr<const backend::Tables> on(const Work& work) const;
 
   private:
@@ -40,7 +40,7 @@ class BoundTable {
     mutable std::map<int, std::weak_ptr<const backend::Tables>> on_device_;
 };
 
-// The pairs (instance, cluster) of a selection, and its results.
+// A selected cut for Python: pairs (instance, cluster), and the results of the budget.
 struct BoundCut {
     py::array_t<int32_t> instance_ids, cluster_ids;
     py::array_t<float> weights;

@@ -1,6 +1,6 @@
 #pragma once
 
-// One picture of gaussians without levels, and its gradients, as backends return them.
+// One picture of gaussians without levels, and its gradients.
 
 #include <optional>
 
@@ -9,20 +9,20 @@
 
 namespace v3dg {
 
-// The requested gradients with respect to the gaussians' centres on the image.
+// Which gradients with respect to the gaussians' centres are requested.
 struct Centers {
     bool sum, size;
 };
 
-// The gradients of a picture, arrays on the device of its gaussians; None for those not
+// The gradients of a picture, as arrays on the device of the gaussians. None if not
 // requested.
 struct Gradients {
     py::object means, quats, scales, opacities, sh, background;
-    py::object centers = py::none();       // (N, 2), by the centres on the image
-    py::object center_sizes = py::none();  // (N, 2), of the absolute values of pixels
+    py::object centers = py::none();       // (N, 2) with respect to the centres, 1 / px
+    py::object center_sizes = py::none();  // (N, 2) sums of absolute values over pixels
 };
 
-// The data that rasterize() leaves for its backward pass.
+// The results of rasterize() that its backward pass needs.
 class Tape {
   public:
     virtual ~Tape() = default;
@@ -30,12 +30,12 @@ class Tape {
                                const py::object& d_depth, Centers wanted) = 0;
 };
 
-// The settings of one picture besides gaussians and camera.
+// The settings of a picture besides gaussians and camera.
 struct DrawLook {
     double filter_px2;
     bool antialiased;
     std::array<double, 3> background;
-    bool plain_colors;  // the coefficients, of degree 0, are used directly as colours
+    bool plain_colors;  // use the coefficients (of degree 0) directly as colours
 
     template <class T>
     GaussianRows<const T> read(const Rows& gaussians) const {
@@ -45,18 +45,18 @@ struct DrawLook {
     }
 };
 
-// A picture, its statistics on the host, and the tape or null.
+// A drawn picture. `counts` are set on the host only; `tape` is null if not requested.
 struct Rasterized {
     py::object color, alpha, depth;
     std::optional<RenderCounts> counts;
     std::unique_ptr<Tape> tape;
 };
 
-// Draws with the backend of the gaussians' device, after checks.
+// Checks the arguments, and draws on the device of the gaussians.
 Rasterized rasterize(const Rows& gaussians, const BoundCamera& camera, const DrawLook& look,
                      bool with_depth, bool keep_tape);
 
-// Returns the gradient of a plane of the picture, or zeros if none is given.
+// The gradient of one plane of a picture; zeros if it is None.
 template <class T>
 struct GradientPlane {
     py::object object;
@@ -71,7 +71,7 @@ struct GradientPlane {
     }
 
   private:
-    // NumPy arrays are filled here; torch tensors fill themselves with fill_().
+    // NumPy arrays have fill(), torch tensors fill_().
     static py::object zeros(Device device, const std::vector<py::ssize_t>& shape) {
         const py::object array = make_array(device, element_of<T>(), shape).object;
         array.attr(py::isinstance<py::array>(array) ? "fill" : "fill_")(0);

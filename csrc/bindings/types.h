@@ -1,7 +1,7 @@
 #pragma once
 
-// Value types that Python passes to the core. They are immutable; those that borrow
-// from arrays keep these alive.
+// The values that Python passes to the core. They are immutable, and keep alive the
+// arrays that they borrow from.
 
 #include <array>
 
@@ -13,7 +13,7 @@
 
 namespace v3dg {
 
-// A camera, for its whole image or a part, and the values that it was made of.
+// A camera, for its whole image or a part, and the view matrix that it was made from.
 struct BoundCamera {
     std::array<double, 16> viewmat;
     Camera camera;
@@ -27,7 +27,7 @@ struct BoundEyes {
     Eyes eyes;
 };
 
-// The arrays of gaussians, all on the host or all on one CUDA device; float32 or, on
+// The arrays of gaussians: all on the host or all on one CUDA device; float32 or, on
 // the host, float64.
 class Rows {
   public:
@@ -40,14 +40,14 @@ class Rows {
     bool is_double() const { return is_double_; }
     const std::array<py::object, 5>& arrays() const { return arrays_; }
 
-    // Borrows the arrays in the precision that they have.
+    // Borrows the arrays, which must have the precision T.
     template <class T>
     GaussianRows<const T> read() const {
         check_precision(std::is_same<T, double>::value);
         const auto at = [&](int k) { return static_cast<const T*>(memory_[k]); };
         return {at(0), at(1), at(2), at(3), at(4), size_, sh_degree_};
     }
-    // Borrows the arrays for writing; float32.
+    // Borrows the arrays for writing. They must be float32.
     GaussianRows<float> write() const { return spans<float>(); }
 
   private:
@@ -78,7 +78,7 @@ class Rows {
     bool is_double_ = false;
 };
 
-// New rows of `size` gaussians, to be filled in.
+// New, uninitialised arrays for `size` gaussians.
 struct NewRows {
     NewArray<float> means, quats, scales, opacities, sh;
     size_t size;
@@ -97,10 +97,10 @@ struct NewRows {
     }
 };
 
-// Returns the SH degree of coefficients with shape (N, K, 3).
+// Returns the SH degree that has this number of bases. `shape` is for the error text.
 int degree_of_bases(py::ssize_t bases, const std::string& shape);
 
-// Instances on the host.
+// The instances of a scene, in host memory.
 class Instances {
   public:
     Instances(py::array bundle, py::array positions, py::array quaternions, py::array scales,
@@ -113,11 +113,11 @@ class Instances {
     std::array<py::object, 6> arrays_;
     InstanceTable table_;
 };
-// (I, 4) factors of red, green, blue and opacity; empty for None.
+// Returns (I, 4) factors of red, green, blue and opacity; empty for None.
 Span<const InstanceFactors> factors_of(const py::object& factors, py::ssize_t count);
 void check_instance_bundles(Span<const int32_t> bundle, size_t num_bundles);
 
-// Returns boundaries of segments: ascending from 0 to `last`.
+// Returns the boundaries of segments, which must ascend from 0 to `last`.
 Span<const int64_t> offsets_of(const py::handle& offset, size_t last);
 
 // Returns the requested part of the camera's image.

@@ -1,34 +1,34 @@
 #pragma once
 
-// The types that camera models use in their interface: a plane that bounds what a
-// camera sees, the image of a sphere, a part of the image, and gradients on the image.
+// The types in the interface of camera models: bounding planes, the image of a sphere,
+// a part of an image, and a projected gaussian.
 
 namespace v3dg {
 
-// The requested part of an image, px: [x0, x1) x [y0, y1).
+// The requested part of an image, px: x in [x0, x1) and y in [y0, y1).
 struct ImagePart {
     double x0, y0, x1, y1;
 };
 
-// A plane that bounds what a camera sees, moved outwards. A point is outside if normal
-// . p + offset is positive.
+// A plane of a camera's frustum. A point p is outside if normal . p + offset is
+// positive.
 struct Plane {
     float normal[3], offset;
-    // How much farther the image of a gaussian may extend than its box, per unit of the
-    // box's half depth, because the projection is linearised at the gaussian's mean.
+    // The linearised image of a gaussian may extend beyond the true projection of its
+    // box. `guard` bounds by how much, per unit of the box's half depth.
     float guard;
 };
 
-// The image of a sphere, px: its centre, and a bound on its extent from there in x and
-// y.
+// The image of a sphere, px: its centre (u, v), and an upper bound on its half extent
+// in x and in y.
 template <class T>
 struct SphereImage {
     T u, v, half;
 };
 
-// The projection of a gaussian with mean p and axes m in view space: the pixel and the
-// depth of its mean, and the rows a1 and a2 of the Jacobian times m. Also the gradients
-// of these.
+// The projection of a gaussian: the pixel (u, v) and the depth of its mean, and the
+// rows a1 and a2 of the Jacobian times the gaussian's axes in view space. Also the
+// gradients of these values.
 template <class V>
 struct LinearImage {
     V u, v, depth;

@@ -1,12 +1,12 @@
 #pragma once
 
-// The pinhole camera model: a point at (x, y, z) in view space has its image at (fx x /
-// z + cx, fy y / z + cy), and its depth is z. camera/camera.h documents each member.
+// The pinhole camera model. The point (x, y, z) in view space has depth z and is drawn
+// at pixel (fx x / z + cx, fy y / z + cy). camera/camera.h documents the members.
 //
-// The Jacobian of that map is
+// The Jacobian of the projection is
 //   J = [fx / z, 0, -fx / z sx; 0, fy / z, -fy / z sy]   with sx = x / z, sy = y / z.
-// The slopes sx and sy in it are clamped outside of the image, where the linearisation
-// would make images far too large (as in 3D Gaussian Splatting).
+// Outside of the image, the slopes sx and sy in J are clamped, because the linearised
+// image of a gaussian would become far too large (as in 3D Gaussian Splatting).
 
 #include <cmath>
 
@@ -18,16 +18,17 @@
 
 namespace v3dg {
 
-// Slopes are clamped this far outside of the image, in units of half the field of view.
+// The distance from the edge of the image to the clamped slopes, in units of half the
+// field of view.
 constexpr double kFovMargin = 0.3;
 
-// The slopes x / z and y / z at which the Jacobian is clamped.
+// The range to which the slopes x / z and y / z in the Jacobian are clamped.
 template <class T>
 struct SlopeLimits {
     T low_x, high_x, low_y, high_y;
 };
 
-// The Jacobian at one point.
+// The values that determine the Jacobian at a point.
 template <class V>
 struct PinholePoint {
     V inv_z;
@@ -35,15 +36,15 @@ struct PinholePoint {
 };
 
 // The side planes of a frustum in camera coordinates: right, left, bottom, top. A point
-// is outside if sign * x > slope * z, or the same with y. For two eyes each plane has
-// the larger slope; a point outside of the plane as seen from both eyes is outside of
-// both frusta.
+// is outside of a plane if sign * x > slope * z, or sign * y for bottom and top. With
+// two eyes, each plane has the larger of their slopes, so that a point outside of the
+// plane for both eyes is outside of both frusta.
 struct FrustumSides {
     double slope[4];
-    float guard[4];  // Plane::guard
+    float guard[4];  // see Plane::guard
 };
 
-// In px. Pixel (i, j) has its centre at (i + ½, j + ½).
+// A pinhole camera, in px. The centre of pixel (i, j) is at (i + ½, j + ½).
 template <class T>
 struct Pinhole {
     using Scalar = T;
@@ -66,6 +67,22 @@ struct Pinhole {
                 .width = U(width),
                 .height = U(height),
                 .near_depth = U(near_depth)};
+    }
+
+    V3DG_HD void scale(T factor) {
+        fx *= factor;
+        fy *= factor;
+        cx *= factor;
+        cy *= factor;
+        width *= factor;
+        height *= factor;
+    }
+
+    V3DG_HD void crop(T left, T top, T new_width, T new_height) {
+        cx -= left;
+        cy -= top;
+        width = new_width;
+        height = new_height;
     }
 
     template <class V>
@@ -114,7 +131,7 @@ struct Pinhole {
             d_m[3 + k] = fy_z * d.a2[k];
             d_m[6 + k] = -at.slope_x * d_m[k] - at.slope_y * d_m[3 + k];
         }
-        // Where a slope is clamped, the Jacobian does not depend on it.
+        // Where a slope is clamped, the Jacobian is constant in that slope.
         const V true_x = p[0] * at.inv_z, true_y = p[1] * at.inv_z;
         V d_slope_x = -(d_m[0] * m[6] + d_m[1] * m[7] + d_m[2] * m[8]);
         V d_slope_y = -(d_m[3] * m[6] + d_m[4] * m[7] + d_m[5] * m[8]);
@@ -140,8 +157,8 @@ struct Pinhole {
         return {.u = u, .v = v, .half = half};
     }
 
-    // The density at the camera's axis. The density grows away from the axis, which is
-    // ignored so that rotating the camera changes nothing.
+    // Returns the density at the optical axis. The true density grows away from the
+    // axis. This is ignored, so that the cut does not depend on the camera's rotation.
     V3DG_HD T px2_per_steradian() const { return fx * fy; }
 
     template <class Eye>
@@ -149,7 +166,7 @@ struct Pinhole {
         FrustumSides sides;
         for (int side = 0; side < 4; ++side) {
             const bool is_x = side < 2, is_positive = side % 2 == 0;
-            double linearised[2];  // slope up to which the projection is linearised
+            double linearised[2];  // up to this slope the Jacobian is exact
             for (int k = 0; k < num_eyes; ++k) {
                 const Eye& eye = eyes[k];
                 const double focal = is_x ? eye.fx : eye.fy;
@@ -196,13 +213,14 @@ struct Pinhole {
     }
 
   private:
-    // Returns whether slopes are clamped towards the camera's axis, as half_of_sphere()
-    // assumes.
+    // Returns whether the optical axis is inside the clamped range. Then clamping moves
+    // slopes towards the axis, as half_of_sphere() assumes.
     static V3DG_HD V3DG_INLINE bool sees_its_axis(const SlopeLimits<T>& limits) {
         return limits.low_x < 0 && limits.high_x > 0 && limits.low_y < 0 && limits.high_y > 0;
     }
 
-    // Computes the bound of image_of_sphere(). `reach_px` is the reach at depth 1.
+    // Returns the half extent for image_of_sphere(). `reach_px` is the radius of the
+    // sphere's image at depth 1.
     static V3DG_HD V3DG_INLINE T half_of_sphere(T reach_px, T inv_z, T slope_x, T slope_y,
                                                 const T& filter_px2) {
         const T along = reach_px * inv_z;

@@ -1,6 +1,6 @@
 #pragma once
 
-// Boxes around the visible extent of clusters.
+// Axis-aligned boxes around what clusters draw.
 
 #include <cstdint>
 
@@ -12,16 +12,17 @@ namespace v3dg {
 
 struct BoxInput {
     const float *means, *quats, *scales;  // rows of the gaussians
-    Span<const int64_t> offset;           // [C + 1] gaussians of each cluster
+    Span<const int64_t> offset;           // [C + 1] first gaussian of each cluster, and the end
 };
 
-// Bounds what clusters draw: each box contains the reach of an opaque gaussian around
-// every mean, rounded outwards, but not the reach of the filter. The box of a cluster
-// without gaussians is empty: +inf to -inf. The CPU and CUDA give the same bits.
+// Computes a box around what each cluster draws. The box contains the reach of each
+// gaussian as if it were opaque, but not the reach of the filter, and is rounded
+// outwards. The box of a cluster without gaussians is from +inf to -inf. The CPU and
+// CUDA compute the same bits.
 namespace cpu { void bound_by_boxes(const BoxInput& in, Span<Box> box); }
 
-// Rows and boxes are on the device, offsets on the host. Work is queued on the stream.
-// Throws std::runtime_error if CUDA reports an error.
+// Rows and boxes are on the device, offsets in host memory. Work is enqueued on the
+// stream. Throws std::runtime_error if CUDA reports an error.
 namespace cuda { void bound_by_boxes(const BoxInput& in, Span<Box> box, Stream stream); }
 
 }  // namespace v3dg

@@ -1,4 +1,4 @@
-// Each thread bounds one cluster at a time.
+// One thread computes one box at a time.
 
 #include "cluster/box.h"
 

@@ -1,4 +1,4 @@
-// Each warp bounds one cluster.
+// One warp computes one box.
 
 #include "base/launch.cuh"
 #include "cluster/box.h"

@@ -1,5 +1,4 @@
-// Checks tables one property after another, each for all rows; reports the first wrong
-// row.
+// Checks the properties of tables one after another, and reports the first wrong row.
 
 #include "cluster/check_tables.h"
 
@@ -16,7 +15,8 @@ namespace v3dg {
 
 namespace {
 
-// Two computations of the same value in double precision may differ in the last bits.
+// Tolerance for values that two programs computed in double precision with different
+// rounding.
 constexpr double kRounding = 1e-9;
 
 template <class Expected>
@@ -27,15 +27,15 @@ std::string text_of(const Expected& expected, size_t row) {
         return expected;
 }
 
-// Throws for the first row for which `holds` is false. `expected` is a text, or a
-// function that returns one for the row.
+// Throws for the first row for which holds(row) is false. `expected` is a text, or a
+// function that returns the text for a row.
 template <class Holds, class Expected>
 void check_rows(const char* table, size_t count, const Holds& holds, const Expected& expected) {
     for (size_t row = 0; row < count; ++row)
         if (!holds(row)) throw TableFault{table, static_cast<int64_t>(row), text_of(expected, row)};
 }
 
-// Checks that values never decrease.
+// Throws for the first row whose value is smaller than the one before.
 template <class Value>
 void check_ascends(const char* table, size_t count, const Value& value, const char* expected) {
     check_rows(
@@ -72,8 +72,8 @@ class Checker {
             "the level before, or one more");
     }
 
-    // Every group replaces the clusters of one page and makes clusters of the next
-    // level for one parent.
+    // Checks that the groups form trees: a group replaces the clusters of one page, and
+    // makes clusters of the next level, which all have the same parent.
     void check_tree() const {
         check_links("clusters.own_group", t_.own_group, t_.level, 0, 0);
         check_links("clusters.parent_group", t_.parent_group, t_.level, last_level_, 1);
@@ -82,8 +82,8 @@ class Checker {
             [&](size_t g) { return t_.group_level[g] >= 1 && t_.group_level[g] <= last_level_; },
             "1 to " + std::to_string(last_level_));
         check_links("groups.parent", t_.parent, t_.group_level, last_level_, 1);
-        // The clusters of the last level count as having one more parent, behind all
-        // others.
+        // Clusters of the last level have no parent. They come last, as if their parent
+        // were group num_groups_.
         check_ascends(
             "clusters.parent_group", num_clusters_,
             [&](size_t c) {
@@ -169,8 +169,8 @@ class Checker {
     }
 
   private:
-    // Checks that each row refers to a group whose level is its own plus `above`, and
-    // that rows of level `without` refer to none.
+    // Checks the groups that rows refer to. Rows of level `without` must refer to none.
+    // The level of the other rows' groups must be the row's level plus `above`.
     void check_links(const char* table, Span<const int32_t> links, Span<const int32_t> level,
                      int32_t without, int above) const {
         const auto wanted = [&](size_t row) { return int64_t{level[row]} + above; };

@@ -1,7 +1,6 @@
 #pragma once
 
-// Checks that the tables of a bundle are consistent, and that they guarantee an exact
-// cut.
+// Checks that the tables of a bundle are consistent, and that cuts of it are exact.
 
 #include <cstdint>
 #include <string>
@@ -11,8 +10,9 @@
 
 namespace v3dg {
 
-// C clusters, by level, then by parent group; G groups, in the order of the clusters
-// that they replace. Group -1 means none.
+// The tables of a bundle with C clusters and G groups. Clusters are ordered by level,
+// then by parent group. Groups are in the order of the clusters that they replace. The
+// group -1 means none.
 struct GivenTables {
     Span<const int64_t> offset;        // [C + 1]
     Span<const int32_t> level;         // [C]
@@ -28,16 +28,17 @@ struct GivenTables {
     Span<const float> error;           // [G * 2]
 };
 
-// Thrown for the first wrong row; -1 means the last row.
+// The first wrong row of a table. Row -1 means the last row.
 struct TableFault {
-    std::string table;  // name of the table in files; "groups" for a group without clusters
+    // name of the table in files; "groups" if a group has no clusters
+    std::string table;
     int64_t row;
     std::string expected;
 };
 
-// Throws TableFault unless the tables are valid, whatever their contents. A group's
-// ball and weight must be at least those of the groups below, so that the metric never
-// decreases towards the root.
+// Throws TableFault unless the tables are valid. They may have any contents. For exact
+// cuts, the ball and the weight of a group must not be smaller than those of the groups
+// below it, so that the metric never decreases towards the root.
 void check_tables(const GivenTables& tables, int64_t num_gaussians);
 
 }  // namespace v3dg

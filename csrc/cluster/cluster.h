@@ -1,6 +1,6 @@
 #pragma once
 
-// Sorts an asset's gaussians into clusters, and bounds groups of gaussians by balls.
+// Sorts the gaussians of an asset into clusters, and computes bounding balls.
 
 #include <cstdint>
 
@@ -10,49 +10,50 @@
 
 namespace v3dg {
 
-// Returns how often n points are halved until no part has more than cluster_size (>=
-// 1).
+// Returns how often n points must be halved until no part has more than cluster_size
+// points. Precondition: cluster_size >= 1.
 int num_halvings(size_t n, size_t cluster_size);
 
-// Computes the beginnings of the leaves if each segment is halved `depth` times; the
-// left part gets ceil(n / 2) points.
+// Computes where leaves begin if each segment is halved `depth` times. The left half of
+// n points has ceil(n / 2) points.
 //
 // offset: [S + 1], ascending from 0. leaf_offset: [S * 2^depth + 1].
 void halve_segments(Span<const int64_t> offset, int depth, Span<int64_t> leaf_offset);
 
-// Sorts the points of each segment so that each cluster of a perfect binary tree is
-// contiguous.
+// Sorts the points of each segment so that the points of each node of a perfect binary
+// tree are contiguous. The leaves of the tree are clusters.
 //
-// Every node is split `depth` times at the median rank along the longest axis of its
-// means' bounding box. Ties go to the lowest axis, and to the left for the lowest
-// index. Leaf l of segment s is s * 2^depth + l; it has ceil or floor of n / 2^depth of
-// the segment's points, and its indices ascend. The result does not depend on the
-// number of threads; the CPU and CUDA give the same bits.
+// A node is split at the median along the longest axis of the bounding box of its
+// points; of equal axes, the first one counts. Points of equal coordinate are ordered
+// by index. Leaf l of segment s has the number s * 2^depth + l. It has floor or ceil of
+// n / 2^depth of the segment's n points, in ascending order of their indices. The
+// result has the same bits on the CPU and on CUDA, for any number of threads.
 //
-// means: [N], finite, N < 2^32. offset: [S + 1], ascending from 0 to N. order: [N], the
-// index at each position. leaf_offset: [S * 2^depth + 1].
+// means: [N], finite, N < 2^32. offset: [S + 1], ascending from 0 to N. order: [N],
+// index of the point at each position. leaf_offset: [S * 2^depth + 1].
 //
-// This split is also the tree of clusters; docs/levels.md compares it with the paper's
-// (V3DG).
+// The tree of clusters is this tree. docs/levels.md compares it with the tree of the
+// paper (V3DG).
 namespace cpu {
 void median_split(Span<const Point> means, Span<const int64_t> offset, int depth,
                   Span<int64_t> order, Span<int64_t> leaf_offset);
 
-// Computes a ball around each segment of spheres (gaussians with their reach, or the
-// balls of the groups below). Its radius is within a fraction of a percent of the
-// smallest possible.
+// Computes a ball around the spheres of each segment. Spheres are gaussians with their
+// reach, or the balls of the groups below. The radius is within a fraction of a percent
+// of the smallest possible radius.
 //
-// Segment s has the spheres offset[s] .. offset[s + 1]. An empty segment gets a ball of
-// kMinRadius at 0. `margin` widens the ball; with kNestingMargin the ball contains the
-// spheres in float32 arithmetic, too. Radii are rounded up and at least kMinRadius. The
-// result does not depend on the number of threads; the CPU and CUDA give the same bits.
+// Segment s has the spheres from offset[s] to offset[s + 1]. An empty segment gets a
+// ball of radius kMinRadius at 0. The radius is enlarged by the relative `margin`. With
+// kNestingMargin, the ball contains the spheres in float32 arithmetic, too. Radii are
+// rounded up, and at least kMinRadius. The result has the same bits on the CPU and on
+// CUDA, for any number of threads.
 void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double margin,
                    Span<Ball> ball);
 }  // namespace cpu
 
-// As cpu::, with means, order, spheres and ball on the device; offsets stay on the
-// host. Work is queued on the stream. Throws std::runtime_error if CUDA reports an
-// error.
+// Like the functions of cpu::, with means, order, spheres and balls on the device, and
+// offsets in host memory. Work is enqueued on the stream. Throws std::runtime_error if
+// CUDA reports an error.
 namespace cuda {
 void median_split(Span<const Point> means, Span<const int64_t> offset, int depth,
                   Span<int64_t> order, Span<int64_t> leaf_offset, Stream stream);

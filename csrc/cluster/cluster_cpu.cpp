@@ -1,6 +1,6 @@
-// The median split processes segments in parallel and starts a task per node, down to a
-// size where tasks cost more than they gain. Each bounding ball is computed by one
-// thread.
+// Clustering on the CPU. The median split processes segments in parallel, and starts a
+// task per node, down to a size at which tasks cost more than they gain. A bounding
+// ball is computed by one thread.
 
 #include "base/threads.h"
 #include "cluster/cluster.h"
@@ -59,9 +59,9 @@ void move_median(IndexedPoint* first, IndexedPoint* middle, IndexedPoint* last) 
     });
 }
 
-// Splits points first .. last into the node's 2^depth leaves. The arguments are plain
-// values because LLVM's OpenMP, which replaces GCC's for the thread sanitizer
-// (.ci/sanitize), does not copy other types into a task that runs immediately.
+// Splits points `first` to `last` into the 2^depth leaves of a node. All arguments are
+// plain values: LLVM's OpenMP, which the thread sanitizer requires (.ci/sanitize), does
+// not copy other types into a task that runs immediately.
 void split_node(IndexedPoint* points, ptrdiff_t first, ptrdiff_t last, int depth, int64_t* order) {
     if (depth == 0) {
         for (ptrdiff_t i = first; i < last; ++i) order[i] = points[i].index;
@@ -93,8 +93,8 @@ size_t farthest(const Center& center, const Ball* spheres, size_t count, double*
     return best;
 }
 
-// Moves `center` towards the centre of the smallest ball around a few spheres; returns
-// the radius of that ball.
+// Moves `center` towards the centre of the smallest ball around a core set. Returns the
+// radius of that ball.
 double center_core(const Ball* core, size_t count, Center* center) {
     double best_radius;
     Center place = *center;
@@ -111,7 +111,7 @@ double center_core(const Ball* core, size_t count, Center* center) {
     return best_radius;
 }
 
-// Returns the centre of approximately the smallest ball around the spheres.
+// Returns the centre of an approximately smallest ball around the spheres.
 Center center_of(const Ball* spheres, size_t count) {
     Center center = center_of(spheres[0]);
     if (count == 1) return center;

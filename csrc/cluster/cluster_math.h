@@ -13,12 +13,12 @@ struct Point {
     float axis[3];
 };
 
-// The relative margin by which a ball contains another. Rounding in the float32
-// footprint (about 1e-6) then cannot reverse their order.
+// The relative margin by which a ball contains the balls below it. It exceeds the
+// rounding error of a footprint in float32 (about 1e-6), so that footprints have the
+// order of balls.
 constexpr double kNestingMargin = 4e-6;
 
-// Squares of larger radii are normal numbers and therefore keep their relative
-// precision.
+// The smallest radius of a ball. Squares of it are normal numbers, with full precision.
 constexpr float kMinRadius = 1e-15f;
 
 struct Center {
@@ -31,19 +31,21 @@ V3DG_HD inline double reach(const Center& center, const Ball& sphere) {
     return sqrt(dx * dx + dy * dy + dz * dz) + sphere.radius;
 }
 
-// The smallest ball around many spheres is approximately that of a small core set, to
-// which the sphere that is farthest from the current centre is added repeatedly (Badoiu
-// and Clarkson, Smaller core-sets for balls, SODA 2003).
+// The smallest ball around many spheres is approximately the smallest ball around a few
+// of them, the core set. The sphere that is farthest from the current centre is added
+// to the core set repeatedly (Badoiu and Clarkson, Smaller core-sets for balls, SODA
+// 2003).
 constexpr int kCoreSize = 24;
 constexpr int kFirstCoreStep = 2, kLastCoreStep = 255;
 constexpr double kCoreTolerance = 1e-4;
 
-// Moves the centre of a core set towards the sphere that reaches farthest, to `radius`.
-// Returns false if the two are concentric, so that there is no direction to move in.
+// Moves the centre of a core set towards the sphere whose farthest point has the
+// distance `radius`. Returns false if centre and sphere are concentric: there is no
+// direction then.
 V3DG_HD inline bool move_center(const Ball& farthest, double radius, int step, Center& center) {
     const double distance = radius - farthest.radius;
     if (distance <= 0.0) return false;
-    // Towards the far side of the sphere, not its centre.
+    // Move towards the sphere's farthest point, not its centre.
     const double move = radius / distance / step;
     center.x += (farthest.x - center.x) * move;
     center.y += (farthest.y - center.y) * move;
@@ -51,12 +53,13 @@ V3DG_HD inline bool move_center(const Ball& farthest, double radius, int step, C
     return true;
 }
 
-// Returns whether all spheres are inside the core set's ball, or nearly.
+// Returns whether the ball of the core set contains all spheres, within the tolerance,
+// or the core set is full.
 V3DG_HD inline bool core_suffices(double radius, double core_radius, int core_size) {
     return radius <= core_radius * (1.0 + kCoreTolerance) || core_size == kCoreSize;
 }
 
-// Returns a float32 ball at the centre; its radius is not yet set.
+// Returns a float32 ball at the centre, with radius 0.
 V3DG_HD inline Ball ball_at(const Center& center) {
     return {static_cast<float>(center.x), static_cast<float>(center.y),
             static_cast<float>(center.z), 0.0f};

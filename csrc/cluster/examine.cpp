@@ -13,7 +13,8 @@ namespace {
 constexpr size_t kGaussiansAtOnce = 4096;
 
 bool are_finite(const float* values, size_t count) {
-    size_t num_finite = 0;  // counted, because a loop that exits early is not vectorised
+    // counted without an early exit, so that the loop is vectorised
+    size_t num_finite = 0;
     for (size_t k = 0; k < count; ++k)
         num_finite += std::abs(values[k]) <= std::numeric_limits<float>::max() ? 1 : 0;
     return num_finite == count;

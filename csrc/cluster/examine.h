@@ -9,8 +9,8 @@
 
 namespace v3dg {
 
-// Bits for the reasons why a gaussian cannot be drawn. All but the last are invalid
-// values.
+// The reasons why a gaussian cannot be drawn, one bit each. All except kTransparent are
+// invalid values.
 enum Finding : uint16_t {
     kMeanNotFinite = 1 << 0,
     kQuatNotFinite = 1 << 1,
@@ -20,14 +20,14 @@ enum Finding : uint16_t {
     kTooLarge = 1 << 5,
     kNegativeScale = 1 << 6,
     kOpacityOutOfRange = 1 << 7,
-    kTransparent = 1 << 8,  // it is invisible
+    kTransparent = 1 << 8,  // valid, but invisible
 };
 
-// The largest coordinate or scale, in world units: squares of larger ones exceed
-// float32.
+// The largest coordinate or scale, in world units. The square of a larger one exceeds
+// the range of float32.
 constexpr float kMostLength = 1e18f;
 
-// Writes [N] findings: 0 if a gaussian can be drawn.
+// Computes the findings of all gaussians, [N]. 0 means that a gaussian can be drawn.
 void examine(const GaussianRows<const float>& in, Span<uint16_t> findings);
 
 }  // namespace v3dg

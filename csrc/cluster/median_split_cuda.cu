@@ -1,10 +1,11 @@
-// The median split processes one level at a time, all nodes together.
+// The median split on CUDA. It processes one level of the tree at a time, all nodes
+// together.
 //
-// There are four lists of the points' indices, sorted within each node: by x, y and z,
-// with ties by index, and by index alone. So a node's extent is the difference of two
-// values, its median is the middle of a list, and a split is a stable partition of the
-// lists by the side of each point. In the end the list by index is the order within
-// leaves.
+// There are four lists of point indices. Within each node, three are sorted by x, y and
+// z, and by index for equal coordinates; the fourth is sorted by index. So the extent
+// of a node is the difference of two values, and its median is the middle of a list. A
+// split is a stable partition of all lists. In the end, the fourth list is the order
+// within leaves.
 
 #include <cub/device/device_radix_sort.cuh>
 
@@ -22,19 +23,18 @@ namespace {
 
 constexpr unsigned kNumLists = 4, kByIndex = 3;  // list l begins at l * count
 constexpr unsigned kBlockSize = 256;
-// Each block partitions one tile of a list, each warp 32 points at a time.
+// A block partitions one tile of a list. A warp processes 32 points at a time.
 constexpr unsigned kWordsPerTile = 64;
 constexpr unsigned kTileSize = 32 * kWordsPerTile;
 
-// A node has positions first .. last of every list; positions before `middle` belong to
-// the left half.
+// A node has the positions first to last in every list. Its left half ends at `middle`.
 struct Node {
     uint32_t first, middle, last;
-    uint32_t lefts_before;  // total size of the left halves of all earlier nodes, in points
+    uint32_t lefts_before;  // number of points in the left halves of all earlier nodes
 };
 
-// Returns the last node that begins at or before `position`, among the nodes low to
-// high. The result is never an empty node.
+// Returns the last of the nodes `low` to `high` that begins at or before `position`.
+// This node is never empty.
 __device__ uint32_t node_at(const Node* nodes, uint32_t low, uint32_t high, size_t position) {
     while (low < high) {
         const uint32_t middle = low + (high - low + 1) / 2;
@@ -46,8 +46,8 @@ __device__ uint32_t node_at(const Node* nodes, uint32_t low, uint32_t high, size
     return low;
 }
 
-// The nodes of a tile's first and last positions. All threads of the block return
-// together.
+// The nodes of the first and the last position of a tile. All threads of the block must
+// call nodes_of_tile().
 struct NodeRange {
     uint32_t low, high;
 };
@@ -63,8 +63,8 @@ __device__ NodeRange nodes_of_tile(const Node* nodes, uint32_t num_nodes, size_t
     return {found[0], found[1]};
 }
 
-// Computes sort keys along one axis: the segment, then the value. -0 counts as 0, as in
-// comparisons.
+// Computes keys for sorting along one axis: the segment, then the coordinate. -0 and 0
+// have equal keys.
 __global__ void keys_kernel(const Point* means, size_t count, const Node* segments,
                             uint32_t num_segments, int axis, uint64_t* keys, uint32_t* indices) {
     const size_t i = blockIdx.x * size_t(kBlockSize) + threadIdx.x;
@@ -98,7 +98,7 @@ __global__ void longest_axis_kernel(const Point* means, const Node* nodes, uint3
     axis_of_node[n] = static_cast<uint8_t>(longest);
 }
 
-// Writes for every point whether it goes to the left half.
+// Computes for each point whether it goes to the left half of its node.
 __global__ void side_kernel(const Node* nodes, uint32_t num_nodes, const uint8_t* axis_of_node,
                             const uint32_t* lists, size_t count, uint8_t* goes_left) {
     const NodeRange range = nodes_of_tile(nodes, num_nodes, blockIdx.x, count);
@@ -110,8 +110,8 @@ __global__ void side_kernel(const Node* nodes, uint32_t num_nodes, const uint8_t
     }
 }
 
-// Writes the sides in the order of each list, one bit per position, and the number of
-// points per tile that go to the left half.
+// Writes the sides of the points in the order of each list, one bit per position. Also
+// counts the points of each tile that go to the left half.
 __global__ void count_kernel(const uint32_t* lists, unsigned first_list, size_t count,
                              const uint8_t* goes_left, uint32_t* words, uint32_t* tile_lefts) {
     const size_t list = first_list + blockIdx.y;
@@ -134,8 +134,7 @@ __global__ void count_kernel(const uint32_t* lists, unsigned first_list, size_t 
     }
 }
 
-// Turns the counts of each list's tiles into prefix sums. Each block processes one
-// list.
+// Replaces the counts of each list's tiles by prefix sums. One block per list.
 __global__ void sum_kernel(uint32_t num_tiles, unsigned first_list, uint32_t* tile_lefts) {
     uint32_t* values = tile_lefts + size_t(first_list + blockIdx.x) * num_tiles;
     uint32_t before = 0;
@@ -148,7 +147,7 @@ __global__ void sum_kernel(uint32_t num_tiles, unsigned first_list, uint32_t* ti
     }
 }
 
-// Moves every point to its half of its node, preserving the order of the list.
+// Moves each point to its half of its node, and preserves the order of the list.
 __global__ void partition_kernel(const Node* nodes, uint32_t num_nodes, const uint32_t* from,
                                  uint32_t* to, unsigned first_list, size_t count,
                                  const uint32_t* words, const uint32_t* tile_lefts) {
@@ -185,7 +184,7 @@ __global__ void widen_kernel(const uint32_t* from, size_t count, int64_t* to) {
     if (i < count) to[i] = from[i];
 }
 
-// Returns the nodes of all levels, those of the first level first.
+// Returns the nodes of all levels, from the root down.
 std::vector<Node> nodes_of_levels(Span<const int64_t> leaf_offset, int depth) {
     const size_t num_leaves = leaf_offset.size - 1;
     std::vector<Node> nodes;
@@ -204,7 +203,7 @@ std::vector<Node> nodes_of_levels(Span<const int64_t> leaf_offset, int depth) {
     return nodes;
 }
 
-// Sorts the points of each segment along the three axes.
+// Sorts the points of each segment along each of the three axes.
 void sort_lists(const Point* means, size_t count, const Node* segments, uint32_t num_segments,
                 uint32_t* lists, cudaStream_t stream) {
     DeviceBuffer<uint64_t> keys(count, stream), sorted_keys(count, stream);
@@ -252,7 +251,7 @@ void median_split(Span<const Point> means, Span<const int64_t> offset, int depth
     DeviceBuffer<uint32_t> words(kNumLists * size_t(tiles) * kWordsPerTile, stream);
     DeviceBuffer<uint32_t> tile_lefts(kNumLists * size_t(tiles), stream);
     for (int level = 0; level < depth; ++level) {
-        // After the last split, the order along an axis is no longer read.
+        // After the last split, the lists along the axes are not needed.
         const unsigned first_list = level + 1 == depth ? kByIndex : 0;
         const unsigned num_lists = kNumLists - first_list;
         launch("median_split: longest axis", longest_axis_kernel, blocks_for(num_nodes, kBlockSize),

@@ -1,6 +1,6 @@
-// The slots of a page pool on a CUDA device. Before a cut, the bytes of arriving pages
-// are copied to the device, where kernels unpack or place them. The needs of the cut
-// come back to the host after the cut. A Flight holds the host memory of both
+// Implements device_pages.h. Before a cut, the bytes of arriving pages are copied to
+// the device; kernels then unpack them or move them to their slots. After the cut, the
+// page requests are copied to the host. A Flight holds the host memory of both
 // transfers.
 
 #include "draw/device_pages.h"
@@ -17,22 +17,24 @@ namespace cuda {
 
 namespace {
 
-// kBringMs is the time per frame that may be spent on copying pages. The speed is
-// measured on frames that copy at least kLeastMeasured bytes.
+// A frame may copy as many bytes as are expected to take kBringMs, but at least
+// kLeastBytesAFrame. The speed is measured on frames that copy at least kLeastMeasured
+// bytes.
 constexpr float kBringMs = 2.0f;
 constexpr size_t kLeastMeasured = size_t(4) << 20, kLeastBytesAFrame = size_t(8) << 20;
 
-// A page that one kernel block copies from host memory to the device, with the table
-// entries that say where the page is.
+// A page to copy from host memory to the device, and the table entries that give its
+// location. One block of threads copies it.
 struct PageMove {
     const uint4* from;
     uint4* to;
     size_t num_vectors;
     int64_t *shift, shift_value;
-    uint32_t *cluster_shift, cluster_value;  // may be null
+    uint32_t *cluster_shift, cluster_value;  // `cluster_shift` may be null
 };
 
-// One block per page. It reads host memory, so that one launch copies all pages.
+// One block per page. The kernel reads host memory directly, so that a single launch
+// copies all pages.
 __global__ void move_kernel(const PageMove* moves) {
     const PageMove move = moves[blockIdx.x];
     for (size_t i = threadIdx.x; i < move.num_vectors; i += blockDim.x) move.to[i] = move.from[i];
@@ -41,7 +43,7 @@ __global__ void move_kernel(const PageMove* moves) {
     if (move.cluster_shift != nullptr) *move.cluster_shift = move.cluster_value;
 }
 
-// One thread per page whose fade changes.
+// One thread per page whose fade starts or ends.
 __global__ void arrivals_kernel(const Arrival* arrivals, unsigned count, int32_t* begins) {
     const unsigned i = blockIdx.x * blockDim.x + threadIdx.x;
     if (i < count) begins[arrivals[i].page] = arrivals[i].begins;
@@ -61,8 +63,8 @@ Pinned<T> pinned(size_t count) {
     return Pinned<T>(static_cast<T*>(memory));
 }
 
-// The number of floats per row of SH coefficients, without degree 0, which is in the
-// planes. Rows begin at multiples of 16 bytes.
+// Returns the number of floats per row of SH coefficients, without those of degree 0,
+// which are in the planes. Rows are aligned to 16 bytes.
 int stride_of(int sh_degree) {
     return sh_degree == 0 ? 0 : (3 * num_sh_bases(sh_degree) + 3) / 4 * 4;
 }
@@ -71,7 +73,9 @@ int stride_of(int sh_degree) {
 
 void FreePinned::operator()(void* memory) const noexcept {
     if (cudaFreeHost(memory) != cudaSuccess)
-        cudaGetLastError();  // at exit the driver may be unloaded before this object
+        // Clear the error: at exit, the driver may be unloaded before this object is
+        // destroyed.
+        cudaGetLastError();
 }
 
 unsigned char* PinnedBlocks::allocate(size_t bytes) {
@@ -82,19 +86,20 @@ size_t packed_row_bytes(int max_sh_degree) {
     return sizeof(float) * (16 + static_cast<size_t>(stride_of(max_sh_degree)));
 }
 
-// The host memory of a frame, in use until its cut is done.
+// The pinned host memory of a frame. It is in use until the frame's cut is finished.
 struct DevicePages::Flight {
     const Pinned<PageMove> moves;
-    const Pinned<PageRows> rows;  // arriving pages of a pool that keeps rows
+    const Pinned<PageRows> rows;  // pages to unpack, if the pool keeps rows
     const Pinned<SlotPage> codes;
     const Pinned<Arrival> arrivals;
     const Pinned<NeedsReport> report;
     FrameNeeds* needs = nullptr;
-    std::vector<unsigned char*> blocks;  // the blocks that `moves` reads
+    std::vector<unsigned char*> blocks;  // host memory that `moves` reads
     bool is_bounded = false;
     size_t bytes_in = 0;
     cudaEvent_t done = nullptr, begun = nullptr,
-                brought = nullptr;  // before and after copying pages
+                // `begun` and `brought`: before and after copying pages
+        brought = nullptr;
 
     Flight(size_t most_changes, size_t most_arrivals)
         : moves(pinned<PageMove>(most_changes)),
@@ -109,7 +114,7 @@ struct DevicePages::Flight {
     ~Flight() {
         for (cudaEvent_t event : {done, begun, brought})
             if (event != nullptr && cudaEventDestroy(event) != cudaSuccess)
-                cudaGetLastError();  // as in FreePinned
+                cudaGetLastError();  // Clear the error, as FreePinned does.
     }
 };
 
@@ -205,11 +210,12 @@ void DevicePages::make_tables(const std::vector<ClusterTable>& host,
     check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
 }
 
-// Memory is freed in the order of the stream on which it was allocated, and frames may
-// be on other streams.
+// Wait first. Memory is freed in the order of the stream that allocated it, but frames
+// on other streams may still use it.
 DevicePages::~DevicePages() { busy_.wait(); }
 
-// Notes the needs of all cuts that are done. Returns the result for the last one.
+// Passes the page requests of all finished cuts to the pool. Returns the pool's answer
+// to the last of them. If `waits`, it waits for all cuts.
 NotedView DevicePages::note_flights(bool waits) {
     NotedView noted;
     while (!under_way_.empty()) {
@@ -228,7 +234,8 @@ NotedView DevicePages::note_flights(bool waits) {
         needs->count = std::min<size_t>(flight.report[0].count, pool_.most_needs());
         needs->num_left_out = flight.report[0].count - needs->count;
         needs->tolerance_px2 = flight.report[0].tolerance_px2;
-        // A caller that waits needs a tolerance that does not depend on earlier frames.
+        // A caller that waits expects a result that does not depend on earlier frames,
+        // so the tolerance must not adapt.
         needs->adapts = flight.is_bounded && !waits;
         noted = pool_.note_needs(needs, waits);
         under_way_.pop_front();
@@ -241,8 +248,7 @@ void DevicePages::note_frames(cudaStream_t stream) {
     note_flights(false);
 }
 
-// Adapts the number of bytes that frames may copy to the time that one frame's copies
-// took.
+// Adapts the number of bytes that a frame may copy to the speed measured in `flight`.
 void DevicePages::measure(const Flight& flight) {
     if (flight.bytes_in < kLeastMeasured) return;
     float ms = 0;
@@ -340,7 +346,7 @@ PartlyResident DevicePages::begin_frame(bool is_bounded, Arrive arrive, cudaStre
     if (under_way_.size() == kMostFlights)
         check(cudaEventSynchronize(under_way_.front()->done), "a frame");
     note_flights(false);
-    if (current_ != nullptr) {  // the frame was abandoned before its cut
+    if (current_ != nullptr) {  // The last frame failed before its cut was enqueued.
         check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
         pool_.give_up(std::exchange(current_->needs, nullptr));
         pool_.give_back(std::exchange(current_->blocks, {}));

@@ -1,6 +1,6 @@
 #pragma once
 
-// The slots of a page pool on a CUDA device.
+// The device memory of a page pool: slots that hold pages of gaussians on CUDA.
 
 #include <deque>
 #include <memory>
@@ -13,7 +13,7 @@
 namespace v3dg {
 namespace cuda {
 
-// Frees memory of the host that devices can access.
+// Frees pinned host memory, which devices can access.
 struct FreePinned {
     void operator()(void* memory) const noexcept;
 };
@@ -28,19 +28,20 @@ class PinnedBlocks : public BlockMemory {
     std::vector<Pinned<unsigned char>> blocks_;
 };
 
-// The largest number of frames whose cuts are pending. The next frame waits for the
-// first of them.
+// The largest number of frames whose cuts may be in progress on the device. The next
+// frame waits for the oldest cut.
 constexpr size_t kMostFlights = 4;
 
-// Returns the size of a packed row in a pool.
+// Returns the bytes of a packed row in a pool.
 size_t packed_row_bytes(int max_sh_degree);
 
-// The gaussians in the slots of a pool: codes, or packed rows for pages of any codec.
-// Frames read the slots and page changes write them, on any streams of the device, in
-// the order in which mutex() is locked.
+// The gaussians in the slots of a pool, as codes or as packed rows. Pages of any codec
+// can be packed. Frames read the slots and page changes write them; both may use any
+// stream of the device. mutex() must be locked meanwhile, and keeps the streams in the
+// order of locking.
 class DevicePages {
   public:
-    // `tables` are on the current device, `host` has the same tables on the host.
+    // `tables` are on the current device. `host` are the same tables in host memory.
     DevicePages(PagePool& pool, std::vector<std::shared_ptr<const BundleTables>> tables,
                 const std::vector<ClusterTable>& host,
                 const std::vector<ClusterAppearance>& appearance, cudaStream_t stream);
@@ -49,24 +50,23 @@ class DevicePages {
     DevicePages& operator=(const DevicePages&) = delete;
 
     StreamMutex& mutex() { return busy_; }
-    // Notes the needs of frames whose cuts are done. Enqueues the copies of arriving
-    // pages, which precede the cut, and returns the tables that the cut reads. Requires
-    // the lock. Waits only if kMostFlights cuts are pending.
+    // Starts a frame. Passes the page requests of finished cuts to the pool, enqueues
+    // the copies of arriving pages, and returns the tables for the frame's cut. Waits
+    // only if kMostFlights cuts are in progress. mutex() must be locked.
     PartlyResident begin_frame(bool is_bounded, Arrive arrive, cudaStream_t stream);
-    // Called after the cut was enqueued. Requires the lock.
+    // Ends a frame; to be called when its cut is enqueued. mutex() must be locked.
     void end_frame(cudaStream_t stream);
-    // Notes the needs of frames whose cuts are done, without beginning a new frame.
+    // Passes the page requests of finished cuts to the pool, without starting a frame.
     void note_frames(cudaStream_t stream);
-    // The models of all bundles, on the device. One of the two is null.
+    // The models of all bundles, on the device. One of the two arrays is null.
     const PackedPlanes* packed() const { return packed_.data(); }
     const CodedGaussians* coded() const { return coded_.data(); }
-    // Returns the rule with the tolerance that the pool requires for the frame that
-    // began last.
+    // Returns the rule with the tolerance that the pool sets for the current frame.
     SelectRule raised(SelectRule rule) const;
 
-    // Cuts the scene without drawing, and waits until the pool has decided about the
-    // needs of the cut. With `begins`, the pool first forgets earlier frames
-    // (PagePool::begin_settling).
+    // Selects a cut without drawing, and waits until the pool has decided about the
+    // pages that the cut requests. If `begins`, the pool first discards the requests of
+    // earlier frames (PagePool::begin_settling).
     SettlingStep settle_step(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
                              bool begins, cudaStream_t stream);
 
@@ -87,7 +87,7 @@ class DevicePages {
 
     PagePool& pool_;
     const std::vector<std::shared_ptr<const BundleTables>> tables_;
-    const int sh_stride_;  // of packed rows
+    const int sh_stride_;  // floats per packed row of SH coefficients
     StreamMutex busy_;
     DeviceBuffer<float> rows_, sh_;
     DeviceBuffer<PackedPlanes> packed_;
@@ -98,10 +98,11 @@ class DevicePages {
     DeviceBuffer<CodedGaussians> coded_;
     DeviceBuffer<unsigned char> staged_;
     DeviceBuffer<uint8_t> joins_;
-    DeviceBuffer<int64_t> shift_;           // of the pages of all bundles
-    DeviceBuffer<uint32_t> cluster_shift_;  // likewise, in a pool that keeps codes
+    DeviceBuffer<int64_t> shift_;           // one element per page, over all bundles
+    DeviceBuffer<uint32_t> cluster_shift_;  // likewise; used if the pool keeps codes
     DeviceBuffer<int32_t> begins_;          // likewise; see PageTable
-    std::vector<size_t> first_page_;        // index of each bundle's first page among all pages
+    // index of each bundle's first page among the pages of all bundles
+    std::vector<size_t> first_page_;
     DeviceBuffer<BundleOnDevice> bundles_;
     DeviceBuffer<uint32_t> words_;
     DeviceBuffer<uint32_t*> need_;
@@ -109,7 +110,7 @@ class DevicePages {
     size_t num_words_ = 0;
     std::vector<std::unique_ptr<Flight>> flights_;
     std::deque<Flight*> under_way_;
-    Flight* current_ = nullptr;  // the frame that is being enqueued
+    Flight* current_ = nullptr;  // the frame between begin_frame() and end_frame()
     Cut cut_;
 };
 

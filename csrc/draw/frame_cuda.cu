@@ -1,5 +1,5 @@
-// A frame on a CUDA device: its buffers, the order of its stages, and drawing again if
-// a buffer was too small. draw/frame_cuda.h has the contract.
+// Implements frame_cuda.h: the buffers of a frame, the order of its stages, and drawing
+// again if a buffer was too small.
 
 #include "draw/frame_cuda.h"
 
@@ -13,17 +13,18 @@
 namespace v3dg {
 namespace cuda {
 
-// The counters of a frame, which are cleared before it.
+// Device memory of a frame that is cleared before the frame: counters of results and
+// work.
 struct Frame::State {
     FrameCounters counters;
     unsigned projected[2], scan_ticket, scattered,
-        spread;  // work items that blocks and warps have claimed
+        spread;  // work counters that kernels claim items of work from
     alignas(8) uint32_t plan_counts[2 * kPlanClasses];
 };
 
-// The host's state of a frame in flight.
+// Host memory and events of a frame in flight.
 struct Frame::Slot {
-    FrameCounters* counters = nullptr;  // in pinned memory
+    FrameCounters* counters = nullptr;  // in pinned host memory
     cudaEvent_t begun = nullptr, prepared = nullptr, counted = nullptr, done = nullptr;
 
     Slot() {
@@ -34,7 +35,8 @@ struct Frame::Slot {
             check(cudaEventCreate(event), "cudaEventCreate");
     }
     ~Slot() {
-        // At exit the driver may be unloaded before this object.
+        // Ignore errors: at exit, the driver may be unloaded before this object is
+        // destroyed.
         for (const cudaEvent_t event : {begun, prepared, counted, done})
             if (event != nullptr) cudaEventDestroy(event);
         cudaFreeHost(counters);
@@ -43,12 +45,12 @@ struct Frame::Slot {
 };
 
 constexpr size_t kEllipseFloats = 8,
-                 // Floats per record in RecordPlanes::ellipse, and together with
-                 // ::rest.
+                 // Floats per record in RecordPlanes::ellipse; in `ellipse` and `rest`
+                 // together.
     kRecordFloats = 10;
 
-// The number of frames that can be in flight or captured before a new slot is
-// allocated.
+// The number of slots that are allocated in advance. So many frames can be in flight or
+// captured before more are allocated.
 constexpr size_t kSlots = 8;
 
 Frame::Frame(Keeps keeps) : keeps_(keeps) {
@@ -66,8 +68,7 @@ T* Frame::room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing) {
 }
 
 Frame::Slot* Frame::take_slot(bool capturing) {
-    // The oldest frame ends first. A thread must not query an event during a capture;
-    // meanwhile no other thread draws.
+    // The oldest frame ends first. During a capture, events must not be queried.
     const bool waits = !free_slots_.empty() && !capturing &&
                        cudaEventQuery(free_slots_.front()->done) != cudaSuccess;
     if (free_slots_.empty() || waits) {
@@ -87,9 +88,10 @@ void Frame::enlarge(const FrameCounters& counters) {
     if (counters.gaussians > kMostFrameRecords)
         throw std::length_error("gaussians: expected at most " + std::to_string(kMostFrameRecords) +
                                 " in one frame, got " + std::to_string(counters.gaussians));
-    // Growing a buffer takes as long as several frames. So buffers grow rarely, all
-    // nearly full ones together, by more than the counts require, and before a moving
-    // camera exceeds them, which would cost drawing a frame twice.
+    // Growing a buffer takes as long as drawing several frames, and a frame that
+    // exceeds a buffer is drawn twice. So buffers grow before a moving camera exceeds
+    // them. All buffers that are nearly full grow together, by more than the counts
+    // require.
     const auto is_full = [](unsigned long long capacity, unsigned long long count,
                             unsigned free_part) { return count > capacity - capacity / free_part; };
     const bool grows = is_full(capacity_.items, counters.items, 32) ||
@@ -102,8 +104,8 @@ void Frame::enlarge(const FrameCounters& counters) {
     const auto grow = [is_full](unsigned long long& capacity, unsigned long long count) {
         if (is_full(capacity, count, 8)) capacity = std::max(capacity, count + count / 8);
     };
-    // Gaussians that were not projected have no entries yet. Most scenes have one or
-    // two entries per gaussian.
+    // If gaussians exceed their capacity, entries were not counted. Most scenes have
+    // one or two entries per gaussian.
     if (counters.gaussians > capacity_.records) grow(capacity_.entries, counters.gaussians);
     grow(capacity_.items, counters.items);
     grow(capacity_.records, counters.gaussians);
@@ -111,13 +113,14 @@ void Frame::enlarge(const FrameCounters& counters) {
     grow(capacity_.entries, counters.entries);
     grow(capacity_.spread, counters.spread);
     capacity_.records = std::min(capacity_.records, kMostFrameRecords);
-    capacity_.spread = std::max(capacity_.spread, capacity_.records);  // both use the same memory
-    // A caller that differentiates receives the counts before lists are spread, so
-    // there must be room for all entries.
+    // The records' tile lists and the spread lists use the same memory.
+    capacity_.spread = std::max(capacity_.spread, capacity_.records);
+    // With a tape, the caller receives the counts before lists are spread. So the
+    // buffer must have room for all entries.
     if (keeps_ == Keeps::tape) capacity_.spread = std::max(capacity_.spread, capacity_.entries);
     if (was_captured_ || capacity_ == before) return;
     // Free the largest buffers before allocating larger ones, and return their memory
-    // to the device: the memory pool could not reuse blocks of the old size.
+    // to the device, because the memory pool cannot reuse the smaller blocks.
     records_ = {};
     boxes_ = {};
     entries_ = {};
@@ -131,8 +134,8 @@ std::unique_ptr<Drawing> Frame::draw(const FrameBatch& batch, Prepare prepare, c
     drawing->is_captured_ = is_capturing(stream);
     was_captured_ = was_captured_ || drawing->is_captured_;
     drawing->slot_ = take_slot(drawing->is_captured_);
-    // If the last frame is done and exceeded or nearly filled a buffer, this frame is
-    // likely to do so, too.
+    // If the last frame exceeded or nearly filled a buffer, this one is likely to do
+    // so, too. So enlarge the buffers first, if the last frame's counts are known.
     if (last_ != nullptr && !last_->is_captured_ && !drawing->is_captured_) {
         const cudaError_t over = cudaEventQuery(last_->slot_->done);
         if (over == cudaSuccess) enlarge(*last_->slot_->counters);
@@ -174,8 +177,8 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     ItemTiles* item_tiles = room(item_tiles_, capacity.items, drawing);
     LargeRecord* large = room(large_, capacity.large, drawing);
     TileEntry* entries = room(entries_, capacity.entries, drawing);
-    // The blend stage overwrites the tile lists of small records, which all have been
-    // read by then.
+    // Later, the blend stage stores spread lists in this memory. By then, the tile
+    // lists of small records are no longer needed.
     FewTiles* few = room(scratch_, capacity.spread, drawing);
     const bool keeps_tape = keeps_ == Keeps::tape;
     uint32_t* source = keeps_tape ? room(source_, capacity.records, drawing) : nullptr;
@@ -227,8 +230,9 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     const RasterTape tape{keeps_tape ? room(order_, capacity.entries, drawing) : nullptr,
                           keeps_tape ? room(blended_, batch.num_tiles, drawing) : nullptr};
     FrameLists of_frame = lists(batch);
-    // With a tape, the host gets the counts while the pictures are blended, so that the
-    // caller can go on; otherwise the blend kernel reports them.
+    // With a tape, the counts are copied before blending, so that the caller need not
+    // wait for the pictures. Without a tape, the blend kernel writes them to host
+    // memory.
     if (keeps_tape) {
         place_slots(items, item_records, planes.box, room(first_slot_, capacity.records, drawing),
                     stream);
@@ -249,9 +253,9 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     if (!capturing) check(cudaEventRecord(slot.done, stream), "cudaEventRecord");
     last_stream_ = stream;
     last_batch_ = batch;
-    // The next frame starts sooner if its counters are already cleared. They are not
-    // cleared now if a graph exists, which may be replayed at any time, or a tape,
-    // because the backward pass reads the counters.
+    // Clear the counters for the next frame now, so that it starts sooner. There are
+    // two exceptions: a captured graph may be replayed at any time, and the backward
+    // pass of a tape reads the counters.
     if (was_captured_ || keeps_tape) return;
     check(cudaMemsetAsync(cleared, 0, cleared_bytes, stream), "cudaMemsetAsync");
     num_zero_bytes_ = num_zero_bytes;
@@ -305,7 +309,7 @@ Drawing::Drawing(Frame& frame, const FrameBatch& batch, Frame::Prepare prepare, 
 
 Drawing::~Drawing() {
     if (frame_.last_ == this) frame_.last_ = nullptr;
-    // A graph continues to write to its slot.
+    // A captured graph continues to write to its slot.
     if (slot_ != nullptr && !is_captured_) frame_.free_slots_.push_back(slot_);
 }
 

@@ -1,6 +1,6 @@
 #pragma once
 
-// Frames on a CUDA device, from items to pixels, and drawings in progress.
+// Frames on a CUDA device: from the items of a frame to pixels.
 
 #include <deque>
 #include <functional>
@@ -17,41 +17,45 @@
 namespace v3dg {
 namespace cuda {
 
-// The input of a frame; device memory in it must stay unchanged until the frame is
-// drawn.
+// The input of a frame. The device memory must stay unchanged until the frame is drawn.
 struct FrameBatch {
     const GaussianRows<const float>* models;
     const Placement* placements;
     const FrameImage* images;
-    uint32_t num_images, num_tiles;  // sum over all images
-    // See ProjectInput.
+    uint32_t num_images, num_tiles;  // `num_tiles`: total over all images
+    // See ProjectInput for these two.
     const PackedPlanes* packed = nullptr;
     const CodedGaussians* coded = nullptr;
-    bool has_shared_items = false;  // whether any may be shared; never with a tape
-    // Of the images; kStopsByCut only with a budget.
+    // whether any item may be shared; must be false with a tape
+    bool has_shared_items = false;
+    // The same for all images; kStopsByCut only with a budget.
     float min_transmittance = kStopsBefore;
-    // Whether any may be faded; only items of scenes, which are not shared.
+    // Whether any item may have a weight below 1. Only the items of scenes can; those
+    // that do are not shared.
     bool has_faded_items = false;
-    const InstanceFactors* factors = nullptr;  // [num_factors], or null
+    // [num_factors], see ProjectInput; or null
+    const InstanceFactors* factors = nullptr;
     uint32_t num_factors = 0;
-    // The mutex that guards the models, if these change from frame to frame. The caller
-    // holds it while it draws.
+    // The mutex that guards the models, if they change between frames; else null. The
+    // caller must hold it during draw().
     StreamMutex* guards_models = nullptr;
     size_t num_zeros = 0;  // size of ItemList::zeros
-    // Whether any image that has a destination is drawn with depth.
+    // Whether depth is drawn in any image that gets its destination later.
     bool has_depth = true;
 };
 
-// The output of a frame for its backward pass, valid until the next frame is drawn.
+// The results of a frame that its backward pass needs. Valid until the next frame is
+// drawn.
 struct FrameTape {
     FrameLists lists;
     RasterTape raster;
     const GaussianRows<const float>* models;
     const Placement* placements;
     const DrawItem* items;         // counters->items elements
-    const uint32_t* item_records;  // number of records per item
-    const uint32_t* source;        // of each record: index of its gaussian in the model
-    const uint32_t* first_slot;    // of each record, set by place_slots()
+    const uint32_t* item_records;  // number of records of each item
+    const uint32_t* source;        // index of each record's gaussian in the model
+    // first gradient slot of each record, set by place_slots()
+    const uint32_t* first_slot;
 };
 
 struct FrameTimes {
@@ -60,13 +64,13 @@ struct FrameTimes {
 
 class Drawing;
 
-// Draws batches of pictures: project, bin, blend. It reuses its buffers from frame to
-// frame.
+// Draws batches of pictures: projects, bins and blends the gaussians. The buffers are
+// reused from frame to frame.
 //
-// Counts stay on the device, so draw() never waits. A frame whose buffers are too small
-// draws nothing. finish() of its Drawing detects that, enlarges the buffers and draws
-// again; hence pictures must be read only after finish(). Frames may be enqueued on any
-// streams, one after another.
+// Counts stay on the device, so draw() does not wait. If a buffer turns out to be too
+// small, nothing is drawn; Drawing::finish() then enlarges the buffers and draws again.
+// Therefore pictures must be read only after finish(). Frames may be enqueued on any
+// streams, one at a time.
 class Frame {
   public:
     enum class Keeps { nothing, tape };
@@ -76,25 +80,25 @@ class Frame {
     Frame(const Frame&) = delete;
     Frame& operator=(const Frame&) = delete;
 
-    // Enqueues the work that writes the batch's items and, unless they exist, its
-    // tables. It is called again when a frame is drawn again. The counters are zero at
-    // that point.
+    // A function that enqueues the work to write the batch's items and the tables that
+    // do not exist yet. It is called again if the frame is drawn again. All counters
+    // are zero before that work runs.
     using Prepare = std::function<void(const ItemList& items, cudaStream_t stream)>;
 
-    // Provides the destinations of images that have none. It is called once, after work
-    // for the device was enqueued.
+    // A function that sets the destinations of images that have none. It is called
+    // once, after the first work for the device is enqueued.
     using Place = std::function<void(PicturePlanes planes[2])>;
 
-    // Enqueues a frame. While `stream` captures a graph nothing is allocated; so draw a
-    // frame of the same size before the capture. The buffers of a captured frame exist
-    // as long as this object.
+    // Enqueues a frame. While `stream` captures a graph, nothing can be allocated, so a
+    // frame of the same size must be drawn before the capture. The buffers of a
+    // captured frame exist as long as this object.
     std::unique_ptr<Drawing> draw(const FrameBatch& batch, Prepare prepare, cudaStream_t stream,
                                   const Place& place = {});
 
-    // Returns the bytes on the device by part.
+    // Returns the device memory in bytes, by part.
     std::vector<std::pair<const char*, size_t>> bytes() const;
 
-    // Returns the tape of the last frame; requires Keeps::tape.
+    // Returns the tape of the last frame. Precondition: the frame keeps a tape.
     FrameTape tape() const;
 
   private:
@@ -119,17 +123,20 @@ class Frame {
     DeviceBuffer<ItemTiles> item_tiles_;
     DeviceBuffer<LargeRecord> large_;
     DeviceBuffer<TileEntry> entries_;
-    DeviceBuffer<unsigned long long>
-        scratch_;  // tile lists of small records, later lists that are spread
+    DeviceBuffer<unsigned long long> scratch_;  // tile lists of small records, later spread lists
     DeviceBuffer<unsigned long long> tile_first_;
     DeviceBuffer<TilePlan> plans_;
     uint32_t num_plans_ = 0;
-    DeviceBuffer<unsigned char> cleared_;  // State, scan states, zeros of items, tile counts
-    size_t num_zero_bytes_ = 0;  // bytes of `cleared_` that are zero when the next frame begins
+    // State, scan state, zeros for items, tile counts
+    DeviceBuffer<unsigned char> cleared_;
+    // the first bytes of `cleared_` that are zero when the next frame starts
+    size_t num_zero_bytes_ = 0;
 
     std::vector<std::unique_ptr<Slot>> slots_;
-    std::deque<Slot*> free_slots_;                // slots whose frames may still be in flight
-    std::vector<std::shared_ptr<void>> retired_;  // buffers that captured graphs still use
+    // may belong to frames that are still drawn on the device
+    std::deque<Slot*> free_slots_;
+    // buffers that captured graphs may still use
+    std::vector<std::shared_ptr<void>> retired_;
     bool was_captured_ = false;
     Drawing* last_ = nullptr;
     FrameBatch last_batch_{};
@@ -137,28 +144,30 @@ class Frame {
     StreamMutex busy_;
 };
 
-// A frame that has been enqueued. The Frame must outlive it.
+// A frame that was enqueued. The Frame must outlive it.
 class Drawing {
   public:
     ~Drawing();
     Drawing(const Drawing&) = delete;
     Drawing& operator=(const Drawing&) = delete;
 
-    // Waits until the device has finished the drawing; finish() may still draw it
-    // again.
+    // Waits until the device has finished. If a buffer was too small, nothing was drawn
+    // yet, and finish() draws again.
     void wait() const;
-    // Like finish(), but the pictures may still be in progress. With a tape, it waits
-    // only until all counts are known. Not allowed for a captured frame.
+    // Like finish(), but returns as soon as it is certain that the buffers suffice.
+    // With a tape, the pictures may then still be in progress. Not allowed for a
+    // captured frame.
     const FrameCounters& settle();
-    // Waits until the pictures are drawn, and draws again if a buffer was too small.
-    // Throws OutOfMemory, or std::length_error beyond kMostFrameRecords.
+    // Waits until the pictures are drawn. Draws again if a buffer was too small. Throws
+    // OutOfMemory, or std::length_error if there are more than kMostFrameRecords
+    // records.
     //
-    // For a captured frame, it reports the last replay, which must have ended; throws
-    // std::runtime_error if a buffer was too small.
+    // For a captured frame, it returns the counters of the last replay, which must have
+    // ended. It throws std::runtime_error if a buffer was too small for that replay.
     const FrameCounters& finish();
     FrameTimes times() const;
-    // Returns how often the frame was drawn: more than once if buffers were too small.
-    // Known after finish().
+    // Returns how often the frame was drawn; more than once if a buffer was too small.
+    // Valid after finish().
     int num_draws() const { return num_draws_; }
 
   private:
@@ -171,7 +180,7 @@ class Drawing {
     Frame::Prepare prepare_;
     cudaStream_t stream_;
     Frame::Slot* slot_ = nullptr;
-    Capacity capacity_{};  // capacity with which it was drawn
+    Capacity capacity_{};  // capacity of the buffers when it was enqueued
     PicturePlanes planes_[2]{};
     bool is_captured_ = false, is_settled_ = false;
     int num_draws_ = 1;

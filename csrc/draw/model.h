@@ -6,7 +6,7 @@
 
 namespace v3dg {
 
-// Gaussians in planes that the rasterizer reads; owns the planes.
+// The gaussians of a model in planes (one array per component), which it owns.
 template <class T>
 class Model {
   public:

@@ -11,19 +11,20 @@
 
 namespace v3dg {
 
-// The temporary memory of one picture, reused from picture to picture.
+// Temporary memory for drawing a picture on the CPU, reused from picture to picture.
 template <class T>
 struct Workspace {
-    // The records of a chunk are adjacent, in the order of the draws. Chunks are in any
-    // order, with gaps between them.
+    // The records of a chunk are contiguous, in the order of the draws. Chunks are in
+    // any order, with gaps between them.
     Buffer<Record<T>> records;
     Buffer<uint32_t> source;
     Buffer<uint64_t> chunk_first;
     Buffer<uint32_t> chunk_count;
     TileLists lists;
     size_t num_chunks = 0;
-    uint64_t room = 0;       // length of the records, including gaps
-    uint64_t most_room = 0;  // largest `room` so far, of which pages may be in physical memory
+    uint64_t room = 0;  // length of the used part of `records`, including gaps
+    // largest `room` so far, and thus the memory that was ever touched
+    uint64_t most_room = 0;
 };
 
 struct RenderCounts {
@@ -33,32 +34,35 @@ struct RenderCounts {
     double project_seconds, bin_seconds, rasterize_seconds;
 };
 
-// Draws the picture's window of everything in `draws`: project, bin, sort, blend.
-// Gaussians of equal depth are blended in the order of the draws. A picture that
-// exceeds the memory limit is drawn in bands of tile rows, with the same result. With
-// `keep_source`, it is drawn in one band and the workspace can be passed to
-// render_backward(); `source` is then the index of each record's gaussian, counted
-// through all draws. Throws std::length_error above about 3e9 gaussians. Once `stop` is
-// true, it returns soon and leaves the picture and the counts unfinished.
+// Draws the window of a picture: projects, bins, sorts and blends the gaussians of
+// `draws`. Gaussians of equal depth are blended in the order of the draws. If records
+// and entries would need much memory, the picture is drawn in bands of tile rows, with
+// the same result. Throws std::length_error above about 3e9 gaussians.
+//
+// If `keep_source`, the picture is drawn in one band, and render_backward() can use the
+// workspace. `source` is then the index of each record's gaussian, counted over all
+// draws. If `stop` becomes true, the function returns soon; the picture and the counts
+// are then incomplete.
 template <class T>
 RenderCounts render(const std::vector<Draw<T>>& draws, const Intrinsics<T>& camera,
                     const Picture<T>& picture, bool keep_source, Workspace<T>& workspace,
                     const std::atomic<bool>* stop = nullptr);
 
-// The gaussian with the largest weight in a pixel.
+// The gaussian with the largest blend weight in a pixel.
 struct Pick {
-    uint64_t gaussian;  // index, counted through all draws
-    float weight;       // its blend weight
+    uint64_t gaussian;  // index, counted over all draws
+    float weight;       // blend weight
     float depth;
 };
 
-// Finds the gaussian with the largest weight. Returns whether there is any.
+// Finds the gaussian with the largest blend weight in pixel (x, y). Returns whether any
+// gaussian is drawn there.
 bool pick(const std::vector<Draw<float>>& draws, const Intrinsics<float>& camera, int x, int y,
           Pick& picked);
 
-// Computes the gradients of a single draw's gaussians from the gradients of the picture
-// that `workspace` was used for. It does not accumulate: `out` and `centers` are
-// overwritten for gaussians with a record and unchanged for others.
+// Computes the gradients of the gaussians of a single draw. `workspace` must be that of
+// the picture's render() call. Writes, but does not accumulate: `out` and `centers` are
+// overwritten for gaussians with a record, and unchanged for others.
 template <class T>
 void render_backward(const Draw<T>& draw, const Intrinsics<T>& camera, const Picture<T>& picture,
                      const PictureGradient<T>& d_picture, const Workspace<T>& workspace,

@@ -20,7 +20,9 @@ DifferentiableFrame::DifferentiableFrame() : frame_(Frame::Keeps::tape) {
 DifferentiableFrame::~DifferentiableFrame() {
     for (const cudaEvent_t event : {drawn_, gone_back_})
         if (event != nullptr) cudaEventDestroy(event);
-    cudaGetLastError();  // at exit the driver may be unloaded before this object
+    // Ignore errors: at exit, the driver may be unloaded before this object is
+    // destroyed.
+    cudaGetLastError();
 }
 
 void DifferentiableFrame::draw(const ModelPicture& in, cudaStream_t stream) {
@@ -65,7 +67,8 @@ struct IdleFrames {
 };
 
 IdleFrames& idle_frames() {
-    // Never destroyed, because at exit the driver may be unloaded first.
+    // Never destroyed: at exit, the driver may be unloaded before static objects are
+    // destroyed.
     static IdleFrames& frames = *new IdleFrames;
     return frames;
 }

@@ -17,8 +17,8 @@ struct ModelPicture {
     FrameImage image;
 };
 
-// Draws a model and computes gradients of the model from those of the picture. It
-// reuses its buffers from picture to picture.
+// Draws pictures of a model, and computes the gradients of its gaussians. The buffers
+// are reused from picture to picture.
 class DifferentiableFrame {
   public:
     DifferentiableFrame();
@@ -26,13 +26,14 @@ class DifferentiableFrame {
     DifferentiableFrame(const DifferentiableFrame&) = delete;
     DifferentiableFrame& operator=(const DifferentiableFrame&) = delete;
 
-    // Returns once it is certain that the picture will be drawn. Throws the exceptions
-    // of Drawing::finish().
+    // Enqueues a picture. Returns when it is certain that the buffers suffice. Throws
+    // like Drawing::finish().
     void draw(const ModelPicture& in, cudaStream_t stream);
 
-    // Enqueues the gradients of the gaussians and the background (3) of the last
-    // picture. Its arrays and the gaussians must be unchanged since draw(). Every
-    // element is written; every run gives the same bits.
+    // Enqueues the backward pass of the last picture: the gradients of the gaussians,
+    // of their centres, and of the background (3). The picture and the gaussians must
+    // be unchanged since draw(). Writes every element. The result has the same bits in
+    // every run.
     void backward(const PictureGradient<float>& d_picture, const GaussianRows<float>& out,
                   const CenterGradients<float>& centers, float* d_background, cudaStream_t stream);
 
@@ -46,8 +47,8 @@ class DifferentiableFrame {
     cudaEvent_t drawn_ = nullptr, gone_back_ = nullptr;
 };
 
-// Returns a frame for the current device, if possible one that was given back with its
-// buffers. A caller whose frame failed must not give it back.
+// Returns a frame for the current device: one that was given back, if there is any. A
+// frame must not be given back after an error.
 std::unique_ptr<DifferentiableFrame> take_frame();
 void give_back(std::unique_ptr<DifferentiableFrame> frame);
 

@@ -1,5 +1,5 @@
-// Draws pictures on the CPU and computes their gradients: it projects and bins the
-// draws in pieces, then blends tile by tile.
+// Draws pictures on the CPU, and computes gradients: the gaussians are projected and
+// binned in parallel pieces, and tiles are blended in parallel.
 
 #include "base/threads.h"
 #include "draw/render.h"
@@ -22,19 +22,19 @@
 
 namespace v3dg {
 
-// The size of a piece: gaussians of one draw that are projected together. It is small
-// enough that a piece meets few rows of tiles, provided that neighbours in memory are
-// neighbours in space.
+// The number of gaussians of a draw that are projected together. Gaussians that are
+// adjacent in memory are usually adjacent in space. So a piece of this size covers few
+// rows of tiles.
 constexpr uint64_t kPieceSize = 4096;
 
 struct Piece {
     size_t draw;
     uint64_t skip, count;  // range in the draw
-    uint64_t first;        // index of the first gaussian, counted through all draws
-    Reach reach;           // known after the first band
+    uint64_t first;        // index of the first gaussian, counted over all draws
+    Reach reach;           // set when the first band is drawn
 };
 
-// Pieces [first, last), whose records one thread computes.
+// Pieces [first, last). One thread computes their records.
 struct Chunk {
     size_t first, last;
 };
@@ -52,8 +52,8 @@ static std::vector<Piece> pieces_of(const std::vector<Draw<T>>& draws) {
     return pieces;
 }
 
-// Returns enough chunks to spread over the threads, but so few that the counters of a
-// chunk stay small compared to its records.
+// Divides the pieces into chunks: enough for all threads, but few enough that a chunk's
+// counters (one per tile) are small compared to its records.
 static std::vector<Chunk> chunks_of(const std::vector<Piece>& pieces, size_t num_tiles) {
     const uint64_t total = pieces.empty() ? 0 : pieces.back().first + pieces.back().count;
     const uint64_t size = std::min(
@@ -68,9 +68,9 @@ static std::vector<Chunk> chunks_of(const std::vector<Piece>& pieces, size_t num
     return chunks;
 }
 
-// Assigns memory to the records of chunks. Each thread allocates strips and writes its
-// chunks one behind the other, so that used memory has few gaps and unused memory is
-// never touched.
+// Allocates the memory of records. Each thread takes large strips and writes its chunks
+// there contiguously. So the used memory has few gaps, and unused memory is never
+// touched.
 class RecordRoom {
   public:
     RecordRoom(const std::vector<Piece>& pieces, const std::vector<Chunk>& chunks)
@@ -81,7 +81,8 @@ class RecordRoom {
             longest_ = std::max(longest_, end - pieces[c.first].first);
             total = end;
         }
-        // A strip is abandoned when less than the longest chunk is left of it.
+        // A thread takes a new strip when the longest chunk does not fit in its current
+        // one. So the gaps are at most an eighth of the strips.
         strip_ = 8 * longest_;
         size_ = total + total / 7 + (mine_.size() + 1) * strip_;
         if (size_ > UINT32_MAX)
@@ -91,7 +92,7 @@ class RecordRoom {
     }
     uint64_t size() const { return size_; }
     uint64_t used() const { return used_; }
-    // Returns where this thread's next chunk begins.
+    // Returns the index of the first record of this thread's next chunk.
     uint64_t take() {
         Strip& mine = mine_[omp_get_thread_num()];
         if (mine.left < longest_)
@@ -113,8 +114,8 @@ class RecordRoom {
     std::vector<Strip> mine_;
 };
 
-// Returns the tiles with the longest lists first, so that no thread starts a long one
-// at the end.
+// Returns the tiles, those with the longest lists first, so that no thread starts a
+// long list at the end.
 static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_tiles) {
     std::vector<uint32_t> order(num_tiles);
     std::iota(order.begin(), order.end(), 0);
@@ -124,22 +125,22 @@ static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_ti
     return order;
 }
 
-// The approximate size of the records and entries that a frame holds at once. It is
-// small because they are accessed randomly, yet large enough that a band has tiles for
-// all threads. With a `stop` flag it is the minimum, because the flag is rarely checked
-// while a band is binned.
+// The approximate bytes of the records and entries of one band. Records are accessed
+// randomly, so smaller bands use caches better; but a band must have tiles for all
+// threads. If there is a `stop` flag, bands have the smallest size, because the flag is
+// rarely checked within a band.
 constexpr double kLeastBandBytes = 96 << 20, kMostBandBytes = 768 << 20,
                  kThreadBandBytes = 48 << 20;
 static double band_bytes_of(const std::atomic<bool>* stop) {
     if (stop != nullptr) return kLeastBandBytes;
     return std::clamp(kThreadBandBytes * most_threads(), kLeastBandBytes, kMostBandBytes);
 }
-// Up to this number of gaussians, one band is used without estimating their coverage.
+// The number of gaussians up to which a picture is drawn in a single band, without an
+// estimate.
 constexpr uint64_t kFewGaussians = 65536;
 
-// Returns bands of tile rows of about equal size in bytes; a single band if memory
-// holds everything. The first few gaussians of a piece give an estimate of its location
-// and coverage.
+// Divides a window into bands of tile rows with about equally many bytes of records and
+// entries. The rows and bytes of a piece are estimated from its first few gaussians.
 template <class T>
 static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws,
                                     const std::vector<Piece>& pieces, const Intrinsics<T>& camera,
@@ -185,8 +186,8 @@ static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws,
     return bands;
 }
 
-// Draws one band. The first band of a picture (`is_first`) also determines the reach of
-// each piece.
+// Draws one band. If `is_first` (the first band of a picture), it also sets the reach
+// of each piece.
 template <class T>
 static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& pieces,
                         bool is_first, const Intrinsics<T>& camera, const Picture<T>& picture,
@@ -250,7 +251,7 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
     counts.rasterize_seconds += now() - binned;
 }
 
-// Returns the part of a picture inside a band.
+// Returns the part of a picture that is in a band.
 template <class T>
 static Picture<T> band_of(const Picture<T>& picture, const Window& band) {
     const size_t skip = static_cast<size_t>(band.y0 - picture.window.y0) *
@@ -298,8 +299,8 @@ void render_backward(const Draw<T>& draw, const Intrinsics<T>& camera, const Pic
     const Record<T>* records = ws.records.data();
     const uint64_t* offset = ws.lists.offset.data();
     const uint64_t* entry = ws.lists.entry.data();
-    // A record has a gradient slot for each of its tiles, adjacent and in tile order,
-    // so the sum over tiles does not depend on the order of threads.
+    // A record has one gradient slot per tile. Adding the slots in the order of tiles
+    // makes the sum independent of the order of threads.
     std::vector<uint64_t> first_slot(ws.room);
     uint64_t num_slots = 0;
     for (size_t c = 0; c < ws.num_chunks; ++c)

@@ -1,7 +1,7 @@
 #pragma once
 
-// The request for a frame, the same on every device: one value that Python creates,
-// that passes through the bindings to a backend, and that nobody changes on the way.
+// The request for a frame, for all backends. Python creates this value, the bindings
+// pass it to a backend, and nothing changes it on the way.
 
 #include <array>
 #include <optional>
@@ -15,14 +15,14 @@ namespace v3dg {
 
 // What the colours of a picture show.
 enum class FrameLook {
-    appearance,  // the gaussians' colours, or a palette of cluster colours
+    appearance,  // the colours of the gaussians, or of a palette of clusters
     missing,     // where finer pages are missing; see missing_color()
-    metrics,     // each pair's metric as a fraction of the tolerance, in grey
-    count        // as appearance, but the depth is replaced by the number of gaussians per pixel
+    metrics,     // each cluster's metric divided by the tolerance, in grey
+    count        // like `appearance`, but the number of gaussians per pixel replaces depth
 };
 
-// The background, the transmittance at which pixels stop (frame/image.h), and whether
-// depth is drawn.
+// Options of blending: the background, the transmittance at which a pixel stops
+// (frame/image.h), and whether depth is drawn.
 struct Shade {
     std::array<double, 3> background;
     float min_transmittance = kStopsBefore;
@@ -30,21 +30,23 @@ struct Shade {
 };
 
 struct FrameRequest {
-    Eyes eyes;        // the cameras of the pictures
-    SelectRule rule;  // of the cut; of a given cut, only the tolerance
+    Eyes eyes;        // the camera of each picture
+    SelectRule rule;  // rule of the cut; with `cut`, only the tolerance
     Shade shade;
     FrameLook look = FrameLook::appearance;
-    std::optional<GivenCut> cut = {};  // drawn instead of a selected cut
-    std::optional<Eyes> chooser = {};  // eyes that the cut is selected for; if absent, `eyes`
-    // With a pool: use the resident pages of the last frame, and neither bring pages in
-    // nor request any.
+    std::optional<GivenCut> cut = {};  // a cut to draw instead of selecting one
+    // eyes for which the cut is selected; default: `eyes`
+    std::optional<Eyes> chooser = {};
+    // With a pool: draw with the pages that are resident, without loading or requesting
+    // any.
     bool is_aside = false;
-    // [C][3] per bundle, SH coefficients of degree 0: the colours of clusters in host
-    // memory. Empty: none.
+    // Per bundle: the colours of clusters in host memory, as SH coefficients of degree
+    // 0, [C][3]. An empty vector keeps the gaussians' colours.
     std::vector<const float*> cluster_colors = {};
 
     const Eyes& choosing_eyes() const { return chooser ? *chooser : eyes; }
-    // Whether every backend can draw it. Other requests are drawn on the host only.
+    // Whether every backend can draw the request. Other requests are drawn on the host
+    // only.
     bool is_plain() const {
         return look == FrameLook::appearance && !is_aside && !chooser && cluster_colors.empty();
     }

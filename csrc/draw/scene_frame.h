@@ -1,7 +1,6 @@
 #pragma once
 
-// Frames of a scene on the host: the input is a request, the output are pictures and
-// counts.
+// Frames of a scene on the host: from a request to pictures and counts.
 
 #include <atomic>
 #include <vector>
@@ -13,36 +12,37 @@ namespace v3dg {
 
 // The gaussians of one bundle on the host, and the appearance of its clusters.
 struct SceneModel {
-    const GaussianPlanes<float>* planes;  // null if the gaussians are codes
+    const GaussianPlanes<float>* planes;  // null if the gaussians are coded
     ClusterAppearance appearance;
     Palette palette;
     const Codes* codes = nullptr;
-    // [C][3] SH coefficients of degree 0, which replace the palette of clusters; null:
-    // none.
+    // [C][3] SH coefficients of degree 0: colours of clusters that replace the palette;
+    // null: none.
     const float* cluster_sh = nullptr;
 };
 
-// A scene on the host: the bundle tables that selection reads, the gaussians, and the
-// instances.
+// A scene on the host: the tables for selection, the gaussians, and the instances.
 struct HostScene {
     Span<const ClusterTable> tables;
-    Span<const SceneModel> models;  // of the same bundles
+    Span<const SceneModel> models;  // one per table
     InstanceTable instances;
-    // See SelectInput.
+    // See SelectInput for these two.
     Span<const Span<uint32_t>> needs = {};
     uint32_t* last_bin = nullptr;
 };
 
 // The counts of one frame.
 struct SceneFrameCounts {
-    int64_t gaussians;  // selected gaussians; if the budget is exceeded, those of the coarsest cut
-    float tolerance_px2;  // the tolerance that was used
-    bool exceeds_budget;  // if so, nothing was drawn
+    // selected gaussians; if exceeds_budget, those of the coarsest cut
+    int64_t gaussians;
+    float tolerance_px2;  // tolerance of the cut
+    bool exceeds_budget;  // if true, nothing was drawn
     double select_seconds, draw_seconds;
-    RenderCounts render;          // sums over both pictures, if there are two
-    std::vector<int64_t> levels;  // selected gaussians by level; for scenes only
+    RenderCounts render;  // sums over both pictures of a stereo frame
+    // selected gaussians of each level; not set by draw_model()
+    std::vector<int64_t> levels;
 
-    // Adds the counts of another picture of the same frame.
+    // Adds the counts of the second picture of a stereo frame.
     void add_picture(const SceneFrameCounts& other) {
         draw_seconds += other.draw_seconds;
         render.in_frustum += other.render.in_frustum;
@@ -51,22 +51,23 @@ struct SceneFrameCounts {
     }
 };
 
-// The gaussian with the largest weight in a pixel, and its pair.
+// The instance and the cluster of the gaussian with the largest blend weight in a
+// pixel.
 struct ScenePick {
     int32_t instance, cluster;
-    float weight;  // its blend weight
+    float weight;  // blend weight
     float depth;
 };
 
 namespace cpu {
 
-// Metrics are shown up to this multiple of the tolerance.
+// The ratio of metric to tolerance that is shown as white; larger ratios look the same.
 constexpr float kMostShare = 2.0f;
 
-// Draws a request, one picture per eye. `rule` is the rule of the request after changes
-// by a pool or by the pacing of a budget. A given cut is drawn for the first eye only;
-// throws std::out_of_range if one of its pairs is not in the scene. Once `stop` is
-// true, it returns soon and leaves the pictures unfinished.
+// Draws a request: one picture per eye, or only the first picture if the request has a
+// cut. `rule` is the request's rule after changes by a pool or by the pacing of a
+// budget. Throws std::out_of_range if the request's cut has a pair that is not in the
+// scene. If `stop` becomes true, it returns soon, and the pictures are incomplete.
 SceneFrameCounts draw_scene(const HostScene& scene, const FrameRequest& request,
                             const SelectRule& rule, Span<const Picture<float>> pictures,
                             const std::atomic<bool>* stop = nullptr);
@@ -76,8 +77,9 @@ SceneFrameCounts draw_model(const GaussianPlanes<float>& model, size_t count,
                             const Appearance<float>& appearance, const Camera& camera,
                             const Picture<float>& picture, const std::atomic<bool>* stop = nullptr);
 
-// Finds the gaussian with the largest weight in the first pixel of the first eye's
-// window, for the cut that draw_scene() would draw. Returns whether there is any.
+// Finds the gaussian with the largest blend weight in the first pixel of the first
+// eye's window. The cut is that of draw_scene(). Returns whether any gaussian is drawn
+// there.
 bool pick_scene(const HostScene& scene, const FrameRequest& request, const SelectRule& rule,
                 ScenePick& picked);
 

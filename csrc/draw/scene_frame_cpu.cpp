@@ -1,5 +1,5 @@
-// Frames of a scene on the host: the clusters of a cut as draws, their false colours,
-// and the functions of draw/scene_frame.h.
+// Implements scene_frame.h: converts the clusters of a cut to draws, and sets their
+// false colours.
 
 #include "draw/scene_frame.h"
 
@@ -16,12 +16,12 @@ namespace v3dg {
 
 namespace {
 
-// A workspace that is lent to one caller at a time and reused from frame to frame; a
-// concurrent caller gets a workspace of its own. It has no mutex, because a fork()
-// could leave that locked.
+// A workspace that is reused from frame to frame. One caller at a time can take it;
+// concurrent callers get new ones. It is a single atomic pointer, because a mutex could
+// stay locked in the child of a fork().
 class SharedWorkspace {
   public:
-    // Threads may still be drawing when the process ends.
+    // Exchanged atomically: threads may still be drawing when the process exits.
     ~SharedWorkspace() { delete kept_.exchange(nullptr); }
     std::unique_ptr<Workspace<float>> take() {
         std::unique_ptr<Workspace<float>> kept(kept_.exchange(nullptr));
@@ -52,9 +52,10 @@ SceneFrameCounts draw_all(const std::vector<Draw<float>>& draws, const Camera& c
     return counts;
 }
 
-// The clusters of a cut as draws. Clusters of one instance with adjacent rows form one
-// draw if they are drawn alike, with the same weight. `tint` has three SH coefficients
-// of degree 0 per pair, which replace the colours of its gaussians; null: none.
+// Converts the clusters of a cut to draws. Clusters of one instance become a single
+// draw if their rows are adjacent and their appearance and weights are equal. `tint`
+// has SH coefficients of degree 0, [S][3] for S pairs, which replace the gaussians'
+// colours; null: none.
 class CutDraws {
   public:
     CutDraws(const HostScene& scene, const Camera& camera, const GivenCut& given,
@@ -67,7 +68,8 @@ class CutDraws {
 
     const std::vector<Draw<float>>& draws() const { return draws_; }
     int64_t num_gaussians() const { return static_cast<int64_t>(num_gaussians_); }
-    // Returns the pair of a gaussian, whose index counts through all draws.
+    // Returns the index of the pair that a gaussian belongs to. `gaussian` is counted
+    // over all draws.
     size_t pair_of(uint64_t gaussian) const {
         return std::upper_bound(end_of_pair_.begin(), end_of_pair_.end(), gaussian) -
                end_of_pair_.begin();
@@ -113,7 +115,8 @@ class CutDraws {
         last_instance_ = i;
     }
 
-    // Whether b, a draw of the same instance, begins where a ends and is drawn alike.
+    // Returns whether a and b, draws of one instance, can be joined: b begins where a
+    // ends, and both are drawn alike.
     static bool joins(const Draw<float>& a, const Draw<float>& b) {
         return a.first + a.count == b.first && a.appearance == b.appearance &&
                a.weight == b.weight && a.palette.sh == b.palette.sh;
@@ -123,14 +126,14 @@ class CutDraws {
     const Camera& camera_;
     const bool fades_;
     std::vector<Draw<float>> draws_;
-    // [S] end of each pair's gaussians, counted through all draws.
+    // [S] end of each pair's gaussians, counted over all draws.
     std::vector<uint64_t> end_of_pair_;
     uint64_t num_gaussians_ = 0;
     int32_t last_instance_ = -1;
     ModelView<float> view_{};
 };
 
-// Returns the metrics of pairs divided by the tolerance: (S).
+// Returns the ratio of metric to tolerance of each pair: (S).
 std::vector<float> shares_of(const HostScene& scene, const Camera& camera, const SelectRule& rule,
                              const GivenCut& given, float tolerance_px2) {
     std::vector<float> share(given.instance.size);
@@ -173,17 +176,18 @@ std::vector<int64_t> levels_of(const HostScene& scene, const GivenCut& given) {
     return levels;
 }
 
-// Returns the [S][3] colours that replace those of the pairs' gaussians; empty if none
-// do. `tolerance_px2` is the tolerance of the cut.
+// Returns false colours of the pairs, [S][3], which replace the colours of the
+// gaussians. Empty if the request has no false colours. `tolerance_px2` is the
+// tolerance of the cut.
 std::vector<float> tint_of(const HostScene& scene, const FrameRequest& request,
                            const SelectRule& rule, const GivenCut& given, float tolerance_px2) {
     const bool is_metric = request.look == FrameLook::metrics;
     if (!is_metric && request.look != FrameLook::missing) return {};
-    // Metrics are for the eye that views the picture. Missing pages are for the eye
-    // that the cut was selected for.
+    // Metrics depend on the eye that views the picture; missing pages on the eye for
+    // which the cut was selected.
     const Camera& judge = is_metric ? request.eyes.camera[0] : request.choosing_eyes().camera[0];
-    // Without a budget, the wanted tolerance is the requested one, not the one that a
-    // pool raised it to. With a budget, it is the one that the budget led to.
+    // Compare with the requested tolerance: the pool may have raised the tolerance of
+    // the cut. With a budget, there is no requested tolerance, so use that of the cut.
     const bool wants_used = is_metric || rule.budget != kNoBudget;
     const float wanted = wants_used ? tolerance_px2 : request.rule.tolerance_px2;
     std::vector<float> tint(3 * given.instance.size);
@@ -193,7 +197,7 @@ std::vector<float> tint_of(const HostScene& scene, const FrameRequest& request,
         const ClusterTable& table = scene.tables[scene.instances.bundle[given.instance[s]]];
         const bool is_finest = level_of(table, given.cluster[s]) <= rule.min_level;
         const float grey = std::min(share[s], cpu::kMostShare);
-        // Slightly more than the fade's factor, because metrics are rounded.
+        // 1.0001: a margin for the rounding of metrics.
         const Rgb rgb =
             is_metric ? Rgb{grey, grey, grey}
                       : missing_color(is_finest ? 0.0f : share[s], 1.0001f * rule.fade.factor);
@@ -226,7 +230,8 @@ SceneFrameCounts draw_given(const HostScene& scene, const FrameRequest& request,
     const GivenCut& given = *request.cut;
     std::vector<float> tint;
     if (request.look == FrameLook::metrics) {
-        static_cast<void>(CutDraws(scene, camera, given));  // throws if a pair is not in the scene
+        // Throws if a pair is not in the scene.
+        static_cast<void>(CutDraws(scene, camera, given));
         tint = tint_of(scene, request, rule, given, rule.tolerance_px2);
     }
     return draw_pairs(scene, camera, given, rule.tolerance_px2,

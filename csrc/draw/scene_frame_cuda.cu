@@ -1,4 +1,4 @@
-// Frames of a scene on a CUDA device: they choose the cut that writes the items, and
+// Implements scene_frame_cuda.h: enqueues the cut that writes a frame's items, and sets
 // the models of the batch.
 
 #include "draw/scene_frame_cuda.h"
@@ -132,7 +132,7 @@ FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures
             .has_depth = false};
 }
 
-// The rule for drawing a frame again whose buffers were too small.
+// Returns the rule for drawing a frame again after a buffer was too small.
 static SelectRule drawn_again(SelectRule rule) {
     if (rule.pace == BudgetPace::in_steps) rule.pace = BudgetPace::again;
     return rule;
@@ -180,8 +180,8 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
             cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items,
                            on, &resident);
             next = drawn_again(next);
-            // A frame that is drawn again reports no needs, because another frame may
-            // be reporting its own.
+            // When a frame is drawn again, another frame may already be reporting page
+            // requests; so this one must not.
             if (resident.needs.report != nullptr) pages.end_frame(on);
             resident.needs = {};
         },

@@ -1,7 +1,7 @@
 #pragma once
 
-// Frames of a scene on a CUDA device, which turn a request into an enqueued drawing,
-// and the models that they draw.
+// Frames of a scene on a CUDA device. They enqueue the drawing of a request. Also the
+// models that they draw.
 
 #include "draw/device_pages.h"
 #include "draw/frame_cuda.h"
@@ -12,12 +12,11 @@
 namespace v3dg {
 namespace cuda {
 
-// Returns the only picture of a frame; the function fills in `first_tile` and the
-// tiles.
+// Returns a FrameImage for a frame with one picture, including its tiles.
 FrameImage frame_image(const Intrinsics<float>& camera, int width, int height,
                        const float background[3], const PicturePlanes& planes);
 
-// Packed gaussians that never change.
+// The packed gaussians of a model that never changes.
 class PackedModel {
   public:
     PackedModel(const GaussianRows<const float>& rows, cudaStream_t stream);
@@ -31,11 +30,12 @@ class PackedModel {
     PackedPlanes packed_;
 };
 
-// Coded gaussians on the device that is current when they are made: all records, then
-// all SH codes, so that the address of a row follows from its index.
+// The coded gaussians of a model, on the device that is current at construction. All
+// records are contiguous, and so are all SH codes, so that the address of a row follows
+// from its index.
 class CodedModel {
   public:
-    // Returns once the codes are on the device.
+    // Returns when the codes are on the device.
     CodedModel(const CodedPages& pages, cudaStream_t stream);
     const Codes& codes() const { return codes_; }
     size_t bytes() const {
@@ -49,17 +49,17 @@ class CodedModel {
     Codes codes_;
 };
 
-// The gaussians of a bundle: one of the two is set.
+// The gaussians of a bundle. One of the two pointers is set.
 struct DeviceModel {
     std::shared_ptr<const PackedModel> packed;
     std::shared_ptr<const CodedModel> coded;
 };
 
-// Colours of the clusters of one bundle.
+// The colours of the clusters of one bundle, on the device.
 class DevicePalette {
   public:
-    // `sh` is (C, 3), SH coefficients of degree 0; the host memory may be reused on
-    // return.
+    // `sh` is (C, 3), SH coefficients of degree 0 in host memory. The caller may reuse
+    // this memory on return.
     DevicePalette(Span<const float> sh, std::shared_ptr<const BundleTables> tables,
                   cudaStream_t stream);
     Palette palette() const;
@@ -69,31 +69,32 @@ class DevicePalette {
     DeviceBuffer<float> sh_;
 };
 
-// Returns the pictures of two eyes in one frame.
+// Combines the pictures of two eyes into one frame.
 EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_transmittance);
 
 // Draws a scene that is on the device: selects a cut, then draws it.
 class SceneFrame {
   public:
-    // Sets the gaussians of each bundle of the scenes to be drawn next and, unless
-    // empty, the colours of their clusters. The host arrays may be reused on return.
+    // Sets the gaussians of each bundle of the scene and, unless `palettes` is empty,
+    // the colours of the bundles' clusters. The caller may reuse host memory on return.
     void set_models(std::vector<DeviceModel> models,
                     std::vector<std::shared_ptr<const DevicePalette>> palettes,
                     cudaStream_t stream);
 
-    // Draws a plain request (FrameRequest::is_plain) into `pictures`; `place` provides
-    // their destinations. With `pages`, it draws the resident part of a pool's bundles,
-    // after bringing in pages that are ready. `rule` is the rule of the request after
-    // changes by the pacing of a budget; it becomes the rule that was used. The scene,
-    // the pool and a given cut, which is on the device and has one picture, must exist
-    // until the drawing is finished. If a frame is drawn again, it uses the pages that
-    // are resident by then.
+    // Enqueues a plain request (FrameRequest::is_plain). `pictures` are the pictures to
+    // draw; `place` sets their destinations. With `pages`, it first brings in pages
+    // that are ready, then draws the resident part of the pool's bundles. `rule` is the
+    // request's rule after the pacing of a budget; it is set to the rule that was used.
+    //
+    // The scene, the pool and a given cut must exist until the drawing is finished. A
+    // given cut is on the device and has one picture. If the frame is drawn again, it
+    // uses the pages that are resident at that time.
     std::unique_ptr<Drawing> draw(const SceneTables& scene, DevicePages* pages,
                                   const FrameRequest& request, SelectRule& rule,
                                   const EyeImages& pictures, cudaStream_t stream,
                                   const Frame::Place& place);
 
-    // Returns the bytes on the device by part, without the models.
+    // Returns the device memory in bytes, by part, without the models.
     std::vector<std::pair<const char*, size_t>> bytes() const;
 
   private:
@@ -107,7 +108,7 @@ class SceneFrame {
     std::unique_ptr<Drawing> draw_given(const SceneTables& scene, const FrameRequest& request,
                                         const EyeImages& pictures, cudaStream_t stream,
                                         const Frame::Place& place);
-    // Returns the batch for the models that were set.
+    // Returns the batch that draws the models.
     FrameBatch batch(const SceneTables& scene, const EyeImages& pictures, const SelectRule& rule,
                      cudaStream_t stream);
 
@@ -123,7 +124,7 @@ class SceneFrame {
     Frame frame_;
 };
 
-// One model in front of one camera.
+// A model, and the camera in front of which it is placed.
 struct ModelTables {
     GaussianRows<const float> rows;
     PackedPlanes packed;
@@ -131,13 +132,13 @@ struct ModelTables {
     FrameImage image;
 };
 
-// Draws all gaussians of one model.
+// Draws all gaussians of one model on CUDA.
 class ModelFrame {
   public:
     explicit ModelFrame(Frame::Keeps keeps = Frame::Keeps::nothing) : frame_(keeps) {}
 
-    // The rows, and the planes packed from them, must exist until the drawing is
-    // finished.
+    // Enqueues a picture of a model. The rows, and the planes packed from them, must
+    // exist until the drawing is finished.
     std::unique_ptr<Drawing> draw(const GaussianRows<const float>& rows,
                                   const ModelView<float>& view, float filter_px2, bool antialiased,
                                   const FrameImage& image, cudaStream_t stream,

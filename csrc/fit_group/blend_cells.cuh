@@ -1,8 +1,8 @@
 #pragma once
 
-// Half-warps blend cells of 4 x 4 pixels, and visit them again for the gradients. The
-// gradient of each gaussian is summed over a cell's pixels into a slot for that
-// gaussian and cell.
+// Blends cells of 4 x 4 pixels with half-warps, and computes gradients by visiting the
+// same gaussians again. For each gaussian and cell, the gradient is summed over the
+// cell's pixels and stored in a slot.
 
 #include "fit_group/cell_lists.cuh"
 #include "frame/record.cuh"
@@ -13,7 +13,7 @@ namespace cuda {
 
 enum class Pass { measure, draw, train };
 
-// The pixel of a lane in the cell of its half-warp.
+// The pixel of a lane, in the cell of its half-warp.
 struct CellPixel {
     int x, y;
     float center_x, center_y;
@@ -28,14 +28,15 @@ __device__ CellPixel pixel_at(const Fit& fit, int cell_x, int cell_y) {
             x < fit.job.size && y < fit.job.size};
 }
 
-// Entries of a list that are loaded at once.
+// List entries that are loaded with one instruction.
 template <class Index>
 struct alignas(kAtOnce * sizeof(Index)) CellEntries {
     Index record[kAtOnce];
 };
 
-// Copies the records of a part of both half-warps' lists to shared memory. Records of
-// small groups are always in shared memory.
+// Copies the records of entries [begin, end) of both half-warps' lists to shared
+// memory. For small groups there is nothing to do: their records are always in shared
+// memory.
 template <class Fit>
 __device__ void stage_records(const Fit& fit, uint32_t begin, uint32_t end) {
     if (Fit::kSmall) return;
@@ -51,8 +52,8 @@ __device__ void stage_records(const Fit& fit, uint32_t begin, uint32_t end) {
     __syncwarp();
 }
 
-// kAtOnce records of a half-warp's list, from entry i on; `begin` is the first entry of
-// the chunk.
+// kAtOnce records of a half-warp's list, from entry i on. `begin` is the first entry of
+// the current chunk.
 struct CellRecords {
     const Record<float>* record[kAtOnce];
 };
@@ -75,7 +76,7 @@ __device__ CellRecords records_at(const Fit& fit, const CellList<Fit>& list, uin
     return out;
 }
 
-// The contributions of kAtOnce gaussians to a pixel, front to back.
+// How kAtOnce gaussians contribute to a pixel, front to back.
 struct Blended {
     float alpha[kAtOnce], before[kAtOnce], weight[kAtOnce];
     float3 color[kAtOnce];
@@ -86,8 +87,8 @@ __device__ inline Blended blend_records(const CellPixel& p, const CellRecords& r
     Blended out;
 #pragma unroll
     for (int q = 0; q < kAtOnce; ++q) {
-        // The record is read as vectors (frame/record.cuh), because nvcc rounds the
-        // falloff of a record that was copied differently.
+        // Read the record as vectors (frame/record.cuh), because nvcc rounds the
+        // falloff of a copied record differently.
         const Record<float>& r = *records.record[q];
         const float4 a = *reinterpret_cast<const float4*>(&r.u);
         const float4 b = *reinterpret_cast<const float4*>(&r.l22);
@@ -98,24 +99,24 @@ __device__ inline Blended blend_records(const CellPixel& p, const CellRecords& r
     return out;
 }
 
-// The outputs of a pass.
+// The outputs of a pass. Those of other passes are unused.
 struct BlendTargets {
     float* slots;          // for Pass::train
-    uint32_t slot_base;    // index of the first slot
+    uint32_t slot_base;    // index of the first slot in `slots`
     const float* d_dssim;  // for Pass::train; may be null
     float* picture;        // for Pass::draw
     float2* errors;        // for Pass::measure
 };
 
-// Half-warps sum the fragments of a chunk, with one lane per gaussian or, if the chunk
-// has fewer gaussians, with two.
+// The number of lanes that sum the fragments of one gaussian: 1, or 2 if a chunk has
+// fewer gaussians than a half-warp has lanes.
 template <class Fit>
 constexpr int kLanesOfSum = kCellPixels / (Fit::kChunk < kCellPixels ? Fit::kChunk : kCellPixels);
 
-// Sums over the half-warp's cell for record r, which is gaussian `i` of the chunk. All
-// lanes call it; those without a gaussian pass a null `slot`. The row sums are written
-// out instead of using RowSums, because nvcc would round those differently and change
-// the last bits of bundles.
+// Computes the gradient of record r, which is gaussian `i` of the chunk, summed over
+// the half-warp's cell. All lanes must call it; lanes without a gaussian pass a null
+// `slot`. The sums are not written with RowSums: nvcc would round them differently,
+// which would change the bits of bundles.
 template <class Fit>
 __device__ void add_up(const Fit& fit, const CellPixel& p, uint32_t i, const Record<float>& r,
                        float* slot) {
@@ -164,8 +165,8 @@ __device__ void add_up(const Fit& fit, const CellPixel& p, uint32_t i, const Rec
         if (kLanes == 1 || (k < 5) == (part == 0)) slot[k] = all[k];
 }
 
-// Blends two neighbouring cells in view b. Called by a whole warp. `unit` is the index
-// of the pair.
+// Blends two horizontally adjacent cells in view b. All lanes of the warp must call it.
+// `unit` is the index of the pair of cells.
 template <Pass kPass, class Fit>
 __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, int pair_x,
                             int cell_y, uint32_t unit, const BlendTargets& targets) {
@@ -229,8 +230,8 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
     }
     fit.d_pixels()[lane] = make_float4(d[0], d[1], d[2], 0);
 
-    // Blends the same records again, with the same results, now that the sum over all
-    // of them is known.
+    // Blend the same records again, with the same results. The sums over all records
+    // are known now, which gradients need.
     const auto slot_of = [&](uint32_t j) {
         const uint32_t slot =
             fit.slot_first(region)[j] + __popcll(fit.mask(region)[j] & ((CellMask(1) << cell) - 1));
@@ -270,7 +271,7 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
         }
         __syncwarp();
     }
-    // All pixels stop before the remaining records, so the sums of those are 0.
+    // The gradients of the remaining records are 0, because all pixels have stopped.
     for (uint32_t i = begin + lane % kCellPixels; i < list.length; i += kCellPixels) {
         float* slot = slot_of(list.entry[i]);
         for (int k = 0; k < kSums; ++k) slot[k] = 0;
@@ -286,13 +287,13 @@ __device__ int cell_pairs(const Fit& fit) {
     return (fit.job.size + 2 * kCell - 1) / (2 * kCell);
 }
 
-// Maps 0, 1, 2, ... to the middle of [0, size), then alternately before and behind it.
+// Maps 0, 1, 2, ... to the middle of [0, size), then alternately to both sides of it.
 __device__ inline int from_middle(int k, int size) {
     return size / 2 + (k % 2 ? -(k + 1) / 2 : k / 2);
 }
 
-// Warps claim pairs of cells from a queue. Pairs in the middle come first, because they
-// have the longest lists.
+// Blends all pairs of cells of some regions. Warps claim pairs from a counter. Pairs in
+// the middle come first, because their lists are longest.
 template <Pass kPass, class Fit>
 __device__ void blend_regions(const Fit& fit, const FitCameras& cameras, int num_views,
                               int first_region, int last_region, const BlendTargets& targets) {

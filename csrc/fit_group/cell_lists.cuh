@@ -1,7 +1,7 @@
 #pragma once
 
-// The gaussians that reach each cell of 4 x 4 pixels: a cell mask for each record, a
-// gradient slot for each record and cell, and the list of each cell.
+// Lists the gaussians that reach each cell of 4 x 4 pixels. A record has a mask of
+// cells, and a gradient slot for each of these cells.
 
 #include "base/scan.cuh"
 #include "fit_group/depth_order.cuh"
@@ -32,7 +32,8 @@ __device__ inline CellMask cells_of(const Record<float>& r, int left, int top) {
     return reached;
 }
 
-// Sorts the records of a large group, finds the cells of each, and waits for the team.
+// Sorts the records of a large group by depth, computes their cells, and waits for the
+// team.
 template <class Fit>
 __device__ void arrange_by_depth(const Fit& fit, int num_views) {
     for (uint32_t r = fit.first(); r < num_views * fit.n_padded; r += fit.stride()) {
@@ -49,8 +50,7 @@ __device__ void arrange_by_depth(const Fit& fit, int num_views) {
     fit.sync();
 }
 
-// Assigns each record a slot for each cell that it reaches, region by region, and
-// counts the slots.
+// Assigns each record one slot per cell, region by region. Returns the number of slots.
 template <class Fit>
 __device__ uint32_t assign_slots(const Fit& fit, int num_views) {
     const uint32_t used = num_views * fit.n_padded, count = fit.num_regions() * used;
@@ -86,7 +86,7 @@ __device__ uint32_t assign_slots(const Fit& fit, int num_views) {
     return total;
 }
 
-// Adds each record's slots in these regions to the sums from earlier regions.
+// Adds the slots of each record in some regions to its sums over earlier regions.
 template <class Fit>
 __device__ void sum_slots(const Fit& fit, int num_views, const float* slots, uint32_t slot_base,
                           int first_region, int last_region) {
@@ -111,16 +111,17 @@ __device__ void sum_slots(const Fit& fit, int num_views, const float* slots, uin
     }
 }
 
-// The list of a half-warp's cell: ranks of records, nearest first. The lists of both
-// half-warps have the same length, including padding with the rank of an empty record.
+// The list of a half-warp's cell: ranks of records, nearest first. Both half-warps have
+// lists of the same length. `filled` is the length without padding; padding is the rank
+// of an empty record.
 template <class Fit>
 struct CellList {
     const typename Fit::Index* entry;
     uint32_t length, filled;
 };
 
-// Writes the lists of two neighbouring cells in view b, and returns the list of this
-// lane's cell; `cell` is the mask bit of the left one.
+// Writes the lists of two horizontally adjacent cells in view b, and returns the list
+// of this lane's cell. `cell` is the bit of the left cell in masks.
 template <class Fit>
 __device__ CellList<Fit> make_lists(const Fit& fit, int b, int region, int cell) {
     constexpr int kLoads = 4;

@@ -1,6 +1,6 @@
 #pragma once
 
-// The loss of a group's picture on the CPU, and its gradient.
+// The loss of a group's pictures on the CPU, and its gradient.
 
 #include <algorithm>
 #include <vector>
@@ -11,12 +11,13 @@
 namespace v3dg {
 namespace V3DG_ISA {
 
-// Draws the student, compares it with its target, and accumulates its gradient.
+// Draws the student (the gaussians being fitted), compares the picture with its target,
+// and accumulates gradients.
 class Comparison {
   public:
     Comparison(const FitConfig& config) : config_(config) {}
 
-    // Adds the mean |difference| of colour and alpha in one view.
+    // Adds the mean |difference| of colour and of alpha in one view to `error`.
     void residual(const Student& student, const FitView& view, const FitImage& target,
                   double error[2]) {
         draw(student, view);
@@ -73,8 +74,8 @@ class Comparison {
         return count;
     }
 
-    // Computes the L1 parts of the loss in one tile: adds to the sums and, unless
-    // `grad` is null, writes the gradients of its pixels.
+    // Computes the L1 parts of the loss in one tile. Adds them to `error`. Unless
+    // `grad` is null, also computes the gradients of the tile's pixels.
     void compare(int t, const FitView& view, const FitImage& target, TileGradient<float>* grad,
                  double error[2]) {
         using V = Vec<float>;
@@ -113,7 +114,7 @@ class Comparison {
         error[1] += sum_of(alpha_sum) / num_pixels;
     }
 
-    // Adds the D-SSIM part to the gradient; planes are row major.
+    // Adds the gradient of the D-SSIM part of the loss. Its planes are row major.
     void add_dssim(const FitView& view, const FitImage& target) {
         const int size = view.size, across = tiles_across(view);
         const size_t n = static_cast<size_t>(size) * size;

@@ -1,24 +1,25 @@
 #pragma once
 
-// Sorts gaussians by depth in each view; ties are sorted by index.
+// Sorts the gaussians of each view by depth, and by index where depths are equal.
 
 #include "fit_group/team.cuh"
 
 namespace v3dg {
 namespace cuda {
 
-// The key of gaussians that are not drawn; it is above all depths.
+// The key of gaussians that are not drawn. It is larger than all depths.
 constexpr uint32_t kHiddenKey = 0xfffffffeu;
 
-// Writes gaussian `i` of the view with these keys to its sorted position.
+// Computes the rank of gaussian `i` and writes `i` there. `view_keys` are the keys of
+// its view.
 template <class Fit>
 __device__ void rank_by_depth(const Fit& fit, const uint32_t* view_keys, uint32_t begin,
                               uint32_t i) {
     const uint4* all = reinterpret_cast<const uint4*>(view_keys);
     const uint32_t key = view_keys[i], warp_first = i - threadIdx.x % 32;
     uint32_t rank = 0;
-    // Equal keys are sorted by index. So equal keys precede this one if they are in an
-    // earlier run of 32 than this warp's, and follow it if they are in a later run.
+    // Equal keys are ordered by index. So an equal key in an earlier run of 32 precedes
+    // this one, and an equal key in a later run follows it.
     const auto count = [&](uint32_t from, uint32_t to, const auto& before) {
         for (uint32_t run = from; run < to; run += 32) {
             uint4 other[8];
@@ -47,8 +48,8 @@ __device__ void rank_by_counting(const Fit& fit, int num_views) {
                           j / fit.n_padded * fit.n_padded, j % fit.n_padded);
         return;
     }
-    // All threads read all keys, so the keys are copied to shared memory if they fit.
-    // This memory is used for fragments later.
+    // All threads read all keys, so copy the keys to shared memory if there is room.
+    // The memory is used for fragments later.
     auto* copy = reinterpret_cast<uint32_t*>(shared_memory() + fit.layout.fragments);
     const bool fits = fit.n_padded * sizeof(uint32_t) <= Fit::kWarps * fragments_bytes(Fit::kChunk);
     for (int b = 0; b < num_views; ++b) {
@@ -91,7 +92,7 @@ __device__ void sort_bitonic(const Fit& fit, int b) {
     __syncthreads();
 }
 
-// Sorts the gaussians of each view by depth; ties are sorted by index.
+// Sorts the gaussians of each view by depth, and by index where depths are equal.
 template <class Fit>
 __device__ void order_by_depth(const Fit& fit, int num_views) {
     if (Fit::kSmall || fit.team_size > 1)

@@ -1,13 +1,12 @@
 #pragma once
 
-// The D-SSIM of a picture and its gradient, for the loss of a fit.
+// The D-SSIM of a picture, and its gradient, for the loss of a fit.
 
 #include <vector>
 
 namespace v3dg {
 
-// Weights of the parts of the loss between two pictures. Each part is a mean over
-// pixels, and over channels if it has several.
+// The weights of the terms of the loss. Each term is a mean over pixels and channels.
 struct LossWeights {
     float l1;     // |difference| of premultiplied colour
     float dssim;  // 1 - SSIM of premultiplied colour
@@ -19,10 +18,10 @@ struct SsimScratch {
     std::vector<float> maps;
 };
 
-// Returns the mean of 1 - SSIM over one channel of width x height, row major, and adds
-// `weight` times its gradient with respect to `picture` to `d_picture`. The Gaussian
-// window is 11 x 11 with sigma 1.5, pixels beyond the border are zero, and the
-// constants are 0.01² and 0.03² (Wang et al. 2004, as 3D Gaussian Splatting uses it).
+// Returns the mean of 1 - SSIM for one channel of width x height pixels, row major.
+// Adds `weight` times the gradient with respect to `picture` to `d_picture`. The
+// Gaussian window is 11 x 11 with sigma 1.5. Pixels beyond the border are zero. The
+// constants are 0.01² and 0.03² (Wang et al. 2004, as used by 3D Gaussian Splatting).
 float dssim(const float* picture, const float* target, int width, int height, float weight,
             float* d_picture, SsimScratch& scratch);
 

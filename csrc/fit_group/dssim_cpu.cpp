@@ -4,8 +4,8 @@
 
 namespace v3dg {
 
-// Applies both passes of the separable window. The operation is its own transpose,
-// because the window is symmetric and pixels outside are zero.
+// Applies the window, which is separable, in two passes. The operation is its own
+// transpose, because the window is symmetric and pixels beyond the border are zero.
 static void blur(const float* in, int width, int height, float* rows, float* out) {
     for (int y = 0; y < height; ++y)
         for (int x = 0; x < width; ++x) {

@@ -1,6 +1,6 @@
 #pragma once
 
-// D-SSIM of the pictures of a group; dssim.h has the definition and the CPU version.
+// D-SSIM of a group's pictures on CUDA. dssim.h has the definition.
 
 #include "fit_group/team.cuh"
 #include "math/ssim.h"
@@ -8,14 +8,16 @@
 namespace v3dg {
 namespace cuda {
 
-// Writes the gradients of D-SSIM by the pictures, three planes each.
+// Computes the gradient of D-SSIM with respect to each picture, three planes per
+// picture.
 template <class Fit>
 __device__ void dssim_backward(const Fit& fit, const FitCameras& cameras, int num_views,
                                const float* pictures, float* d_pictures, float* all_maps) {
     const int size = fit.job.size;
     const uint32_t num_pixels = size * size, count = 3 * num_views * num_pixels;
     const float scale = -fit.in.config.loss.dssim / (3 * static_cast<float>(num_pixels));
-    // Sums the maps over the window along rows (step 1) or columns.
+    // Adds up the maps within the window along rows (step = 1) or columns (step =
+    // size).
     const auto blur = [&](const float* maps, uint32_t i, int place, int step, auto& sums) {
 #pragma unroll
         for (int k = -kSsimRadius; k <= kSsimRadius; ++k)
@@ -62,7 +64,8 @@ __device__ void dssim_backward(const Fit& fit, const FitCameras& cameras, int nu
         maps[6 * num_pixels + i] = scale * ssim.d_xx;
         maps[7 * num_pixels + i] = scale * ssim.d_xy;
     });
-    // The backward pass applies the window again, which is its own transpose.
+    // The backward pass applies the window again, because the window is its own
+    // transpose.
     for_each_pixel([&](uint32_t, uint32_t i, float* maps) {
         float sums[3] = {0, 0, 0};
         blur(maps + 5 * num_pixels, i, i % size, 1, sums);

@@ -1,6 +1,6 @@
-// One thread fits one group from start to end. In the group's coordinates the ball is
-// at the origin with radius 1, so that step sizes mean the same for every group, and no
-// precision is lost far from the origin of the world.
+// Fits a group on the CPU, on a single thread. In the group's coordinates, the ball is
+// at the origin and has radius 1. So step sizes mean the same for every group, and
+// groups far from the world's origin lose no precision.
 
 #include "fit_group/fit_group.h"
 

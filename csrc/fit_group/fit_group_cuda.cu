@@ -1,12 +1,12 @@
-// Each block, or team of blocks, fits one group from start to end, then claims the next
-// one from a queue.
+// Fits groups on CUDA. A block, or a team of blocks, fits one group from start to end,
+// then claims the next one.
 //
-// In each step threads project gaussians and sort them by depth. Half-warps process
-// cells of 4 x 4 pixels: they list the gaussians that reach a cell, blend them front to
-// back, compare with the target, and visit them again for the gradients. Each gaussian
-// has a slot for each cell, and slots are summed in a fixed order; threads propagate
-// the sums to the parameters, and Adam updates those. So every run has the same result,
-// whatever the order of blocks and warps.
+// In each step, threads project the gaussians and sort them by depth. Half-warps
+// process cells of 4 x 4 pixels: they list the gaussians that reach the cell, blend
+// them front to back, compare with the target, and visit the gaussians again to compute
+// gradients. Each gaussian has a slot per cell. Threads add up the slots in a fixed
+// order, propagate the sums to the parameters, and perform a step of Adam. So every run
+// has the same result, regardless of the order of blocks and warps.
 
 #include "fit_group/fit_group.h"
 
@@ -23,7 +23,7 @@ namespace cuda {
 
 namespace {
 
-// Largest number of gaussians in a small group, whose picture is a single region.
+// The largest number of gaussians in a small group. Its picture is a single region.
 constexpr uint32_t kSmallCount = 256;
 constexpr int kStepsPerPoll = 16;
 
@@ -36,7 +36,8 @@ __device__ void set_camera(const Fit& fit, FitCameras& cameras, int b, uint64_t 
         fit.in.targets + fit.job.first_pixel + picture * fit.job.size * fit.job.size;
 }
 
-// Adds the |difference| of colour and alpha, summed over pixels, in every thread.
+// Adds the |difference| of colour and of alpha, summed over pixels, to `error` in every
+// thread.
 template <class Fit>
 __device__ void measure_views(const Fit& fit, const FitCameras& cameras, int num_views,
                               double error[2]) {
@@ -72,8 +73,7 @@ __device__ void differentiate_views(const Fit& fit, const FitCameras& cameras, i
     targets.slots = is_near ? fit.at(fit.layout.near_slots)
                             : reinterpret_cast<float*>(fit.scratch + fit.layout.far_slots);
     const uint32_t capacity = is_near ? num_slots : fit.layout.num_far_slots;
-    // All regions are processed at once, unless they have more slots than there is room
-    // for.
+    // Process as many regions at once as there is room for their slots.
     const auto slots_before = [&](int region) {
         return region < fit.num_regions() ? fit.slot_first(region)[0] : num_slots;
     };
@@ -92,7 +92,7 @@ __device__ void differentiate_views(const Fit& fit, const FitCameras& cameras, i
     project_views_backward(fit, cameras, num_views, turn);
 }
 
-// Sums the errors over the blocks that share the views; every block gets the sums.
+// Adds up the errors of all blocks of the group. Every block gets the sums.
 template <class Fit>
 __device__ void sum_errors(const Fit& fit, double error[2][2]) {
     if (threadIdx.x == 0)
@@ -106,8 +106,8 @@ __device__ void sum_errors(const Fit& fit, double error[2][2]) {
     }
 }
 
-// Keeps the result if it is better than the initial values. `error` has sums over
-// pixels, before and after.
+// Writes the result if it is better than the initial values. `error` has sums over
+// pixels: those of the initial values, and those of the result.
 template <class Fit>
 __device__ void keep_if_better(const Fit& fit, double error[2][2]) {
     const FitConfig& config = fit.in.config;
@@ -125,15 +125,15 @@ __device__ void keep_if_better(const Fit& fit, double error[2][2]) {
         fit.in.error[2 * fit.job.error + k] = static_cast<float>(error[better][k]);
 }
 
-// Visits the views held out, then those of all steps, then those held out again, in
-// batches of at most kViewsAtOnce.
+// Visits the held-out views, then the views of all steps, then the held-out views
+// again, in batches of at most kViewsAtOnce views.
 template <class Fit>
 __device__ void fit_one_group(const Fit& fit) {
     const FitConfig& config = fit.in.config;
     const int views_per_step = config.views_per_step;
     const int64_t num_visits = static_cast<int64_t>(config.steps) * views_per_step;
-    // Visits of steps count from 0; visits of the views held out come before and after
-    // these.
+    // Visits of steps are numbered from 0. The first visits of held-out views have
+    // negative numbers; the last ones follow the steps.
     const auto views_at = [&](int64_t visit) {
         const int64_t left = visit < 0            ? -visit
                              : visit < num_visits ? views_per_step - visit % views_per_step
@@ -147,7 +147,8 @@ __device__ void fit_one_group(const Fit& fit) {
                                                              : 0;
     };
     const auto set_cameras = [&](FitCameras& cameras, int64_t first) {
-        const int b = static_cast<int>(threadIdx.x) - (Fit::kThreads - 32);  // the least busy warp
+        // threads of the last warp, which is the least busy one
+        const int b = static_cast<int>(threadIdx.x) - (Fit::kThreads - 32);
         if (b == kViewsAtOnce && first >= 0 && first < num_visits)
             cameras.step = fit.in.steps[first / views_per_step];
         if (b < 0 || b >= own_of(views_at(first))) return;
@@ -158,7 +159,7 @@ __device__ void fit_one_group(const Fit& fit) {
                    is_of_step ? visited_view(config, fit.in.stride, visit)
                               : num_fitted_pictures(config) + held_out);
     };
-    double error[2][2] = {{0, 0}, {0, 0}};  // before and after the fit
+    double error[2][2] = {{0, 0}, {0, 0}};  // of the initial values, and of the result
     start_parameters(fit);
     set_cameras(fit.s.cameras[0], -kHeldOutViews);
     if (fit.leads()) fit.team.unit = 0;
@@ -192,14 +193,14 @@ __device__ void fit_one_group(const Fit& fit) {
     if (fit.view_rank == 0) keep_if_better(fit, error);
 }
 
-// The step sizes are computed once, because powers are slow and all groups use the same
-// steps.
+// Computes the step sizes of all steps once, because powers are slow and all groups use
+// the same step sizes.
 __global__ void steps_kernel(const FitConfig config, FitStep* steps) {
     const unsigned i = blockIdx.x * blockDim.x + threadIdx.x;
     if (i < static_cast<unsigned>(config.steps)) steps[i] = fit_step(config, static_cast<int>(i));
 }
 
-// Counters of the queue, in device memory.
+// The counters from which blocks claim groups.
 struct FitQueue {
     unsigned arrived, next;
     unsigned long long groups_done, loss_sum;
@@ -210,7 +211,7 @@ __global__ void __launch_bounds__(Shape::kThreads, kBlocks)
     fit_groups_kernel(const FitGroupsInput in, const FitLayout layout, unsigned char* scratch,
                       unsigned num_blocks, FitTeam* teams, FitQueue* queue) {
     __shared__ FitShared s;
-    // Teams are formed in the order of arrival, so that blocks only wait for blocks
+    // Teams are formed in the order of arrival, so that a block waits only for blocks
     // that are running or certain to run.
     if (threadIdx.x == 0) s.arrival = atomicAdd(&queue->arrived, 1u);
     __syncthreads();
@@ -245,12 +246,12 @@ int attribute(cudaDeviceAttr name) {
     return value;
 }
 
-// Starts the kernel and returns true if this many blocks, at most kBlocks, fit on a
-// multiprocessor; otherwise does nothing.
+// Launches the kernel and returns true, if `blocks` blocks (at most kBlocks) fit on a
+// multiprocessor. Otherwise does nothing and returns false.
 template <class Shape, int kBlocks>
 bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stream,
          int blocks = kBlocks) {
-    // The shared memory that this kernel and the driver reserve per block, bytes.
+    // shared memory per block that the kernel and the driver reserve, bytes
     const size_t reserved = sizeof(FitShared) + 1024;
     const size_t limit =
         (std::min<size_t>(
@@ -259,7 +260,7 @@ bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stre
         16 * 16;
     const size_t most_blocks =
         blocks * static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
-    // The number of blocks per group; these must run at the same time.
+    // The number of blocks per group. All of them must run concurrently.
     size_t num_blocks = 1;
     if (attribute(cudaDevAttrCooperativeLaunch) != 0)
         num_blocks = std::clamp<size_t>(
@@ -310,8 +311,8 @@ void fit_groups(const FitGroupsInput& in, const FitExtent& level, cudaStream_t s
     const uint32_t most = level.most;
     const int largest = level.largest;
     const auto multiprocessors = static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
-    // Three concurrent groups per multiprocessor are faster than two if each
-    // multiprocessor has many to fit.
+    // If each multiprocessor has many groups to fit, three concurrent groups per
+    // multiprocessor are faster than two.
     const bool are_many = level.num_groups > multiprocessors,
                are_most = level.num_groups >= 6 * multiprocessors;
     const auto run_small = [&] {
@@ -320,7 +321,7 @@ void fit_groups(const FitGroupsInput& in, const FitExtent& level, cudaStream_t s
                run<FitShape<512, true, 16>, 1>(in, most, largest, stream) ||
                run<FitShape<256, true, 8>, 3>(in, most, largest, stream, 1);
     };
-    // Shapes with fewer threads are for devices with less shared memory.
+    // The shapes with fewer threads are for devices with less shared memory.
     const bool runs = most <= kSmallCount && largest <= kRegion
                           ? run_small()
                           : run<FitShape<512, false, 32>, 1>(in, most, largest, stream) ||

@@ -14,37 +14,37 @@
 
 namespace v3dg {
 
-// The paper's code uses a 64 px image with a focal length of 88.9 px.
+// The focal length per image size in the paper's code: 88.9 px for 64 px.
 constexpr double kFocalPerSize = 88.9 / 64;
-// The border around the ball, because gaussians extend beyond it.
+// The border around the ball, because gaussians extend beyond the ball.
 constexpr double kMarginPx = 2.5;
-// The number of views held out, which no step uses. Initial values and result are
-// compared on them, and the residual is measured on them.
+// The number of held-out views, which no step uses. The initial values and the result
+// are compared in these views.
 constexpr int kHeldOutViews = 8;
 
-// Multiplies matrices of 3 x 3, row major.
+// Multiplies 3 x 3 matrices, row major.
 V3DG_HD V3DG_INLINE void multiply(const double a[9], const double b[9], double out[9]) {
     for (int i = 0; i < 3; ++i)
         for (int k = 0; k < 3; ++k)
             out[3 * i + k] = a[3 * i] * b[k] + a[3 * i + 1] * b[3 + k] + a[3 * i + 2] * b[6 + k];
 }
 
-// Computes a uniform rotation from three uniform numbers (Shoemake 1992).
+// Computes a uniformly random rotation from three uniform numbers (Shoemake 1992).
 V3DG_HD V3DG_INLINE void random_rotation(double u0, double u1, double u2, double r[9]) {
     const double a = sqrt_of(1 - u0), b = sqrt_of(u0), s = 2 * kPi * u1, t = 2 * kPi * u2;
     const double x = a * ::sin(s), y = a * ::cos(s), z = b * ::sin(t), w = b * ::cos(t);
     const double quat[4] = {w, x, y, z};
-    rotation_of_quat(quat, 2.0, r);  // its length is 1
+    rotation_of_quat(quat, 2.0, r);  // 2 is exact, because the quaternion has length 1
 }
 
-// The size of a group's picture if config.image_size is 0, px.
+// The size of a group's picture, px, if config.image_size is 0.
 struct FitSize {
-    double focal, side;  // the side is a multiple of 4 px
+    double focal, side;  // `side` is a multiple of 4 px
 };
 
 V3DG_HD V3DG_INLINE FitSize size_of_group(const FitConfig& config, const FitGroup& group) {
-    // The focal length at which the ball's footprint (select_math.h) has the wanted
-    // number of px².
+    // With this focal length, the ball's footprint (select/footprint.h) has
+    // px2_per_gaussian for each gaussian.
     const double x2 = 1 / (static_cast<double>(config.distance) * config.distance);
     const double focal = sqrt_of(static_cast<double>(group.count) * config.px2_per_gaussian /
                                  solid_angle_of_ball(x2));
@@ -52,9 +52,9 @@ V3DG_HD V3DG_INLINE FitSize size_of_group(const FitConfig& config, const FitGrou
     return {focal, 4 * ::ceil((radius_px + kMarginPx) / 2)};
 }
 
-// Returns view `index` of a group. Fixed views are on a randomly rotated lattice on the
-// sphere; the views held out, whose indices follow, are on another lattice. New views
-// are uniformly random.
+// Returns view `index` of a group. The fixed views form a randomly rotated lattice on
+// the sphere. The held-out views, whose indices follow, form another lattice. Without
+// fixed views, each view is uniformly random.
 V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGroup& group,
                                           uint64_t index) {
     const auto uniform = [&](uint64_t counter) {
@@ -62,8 +62,8 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
     };
     double rotation[9];
     if (config.num_views > 0) {
-        // Directions form a Fibonacci lattice; each has a random roll, and all are
-        // rotated together.
+        // A Fibonacci lattice of directions, each with a random roll, all rotated
+        // together.
         double lattice[9], turn[9];
         const auto num_fixed = static_cast<uint64_t>(config.num_views);
         const bool is_held_out = index >= num_fixed;
@@ -86,7 +86,7 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
         random_rotation(uniform(turned), uniform(turned + 1), uniform(turned + 2), turn);
         multiply(lattice, turn, rotation);
     } else {
-        // These counters differ from those that shift the picture.
+        // The counters must differ from those that shift the picture.
         const uint64_t base = (uint64_t(1) << 63) + 4 * index;
         random_rotation(uniform(base), uniform(base + 1), uniform(base + 2), rotation);
     }
@@ -110,9 +110,9 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
     return view;
 }
 
-// Maps visits to views. Fixed views are visited repeatedly; a new view is visited once.
-// `stride` is coprime to the number of fixed views, so that all are visited and
-// successive ones are far apart.
+// Chooses the view of each visit. Fixed views are visited repeatedly. `stride` is
+// coprime to their number, so that all are visited, and consecutive views are far
+// apart. Without fixed views, each visit has its own view.
 inline uint64_t visiting_stride(const FitConfig& config) {
     const auto num_views = static_cast<uint64_t>(config.num_views);
     uint64_t stride = 29;
@@ -123,15 +123,16 @@ V3DG_HD inline uint64_t visited_view(const FitConfig& config, uint64_t stride, u
     return config.num_views > 0 ? visit * stride % static_cast<uint64_t>(config.num_views) : visit;
 }
 
-// Returns the index of a view held out. If views are new for each visit, its index is
-// one that no step uses.
+// Returns the index of a held-out view. Without fixed views, it is an index that no
+// step reaches.
 V3DG_HD inline uint64_t held_out_view(const FitConfig& config, int i) {
     return config.num_views > 0 ? static_cast<uint64_t>(config.num_views + i) : ~uint64_t(0) - i;
 }
 
-// A group is compared with the pictures of its fixed views, or else of the views of all
-// steps; then with the pictures of the views held out. The functions below return the
-// number of fitted pictures, the number of all pictures, and the view of one picture.
+// A group is compared with the pictures of its fixed views or, without fixed views,
+// with those of the views of all steps; then with the pictures of the held-out views.
+// The functions return the number of pictures before the held-out ones, the number of
+// all pictures, and the view of a picture.
 V3DG_HD inline uint64_t num_fitted_pictures(const FitConfig& config) {
     return config.num_views > 0 ? static_cast<uint64_t>(config.num_views)
                                 : static_cast<uint64_t>(config.steps) * config.views_per_step;
@@ -179,8 +180,9 @@ V3DG_HD V3DG_INLINE Pinhole<float> camera_of(const FitView& view, float scale) {
             .near_depth = 1e-3f};
 }
 
-constexpr float kLeastScale = 1e-5f;    // relative to the radius; far below the size of a pixel
-constexpr float kLeastOpacity = 1e-4f;  // keeps the logit finite and its gradient nonzero
+constexpr float kLeastScale = 1e-5f;  // relative to the radius; far below a pixel
+// keeps the logit finite, and its gradient above 0
+constexpr float kLeastOpacity = 1e-4f;
 constexpr float kLog2e = 1.4426950408889634f;
 
 V3DG_HD V3DG_INLINE float log_of_scale(float scale) { return ::logf(max_of(scale, kLeastScale)); }
@@ -189,31 +191,33 @@ V3DG_HD V3DG_INLINE float logit_of_opacity(float opacity) {
     return ::logf(o / (1 - o));
 }
 
-// Clamps a coordinate of a mean to the box around the ball. A mean outside might reach
-// no picture of the group; then it would have no gradient and stay outside.
+// Clamps a coordinate of a mean to the box around the ball. A mean outside of all
+// pictures would have no gradient, and never come back.
 template <class V>
 V3DG_HD V3DG_INLINE V held_in_box(V x) {
     return min_of(all_lanes<V>(1.0f), max_of(all_lanes<V>(-1.0f), x));
 }
 
-// Returns a scale that does not exceed the ball's radius, as no gaussian of the target
-// does, and that does not vanish: an extreme value could not recover.
+// Converts a log scale to a scale, between a tiny positive value and 1, the ball's
+// radius. No gaussian of the target is larger than the ball. Extreme values could not
+// recover.
 template <class V>
 V3DG_HD V3DG_INLINE V scale_of_log(V x) {
     return exp2_in_range(min_of(all_lanes<V>(0.0f), max_of(all_lanes<V>(-20.0f), x * kLog2e)));
 }
-// Returns an opacity that differs from 0 and 1 by at least `kLeastOpacity`, because the
-// gradient vanishes there. This range suffices, as alpha is clamped to 0.999.
+// Converts a logit to an opacity, which stays kLeastOpacity away from 0 and 1, because
+// gradients vanish there. This is no restriction: alpha is clamped to 0.999 anyway.
 template <class V>
 V3DG_HD V3DG_INLINE V opacity_of_logit(V x) {
-    constexpr float kMost = 13.287568f;  // log2 of 1 / kLeastOpacity - 1
+    constexpr float kMost = 13.287568f;  // log2(1 / kLeastOpacity - 1)
     return 1 / (1 + exp2_in_range(
                         min_of(all_lanes<V>(kMost), max_of(all_lanes<V>(-kMost), x * -kLog2e))));
 }
 
 // The step sizes of one step of Adam.
 struct FitStep {
-    float position, quat, log_scale, logit, sh0, sh_rest;  // position in the units of the config
+    // position: in the units of FitConfig
+    float position, quat, log_scale, logit, sh0, sh_rest;
     float correction1, correction2;
 };
 
@@ -236,8 +240,8 @@ V3DG_HD inline float position_step(const FitConfig& config, const FitGroup& grou
     return config.position_in_world ? step.position / group.radius : step.position;
 }
 
-// Returns the loss by which initial values and result are compared, from the mean
-// |difference| of colour and alpha.
+// Returns the loss by which the initial values and the result are compared. `error` has
+// the mean |difference| of colour and of alpha.
 V3DG_HD inline double residual_loss(const LossWeights& loss, const double error[2]) {
     return loss.l1 * error[0] + loss.alpha * error[1];
 }

@@ -1,7 +1,7 @@
 #pragma once
 
-// The locations of the arrays of a fit on the device: in the shared memory of blocks,
-// or in scratch memory. The host computes them, so this header does not use CUDA.
+// Where the arrays of a fit are on the device: in the shared memory of a block, or in
+// scratch memory. The host computes this, so the header does not use CUDA.
 
 #include <cstddef>
 #include <cstdint>
@@ -13,42 +13,40 @@ namespace v3dg {
 namespace cuda {
 
 constexpr int kViewsAtOnce = 2;
-// Each half-warp blends a cell. A mask has a bit for each cell of a region; a larger
-// picture has several regions.
+// The size of a cell, which a half-warp blends, and of a region, px. A CellMask has one
+// bit per cell of a region. Larger pictures have several regions.
 constexpr int kCell = 4, kCellPixels = kCell * kCell;
 constexpr int kRegion = 32, kRegionCells = kRegion / kCell;
 static_assert(kRegionCells * kRegionCells == 64 && kCellPixels == 16,
               "a mask is a word, a cell half a warp");
 using CellMask = unsigned long long;
 constexpr int kAtOnce = 4;  // gaussians that a half-warp blends together
-constexpr int kSums = 9;    // FalloffSums and colour
+constexpr int kSums = 9;    // values per slot: FalloffSums and colour
 constexpr int kSumStride = 12;
 
-// The shape that a kernel is compiled for: small groups, which keep frequently read
-// arrays in shared memory, or large ones; and the number of gaussians that a warp
-// processes between two reductions over pixels.
+// The shape that a kernel is compiled for: the number of threads; whether groups are
+// small, so that frequently read arrays are in shared memory; and the number of
+// gaussians that a warp processes between two sums over pixels (chunk).
 template <int kThreadsOfBlock, bool kIsSmall, int kChunkSize>
 struct FitShape {
     static constexpr int kThreads = kThreadsOfBlock, kWarps = kThreads / 32, kChunk = kChunkSize;
     static constexpr bool kSmall = kIsSmall;
-    // Index of a gaussian in the current views.
+    // the index of a gaussian in the current views
     using Index = std::conditional_t<kSmall, uint16_t, uint32_t>;
 };
 
-// The location of an array: in the block's shared memory, or in the team's scratch
-// memory.
+// Where an array is: in the block's shared memory, or in the team's scratch memory.
 struct Place {
     size_t offset;
     bool is_shared;
 };
 
 struct FitLayout {
-    // These are in shared memory for small groups, and in scratch memory for large
-    // ones.
+    // in shared memory for small groups, in scratch memory for large ones
     size_t records, sorted, keys, mask, slot_first, order, lists, errors;
     size_t list_size;          // bytes of a half-warp's list
     size_t fragments, staged;  // in shared memory
-    // These are in shared memory as far as it has room.
+    // in shared memory if there is room, else in scratch memory
     Place value, m, v, by_view, sum, sort_keys, sums, near_slots;
     size_t far_slots, maps, exchange;  // in scratch memory
     uint32_t num_near_slots, num_far_slots;
@@ -57,13 +55,12 @@ struct FitLayout {
 };
 
 // Returns the bytes of a warp's fragments: two floats per gaussian and pixel, in rows
-// of 33, and four floats per pixel.
+// of 33, then four floats per pixel.
 V3DG_HD constexpr size_t fragments_bytes(int chunk) {
     return (chunk * 33 * 2 + 32 * 4) * sizeof(float);
 }
 
-// Allocates memory. Some arrays are in shared memory for small groups and in scratch
-// memory for large ones.
+// Assigns memory to arrays, in shared memory and in scratch memory.
 struct Arena {
     bool is_small;
     size_t shared_limit, shared = 0, scratch = 0;  // bytes
@@ -77,9 +74,11 @@ struct Arena {
         scratch += rounded(bytes);
         return scratch - rounded(bytes);
     }
-    // Allocates an array that must be in shared memory for a small group.
+    // Returns memory that is in shared memory for a small group, and in scratch memory
+    // for a large one.
     size_t hot(size_t bytes) { return is_small ? in_shared(bytes) : in_scratch(bytes); }
-    // Allocates an array that is in shared memory for a small group if there is room.
+    // Returns memory that is in shared memory for a small group if there is room, and
+    // otherwise in scratch memory.
     Place anywhere(size_t bytes) {
         const bool fits = is_small && shared + rounded(bytes) <= shared_limit;
         return {fits ? in_shared(bytes) : in_scratch(bytes), fits};
@@ -88,15 +87,14 @@ struct Arena {
 
 // The sizes that determine a layout.
 struct FitSizes {
-    size_t most_gaussians, floats_per_gaussian;  // maxima over groups
-    int largest_picture;                         // px per side
+    size_t most_gaussians, floats_per_gaussian;  // largest values of any group
+    int largest_picture;                         // side, px
     bool has_dssim;
     size_t num_blocks;    // blocks that fit a group together
-    size_t shared_limit;  // maximum bytes per block
+    size_t shared_limit;  // bytes per block
 };
 
-// Returns the layout. Fields that only large groups have, or only small ones, are 0 for
-// the others.
+// Returns the layout. Fields that a small, or a large, group does not use are 0.
 template <class Shape>
 FitLayout layout_of(const FitSizes& sizes) {
     constexpr bool kSmall = Shape::kSmall;
@@ -115,8 +113,8 @@ FitLayout layout_of(const FitSizes& sizes) {
     if (!kSmall) l.sorted = arena.hot((places + 1) * sizeof(Record<float>));
     l.mask = arena.hot(regions * places * sizeof(CellMask));
     l.slot_first = arena.hot(regions * places * sizeof(uint32_t));
-    // The keys of a small group are no longer needed once it is sorted, which is before
-    // it gets slots.
+    // A small group's keys share memory with slot_first: the keys are used only before
+    // slots are assigned.
     l.keys = kSmall ? l.slot_first : arena.hot(places * sizeof(uint32_t));
     l.order = arena.hot(places * kIndex);
     l.list_size = Arena::rounded((padded + kAtOnce) * kIndex);
@@ -125,8 +123,9 @@ FitLayout layout_of(const FitSizes& sizes) {
     const size_t errors_bytes = kViewsAtOnce * (cells + largest) * 2 * kFloat;
     l.errors = kSmall && errors_bytes <= kFragments ? l.fragments : arena.hot(errors_bytes);
     if (!kSmall) l.staged = arena.in_shared(kWarps * 2 * Shape::kChunk * sizeof(Record<float>));
-    // When gradients are written, fragments and the lists of small groups before them
-    // are no longer needed; when keys are sorted, they are not yet needed.
+    // While gradients are written, the fragments are not in use, nor, in small groups,
+    // the lists before them. While keys are sorted, they are not in use yet. So
+    // gradients and keys can share their memory.
     const size_t over = kSmall ? l.lists : l.fragments;
     const auto over_fragments = [&](size_t bytes) {
         return num_blocks == 1 && bytes <= l.fragments + kFragments - over ? Place{over, true}
@@ -148,13 +147,13 @@ FitLayout layout_of(const FitSizes& sizes) {
     l.m = arena.anywhere(values * kFloat);
     l.v = arena.anywhere(values * kFloat);
     l.sum = {arena.in_scratch(values * kFloat), false};
-    // There is room at least for the slots of one region.
+    // at least enough for the slots of one region
     l.num_far_slots = static_cast<uint32_t>(places * kRegionCells * kRegionCells);
     l.far_slots = arena.in_scratch(l.num_far_slots * kSums * kFloat);
     if (sizes.has_dssim)
         l.maps = arena.in_scratch(10 * 3 * kViewsAtOnce * largest * largest * kFloat);
     if (kSmall && arena.shared < sizes.shared_limit) {
-        // The rest of the shared memory holds slots.
+        // Slots use the rest of the shared memory.
         l.num_near_slots =
             static_cast<uint32_t>((sizes.shared_limit - arena.shared) / (kSums * kFloat));
         l.near_slots = {arena.in_shared(l.num_near_slots * kSums * kFloat), true};

@@ -1,4 +1,4 @@
-// Views of a group for callers that do not include the formulas.
+// Functions of fit_group.h about views, for callers that do not include the formulas.
 
 #include <stdexcept>
 #include <string>

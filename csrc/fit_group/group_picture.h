@@ -1,7 +1,7 @@
 #pragma once
 
-// The picture of a group on the CPU: its gaussians are sorted by depth and blended over
-// the tiles of a square.
+// Draws the picture of a group on the CPU: sorts its gaussians by depth, and blends
+// them over the tiles of a square.
 
 #include "fit_group/fit_group.h"
 #include "project/project.h"
@@ -16,7 +16,8 @@ constexpr int kPlanes = 4;  // red, green, blue, alpha
 static V3DG_INLINE Window square(int size) { return {0, 0, size, size}; }
 static int tiles_across(const FitView& view) { return (view.size + kTileSize - 1) / kTileSize; }
 
-// Projects a draw and sorts its visible gaussians by depth; returns their number.
+// Projects the gaussians of a draw, and sorts the visible ones by depth. Returns their
+// number.
 static size_t project_sorted(const Draw<float>& draw, const Pinhole<float>& camera,
                              FitScratch& scratch) {
     Record<float>* records = scratch.records.reserve(draw.count);
@@ -37,7 +38,7 @@ static bool misses_tile(const Record<float>& g, int left, int top) {
     return g.x1 < left || g.y1 < top || g.x0 >= left + kTileSize || g.y0 >= top + kTileSize;
 }
 
-// Blends records in this order.
+// Blends records in the order of `order`.
 static void blend_sorted(const FitScratch& scratch, const uint64_t* order, size_t count, int left,
                          int top, int size, TilePlanes<float>& tile) {
     blend_tile<float, Extra::kNothing>(

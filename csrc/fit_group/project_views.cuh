@@ -1,7 +1,7 @@
 #pragma once
 
-// Projects the gaussians of a group into the views of a batch, one thread each, and
-// computes the gradients of their parameters from those of their records.
+// Projects the gaussians of a group into the views of a batch, one thread per gaussian
+// and view. Computes the gradients of parameters from those of records.
 
 #include <type_traits>
 
@@ -11,7 +11,7 @@
 namespace v3dg {
 namespace cuda {
 
-// Calls `body` with the degree as a constant, so that its loops are unrolled.
+// Calls `body` with the degree as a compile-time constant, so that loops are unrolled.
 template <class Body>
 __device__ void with_degree(int degree, const Body& body) {
     switch (degree) {
@@ -71,7 +71,7 @@ __device__ void project_views(const Fit& fit, const FitCameras& cameras, int num
     }
 }
 
-// Computes the gradients of the parameters for each view from the sums of records.
+// Computes the gradients of the parameters for each view, from the sums of records.
 template <class Fit>
 __device__ void project_views_backward(const Fit& fit, const FitCameras& cameras, int num_views,
                                        int turn) {

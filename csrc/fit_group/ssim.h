@@ -1,6 +1,6 @@
 #pragma once
 
-// SSIM of whole pictures.
+// The SSIM of whole pictures.
 
 #include <cstddef>
 
@@ -8,19 +8,18 @@
 
 namespace v3dg {
 
-// Two pictures of several channels, interleaved. T is float or double; everything is
-// computed in double.
+// Two pictures with interleaved channels. T is float or double; all computation is in
+// double.
 template <class T>
 struct SsimInput {
     const T *picture, *target;  // [height * width * channels]
-    size_t height, width;       // each more than kSsimRadius
+    size_t height, width;       // both larger than kSsimRadius
     size_t channels;
 };
 
 // Returns the mean SSIM over all pixels and channels. The Gaussian window is 11 x 11
-// with sigma 1.5, variances are population variances, the border is mirrored without
-// repeating the edge, and the constants are 0.01² and 0.03². Every run gives the same
-// bits.
+// with sigma 1.5. Variances are population variances. The border is mirrored without
+// repeating the edge. The constants are 0.01² and 0.03². Every run gives the same bits.
 //
 // Source: Wang et al., Image quality assessment: from error visibility to structural
 // similarity, 2004.

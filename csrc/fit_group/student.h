@@ -13,8 +13,9 @@
 namespace v3dg {
 namespace V3DG_ISA {
 
-// The parameters of one group are one flat array in the order means, quats, log scales,
-// logits, sh; the gradient and two moments have the same layout.
+// The fitted gaussians of one group. The parameters are a single array: means,
+// quaternions, log scales, logits, SH coefficients. The gradient and the two moments
+// have the same layout.
 class Student {
   public:
     Student(const FitConfig& config, const FitGroup& group, const GaussianRows<float>& rows)
@@ -65,7 +66,7 @@ class Student {
 
     void clear_gradient() { std::fill(gradient_.begin(), gradient_.end(), 0.0f); }
 
-    // Adds the gradients of records to those of the parameters.
+    // Adds the gradients of records to the gradients of the parameters.
     void add_gradient(const Draw<float>& draw, const Pinhole<float>& camera, const uint32_t* source,
                       const RecordGradient<float>* d_records, size_t count) {
         by_value_.resize(gradient_.size());
@@ -112,8 +113,8 @@ class Student {
         activate();
     }
 
-    // Writes the values in world units. If one of them is not finite, returns false and
-    // writes nothing.
+    // Writes the parameters to the rows, in world units. If any is not finite, it
+    // writes nothing and returns false.
     bool write(const GaussianRows<float>& rows) const {
         for (size_t i = 0; i < n_ * (11 + num_sh_); ++i)
             if (!std::isfinite(value_[i])) return false;
@@ -153,7 +154,7 @@ class Student {
         return end;
     }
 
-    // Computes the planes to draw from the parameters.
+    // Converts the parameters to the planes that are drawn.
     void activate() {
         const float* p = value_.data();
         float* plane = planes_.data();

@@ -2,10 +2,10 @@
 
 // The blocks that fit a group together, and their memory.
 //
-// Small groups keep frequently read arrays in shared memory. One block fits a group or,
-// if there are few groups, a pair of blocks, each of which processes every other view.
-// Large groups are in global memory; if there are fewer of them than multiprocessors,
-// teams of blocks fit them.
+// Small groups keep frequently read arrays in shared memory. One block fits a small
+// group. If there are few groups, two blocks fit it, each with every other view. Large
+// groups are in global memory. If there are fewer of them than multiprocessors, a team
+// of blocks fits each.
 
 #include "base/launch.cuh"
 #include "fit_group/fit_group_math.h"
@@ -18,7 +18,7 @@ constexpr unsigned kLargestTeam = 16;
 
 // The views that a block processes together.
 struct FitCameras {
-    FitStep step;  // the step of these views
+    FitStep step;  // the step that the views belong to
     ModelView<float> view[kViewsAtOnce];
     Pinhole<float> camera[kViewsAtOnce];
     const float4* target[kViewsAtOnce];
@@ -26,28 +26,30 @@ struct FitCameras {
 
 constexpr int kBetweenGroups = 2;
 
-// State that the blocks of a group share, without arrays.
+// The state that the blocks of a group share, without arrays.
 struct FitTeam {
     unsigned arrived;  // number of arrivals at barriers
     unsigned unit, ticket;
-    // Alternates within steps; the last element is used between groups.
+    // The elements before kBetweenGroups are used in turn within steps; the last
+    // element is used between groups.
     int cancel[kBetweenGroups + 1];
-    uint32_t num_slots[kLargestTeam];  // slots in each block's part
-    double error[kViewsAtOnce][2][2];  // errors of each block's views, before and after
+    uint32_t num_slots[kLargestTeam];  // number of slots in each block's part
+    // errors of each block's views: initial values, and result
+    double error[kViewsAtOnce][2][2];
 };
 
-// State of a block in shared memory, without arrays.
+// The state of a block in shared memory, without arrays.
 struct FitShared {
-    FitCameras cameras[2];  // cameras of this step and the next
-    FitTeam own;            // the team of a single block
+    FitCameras cameras[2];  // for this batch of views, and for the next
+    FitTeam own;            // used if the team is a single block
     uint32_t warp_total[32];
     FitJob job;
     unsigned arrival;
     int cancel;
 };
 
-// A block that fits groups, one after another: its rank among the blocks that fit the
-// same group, the barriers between them, and the locations of their arrays.
+// A block that fits groups, one after another: its rank among the blocks of its group,
+// the barriers between them, and where their arrays are.
 template <class Shape>
 struct FitBlock : Shape {
     using Shape::kChunk, Shape::kSmall, Shape::kThreads, Shape::kWarps;
@@ -56,15 +58,18 @@ struct FitBlock : Shape {
     const FitGroupsInput& in;
     const FitLayout& layout;
     FitShared& s;
-    FitTeam& all;   // The blocks that fit the group; in a small group they share its views.
-    FitTeam& team;  // The blocks that process the same views; a block of a small group is alone.
+    // All blocks of the group. The blocks of a small group divide the views among them.
+    FitTeam& all;
+    // The blocks that process the same views. In a small group, each block is a team.
+    FitTeam& team;
     const unsigned team_rank, team_size;
-    const unsigned view_rank, view_stride;  // the block's share of a batch's views
+    // the block's views of a batch: view_rank, view_rank + view_stride, ...
+    const unsigned view_rank, view_stride;
     unsigned char* const scratch;
-    // Gradients by view, for small groups whose blocks share the views.
+    // The gradients per view, for small groups with several blocks.
     unsigned char* const exchange;
     unsigned char* const hot;
-    // The current group.
+    // the current group
     const FitJob& job;
     uint32_t n = 0, n_padded = 0;
     int num_sh = 0;
@@ -99,7 +104,7 @@ struct FitBlock : Shape {
 
     __device__ bool leads() const { return threadIdx.x == 0 && team_rank == 0; }
     __device__ bool leads_all() const { return leads() && view_rank == 0; }
-    // Returns the index of a thread in the team; neighbouring warps are in different
+    // Returns the thread's index in the team. Consecutive warps are in different
     // blocks.
     __device__ uint32_t first() const {
         return (threadIdx.x / 32 * team_size + team_rank) * 32 + threadIdx.x % 32;
@@ -116,8 +121,8 @@ struct FitBlock : Shape {
             __syncthreads();
     }
 
-    // Waits for all blocks that fit the group. Afterwards s.cancel is the same in all
-    // of them: the value that read_cancel() wrote to `note`, which must not be
+    // Waits for all blocks of the group. Afterwards s.cancel is equal in all of them:
+    // the value that read_cancel() wrote to `note`. This element must not be
     // overwritten before all blocks have reached another barrier.
     __device__ void sync_all(int note) const {
         if (num_blocks() > 1)
@@ -151,10 +156,10 @@ struct FitBlock : Shape {
         return reinterpret_cast<float*>((place.is_shared ? shared_memory() : scratch) +
                                         place.offset);
     }
-    // A place is the index of a gaussian in a view: places of view b begin at b *
-    // n_padded. A rank is the index of a blended record. In a small group ranks are
-    // places, and lists follow `order`; in a large one ranks are positions by depth, in
-    // which the records are sorted.
+    // A place is the index of a gaussian in a view; the places of view b begin at b *
+    // n_padded. A rank is the index of a record for blending. In a small group, ranks
+    // are places, and lists are in the sequence of `order`. In a large group, records
+    // are sorted, and ranks are positions in the sorted sequence.
     __device__ Record<float>* records() const { return hot_at<Record<float>>(layout.records); }
     __device__ Record<float>* ranked() const {
         return hot_at<Record<float>>(kSmall ? layout.records : layout.sorted);
@@ -174,9 +179,9 @@ struct FitBlock : Shape {
     __device__ Index* list(int half) const {
         return hot_at<Index>(layout.lists + (2 * warp() + half) * layout.list_size);
     }
-    // Returns the gradients with respect to the exponent of each gaussian at each
-    // pixel, and its weight there, [gaussian][pixel]. Rows have a spare column, so that
-    // lanes that read the same pixel of different gaussians access different banks.
+    // Returns the fragments of a warp, [gaussian][pixel]: the gradient with respect to
+    // the exponent, and the weight. Rows have an extra column, so that lanes that read
+    // the same pixel of different gaussians access different banks.
     __device__ float2* fragments() const {
         return reinterpret_cast<float2*>(shared_memory() + layout.fragments +
                                          threadIdx.x / 32 * fragments_bytes(kChunk));
@@ -184,15 +189,16 @@ struct FitBlock : Shape {
     __device__ float4* d_pixels() const {
         return reinterpret_cast<float4*>(fragments() + kChunk * 33);
     }
-    // Returns the records of a chunk of a large group, for each half-warp.
+    // Returns the records of the current chunk of each half-warp, for a large group.
     __device__ Record<float>* staged() const {
         return reinterpret_cast<Record<float>*>(shared_memory() + layout.staged) +
                2 * kChunk * (threadIdx.x / 32);
     }
     __device__ int num_regions() const { return regions_across * regions_across; }
-    // Returns the gradients with respect to the values from view b of a batch. Blocks
-    // that share views write the gradients of one batch while others may still read
-    // those of the batch before, so two values of `turn` alternate.
+    // Returns the gradients of the parameters in view b of a batch. If several blocks
+    // divide the views, one block may write the gradients of a batch while another
+    // still reads those of the previous batch; so `turn` alternates between two
+    // buffers.
     __device__ float* gradient(int turn, int b) const {
         if (view_stride == 1) return at(layout.by_view) + static_cast<size_t>(b) * num_values;
         return reinterpret_cast<float*>(exchange) +

@@ -1,7 +1,7 @@
 #pragma once
 
-// Counts records per tile with whole warps. Neighbouring gaussians are mostly in the
-// same tile, so lanes with the same tile share one atomic operation.
+// Counts records per tile with whole warps. Adjacent gaussians are mostly in the same
+// tile, so lanes with the same tile share one atomic operation.
 
 #include "base/launch.cuh"
 #include "frame/tile_list.h"
@@ -9,23 +9,24 @@
 namespace v3dg {
 namespace cuda {
 
-// Adds one to count[tile] for every lane that has a tile. Called by a whole warp.
+// Adds one to count[tile] for each lane whose tile is not kNoTile. All lanes of the
+// warp must call it.
 __device__ inline void count_tile(uint32_t* count, uint32_t tile) {
     const unsigned peers = __match_any_sync(kAllLanes, tile);
     if (tile != kNoTile && threadIdx.x % 32 + 1 == unsigned(__ffs(peers)))
         atomicAdd(count + tile, unsigned(__popc(peers)));
 }
 
-// The tiles of a warp's records beyond the first tile of each record; collected until
-// there are 32.
+// A queue of tiles to count: those beyond the first tile of each record. A warp counts
+// them when there are 32.
 struct WaitingTiles {
     uint32_t tile[31 + 32 * (kFewTiles - 1)];
     unsigned count;
 };
 
-// Calls add(k, at) for each tile k of a lane beyond the first, where `at` is its index
-// in the queue, and adds the number of these tiles to `num_waiting`. Called by a whole
-// warp.
+// Calls add(k, at) for each tile k >= 1 of each lane, where `at` is the tile's index in
+// the queue. Adds the number of these tiles to `num_waiting`. All lanes of the warp
+// must call it.
 template <class Add>
 __device__ void let_wait(unsigned num_tiles, unsigned& num_waiting, const Add& add) {
     const unsigned lane = threadIdx.x % 32;
@@ -37,8 +38,8 @@ __device__ void let_wait(unsigned num_tiles, unsigned& num_waiting, const Add& a
     }
 }
 
-// Adds one to the count of each tile of a lane, or adds the tile to the queue. Called
-// by a whole warp.
+// Counts the first tile of each lane, and adds the lane's further tiles to the queue.
+// Counts queued tiles when there are 32. All lanes of the warp must call it.
 template <class TileOf>
 __device__ void count_tiles(uint32_t* count, unsigned num_tiles, const TileOf& tile_of,
                             WaitingTiles& waiting) {
@@ -54,8 +55,8 @@ __device__ void count_tiles(uint32_t* count, unsigned num_tiles, const TileOf& t
     __syncwarp();
 }
 
-// Counts the tiles that are left in the queue. Called once, at the end, by a whole
-// warp.
+// Counts the tiles that remain in the queue. All lanes of the warp must call it once,
+// at the end.
 __device__ inline void count_waiting(uint32_t* count, const WaitingTiles& waiting) {
     const unsigned lane = threadIdx.x % 32;
     count_tile(count, lane < waiting.count ? waiting.tile[lane] : kNoTile);

@@ -1,6 +1,6 @@
 #pragma once
 
-// The input of a frame: runs of gaussians in front of cameras.
+// The input of a frame: runs of gaussians, placed in front of a camera.
 
 #include <cstdint>
 
@@ -12,13 +12,14 @@ namespace v3dg {
 
 struct Codes;
 
-// How gaussians are drawn. Neighbours in memory with the same appearance are drawn
-// together.
+// How a gaussian is drawn. Gaussians that are adjacent in memory and have equal
+// appearance are drawn together.
 template <class T>
 struct Appearance {
-    T filter_px2;      // added to the variances on screen
-    bool antialiased;  // the opacity compensates for the filter
-    bool is_limited;   // whether the filter of far narrower gaussians is limited (project_math.h)
+    T filter_px2;      // variance that is added on screen in x and in y
+    bool antialiased;  // whether the opacity is reduced to compensate for the filter
+    // whether the filter is limited for very narrow gaussians (project_math.h)
+    bool is_limited;
 
     V3DG_HD bool operator==(const Appearance& other) const {
         return filter_px2 == other.filter_px2 && antialiased == other.antialiased &&
@@ -26,54 +27,57 @@ struct Appearance {
     }
 };
 
-// A run of gaussians of one model, placed in front of the camera.
+// A run of adjacent gaussians of one model, placed in front of the camera.
 template <class T>
 struct Draw {
-    const GaussianPlanes<T>* model;  // null if the gaussians are codes
+    const GaussianPlanes<T>* model;  // null if the gaussians are coded
     uint64_t first, count;
     ModelView<T> view;
     Appearance<T> appearance;
     Palette palette{};
     const Codes* codes = nullptr;
-    T weight = 1;                          // factor of opacities: of an instance, and in a fade
-    const float* color_factors = nullptr;  // [3] of colours that are not a palette's; null: none
+    T weight = 1;  // factor of the opacities: that of the instance times that of a fade
+    // [3] factors of red, green, blue; not applied to palettes; null: none
+    const float* color_factors = nullptr;
 };
 
 namespace cuda {
 
-// The largest number of records of an item: the number of threads of a block.
+// The largest number of records of an item, which equals the number of threads of a
+// block.
 constexpr int kItemSize = 256;
 constexpr unsigned kItemClusters = 8;
 
-// A model in front of a picture's camera. The struct is aligned so that threads write
-// it in few instructions.
+// A model that is placed in front of the camera of one picture. The alignment lets a
+// thread write a placement in few instructions.
 struct alignas(16) Placement {
     ModelView<float> view;
     uint32_t model, image;
 };
 
-// Neighbouring gaussians of a placed model, or of a model that several placements
-// share. In the second case `sharers` is not 0, and the placements are `placement` + k
-// for each of its bits k; all of them are in one picture. An item has at most kItemSize
-// records, which are written from `record` on, ordered by gaussian and then by
-// placement. The first gaussian belongs to `cluster` of the model, or to one of the
-// next kItemClusters - 1 clusters.
+// A run of adjacent gaussians of a model, to be drawn together. A shared item draws the
+// gaussians at several placements of the model in one picture: `placement` + k for each
+// bit k that is set in `sharers`. For other items `sharers` is 0.
+//
+// An item has at most kItemSize records. They begin at index `record`, and are ordered
+// by gaussian, then by placement. The first gaussian belongs to one of kItemClusters
+// clusters of the model, of which `cluster` is the first.
 struct DrawItem {
     uint32_t placement, first, count, record;
     Appearance<float> appearance;
     uint32_t sharers, cluster;
-    float weight;  // factor of opacities, below 1 in a fade
+    float weight;  // factor of the opacities; below 1 in a fade
 };
 
-// The destination of a frame's items, in order. The kernel that writes them counts all
-// items, and stores those that there is room for: counters->items is their number, and
-// counters->gaussians the end of the last item's records. Items that would end beyond
-// record_capacity need not be stored.
+// The buffer for a frame's items. The kernel that writes items counts all of them in
+// counters->items, and stores only those that fit. counters->gaussians is the end of
+// the last item's records. Items whose records end beyond record_capacity may be left
+// out.
 struct ItemList {
     DrawItem* items;
     FrameCounters* counters;
     unsigned long long item_capacity, record_capacity;
-    unsigned long long* zeros;  // zeros that the frame was asked to provide
+    unsigned long long* zeros;  // zeroed memory that the writing kernel requested
 
     V3DG_HD bool has_room_for(unsigned long long num_items,
                               unsigned long long num_gaussians) const {

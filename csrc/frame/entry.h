@@ -1,7 +1,7 @@
 #pragma once
 
-// An entry of a tile's list on the CPU, packed into one integer. CUDA's entries are in
-// tile_list.h.
+// An entry of a tile's list on the CPU: a record's depth, index and blocks in one
+// integer. The format on CUDA is in tile_list.h.
 
 #include <cstdint>
 #include <cstring>
@@ -10,12 +10,12 @@
 
 namespace v3dg {
 
-constexpr int kBlockSize = 4;  // px
+constexpr int kBlockSize = 4;  // width and height of a block of pixels
 constexpr int kTileBlocks = kTileSize / kBlockSize;
 
-// Tables from the columns, or the rows, of a box in a tile to the blocks of the tile.
-// An index has the first column in its lower 3 bits and the last one in the upper 3.
-// The result is a mask with a bit per block, row by row.
+// Tables that convert the range of block columns, or rows, of a box to a mask of the
+// tile's blocks. The index has the first column in its lower 3 bits and the last column
+// in its upper 3 bits. The mask has a bit per block, row by row.
 struct BlocksOfBox {
     uint64_t columns[64] = {}, rows[64] = {};
     constexpr BlocksOfBox() {
@@ -31,23 +31,23 @@ struct BlocksOfBox {
 };
 inline constexpr BlocksOfBox kBlocksOfBox;
 
-// Returns the bits of a depth. Depths are positive, so their bits have the same order.
+// Returns the bits of a depth. For positive numbers, the bits compare like the numbers.
 V3DG_INLINE uint32_t depth_bits_of(float depth) {
     uint32_t bits;
     std::memcpy(&bits, &depth, sizeof bits);
     return bits;
 }
 
-// The format of an entry. From the highest bits on, an entry has the depth's bits minus
-// the smallest depth's bits, the index of the record, and the box in the tile. If an
-// integer is too small for all of these, the lowest bits of depths are dropped.
+// The bit layout of entries. From the highest bits down: the depth's bits minus the
+// smallest depth's bits, the index of the record, the record's box in the tile. If 64
+// bits are too few, the lowest bits of the depths are dropped.
 struct EntryFormat {
     static constexpr int kBoxBits = 12;
     int depth_shift = kBoxBits, dropped_bits = 0;
     uint32_t least_depth = 0;
 
-    // Returns the format for record indices below num_records and depths whose bits are
-    // from `least` to `most`.
+    // Returns the format for up to `num_records` records whose depths have bits from
+    // `least` to `most`.
     static constexpr EntryFormat of(uint64_t num_records, uint32_t least, uint32_t most) {
         EntryFormat f;
         f.least_depth = least;
@@ -63,7 +63,7 @@ struct EntryFormat {
     V3DG_INLINE uint64_t record_of(uint64_t entry) const {
         return (entry & ((uint64_t(1) << depth_shift) - 1)) >> kBoxBits;
     }
-    // Returns the blocks of the tile that the record's box meets.
+    // Returns a mask of the tile's blocks that the record's box touches.
     V3DG_INLINE static uint64_t blocks_of(uint64_t entry) {
         return kBlocksOfBox.columns[entry & 63] & kBlocksOfBox.rows[entry >> 6 & 63];
     }

@@ -1,21 +1,21 @@
 #pragma once
 
-// The slots in which a CUDA frame sums the gradients of its records: one for each tile
-// that a record meets.
+// The memory in which a CUDA frame collects the gradients of its records: one slot per
+// record and tile.
 
 #include "frame/tile_list.h"
 
 namespace v3dg {
 namespace cuda {
 
-// The gradient of a record is the sum of its slots, one for each tile of its pixel box,
-// row by row. A tile writes the slots of the records that it blended and marks them as
-// touched; the contents of other slots are undefined.
+// Gradient slots. Each record has one slot for each tile of its pixel box, row by row;
+// the sum of the slots is the record's gradient. A tile writes the slots of the records
+// that it blended, and marks these slots as touched. Other slots are undefined.
 struct GradientSlots {
-    const uint32_t* first;  // first slot of each record
+    const uint32_t* first;  // index of each record's first slot
     RecordGradient<float>* slot;
-    CenterSize<float>* size;  // sizes of each slot; null if not requested
-    uint8_t* is_touched;      // initially zero
+    CenterSize<float>* size;  // absolute center gradients; null if not requested
+    uint8_t* is_touched;      // one per slot, initially zero
 };
 
 V3DG_HD inline uint32_t slot_of_tile(const RecordBox& r, uint32_t column, uint32_t row) {

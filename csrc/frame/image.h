@@ -9,9 +9,9 @@
 
 namespace v3dg {
 
-constexpr int kTileSize = 32;  // px; the CPU draws pictures tile by tile
+constexpr int kTileSize = 32;  // Width and height of a tile on the CPU, px.
 
-// The pixels [x0, x1) x [y0, y1) of a picture.
+// The pixels of a picture that are drawn: x in [x0, x1) and y in [y0, y1).
 struct Window {
     int x0, y0, x1, y1;
     V3DG_INLINE int width() const { return x1 - x0; }
@@ -19,14 +19,14 @@ struct Window {
     V3DG_INLINE bool contains(int x, int y) const { return x0 <= x && x < x1 && y0 <= y && y < y1; }
 };
 
-// The rule by which a pixel stops when its transmittance is low, and ignores everything
-// behind. Like gsplat, it stops before a gaussian that would leave a transmittance of
-// kMinTransmittance or less; this gaussian is not blended.
+// The stop rule of gsplat. A pixel stops before a gaussian that would leave a
+// transmittance of at most kMinTransmittance. Neither this gaussian nor any behind it
+// is blended.
 struct StopsBefore {};
-// The rule by which a pixel stops after the gaussian that leaves this transmittance or
-// less. The remaining transmittance is distributed in proportion over the gaussians
-// that were blended. So the error of a channel is at most this fraction of the
-// difference between the blended colour and the colour behind.
+// The stop rule with a chosen transmittance. A pixel stops after the gaussian that
+// leaves this transmittance or less. The blend weights are then scaled up to fill the
+// transmittance that is left. So the error of a channel is at most `transmittance`
+// times the difference between the blended colour and the colour behind.
 template <class T>
 struct StopsBehind {
     T transmittance;
@@ -61,21 +61,22 @@ V3DG_INLINE void with_stop(float min_transmittance, const Draw& draw) {
         draw(StopsBehind<T>{static_cast<T>(min_transmittance)});
 }
 
-// The pixels of a window, row major; colour has three channels.
+// A picture to draw: the pixels of a window, row major. Colours have three channels.
 template <class T>
 struct Picture {
     Window window;
     T background[3];
-    T* color;  // premultiplied, composed over the background
+    T* color;  // premultiplied by alpha, plus background
     T* alpha;
-    // The expected depth: sum of weight * depth over alpha, 0 if alpha is 0; may be
-    // null.
+    // Expected depth: the sum of weight * depth, divided by alpha; 0 if alpha is 0. May
+    // be null.
     T* depth;
-    T* count = nullptr;  // number of blended gaussians, instead of depth; may be null
+    // Number of blended gaussians per pixel, drawn instead of depth. May be null.
+    T* count = nullptr;
     float min_transmittance = kStopsBefore;
 };
 
-// Gradients of the picture, in its layout; `depth` may be null.
+// The gradients of a Picture, in the same layout. `depth` may be null.
 template <class T>
 struct PictureGradient {
     const T* color;
@@ -85,12 +86,13 @@ struct PictureGradient {
 
 namespace cuda {
 
-// A block blends one tile, and each of its warps four rows of it.
+// The size of a tile on CUDA, px. A block of threads blends a tile, each warp four
+// rows.
 constexpr int kFrameTileWidth = 32, kFrameTileHeight = 16;
-// The destination of a picture, as in Picture<float>. It may be requested after the
-// first stages of a frame were enqueued.
+// The destination of a picture on CUDA (see Picture<float>). A frame may obtain it
+// after its first stages are enqueued.
 struct PicturePlanes {
-    float *color, *alpha, *depth;  // all may be null, or only depth
+    float *color, *alpha, *depth;  // null: all three, or depth only
 };
 
 // One picture of a batch.
@@ -98,7 +100,8 @@ struct FrameImage {
     Intrinsics<float> camera;
     int width, height;
     int tile_columns, tile_rows;
-    uint32_t first_tile;  // index in the batch; tiles are numbered row by row
+    // Index of the picture's first tile in the batch. Tiles are numbered row by row.
+    uint32_t first_tile;
     float background[3];
     PicturePlanes planes;
 };
@@ -107,12 +110,12 @@ V3DG_HD inline uint32_t num_tiles_of(const FrameImage& image) {
     return static_cast<uint32_t>(image.tile_columns) * static_cast<uint32_t>(image.tile_rows);
 }
 
-// The pictures of a scene's frame, one per eye. The tiles of the second follow those of
-// the first.
+// The pictures of the one or two eyes of a scene's frame. The tiles of the second
+// picture follow those of the first one.
 struct EyeImages {
     FrameImage image[2];
     uint32_t count;
-    float min_transmittance;  // shared by both pictures; may be kStopsByCut
+    float min_transmittance;  // the same for both pictures; may be kStopsByCut
 };
 
 }  // namespace cuda

@@ -1,7 +1,7 @@
 #pragma once
 
-// Loading and storing of records in kernels: a record is vectors of 16 bytes, the last
-// of which is half used.
+// Loads and stores records in kernels. A record consists of vectors of 16 bytes; the
+// last vector is half used.
 
 #include <cstddef>
 
@@ -12,7 +12,7 @@ namespace v3dg {
 namespace cuda {
 
 constexpr int kRecordVectors = 3;
-constexpr int kEllipseVectors = 2;  // the vectors in RecordPlanes::ellipse
+constexpr int kEllipseVectors = 2;  // vectors per record in RecordPlanes::ellipse
 static_assert(sizeof(Record<float>) == kRecordVectors * sizeof(float4) &&
                   offsetof(Record<float>, l22) == 16 && offsetof(Record<float>, color) == 24 &&
                   offsetof(Record<float>, depth) == 36 && offsetof(Record<float>, x0) == 40,
@@ -41,7 +41,7 @@ __device__ inline Record<float> record_of_vectors(const float4& a, const float4&
             .y1 = box.y1};
 }
 
-// Loads a record; the compiler omits fields that the caller does not use.
+// Loads a record. The compiler omits loads of unused fields.
 __device__ inline Record<float> load_record(const RecordPlanes& records, uint32_t record,
                                             const RecordBox& box) {
     const float4* ellipse = ellipse_of(records, record);

@@ -1,6 +1,6 @@
 #pragma once
 
-// A record: one gaussian projected onto the image, ready to blend.
+// A record: one gaussian projected into a picture, ready to be blended.
 
 #include <cstdint>
 
@@ -8,18 +8,18 @@
 
 namespace v3dg {
 
-// A gaussian on the image; Ellipse documents L.
+// A gaussian in a picture. Ellipse documents u, v, L and log2_opacity.
 template <class T>
 struct Record {
     T u, v, l11, l12, l22, log2_opacity;
     T color[3];
     T depth;
-    // The first and last pixel whose centre the gaussian can reach, clipped to the
-    // image or to the window.
+    // The first and last column and row of pixels whose centres the gaussian can reach,
+    // clipped to the image or the window.
     uint16_t x0, x1, y0, y1;
 };
 
-// Sets all fields except colour and pixels.
+// Sets all fields except colour and pixel box.
 template <class T>
 V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, Record<T>& r) {
     r.u = e.u;
@@ -41,8 +41,8 @@ V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, const PixelBox<int>& b
     r.y1 = static_cast<uint16_t>(box.y1);
 }
 
-// The sum over pixels of the absolute gradient with respect to a record's centre, for
-// both axes. It is large even where the gradients of different pixels cancel.
+// The sum, over pixels, of the absolute gradient with respect to a gaussian's centre,
+// per axis. Unlike the gradient, it is large even if the pixels' gradients cancel.
 template <class V>
 struct CenterSize {
     V u, v;
@@ -54,14 +54,15 @@ struct CenterSize {
     }
 };
 
-// Gradients by centres for the caller, (N, 2) each, in 1 / px; either may be null.
+// The gradients with respect to the gaussians' centres, 1 / px: (N, 2) each. Either
+// array may be null.
 template <class T>
 struct CenterGradients {
     T* sum;
     CenterSize<T>* size;
 };
 
-// Gradients of the ellipse and colour of one record.
+// The gradients of the ellipse and the colour of one record.
 template <class T>
 struct RecordGradient {
     Ellipse<T> ellipse;

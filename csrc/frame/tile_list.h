@@ -1,7 +1,7 @@
 #pragma once
 
-// The tiles that a record may touch, and the lists from which tiles are blended, on
-// CUDA. Tiles are numbered consecutively over a batch of pictures, row by row.
+// Tile lists on CUDA: the entries of a list, and the records and plans that blending
+// reads. Tiles are numbered consecutively over the pictures of a batch, row by row.
 
 #include <cstdint>
 #include <cstring>
@@ -13,36 +13,40 @@
 namespace v3dg {
 namespace cuda {
 
-// A gaussian in the list of a tile, packed into 64 bits: 54 bits for depth and record,
-// and 10 for its box in the tile. A record has 26 bits and a depth 28, which is exact.
-// In frames with room for more records, a record has up to two more bits and a depth up
-// to two fewer. Lists are blended by ascending depth; ties are ordered by record. If
-// depths are not exact, entries of equal depth are ordered by the depths of their
-// records, unless more than a thousand entries of a tile share 26 bits.
+// A record in the list of a tile, packed into 64 bits: 28 bits for the depth, 26 for
+// the index of the record, and 10 for its box in the tile. Lists are blended by
+// ascending depth, and by index where depths are equal.
+//
+// Frames with more records use up to two bits of the depth for the index. Depths are
+// then rounded, and entries with equal depth are ordered by the exact depths of their
+// records. The exception are tiles in which more than a thousand entries share 26 bits
+// of depth.
 struct TileEntry {
     unsigned long long key;
 };
 constexpr int kLeastRecordBits = 26, kMostRecordBits = 28, kEntryBoxBits = 10;
 constexpr unsigned long long kMostFrameRecords = 1ull << kMostRecordBits;
-constexpr int kEntryBlockSize = 4;  // px; boxes are in units of these blocks
-// 32 octaves beyond the near depth; everything farther gets this value.
+constexpr int kEntryBlockSize = 4;  // px; boxes are in units of blocks of this size
+// The largest depth of an entry, 32 octaves beyond the near depth. All larger depths
+// are stored as this value.
 constexpr uint32_t kLastEntryDepth = (1u << 28) - 1;
 
 constexpr uint32_t kExactDepths = ~0u << 4;
 
-// Returns the mask of the depth bits in the upper half of an entry, in a frame with
-// room for this many records.
+// Returns the mask of the depth bits in the upper 32 bits of an entry, for a frame with
+// at most `most_records` records.
 inline uint32_t depth_mask_of_entries(unsigned long long most_records) {
     uint32_t mask = kExactDepths;
     for (auto held = 1ull << kLeastRecordBits; held < most_records; held *= 2) mask <<= 1;
     return mask;
 }
 
-// Returns the depth of an entry, in steps of a float's last bit, or of up to four of
-// them if records need more bits. Precondition: the depth is at least the camera's near
-// depth.
+// Converts a depth to the integer in an entry: the number of float steps beyond the
+// near depth, with the bits that `depth_mask` drops set to 0. Precondition: the depth
+// is at least the near depth.
 V3DG_HD inline uint32_t entry_depth(float depth, float near_depth, uint32_t depth_mask) {
-    uint32_t depth_bits, near_bits;  // positive floats are ordered like their bits
+    // The bits of positive floats compare like the floats.
+    uint32_t depth_bits, near_bits;
     std::memcpy(&depth_bits, &depth, sizeof depth_bits);
     std::memcpy(&near_bits, &near_depth, sizeof near_bits);
     return min_of(depth_bits - near_bits, kLastEntryDepth) & depth_mask >> 4;
@@ -51,21 +55,21 @@ V3DG_HD inline uint32_t entry_depth(float depth, float near_depth, uint32_t dept
 constexpr uint32_t kTileBlockColumns = kFrameTileWidth / kEntryBlockSize;
 constexpr uint32_t kTileBlockRows = kFrameTileHeight / kEntryBlockSize;
 
-// The first and last block that contain pixels of a record, relative to the corner of
-// the picture or of a tile.
+// The first and last column and row of the blocks that a record touches, relative to
+// the picture or to a tile.
 struct EntryBox {
     uint32_t x0, x1, y0, y1;
 };
 
-// Returns the blocks of a box of pixels in the picture.
+// Converts a box of pixels to blocks.
 template <class Box>
 V3DG_HD inline EntryBox entry_box(const Box& pixels) {
     const auto block_of = [](auto pixel) { return static_cast<uint32_t>(pixel) / kEntryBlockSize; };
     return {block_of(pixels.x0), block_of(pixels.x1), block_of(pixels.y0), block_of(pixels.y1)};
 }
 
-// Returns an entry for the tile in this column and row, relative to the origin of the
-// box. Precondition: the box meets the tile.
+// Returns a record's entry for the tile at (column, row). `box` and the tile are
+// relative to the same origin. Precondition: the box touches the tile.
 V3DG_HD inline TileEntry tile_entry(uint32_t depth, uint32_t record, const EntryBox& box,
                                     uint32_t column, uint32_t row) {
     const int left = static_cast<int>(kTileBlockColumns * column);
@@ -80,7 +84,8 @@ V3DG_HD inline TileEntry tile_entry(uint32_t depth, uint32_t record, const Entry
             ((3 - (y1 - y0)) << 8 | (7 - (x1 - x0)) << 5 | y0 << 3 | x0)};
 }
 
-// Return the first 26 bits of the depth, and the 28 bits after them.
+// Return the upper 26 bits of a key, which are depth, and the next 28, which are depth
+// and record.
 V3DG_HD inline uint32_t key_depth(TileEntry e) {
     return static_cast<uint32_t>(e.key >> (kEntryBoxBits + kMostRecordBits));
 }
@@ -88,30 +93,34 @@ V3DG_HD inline uint32_t key_order(TileEntry e) {
     return static_cast<uint32_t>(e.key >> kEntryBoxBits) & ((1u << kMostRecordBits) - 1);
 }
 
-// Returns a mask of the 4 x 4 blocks of the tile that the record's box meets, row by
-// row.
+// Returns a mask of the tile's blocks that the record's box touches: one bit per block
+// of 4 x 4 px, row by row.
 V3DG_HD inline uint32_t blocks_of(TileEntry e) {
-    // The entry stores the first block, and how many columns and rows the box lacks to
-    // the full size.
+    // The entry stores the first block, and the number of columns and of rows that the
+    // box lacks to fill the tile.
     static_assert(kTileBlockColumns == 8 && kTileBlockRows == 4, "a row of blocks is a byte");
     const uint32_t box = static_cast<uint32_t>(e.key), fewer = box >> 5;
     return (0xffu >> (fewer & 7)) * (0x01010101u >> (fewer & 24)) << (box & 31);
 }
 
-// A tile, or one of its parts, in blending order. The parts of a tile are contiguous;
-// the first one describes how the tile's list was spread, if it is long.
+// A tile, or a part of a tile, in the order of blending. The parts of a tile are
+// adjacent. The first part describes how the tile's list was spread, if the list is
+// long.
 struct TilePlan {
-    uint32_t tile, image;  // kNoTile for an empty plan
-    uint32_t lowest;       // lowest depth in the buckets
+    uint32_t tile, image;  // `tile` is kNoTile for an empty plan
+    uint32_t lowest;       // smallest depth in the buckets
     uint16_t last_bucket, shift;
     uint8_t part, log2_parts;
-    // The list is in windows, so that parts of the tile can be blended concurrently.
+    // Whether the list is divided into windows, so that the tile's parts can be blended
+    // concurrently.
     bool in_windows;
-    bool in_scratch;                   // The spread list is in scratch memory, not in place.
-    unsigned long long first_scratch;  // index of the list in scratch memory, if it is there
+    bool in_scratch;  // whether the spread list is in scratch memory, not in place
+    // index of the list in scratch memory, if in_scratch
+    unsigned long long first_scratch;
 };
 constexpr uint32_t kNoTile = ~0u;
-constexpr int kPlanClasses = 64;  // classes of plans, by load
+// number of classes into which plans are sorted by load
+constexpr int kPlanClasses = 64;
 
 // The pixel box of a Record.
 struct RecordBox {
@@ -127,66 +136,66 @@ V3DG_HD inline uint32_t num_tiles_of(const RecordBox& r) {
     return tile_columns_of(r) * tile_rows_of(r);
 }
 
-// The records of a frame in three planes, in the order of a Record's fields.
+// The records of a frame in three arrays, in the order of the fields of a Record.
 struct RecordPlanes {
-    float* ellipse;       // (N, 8) u, v, l11, l12, l22, log2_opacity, two channels
-    float* rest;          // (N, 2) the third channel and the depth
-    RecordBox* box;       // null unless the frame keeps a tape, because few records need it later
-    uint32_t depth_mask;  // mask of the depth bits in the upper half of entries
+    float* ellipse;       // (N, 8) u, v, l11, l12, l22, log2_opacity, red, green
+    float* rest;          // (N, 2) blue, depth
+    RecordBox* box;       // null without a tape: only the backward pass needs all boxes
+    uint32_t depth_mask;  // the depth bits in the upper 32 bits of an entry's key
 
     V3DG_HD uint32_t record_of(TileEntry e) const {
         return static_cast<uint32_t>(e.key >> kEntryBoxBits) &
                ~(depth_mask << (32 - kEntryBoxBits));
     }
-    // Returns a value with the order of depths. is_exact() says whether equal values
+    // Returns an integer that is ordered like the depth. If is_exact(), equal integers
     // mean equal depths.
     V3DG_HD uint32_t depth_of(TileEntry e) const {
         return static_cast<uint32_t>(e.key >> 32) & depth_mask;
     }
     V3DG_HD bool is_exact(TileEntry e) const {
-        // The last value represents many depths.
+        // The largest value stands for many depths.
         return depth_mask == kExactDepths && depth_of(e) != kExactDepths;
     }
 };
 
-// Input of the blend stage.
+// The input of the blend stage.
 struct FrameLists {
     const FrameImage* images;
-    const uint32_t* image_of_tile;  // [num_tiles]
+    const uint32_t* image_of_tile;  // [num_tiles] index of the image of each tile
     uint32_t num_tiles;
     RecordPlanes records;                  // ordered by item and gaussian, with gaps between items
-    const unsigned long long* tile_first;  // [num_tiles + 1] indices into `entries`
-    TileEntry *entries, *scratch;          // the entries of each tile, unordered
+    const unsigned long long* tile_first;  // [num_tiles + 1] first entry of each tile
+    // each tile's entries in any order; and scratch memory
+    TileEntry *entries, *scratch;
     FrameCounters* counters;
-    Capacity capacity;  // at most kMostFrameRecords records
+    Capacity capacity;  // `records` is at most kMostFrameRecords
     TilePlan* plans;    // [num_plans] scratch memory
-    // [2 * kPlanClasses] initially zero: the number of plans of each class, and the
-    // number of those already written.
+    // [2 * kPlanClasses] number of plans of each class, then number of plans of each
+    // class that are written. Initially zero.
     uint32_t* plan_counts;
-    // Plans claimed beyond the first of each block of spread_kernel; initially zero.
+    // Work counter: plans that blocks of spread_kernel claimed beyond their first one.
+    // Initially zero.
     unsigned* taken;
     uint32_t num_plans;  // num_tiles, or most_plans() if tiles may be in parts
-    // Shared by all images; kStopsByCut for a cut by a budget, whose tolerance is in
+    // The same for all images; kStopsByCut for a cut by a budget, whose tolerance is in
     // the counters.
     float min_transmittance;
-    // The destinations of images without one of their own: of the first and of the
-    // second.
     PicturePlanes planes[2] = {};
-    bool has_depth = true;  // must be true if any image has depth
-    // Destination of a copy of the counters on the host; may be null.
+    bool has_depth = true;  // must be true if any image has a depth plane
+    // Host memory that receives a copy of the counters; may be null.
     FrameCounters* report = nullptr;
 };
 
-// A record over more tiles than this is processed by rows of tiles.
+// Records over more tiles than this are large: they are processed by rows of tiles.
 constexpr unsigned kFewTiles = 4;
 
-// The tiles that contain a record's blocks: the first one, and the number of columns
-// and rows.
+// The tiles that a record touches: the first tile, and the number of columns and of all
+// tiles.
 struct TileBox {
     uint32_t left, top, columns, count;
 
-    // Return the distance of tile k, of at most kFewTiles, from the first. A box of
-    // more than two columns has one row.
+    // Return the offset of tile k from the first tile. Precondition: at most kFewTiles
+    // tiles. A box with more than two columns then has only one row.
     V3DG_HD uint32_t columns_to(uint32_t k) const {
         return columns > 2 ? k : columns == 2 ? k & 1 : 0;
     }
@@ -202,14 +211,16 @@ V3DG_HD inline TileBox tile_box(const EntryBox& b) {
     return {left, top, columns, columns * rows};
 }
 
-// A record over few tiles, packed for the scattering kernel: its depth, the index of
-// its first tile in the picture, and its blocks relative to that tile: the first block,
-// and the number of further ones.
+// A record over few tiles, packed for the scatter kernel: the depth, the first tile in
+// the picture, the first block relative to that tile, and the numbers of further block
+// columns and rows.
 using FewTiles = unsigned long long;
-// The code of a box of five columns, which no such record has.
+// Marks a large record. No small record has this value: its box would cover 5 x 5
+// tiles.
 constexpr FewTiles kManyTiles = ~FewTiles(0);
 constexpr int kFewBoxBits = 14, kFewTileBits = 22;
-// Records whose first tile is later count as large.
+// The largest index of a tile that FewTiles holds. A record whose first tile has a
+// larger index is treated as large.
 constexpr uint32_t kMostFewTile = (1u << kFewTileBits) - 1;
 
 V3DG_HD inline FewTiles few_tiles(uint32_t depth, uint32_t tile, const EntryBox& b) {
@@ -228,30 +239,32 @@ V3DG_HD inline EntryBox box_of(FewTiles f) {
     return {x0, x0 + (box >> 4 & 31), y0, y0 + (box & 15)};
 }
 
-// A record over more than kFewTiles tiles, or some of its rows of tiles with the pixels
-// in these. Large records are stored in batches of kLargeAtOnce from one item, and
-// therefore from neighbours in one picture; a batch is padded at its end. A batch
-// covers at most kMostLargeTiles tiles, or one row of tiles of each record.
+// A large record: a record over more than kFewTiles tiles, or a part of it with some of
+// its rows of tiles. Large records are stored in batches of kLargeAtOnce. The records
+// of a batch come from one item; the end of a batch may be padding. A batch covers at
+// most kMostLargeTiles tiles, or one row of tiles of each record.
 struct alignas(16) LargeRecord {
-    uint32_t record, image;  // kNoRecord for padding
+    uint32_t record, image;  // `record` is kNoRecord for padding
     RecordBox box;
 };
 constexpr unsigned kLargeAtOnce = 16;
 constexpr int kMostLargeTiles = 1024;
 constexpr uint32_t kNoRecord = ~0u;
 
-// The records of an item, and the tiles of their picture.
+// The records of an item, and the tiles of its picture.
 struct ItemTiles {
     uint32_t num_records, record, first_tile, columns;
 };
 
-// The counts of records per tile by project(), and scratch memory of tile_bin(). All is
-// zero before project().
+// Counts of records per tile, written by project(), and scratch memory of tile_bin().
+// All memory must be zero before project().
 struct TileCounts {
-    uint32_t* count;  // [num_tiles] records over at most kFewTiles tiles; zero after tile_bin()
-    // Claimed parts of the scan; claimed items whose records are scattered.
+    // [num_tiles] counts of records over few tiles; tile_bin() resets them to zero
+    uint32_t* count;
+    // Work counters: parts of the scan that were claimed; items that the scatter kernel
+    // claimed.
     unsigned *scan_ticket, *taken;
-    unsigned long long* state;  // [tile_bin_parts(num_tiles)]
+    unsigned long long* state;  // [tile_bin_parts(num_tiles)] state of the scan
 };
 
 }  // namespace cuda

@@ -1,4 +1,4 @@
-// Each thread gathers one cluster at a time.
+// A thread gathers one cluster at a time.
 
 #include "base/parallel_for.h"
 #include "gather/gather_math.h"

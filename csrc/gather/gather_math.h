@@ -1,6 +1,6 @@
 #pragma once
 
-// Formulas of gather(), for the CPU and CUDA, all in double precision.
+// Formulas of gather(), for the CPU and CUDA, in double precision.
 
 #include <vector>
 
@@ -11,20 +11,20 @@
 
 namespace v3dg {
 
-// Rotations of instances, and of their SH bands.
+// The rotations of all instances, and the matrices that rotate their SH bands.
 struct Rotations {
-    const double* rotation;  // [I * 9] rows
+    const double* rotation;  // [I * 9] row-major matrices
     const double* bands;     // [I * kBandsSize]; empty if the result has SH degree 0
 };
 
-// Owns these rotations on the host.
+// The same as Rotations, in memory that it owns.
 struct RotationTables {
     std::vector<double> rotation, bands;
 
     RotationTables(const GatherInput& in, int sh_degree);
 };
 
-// Writes a gaussian, except its SH coefficients; `within` is its index in cluster s.
+// Writes a gaussian without its SH coefficients. `within` is its index in cluster s.
 V3DG_HD inline void gather_shape(const GatherInput& in, const Rotations& rotations, size_t s,
                                  int64_t within, const GaussianRows<float>& out) {
     const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;
@@ -55,8 +55,8 @@ V3DG_HD inline void gather_shape(const GatherInput& in, const Rotations& rotatio
     out.opacities[to] = opacity;
 }
 
-// Writes the three coefficients of one SH basis of that gaussian, rotated into the
-// world and multiplied by the tint.
+// Writes the three coefficients of one SH basis of a gaussian, rotated into the world
+// and multiplied by the tint.
 V3DG_HD inline void gather_sh(const GatherInput& in, const Rotations& rotations, size_t s,
                               int64_t within, int basis, const GaussianRows<float>& out) {
     const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;

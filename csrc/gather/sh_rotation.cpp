@@ -1,6 +1,7 @@
-// A band is closed under rotation, so its matrix follows from the bases at enough
-// directions: the colour towards d in the new frame is the colour of the old frame
-// towards d rotated back.
+// Computes the matrix that rotates an SH band. A band is closed under rotation. So its
+// matrix follows from the values of the bases in enough directions: the colour in
+// direction d of the new frame is the colour of the old frame in direction d rotated
+// back.
 
 #include "gather/sh_rotation.h"
 
@@ -14,7 +15,7 @@ namespace v3dg {
 namespace {
 
 constexpr int kMaxBand = 7;
-// Using many more directions than the 7 that the largest band needs makes the equations
+// The number of directions. The largest band needs 7; with many more, the equations are
 // well-conditioned.
 constexpr int kNumDirections = 32;
 
@@ -22,7 +23,7 @@ struct Direction {
     double x, y, z;
 };
 
-// Returns points on a spiral from pole to pole.
+// Returns a point of a spiral from pole to pole.
 Direction direction_of(int i) {
     const double z = 1 - (2 * i + 1) / static_cast<double>(kNumDirections);
     const double turn = i * 3.14159265358979323846 * (3 - std::sqrt(5.0)),
@@ -30,8 +31,9 @@ Direction direction_of(int i) {
     return {radius * std::cos(turn), radius * std::sin(turn), z};
 }
 
-// Solves least squares over the directions: for a right-hand side b with one row b[i]
-// for each direction i, row r of the solution is the sum over i of weight[r][i] * b[i].
+// Solves least-squares problems over the directions. For a right-hand side b[i], with
+// one element per direction i, element r of the solution is the sum of weight[r][i] *
+// b[i].
 class Band {
   public:
     explicit Band(int degree) : degree_(degree), size_(2 * degree + 1) {
@@ -47,7 +49,7 @@ class Band {
                 for (const auto& row : rows) system[r][c] += row[first + r] * row[first + c];
             for (int i = 0; i < kNumDirections; ++i) system[r][size_ + i] = rows[i][first + r];
         }
-        // The normal equations are nearly diagonal: elimination needs no pivots.
+        // The normal equations are nearly diagonal, so elimination needs no pivoting.
         for (int r = 0; r < size_; ++r) {
             const double pivot = system[r][r];
             for (int c = 0; c < size_ + kNumDirections; ++c) system[r][c] /= pivot;

@@ -1,7 +1,7 @@
 #pragma once
 
-// The hash of pages, tables and files: BLAKE2b of one message, of several at once, and
-// of pieces.
+// The hash of pages, tables and files: BLAKE2b, for one message, for several at once,
+// and for pieces of a message.
 
 #include <array>
 #include <cstddef>
@@ -17,33 +17,33 @@ constexpr size_t kHashBlockBytes = 128;
 constexpr size_t kHashPieceBytes = 16384;
 using PageHash = std::array<uint8_t, kPageHashBytes>;
 
-// Hashes several messages with BLAKE2b, RFC 7693, with digests of 16 bytes and no key.
-// On processors with wide vectors each message is a lane of a vector, so eight messages
-// of similar length are fastest.
+// Computes the hashes of several messages: BLAKE2b (RFC 7693) with digests of 16 bytes
+// and no key. On processors with wide vectors, each message is a lane of a vector. So
+// eight messages of similar length are fastest.
 void blake2b(Span<const Span<const uint8_t>> messages, PageHash* digests);
 
-// Computes the same hash for one message that is added in parts.
+// Computes the hash of one message, which is added in parts.
 class Blake2b {
   public:
     Blake2b();
     void add(const unsigned char* bytes, size_t size);
-    // Returns the hash of all bytes that were added. No bytes may be added afterwards.
+    // Returns the hash of all bytes that were added. No more bytes may be added.
     PageHash digest();
 
   private:
     uint64_t state_[8];
-    uint64_t num_bytes_ = 0;  // hashed bytes, without those in the buffer
+    uint64_t num_bytes_ = 0;  // hashed bytes, without those that wait in the buffer
     unsigned char waiting_[kHashBlockBytes] = {};
     size_t num_waiting_ = 0;
 };
 
-// The hash of the concatenated digests of a message's pieces. A piece has
-// kHashPieceBytes; the last one may be shorter. Pieces are hashed in parallel lanes, so
-// this is several times as fast as Blake2b.
+// Computes the hash of the digests of a message's pieces. A piece has kHashPieceBytes;
+// the last one may be shorter. Pieces are hashed in parallel lanes, so this is several
+// times as fast as Blake2b.
 class HashOfPieces {
   public:
     explicit HashOfPieces(Span<const uint8_t> message) : message_(message) {}
-    // Hashes the pieces that end within the first `end` bytes of the message.
+    // Hashes the pieces that are complete within the first `end` bytes of the message.
     void add_until(size_t end);
     PageHash digest();
 

@@ -1,6 +1,5 @@
-// The formula of BLAKE2b, for a 64-bit word or for a vector of them. The words of a
-// vector are either from several messages, one message per lane, or a row of the state
-// of one message.
+// BLAKE2b for 64-bit words or for vectors of words. The lanes of a vector are either
+// the words of several messages, or a row of the state of one message.
 
 #include "io/blake2b_lanes.h"
 
@@ -74,7 +73,7 @@ using Words = Row;
 using Words = uint64_t;
 #endif
 
-// b becomes available last, so it is added last.
+// b is added last, because it is computed last.
 template <class V>
 V3DG_INLINE void mix(V& a, V& b, V& c, V& d, V x, V y) {
     a = a + x + b;
@@ -100,14 +99,14 @@ V3DG_INLINE void mix_round(V* v, const V* m) {
     mix(v[3], v[4], v[9], v[14], m[s[14]], m[s[15]]);
 }
 
-// Unrolled, so that the compiler knows the order of the message words in each round.
+// Unrolled, so that the order of message words in each round is known at compile time.
 template <class V, size_t... kRounds>
 V3DG_INLINE void mix_rounds(V* v, const V* m, std::index_sequence<kRounds...>) {
     (mix_round<kRounds>(v, m), ...);
 }
 
-// `end`: number of bytes up to the end of this block. `last`: all bits set for the last
-// block, else none.
+// Adds one block. `end` is the number of bytes up to the end of this block. `last` has
+// all bits set for the last block, otherwise none.
 template <class V>
 V3DG_INLINE void compress(V* h, const V* m, V end, V last) {
     V v[16];
@@ -137,8 +136,7 @@ V3DG_INLINE uint64_t word(const unsigned char* block, int i) {
     return word;
 }
 
-// For the diagonals, the rows other than b are rotated, because b becomes available
-// last.
+// To form the diagonals, rotate all rows except b, because b is computed last.
 template <size_t kRound>
 V3DG_INLINE void mix_rows(Row& a, Row& b, Row& c, Row& d, const unsigned char* block) {
     constexpr const uint8_t* s = kOrder[kRound % 10];
@@ -194,8 +192,8 @@ void add_last_block(uint64_t* state, uint64_t num_bytes, const unsigned char* bl
     compress_one(state, block, num_bytes, ~uint64_t{0});
 }
 
-// Returns the digest of a message whose first `num_bytes` were already added to the
-// state; `rest` contains the remaining bytes.
+// Returns the digest of a message. Its first `num_bytes` bytes were added to the state;
+// `rest` has the others.
 static PageHash digest_of_rest(uint64_t* state, uint64_t num_bytes, const unsigned char* rest,
                                size_t size) {
     const size_t whole = size > 0 ? (size - 1) / kHashBlockBytes : 0,
@@ -224,15 +222,17 @@ V3DG_INLINE void load_words(const unsigned char* const* blocks, Words* m) {
         __m512i rows[8];
         for (int i = 0; i < 8; ++i) rows[i] = _mm512_loadu_si512(blocks[i] + 64 * half);
         for (int odd = 0; odd < 2; ++odd) {
-            __m512i pairs[4];  // per lane: words odd, odd + 2, odd + 4 and odd + 6
-            __m512i fours[4];  // per lane: two of those words
+            __m512i pairs[4];  // per lane: words odd, odd + 2, odd + 4, odd + 6
+            __m512i fours[4];  // per lane: two of these words
             for (int i = 0; i < 4; ++i)
                 pairs[i] = odd ? _mm512_unpackhi_epi64(rows[2 * i], rows[2 * i + 1])
                                : _mm512_unpacklo_epi64(rows[2 * i], rows[2 * i + 1]);
             for (int i = 0; i < 2; ++i) {
-                fours[i] = _mm512_shuffle_i64x2(pairs[2 * i], pairs[2 * i + 1], 0x88);  // + 0, + 4
+                // odd + 0 and odd + 4
+                fours[i] = _mm512_shuffle_i64x2(pairs[2 * i], pairs[2 * i + 1], 0x88);
                 fours[2 + i] =
-                    _mm512_shuffle_i64x2(pairs[2 * i], pairs[2 * i + 1], 0xdd);  // + 2, + 6
+                    // odd + 2 and odd + 6
+                    _mm512_shuffle_i64x2(pairs[2 * i], pairs[2 * i + 1], 0xdd);
             }
             for (int i = 0; i < 2; ++i) {
                 Words* words = m + 8 * half + odd + 2 * i;
@@ -274,8 +274,8 @@ class Lanes {
         end_[lane] = 0;
         for (int i = 0; i < 8; ++i) state_[i][lane] = kHashStart[i];
     }
-    // Adds blocks to all messages until one ends, and stores the digests of those that
-    // ended.
+    // Adds blocks to all messages until one of them ends, and stores the digests of
+    // messages that ended.
     void advance() {
         size_t whole = SIZE_MAX;
         for (size_t k = 0; k < kNumLanes; ++k)
@@ -337,7 +337,7 @@ class Lanes {
     Words state_[8] = {}, end_ = {};             // end_: number of bytes that were added
     const unsigned char* rest_[kNumLanes] = {};  // bytes that are not hashed yet
     size_t left_[kNumLanes] = {};
-    PageHash* digest_[kNumLanes] = {};  // null: idle
+    PageHash* digest_[kNumLanes] = {};  // null if the lane is idle
 };
 
 }  // namespace

@@ -1,7 +1,7 @@
 #pragma once
 
 // The compression function of BLAKE2b for each instruction set: for one message, and
-// for several in parallel.
+// for several messages in parallel.
 
 #include <cstddef>
 #include <cstdint>
@@ -15,7 +15,7 @@ namespace v3dg {
 constexpr uint64_t kHashConstant[8] = {0x6a09e667f3bcc908, 0xbb67ae8584caa73b, 0x3c6ef372fe94f82b,
                                        0xa54ff53a5f1d36f1, 0x510e527fade682d1, 0x9b05688c2b3e6c1f,
                                        0x1f83d9abfb41bd6b, 0x5be0cd19137e2179};
-// The initial state of a hash of kPageHashBytes without a key.
+// The initial state for digests of kPageHashBytes bytes and no key.
 constexpr uint64_t kHashStart[8] = {kHashConstant[0] ^ 0x01010000 ^ kPageHashBytes,
                                     kHashConstant[1],
                                     kHashConstant[2],
@@ -26,12 +26,11 @@ constexpr uint64_t kHashStart[8] = {kHashConstant[0] ^ 0x01010000 ^ kPageHashByt
                                     kHashConstant[7]};
 
 V3DG_DECLARE_PER_ISA(
-    // Adds whole blocks, none of which is the last one, to a state of eight words to
-    // which `num_bytes` were added before.
+    // Adds whole blocks to the state. None of them may be the last block of the
+    // message. `num_bytes` bytes must have been added before.
     void add_blocks(uint64_t* state, uint64_t num_bytes, const unsigned char* blocks,
                     size_t num_blocks);
-    // Adds the last block, padded with zeros; `num_bytes` is the size of the whole
-    // message.
+    // Adds the last block, padded with zeros. `num_bytes` is the size of the message.
     void add_last_block(uint64_t* state, uint64_t num_bytes, const unsigned char* block);
     void hash_messages(Span<const Span<const uint8_t>> messages, PageHash* digests);)
 

@@ -60,8 +60,8 @@ void HashedRead::report(size_t num_read, bool is_over) {
     has_more_.notify_one();
 }
 
-// Waits until more than `num_known` bytes are read, or reading has ended. Returns how
-// many bytes are read.
+// Waits until more than `num_known` bytes are read, or reading has ended. Returns the
+// number of bytes that were read.
 size_t HashedRead::wait_for_more(size_t num_known) {
     const MutexLock lock(busy_);
     while (!is_over_ && num_read_ <= num_known) has_more_.wait(busy_);
@@ -80,7 +80,7 @@ bool HashedRead::hash() {
         end = num_before + std::min(wait_for_more(done - num_before), message_.size - num_before);
         if (end == done) break;  // the file ended early, which wait() reports
     }
-    // The remaining bytes may be exactly the hash to compare with.
+    // Wait for the hash at the end of the message, with which the digest is compared.
     wait_for_more(bytes_.size - 1);
     const PageHash digest = hash_of_ == HashOf::bytes ? of_bytes.digest() : of_pieces.digest();
     return std::equal(digest.begin(), digest.end(), message_.end());

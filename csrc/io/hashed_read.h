@@ -1,6 +1,6 @@
 #pragma once
 
-// A part of a file that is read and hashed at the same time.
+// Reads a part of a file and hashes it at the same time.
 
 #include <future>
 
@@ -11,29 +11,28 @@
 
 namespace v3dg {
 
-// The input of the hash: all bytes in order, or the hashes of their pieces
-// (HashOfPieces).
+// The input of the hash: all bytes in order, or the hashes of pieces (HashOfPieces).
 enum class HashOf { bytes, pieces };
 
-// A part of a file, followed by its hash, that is read and hashed at the same time. A
-// large part has two threads, so the caller may use it while it is still being hashed.
-// A small one is read and hashed by the threads that wait for it.
+// Reads a part of a file that ends with its hash, and computes the hash at the same
+// time. Two threads process a large part, so the caller can use it while it is still
+// being hashed. A small part is read and hashed by the threads that wait for it.
 class HashedRead {
   public:
     static constexpr size_t kLargeBytes = size_t(4) << 20;
 
-    // Reads from `offset` on into `message`, behind its first `num_before` bytes, which
-    // are hashed, too. The message ends with the hash of all bytes before that. The
-    // message must outlive this object.
+    // Reads from `offset` on to message[num_before] and later. The bytes before that
+    // are given, and are hashed, too. The last bytes of the message are the hash of all
+    // preceding bytes. The memory of the message must outlive this object.
     HashedRead(PosixFile file, size_t offset, Span<uint8_t> message, size_t num_before,
                HashOf hash_of);
     HashedRead(const HashedRead&) = delete;
 
     // Waits until everything is read. Returns false if the file ended early. Throws
-    // std::system_error.
+    // std::system_error if the system cannot read it.
     bool wait() { return read_.get(); }
     // Waits until everything is hashed. Returns whether the hash at the end of the
-    // message is right.
+    // message is correct.
     bool is_sound();
 
   private:
@@ -44,16 +43,16 @@ class HashedRead {
 
     const PosixFile file_;
     const size_t offset_;
-    const Span<uint8_t> bytes_;          // to be read
-    const Span<const uint8_t> message_;  // to be hashed
+    const Span<uint8_t> bytes_;          // memory to read to
+    const Span<const uint8_t> message_;  // bytes to hash
     const HashOf hash_of_;
 
     Mutex busy_;
     Condition has_more_;
     size_t num_read_ V3DG_GUARDED_BY(busy_) = 0;
     bool is_over_ V3DG_GUARDED_BY(busy_) = false;
-    // These are the last members: their destructors wait for the threads, which use all
-    // members above.
+    // The last members, because their destructors wait for threads that use the members
+    // above.
     std::shared_future<bool> read_;
     std::shared_future<bool> is_sound_;
 };

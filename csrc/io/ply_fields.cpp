@@ -1,6 +1,6 @@
-// Finds the properties of a vertex that make a gaussian, in the files of the 3DGS code
-// and in those of other trainers. If properties are missing, the error says what kind
-// of file it probably is.
+// Finds the properties of a vertex that make a gaussian, in files of the 3DGS code and
+// of other trainers. If properties are missing, the error says what kind of file it
+// probably is.
 
 #include "io/ply_fields.h"
 
@@ -13,9 +13,9 @@ namespace v3dg {
 
 namespace {
 
-constexpr size_t kMaxNames = 8;  // of properties in a message
+constexpr size_t kMaxNames = 8;  // most property names in an error text
 
-// The fields of a vertex's properties by their names, without those of lists.
+// The numbers in a vertex, by name. `lists` are the names of its lists.
 struct Fields {
     std::unordered_map<std::string, PlyField> field_from_name;
     std::unordered_set<std::string> lists;
@@ -41,7 +41,7 @@ Fields fields_of(const PlyElement& vertex) {
     return fields;
 }
 
-// K of the file.
+// Returns K, the number of SH coefficients per channel in the file.
 size_t num_stored_sh(const PlyElement& vertex) {
     size_t num_rest = 0;
     for (const PlyProperty& property : vertex.properties)
@@ -52,8 +52,8 @@ size_t num_stored_sh(const PlyElement& vertex) {
                    std::to_string(num_rest));
 }
 
-// The names of the properties for base colours; none if the file has coefficients or
-// neither.
+// Returns the names of the properties with base colours. Empty if the file has SH
+// coefficients, or neither.
 std::vector<std::string> base_color_names(const Fields& fields) {
     if (fields.has("f_dc_0")) return {};
     for (const std::vector<std::string>& names :
@@ -75,7 +75,8 @@ double color_scale(const std::string& name, PlyType type) {
     }
 }
 
-// The name of the property of each slot; none for a slot that the file does not fill.
+// Returns the name of the property of each slot. Empty for a slot that the file does
+// not have.
 std::vector<std::string> slot_names(const Fields& fields, size_t num_stored, PlyLayout& layout) {
     std::vector<std::string> names = {"x",     "y",       "z",       "rot_0",   "rot_1",  "rot_2",
                                       "rot_3", "scale_0", "scale_1", "scale_2", "opacity"};
@@ -95,8 +96,8 @@ std::vector<std::string> slot_names(const Fields& fields, size_t num_stored, Ply
     return names;
 }
 
-// Returns advice for a file that lacks required properties: what it is, and what to do
-// with it.
+// Returns advice for a file without the required properties: what kind of file it is,
+// and what to do.
 std::string advice(const Fields& fields, size_t num_missing) {
     if (fields.has("f_anchor_feat_0"))
         return "; this file has the anchors of Scaffold-GS, of which a network makes gaussians: "

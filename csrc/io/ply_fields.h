@@ -1,7 +1,6 @@
 #pragma once
 
-// The mapping from the numbers in a row of a .ply file to a gaussian, and their
-// conversion.
+// Maps the numbers in a row of a .ply file to a gaussian, and converts them.
 
 #include <algorithm>
 #include <cmath>
@@ -13,24 +12,26 @@
 
 namespace v3dg {
 
-// Bytes that all threads convert together if a single thread has to separate the rows.
+// The bytes that all threads convert together, if one thread has to separate the rows.
 constexpr size_t kPlyChunkBytes = size_t(1) << 22;
 
-// The slots of a gaussian, in the order of its numbers; after kSh they are in memory's
-// order.
+// The slots of a gaussian: where its numbers begin. From kSh on, slots have the order
+// of memory.
 enum PlySlot : size_t { kMean = 0, kQuat = 3, kScale = 7, kOpacity = 10, kFilter = 11, kSh = 12 };
 
-// Throws PlyError if a property is missing, there twice or a list.
+// Returns the layout of a vertex. Throws PlyError if a property is missing, occurs
+// twice, or is a list.
 PlyLayout layout_of(const PlyElement& vertex);
 
-// The smallest number whose square a double represents with full precision.
+// The limits of numbers whose squares a double represents with full precision.
 constexpr double kLeastSquared = 1e-140;
 constexpr double kMostSquared = 1e140;
 
-// For squared lengths: that of a rounded unit quaternion differs from 1 by 3e-7.
+// The tolerance of squared lengths. Rounding a unit quaternion to float32 changes its
+// squared length by up to 3e-7.
 constexpr double kUnitTolerance = 1e-6;
 
-// Multiplies a quaternion by a power of two if doubles cannot represent its squares.
+// Multiplies a quaternion by a power of two if its squares exceed the range of doubles.
 // Quaternions that are zero or not finite stay unchanged.
 inline void scale_extreme(double quat[4]) {
     double largest = 0;
@@ -41,9 +42,9 @@ inline void scale_extreme(double quat[4]) {
     for (size_t j = 0; j < 4; ++j) quat[j] = std::ldexp(quat[j], -exponent);
 }
 
-// Widens a gaussian by a standard deviation along each axis and lowers its opacity, so
-// that it covers as much as before. Source: Yu et al., Mip-Splatting, CVPR 2024,
-// equation 9.
+// Widens a gaussian along each axis by a filter of this standard deviation, and reduces
+// its opacity, so that it covers as much as before. Source: Yu et al., Mip-Splatting,
+// CVPR 2024, equation 9.
 inline void widen(double filter, size_t num_axes, double scales[3], double& opacity) {
     for (size_t j = 0; j < num_axes; ++j) {
         const double widened = std::hypot(scales[j], filter);
@@ -52,8 +53,7 @@ inline void widen(double filter, size_t num_axes, double scales[3], double& opac
     }
 }
 
-// Converts and stores gaussian i; load(slot) returns the number that the file holds for
-// a slot.
+// Converts and stores gaussian i. load(slot) returns the number for a slot in the file.
 template <class Load>
 void store_gaussian(const Load& load, size_t i, const PlyLayout& layout,
                     const PlyGaussians<float>& out) {

@@ -1,5 +1,5 @@
-// Parses the header of a .ply file. The sizes that it claims are not used here; the
-// callers compare them with the size of the file.
+// Parses the header of a .ply file. Callers compare the sizes in it with the size of
+// the file.
 
 #include "io/ply_header.h"
 
@@ -10,8 +10,10 @@ namespace v3dg {
 
 namespace {
 
-constexpr size_t kMaxHeaderBytes = size_t(1) << 20;  // real headers have a few kilobytes
-// Real files have one or two elements; each one is skipped in sequence.
+// real headers have a few kilobytes
+constexpr size_t kMaxHeaderBytes = size_t(1) << 20;
+// The largest number of elements. Real files have one or two. Elements before the
+// vertices must be skipped one after another.
 constexpr size_t kMaxElements = 64;
 
 constexpr const char* kSpace = " \t\r\v\f";
@@ -27,7 +29,7 @@ std::vector<std::string> words_of(const std::string& line) {
     return words;
 }
 
-// What follows the first word of a line, without space around it.
+// Returns the part of a line after its first word, without surrounding spaces.
 std::string rest_of(const std::string& line) {
     const size_t word = line.find_first_not_of(kSpace);
     const size_t space = line.find_first_of(kSpace, word);
@@ -95,12 +97,12 @@ PlyProperty parse_property(const std::vector<std::string>& words) {
     return property;
 }
 
-// Parses the lines of one header one by one.
+// Parses the lines of one header, one after another.
 struct HeaderParser {
     PlyHeader header;
     bool has_format = false;
 
-    // Returns whether this was the last line.
+    // Parses a line. Returns whether it was the last line of the header.
     bool take(const std::string& line) {
         const std::vector<std::string> words = words_of(line);
         if (words.empty()) return false;

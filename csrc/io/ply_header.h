@@ -12,15 +12,16 @@
 
 namespace v3dg {
 
-// The content of a file is wrong. The message states what was expected and what was
-// found, in one line of printable ASCII, without the name of the file.
+// The error for wrong content of a file. The text is one line of printable ASCII that
+// states what was expected and what was found. It does not name the file.
 struct PlyError : std::runtime_error {
     using std::runtime_error::runtime_error;
 };
 
 enum class PlyEncoding { ascii, binary_little_endian, binary_big_endian };
 
-// The types of the format, integers first, then those that some writers use besides.
+// The scalar types of the format, integers first. The last types are not in the format,
+// but some programs write them.
 enum class PlyType {
     int8,
     uint8,
@@ -42,9 +43,11 @@ inline size_t size_of(PlyType type) {
 
 struct PlyProperty {
     std::string name;
-    PlyType type = PlyType::float32;  // type of a number, or of the elements of a list
+    // type of the number, or of the elements of the list
+    PlyType type = PlyType::float32;
     bool is_list = false;
-    PlyType count_type = PlyType::uint8;  // type of the length of a list; an integer type
+    // type of the length of a list; an integer type
+    PlyType count_type = PlyType::uint8;
 };
 
 struct PlyElement {
@@ -53,24 +56,26 @@ struct PlyElement {
     std::vector<PlyProperty> properties;
 
     bool has_lists() const;
-    // Returns the size of a row in a binary file if its lists are empty.
+    // Returns the bytes of a binary row in which all lists are empty.
     size_t min_row_bytes() const;
 };
 
 struct PlyHeader {
     PlyEncoding encoding = PlyEncoding::ascii;
     std::vector<PlyElement> elements;
-    std::vector<std::string> comments;  // without the keyword, and without outer spaces
+    std::vector<std::string> comments;  // without the keyword and surrounding spaces
     size_t size = 0;                    // bytes, including the line end_header
 };
 
-// Throws std::system_error, or PlyError if the path is not a regular file.
+// Opens a file. Throws std::system_error if it cannot be opened, and PlyError if it is
+// not a regular file.
 PosixFile open_ply_file(const char* path);
 
-// Reads and checks the header, but not against the size of the file. Throws PlyError.
+// Reads and checks the header. Does not compare it with the size of the file. Throws
+// PlyError.
 PlyHeader read_ply_header(const PosixFile& file);
 
-// Returns `text` in quotes, shortened and printable, for a message.
+// Returns `text` in quotes, shortened and printable, for an error text.
 std::string quoted(const std::string& text);
 
 }  // namespace v3dg

@@ -1,4 +1,4 @@
-// Opens .ply files and chooses how their rows are read. ply_fields.h defines the
+// Opens .ply files, and chooses how their rows are read. ply_fields.h defines the
 // meaning of a row, ply_rows.h reads binary rows, ply_text.h reads lines of text.
 
 #include "io/ply.h"
@@ -16,13 +16,13 @@ namespace v3dg {
 
 namespace {
 
-// Throws PlyError unless the rest of the file has room for all rows of the element.
+// Throws PlyError if the file is too short for all rows of the element.
 void check_size(const PlyFile& ply, const PlyElement& element, size_t offset) {
     const bool is_text = ply.encoding == PlyEncoding::ascii;
-    // A number and its separator have at least two characters; the last number may end
-    // with the file.
+    // A number and its separator have at least two characters. After the last number,
+    // the separator may be missing.
     const size_t row_bytes = is_text ? 2 * element.properties.size() : element.min_row_bytes();
-    // The offset is beyond the end if the file has grown since it was opened.
+    // `offset` can exceed file_bytes if the file has grown since it was opened.
     const size_t left = ply.file_bytes - std::min(offset, ply.file_bytes);
     if (row_bytes != 0 && element.count > (left + (is_text ? 1 : 0)) / row_bytes)
         throw PlyError("expected " + std::to_string(element.count) + " rows of element " +
@@ -32,7 +32,7 @@ void check_size(const PlyFile& ply, const PlyElement& element, size_t offset) {
                        " bytes; the file is truncated");
 }
 
-// Returns the offset after the element that begins at `offset`.
+// Returns the offset of the end of the element that begins at `offset`.
 size_t skip_element(const PlyFile& ply, const PlyElement& element, size_t offset) {
     check_size(ply, element, offset);
     if (element.properties.empty()) return offset;

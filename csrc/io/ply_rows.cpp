@@ -1,5 +1,5 @@
-// Binary rows: RowDecoder converts rows of fixed size. A ByteReader parses rows with
-// lists and packs them to rows of fixed size.
+// Reads binary rows. RowDecoder converts rows of fixed size. ByteReader reads rows with
+// lists, which are packed to rows of fixed size.
 
 #include "io/ply_rows.h"
 
@@ -22,7 +22,7 @@ namespace v3dg {
 
 namespace {
 
-// The bytes that one thread reads and converts at a time; they fit into the cache of a
+// The bytes that a thread reads and converts at once. They fit into the cache of a
 // core.
 constexpr size_t kBlockBytes = size_t(1) << 18;
 
@@ -35,7 +35,7 @@ T load_as(const char* bytes, bool is_swapped) {
     return value;
 }
 
-// The number that IEEE 754's 16 bits stand for.
+// Converts an IEEE 754 half.
 double from_half(uint16_t bits) {
     const int exponent = bits >> 10 & 31;
     const int fraction = bits & 1023;
@@ -70,8 +70,8 @@ bool is_swapped(PlyEncoding encoding) {
     return (encoding == PlyEncoding::binary_big_endian) == (first == 1);
 }
 
-// Converts rows of binary numbers to gaussians. Lists have been removed from the rows,
-// so all rows have the same size.
+// Converts rows of binary numbers to gaussians. The rows have no lists, and thus equal
+// size.
 class RowDecoder {
   public:
     RowDecoder(const PlyFile& ply, const PlyGaussians<float>& out)
@@ -84,7 +84,7 @@ class RowDecoder {
     }
     size_t row_bytes() const { return row_bytes_; }
 
-    // Converts `count` rows into the gaussians from `first` on.
+    // Converts `count` rows to the gaussians from `first` on.
     void decode(const char* rows, size_t count, size_t first) const {
         const PlyField* fields = layout_.fields.data();
         for (size_t r = 0; r < count; ++r) {
@@ -130,7 +130,8 @@ class ByteReader {
                            std::to_string(row));
         offset_ += size;
     }
-    // Reads at most kBlockBytes; valid until the next call.
+    // Returns the next `size` bytes, at most kBlockBytes. They are valid until the next
+    // call.
     const char* take(size_t size, const PlyElement& element, uint64_t row) {
         const size_t begin = offset_;
         skip(size, element, row);
@@ -152,8 +153,7 @@ class ByteReader {
     size_t buffer_size_ = 0;
 };
 
-// Parses one row. Copies the numbers that are not in lists to `packed`, unless that is
-// null.
+// Parses one row. Unless `packed` is null, copies the numbers outside of lists there.
 void walk_row(ByteReader& reader, const PlyElement& element, uint64_t row, bool is_swapped,
               char* packed) {
     for (const PlyProperty& property : element.properties) {
@@ -185,8 +185,8 @@ PlyPlace read_fixed_rows(const PlyFile& ply, PlyPlace begin, const PlyGaussians<
     const size_t num_rows = out.opacities.size;
     const size_t num_blocks = (num_rows + block_rows - 1) / block_rows;
     const int num_threads = static_cast<int>(std::min<size_t>(most_threads(), num_blocks));
-    // The array is not value-initialised, so that a thread without a block touches no
-    // memory.
+    // new char[] does not initialise the memory, so that a thread without a block
+    // touches none.
     const std::unique_ptr<char[]> buffers(new char[num_threads * block_rows * row_bytes]);
     FirstError error;
 #pragma omp parallel for schedule(dynamic, 1) num_threads(num_threads)

@@ -1,8 +1,8 @@
 #pragma once
 
-// The binary rows of a .ply file. Rows of fixed size are read and converted by all
-// threads, each in separate blocks. Rows with lists are separated by one thread and
-// converted by all.
+// Reads the binary rows of a .ply file. Rows of fixed size are read and converted by
+// all threads, each in separate blocks. Rows with lists are separated by one thread,
+// and converted by all threads.
 
 #include <cstddef>
 
@@ -10,13 +10,13 @@
 
 namespace v3dg {
 
-// Read the gaussians from `begin` on, as many as `out` has room for, and return the
-// place of the next one. Throw PlyError and std::system_error.
+// Read gaussians from `begin` on, as many as `out` has room for. Return the place of
+// the next gaussian. Throw PlyError and std::system_error.
 PlyPlace read_fixed_rows(const PlyFile& ply, PlyPlace begin, const PlyGaussians<float>& out);
 PlyPlace read_rows_with_lists(const PlyFile& ply, PlyPlace begin, const PlyGaussians<float>& out);
 
-// Returns the offset behind an element with lists that begins at `offset`. Throws
-// likewise.
+// Returns the offset of the end of an element with lists that begins at `offset`.
+// Throws PlyError and std::system_error.
 size_t skip_rows_with_lists(const PlyFile& ply, const PlyElement& element, size_t offset);
 
 }  // namespace v3dg

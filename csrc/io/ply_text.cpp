@@ -1,4 +1,5 @@
-// Text: LineReader separates lines, NumberReader reads the numbers of a line.
+// Reads .ply text. LineReader separates lines, NumberReader reads the numbers of a
+// line.
 
 #include "io/ply_text.h"
 
@@ -27,11 +28,11 @@ struct Line {
 
 bool is_space(char c) { return c == ' ' || c == '\t' || c == '\r' || c == '\v' || c == '\f'; }
 
-// Reads the lines of a text, without blank ones.
+// Reads the lines of a text file, except blank lines.
 class LineReader {
   public:
-    // The buffer has one byte more than the rest of the file, so that reading detects
-    // the end of the file.
+    // The buffer has room for one byte more than the rest of the file, so that reading
+    // detects the end of the file.
     LineReader(const PosixFile& file, size_t offset, size_t file_bytes)
         : file_(file),
           offset_(offset),
@@ -39,8 +40,8 @@ class LineReader {
 
     size_t offset() const { return offset_ - (end_ - begin_); }
 
-    // Returns some of the next lines, at least one and at most `max_lines`; none at the
-    // end of the file. Valid until the next call.
+    // Returns some of the next lines: at least one and at most `max_lines`, or none at
+    // the end of the file. They are valid until the next call.
     const std::vector<Line>& next(uint64_t max_lines) {
         lines_.clear();
         bool at_end = false;
@@ -77,14 +78,14 @@ class LineReader {
     }
 
     const PosixFile& file_;
-    size_t offset_;  // offset of the first byte behind the buffer
+    size_t offset_;  // offset of the end of the buffer
     std::vector<char> buffer_;
     size_t begin_ = 0;
     size_t end_ = 0;
     std::vector<Line> lines_;
 };
 
-// Reads the numbers of one line one by one.
+// Reads the numbers of one line, one after another.
 class NumberReader {
   public:
     struct EndOfLine {};
@@ -131,8 +132,8 @@ class NumberReader {
     size_t num_read_ = 0;
 };
 
-// The shortest text of a float denotes another number when it is read as a double, so
-// the number is rounded to float.
+// Rounds a number to its type. A float is written as the shortest text that identifies
+// it among floats; read as a double, this text is a slightly different number.
 double rounded_to(PlyType type, double value) {
     return type == PlyType::float32 ? static_cast<double>(static_cast<float>(value)) : value;
 }

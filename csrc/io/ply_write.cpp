@@ -1,6 +1,6 @@
-// Writes .ply files. All threads convert blocks of rows. Binary blocks have known
-// offsets, so each thread writes its own blocks; text is converted a few blocks at a
-// time and written in order.
+// Writes .ply files. All threads convert blocks of rows. The offsets of binary blocks
+// are known, so each thread writes its blocks. Text is converted a few blocks at a
+// time, and written in order.
 
 #include <algorithm>
 #include <charconv>
@@ -23,11 +23,11 @@ namespace v3dg {
 namespace {
 
 constexpr size_t kBlockRows = 2048;  // half a megabyte at SH degree 3
-constexpr size_t kTextBlocks = 16;   // in memory at the same time
+constexpr size_t kTextBlocks = 16;   // blocks in memory at once
 
-// Finite replacements for infinities. They are beyond the logarithms and logits of all
-// other float32 values (-103.3 and 16.6 are the extremes), and so large that exp and
-// the sigmoid round to exactly 0 and 1, also in float32.
+// Finite replacements for infinite logarithms and logits. They exceed the logarithms
+// and logits of all other float32 values, which are at least -103.3 and at most 16.6.
+// exp() and the sigmoid of them round to exactly 0 and 1, even in float32.
 constexpr float kLogOfZero = -110;
 constexpr float kLogitOfOne = 20;
 
@@ -80,8 +80,8 @@ void encode_gaussian(const PlyGaussians<const float>& in, size_t num_sh, size_t 
     for (size_t j = 0; j < 4; ++j) *row++ = in.quats[4 * i + j];
 }
 
-// Bytes are stored one by one, so that the result does not depend on the machine's byte
-// order.
+// Stores the bytes one by one, so that the result does not depend on the byte order of
+// the machine.
 void store_bytes(const float* values, size_t count, PlyEncoding encoding, unsigned char* bytes) {
     for (size_t v = 0; v < count; ++v) {
         uint32_t bits;
@@ -96,7 +96,7 @@ void store_bytes(const float* values, size_t count, PlyEncoding encoding, unsign
 }
 
 void append_text(const float* values, size_t count, std::string& text) {
-    // The shortest text that reads back as the same float has at most 15 characters.
+    // The shortest text that is read as the same float has at most 15 characters.
     constexpr size_t kMaxDigits = 32;
     char word[kMaxDigits];
     for (size_t v = 0; v < count; ++v) {

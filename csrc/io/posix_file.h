@@ -1,7 +1,6 @@
 #pragma once
 
-// Files of the system, by descriptor: reads and writes at offsets, with exceptions for
-// errors.
+// Files by descriptor: reads and writes at offsets. Errors are exceptions.
 
 #include <cerrno>
 #include <cstddef>
@@ -16,19 +15,19 @@
 
 namespace v3dg {
 
-// An open file. Reads and writes pass their offset, so several threads can share the
-// file. Failures throw std::system_error with the code of errno.
+// An open file. Each read and write has its own offset, so several threads can share
+// the file. Errors throw std::system_error with the value of errno.
 class PosixFile {
   public:
     static PosixFile open(const char* path) {
-        // With O_NONBLOCK, opening a pipe does not wait for a writer; regular files
+        // With O_NONBLOCK, opening a pipe does not wait for a writer. Regular files
         // ignore it.
         return PosixFile(::open(path, O_RDONLY | O_CLOEXEC | O_NONBLOCK));
     }
     static PosixFile create(const char* path) {
         return PosixFile(::open(path, O_WRONLY | O_CLOEXEC | O_CREAT | O_TRUNC, 0666));
     }
-    // Duplicates the descriptor of an open file, which may be closed afterwards.
+    // Duplicates the descriptor of an open file. The original may be closed afterwards.
     static PosixFile duplicate(int descriptor) {
         return PosixFile(::fcntl(descriptor, F_DUPFD_CLOEXEC, 0));
     }
@@ -46,14 +45,15 @@ class PosixFile {
         return status;
     }
 
-    // Returns how many bytes were read; fewer than `size` only at the end of the file.
+    // Returns the number of bytes that were read: less than `size` only at the end of
+    // the file.
     size_t read_at(size_t offset, char* bytes, size_t size) const {
         iovec piece{bytes, size};
         return read_at(offset, Span<iovec>{&piece, 1});
     }
 
-    // Reads into at most 1024 pieces of memory, one after another, which it modifies.
-    // Returns as read_at() above.
+    // Reads into at most 1024 pieces of memory, one after another. Modifies `pieces`.
+    // Returns the number of bytes that were read, like read_at() above.
     size_t read_at(size_t offset, Span<iovec> pieces) const {
         size_t done = 0;
         while (!pieces.empty()) {
@@ -73,8 +73,8 @@ class PosixFile {
         return done;
     }
 
-    // Asks the system to begin reading a part of the file. This is a hint, on systems
-    // that support it.
+    // Asks the system to start reading a part of the file. This is only a hint, and has
+    // no effect on some systems.
     void expect(size_t offset, size_t size) const {
 #ifdef POSIX_FADV_WILLNEED
         static_cast<void>(::posix_fadvise(descriptor_, static_cast<off_t>(offset),
@@ -93,7 +93,7 @@ class PosixFile {
         }
     }
 
-    // Some file systems report a failed write only here.
+    // Closes the file. Some file systems report a failed write only now.
     void close() {
         const int descriptor = descriptor_;
         descriptor_ = -1;

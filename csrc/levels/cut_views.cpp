@@ -1,6 +1,6 @@
-// Views of random cuts of a bundle. A view follows from its number: a size, a camera,
-// and a window in which cuts are compared. Each of its cuts has a share of the
-// gaussians that goes with its size.
+// Views of random cuts of a bundle. The number of a view determines a size, a camera,
+// and a window in which cuts are compared. The shares of gaussians in its cuts depend
+// on the size.
 
 #include "levels/cut_views.h"
 
@@ -18,18 +18,18 @@ namespace v3dg {
 namespace {
 
 constexpr double kNarrowestPx = 8, kMostPx = 1 << 15;  // limits of a picture's side, px
-// px² a gaussian at which a cut is selected at the default tolerance: the native size.
+// The px² per gaussian of a cut that is selected at the default tolerance: native size.
 constexpr double kNativePx2 = 2;
 // The range of a picture's side, relative to the native size of its cut.
 constexpr double kLeastSize = 0.18, kOctavesOfSize = 5.75;
-constexpr double kDistance = 2.5;  // distance from the centre, in radii
-constexpr double kNear = 0.01;     // radii
-constexpr int kMostTries = 16;     // attempts to find a gaussian that a picture shows
+constexpr double kDistance = 2.5;  // distance of the camera from the centre, in radii
+constexpr double kNear = 0.01;     // near depth, in radii
+constexpr int kMostTries = 16;     // attempts to find a gaussian that is in the picture
 constexpr int kMostTriesOfShare = 64;
-// More random numbers than a view, or one of its shares, takes.
+// More random numbers than one view, or one of its shares, uses.
 constexpr uint64_t kRandomNumbersOfView = 1024;
 constexpr double kMostOfAsset = 0.7;  // largest share of the asset's gaussians in a cut
-// The share of the gaussians within the radius; the rest may float far away.
+// The share of gaussians in CutPictures::ball; others may be far away.
 constexpr double kShare = 0.99;
 
 // The random numbers of one view.
@@ -50,8 +50,8 @@ class Random {
     uint64_t seed_, stream_, counter_;
 };
 
-// Returns a camera that looks at the centre from anywhere around it; its picture is one
-// px wide.
+// Returns a camera that looks at the centre of the ball from a random direction. Its
+// picture is one pixel large.
 Camera camera_around(const CutPictures& pictures, Random& random) {
     double outwards[3], up[3], right[3];
     random.direction(outwards);
@@ -62,42 +62,38 @@ Camera camera_around(const CutPictures& pictures, Random& random) {
         length = std::sqrt(dot3(right, right));
     }
     for (double& x : right) x /= length;
-    Camera camera = camera_at(pictures.ball, kDistance, outwards, right);
-    // The ball fills the picture.
-    camera.fx = camera.fy = std::sqrt(kDistance * kDistance - 1) / 2;
-    camera.cx = camera.cy = 0.5;
-    camera.width = camera.height = 1;
-    camera.near_depth = kNear * pictures.ball.radius;
-    return camera;
+    const double focal = std::sqrt(kDistance * kDistance - 1) / 2;  // the ball fills the picture
+    return camera_at(pictures.ball, kDistance, outwards, right,
+                     {.fx = focal,
+                      .fy = focal,
+                      .cx = 0.5,
+                      .cy = 0.5,
+                      .width = 1,
+                      .height = 1,
+                      .near_depth = kNear * pictures.ball.radius});
 }
 
-// Returns the camera with its picture scaled.
-Camera resized(Camera camera, double scale) {
-    const double width = std::ceil(scale * camera.width), height = std::ceil(scale * camera.height);
-    camera.cx = scale * camera.cx + (width - scale * camera.width) / 2;
-    camera.cy = scale * camera.cy + (height - scale * camera.height) / 2;
-    camera.fx *= scale;
-    camera.fy *= scale;
-    camera.width = camera.x1 = width;
-    camera.height = camera.y1 = height;
-    camera.x0 = camera.y0 = 0;
-    return camera;
+// Returns the camera with the size of its picture scaled, and extended to whole pixels.
+Camera resized(const Camera& camera, double scale) {
+    const Camera scaled = camera.scaled(scale);
+    const double width = std::ceil(scaled.width);
+    const double height = std::ceil(scaled.height);
+    return scaled.cropped(-(width - scaled.width) / 2, -(height - scaled.height) / 2, width,
+                          height);
 }
 
-// Returns the camera with its picture shifted to a random place among the pixels of a
-// screen, and widened where it is narrow.
-Camera on_screen(Camera camera, Random& random) {
+// Returns the camera with its picture shifted by a random fraction of a pixel, and
+// enlarged if it is narrow.
+Camera on_screen(const Camera& camera, Random& random) {
     const double width = std::max(camera.width, kNarrowestPx),
                  height = std::max(camera.height, kNarrowestPx);
-    camera.cx += (width - camera.width) / 2 + random.uniform() - 0.5;
-    camera.cy += (height - camera.height) / 2 + random.uniform() - 0.5;
-    camera.width = camera.x1 = width;
-    camera.height = camera.y1 = height;
-    return camera;
+    const double left = (width - camera.width) / 2 + random.uniform() - 0.5;
+    const double above = (height - camera.height) / 2 + random.uniform() - 0.5;
+    return camera.cropped(-left, -above, width, height);
 }
 
-// Returns a window of the picture around a random gaussian. A gaussian that is twice as
-// large in the asset is chosen twice as often.
+// Returns a window of the picture around a random gaussian. Gaussians are chosen with a
+// probability in proportion to CutPictures::weight.
 Camera window_of(const Camera& camera, double widest_px, const CutPictures& pictures,
                  Random& random) {
     double at[2] = {camera.width / 2, camera.height / 2};
@@ -113,24 +109,22 @@ Camera window_of(const Camera& camera, double widest_px, const CutPictures& pict
                 p[row] +=
                     camera.rotation[3 * row + k] * static_cast<double>(pictures.means[3 * i + k]);
         }
-        if (!(p[2] > camera.near_depth)) continue;
-        const double x = camera.fx * p[0] / p[2] + camera.cx,
-                     y = camera.fy * p[1] / p[2] + camera.cy;
+        if (!(camera.depth_of(p) > camera.near_depth)) continue;
+        double x, y;
+        camera.to_pixel(camera.linearized(camera.limits(), p), p, x, y);
         if (!(x >= 0 && x < camera.width && y >= 0 && y < camera.height)) continue;
         at[0] = x;
         at[1] = y;
         break;
     }
-    Camera window = camera;
-    window.width = window.x1 = std::min(camera.width, widest_px);
-    window.height = window.y1 = std::min(camera.height, widest_px);
-    window.cx -= std::clamp(std::round(at[0] - window.width / 2), 0.0, camera.width - window.width);
-    window.cy -=
-        std::clamp(std::round(at[1] - window.height / 2), 0.0, camera.height - window.height);
-    return window;
+    const double width = std::min(camera.width, widest_px);
+    const double height = std::min(camera.height, widest_px);
+    const double left = std::clamp(std::round(at[0] - width / 2), 0.0, camera.width - width);
+    const double top = std::clamp(std::round(at[1] - height / 2), 0.0, camera.height - height);
+    return camera.cropped(left, top, width, height);
 }
 
-// The only instance of a bundle, where it was built.
+// The tables of a scene with a single instance of a bundle, without transformation.
 struct OneInstance {
     const int32_t bundle = 0;
     const double position[3] = {}, quaternion[4] = {1, 0, 0, 0}, scale = 1;
@@ -155,7 +149,7 @@ SelectOutput selected(const ClusterTable& table, const Camera& camera, const Sel
     return out;
 }
 
-// The cuts of a picture that meet budgets.
+// Returns the cut of a picture for each budget.
 std::vector<BudgetCut> cuts_within(const ClusterTable& table, const Camera& camera,
                                    const SelectRule& rule, Span<const uint64_t> budgets) {
     const OneInstance instance;
@@ -166,14 +160,14 @@ std::vector<BudgetCut> cuts_within(const ClusterTable& table, const Camera& came
     return cuts;
 }
 
-// Returns a share of the gaussians of a picture, by a uniform number.
+// Converts a uniform random number to the share of the gaussians in a cut.
 double share_of_part(const CutPictures& pictures, double part) {
     const auto all = static_cast<double>(pictures.weight.size());
     return pictures.most * std::pow(pictures.least / pictures.most, part * part) / all;
 }
 
-// Returns the share of another cut of a view. It has the distribution of all shares, as
-// far as the picture's size relative to the native size of the cut stays in its range.
+// Returns the share of gaussians in cut `cut` of a view. Shares are distributed like
+// those of first cuts, but the picture must be within the range of sizes for the cut.
 double share_of_cut(const CutPictures& pictures, const AssetView& view, uint64_t number,
                     size_t cut) {
     if (cut == 0) return view.share;
@@ -186,10 +180,9 @@ double share_of_cut(const CutPictures& pictures, const AssetView& view, uint64_t
     return view.share;
 }
 
-// The way in which a picture is compared: the largest side of the window, and the
-// samples of a side of a pixel of the asset. The larger its gaussians appear, the
-// smoother the picture is; small pictures cost little. `size` is that of the picture,
-// relative to the asset's native size.
+// How pictures are compared: the largest side of the window, and the samples per pixel
+// side of the asset's picture. The larger gaussians appear, the smoother a picture is,
+// and the fewer samples it needs. `size` is relative to the asset's native size.
 struct Comparison {
     double widest_px;
     int samples;
@@ -210,10 +203,10 @@ double median(std::vector<double> values) {
 }
 
 Camera camera_at(const Surroundings& ball, double distance, const double outwards[3],
-                 const double right[3]) {
+                 const double right[3], const Pinhole<double>& projection) {
     double down[3];
     cross3(right, outwards, down);
-    Camera camera{};
+    Camera camera = with_projection(projection);
     for (int k = 0; k < 3; ++k) {
         camera.rotation[k] = right[k];
         camera.rotation[3 + k] = down[k];
@@ -262,7 +255,7 @@ CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const
         pictures.least += static_cast<double>(table.num_gaussians(static_cast<size_t>(c)));
     pictures.least = std::max(pictures.least, 1.0);
     pictures.most = std::max(kMostOfAsset * static_cast<double>(asset.size), pictures.least);
-    // A gaussian that is twice as large is looked at twice as often.
+    // Weight gaussians by size: the mean of their two larger scales, times the opacity.
     double sum = 0;
     for (size_t i = 0; i < asset.size; ++i) {
         double scale[3];
@@ -318,9 +311,9 @@ std::vector<SelectRule> cuts_of_view(const CutPictures& pictures, const AssetVie
     for (size_t cut = 0; cut < count; ++cut) {
         SelectRule rule = whole;
         BudgetCut found = cuts[cut];
-        // A camera inside of groups refines these at any tolerance, and only the
-        // coarsest clusters meet a budget below what remains of them. Then coarser
-        // levels alone are used.
+        // If the camera is inside of a group's ball, the group is refined at any
+        // tolerance. So a budget may be met only by the coarsest cut, with far fewer
+        // gaussians. Then exclude the finest levels instead.
         while (std::isinf(found.tolerance_px2) &&
                2 * found.num_gaussians < static_cast<int64_t>(budgets[cut]) &&
                rule.min_level < coarsest) {

@@ -1,6 +1,6 @@
-// Cuts of windows: a block has a window, and goes through all clusters of the table. It
-// is compiled without contraction, so that a window has the clusters that the CPU
-// selects.
+// The cuts of windows on CUDA. A block processes one window, and all clusters of the
+// table. The file is compiled without floating-point contraction, so that a window has
+// the same clusters as on the CPU.
 
 #include "levels/cut_windows_cuda.h"
 
@@ -51,7 +51,7 @@ __global__ void __launch_bounds__(kCutThreads)
     if (threadIdx.x == 0) num_items[w] = done;
 }
 
-// A thread a cluster; a row of blocks a window.
+// One thread per cluster, one row of blocks per window.
 __global__ void __launch_bounds__(kItemThreads)
     window_items_kernel(ClusterTable table, uint32_t num_windows, const int32_t* item_of_cluster,
                         const uint32_t* num_items, Appearance<float> appearance, ItemList items) {
@@ -89,7 +89,7 @@ __global__ void __launch_bounds__(kItemThreads)
 }  // namespace
 
 DeviceTable::DeviceTable(const ClusterTable& table, cudaStream_t stream) : table_(table) {
-    // Kernels of windows do not read these.
+    // The kernels do not read these.
     table_.top_group = {};
     table_.top_cluster = {};
     table_.pages = {};

@@ -10,10 +10,10 @@
 namespace v3dg {
 namespace cuda {
 
-// The tables of a bundle that a cut reads, on the device.
+// The tables of a bundle that a cut reads, in device memory.
 class DeviceTable {
   public:
-    // The host's arrays may be reused on return.
+    // The caller may reuse host memory on return.
     DeviceTable(const ClusterTable& table, cudaStream_t stream);
     const ClusterTable& table() const { return table_; }
 
@@ -24,11 +24,11 @@ class DeviceTable {
 
 // The clusters that windows show.
 enum class Shown {
-    cuts,    // those of the windows' cuts
-    leaves,  // those of level 0
+    cuts,    // the clusters of the windows' cuts
+    leaves,  // the clusters of level 0
 };
 
-// Windows as kernels read them, in one block of memory.
+// The data of windows that kernels read, in one block of memory.
 struct WindowTables {
     uint32_t count;
     InstanceView view[kMostWindows];
@@ -39,32 +39,33 @@ struct WindowTables {
     PictureGradient<float> slope[kMostWindows];
 };
 
-// Returns the colour and alpha planes of one window. `memory` has room for
-// `most_pixels` pixels of each window, four floats each.
+// Returns the colour and alpha planes of a window. `memory` has room for `most_pixels`
+// pixels per window, four floats each.
 V3DG_HD inline PicturePlanes planes_of_window(float* memory, size_t most_pixels, size_t window) {
     float* color = memory + 4 * most_pixels * window;
     return {color, color + 3 * most_pixels, nullptr};
 }
 
-// Windows on the device, and the items of their clusters. A cluster of C has as many
-// items as it has begun kItemSize gaussians.
+// Windows on the device, and the items of their clusters. A cluster with n gaussians
+// has n / kItemSize items, rounded up. C is the number of clusters.
 class DeviceWindows {
   public:
-    // Uploads the tables and cuts all windows; the host's memory may be reused on
-    // return.
+    // Copies the tables to the device, and computes the cuts of all windows. The caller
+    // may reuse host memory on return.
     void cut(const DeviceTable& table, const WindowTables& windows, Shown shown,
              cudaStream_t stream);
 
     uint32_t count() const { return count_; }
     uint32_t num_tiles() const { return num_tiles_; }
     const WindowTables* tables() const { return tables_.data(); }
-    // [count * C] the first item of a cluster among those of its window; -1: it is not
-    // shown.
+    // [count * C] index of the first item of each cluster within its window; -1 if the
+    // window does not show the cluster
     const int32_t* item_of_cluster() const { return item_of_cluster_.data(); }
-    const uint32_t* num_items() const { return num_items_.data(); }  // [count]
+    // [count] number of items of each window
+    const uint32_t* num_items() const { return num_items_.data(); }
 
-    // Enqueues the items of a frame of all windows, window by window. Item i has the
-    // records from kItemSize * i on.
+    // Enqueues writing the items of all windows, window by window. The records of item
+    // i begin at kItemSize * i.
     void write_items(const DeviceTable& table, const Appearance<float>& appearance,
                      const ItemList& items, cudaStream_t stream) const;
 

@@ -1,6 +1,5 @@
-// Compares pictures of the leaves and of level 1 at several sizes. For each group it
-// chooses the growth of its ball from the sum over sizes of the logarithms of loss
-// ratios.
+// Compares pictures of the leaves and of level 1 at several sizes. The growth of a
+// group's ball minimises a sum, over sizes, of the logarithms of the ratios of losses.
 
 #include "levels/first_selected.h"
 
@@ -16,25 +15,28 @@ namespace v3dg {
 
 namespace {
 
-// Limits of the growth of balls: with them and the default tolerance, a group is
-// selected at 1.5 to 0.19 px² per gaussian.
+// Limits of the growth of balls. At the default tolerance of kDefaultPx2, they
+// correspond to 1.5 and 0.19 px² per gaussian.
 constexpr double kLeast = 1.4, kMost = 4, kDefaultPx2 = 3;
-constexpr double kPx2[FirstSelected::kSizes] = {0.2, 0.5, 1.2, 3};  // median px² per gaussian
-constexpr double kWidestPx = 2048;                                  // limit of a picture's width
-constexpr double kBorderPx = 4;                                     // border around the ball
-constexpr double kDistance = 8;   // distance from the centre, in radii
-constexpr double kShare = 0.999;  // fraction of the gaussians in the ball
-// The loss of a pixel is its error to this power, which approximates perception. By
-// this measure, and by FLIP, a level is as good as the leaves if its loss is at most
-// kAsGood times theirs.
+// median px² per gaussian
+constexpr double kPx2[FirstSelected::kSizes] = {0.2, 0.5, 1.2, 3};
+constexpr double kWidestPx = 2048;  // largest width of a picture
+constexpr double kBorderPx = 4;     // border around the ball
+constexpr double kDistance = 8;     // distance of the camera from the centre, in radii
+constexpr double kShare = 0.999;    // share of the gaussians in the ball
+// The loss of a pixel is its absolute error to the power of kPower, which approximates
+// perception. A level looks as good as its leaves if its loss is at most kAsGood times
+// the loss of the leaves. This agrees with FLIP.
 constexpr float kPower = 0.7f;
 constexpr double kAsGood = 1.15;
-// Groups that are visible in few pixels are treated as average: kLikeAll times the mean
-// loss over groups is added to both losses. Moreover their appearance matters little,
-// so kOutOfSight times the mean is added to the leaves' loss.
+// Corrections for groups that are hardly visible. kLikeAll times the mean loss of all
+// groups is added to both losses, so that such a group is treated like the average.
+// kOutOfSight times the mean is added to the loss of the leaves, because errors matter
+// less there.
 constexpr double kLikeAll = 0.2, kOutOfSight = 0.05;
-constexpr double kNothing = 1e-9;  // losses and footprints in the ball count as at least this
-constexpr int kSteps = 64;         // number of sizes to try
+// lower limit of losses, and of footprints in the ball
+constexpr double kNothing = 1e-9;
+constexpr int kSteps = 64;  // number of sizes to try
 
 double mean_of(const std::vector<double>& values) {
     return std::accumulate(values.begin(), values.end(), 0.0) / static_cast<double>(values.size());
@@ -59,8 +61,8 @@ FirstSelected::FirstSelected(Span<const float> means, Span<const Ball> balls,
     }
 }
 
-// Cameras look at the ball from a distance, evenly distributed around it; each picture
-// is shifted by a different fraction of a pixel.
+// Cameras are evenly distributed around the ball. Each picture is shifted by a
+// different fraction of a pixel.
 Camera FirstSelected::camera(size_t picture) const {
     const size_t side = picture % kSides;
     const double z = 1 - (2 * static_cast<double>(side) + 1) / kSides;
@@ -68,16 +70,19 @@ Camera FirstSelected::camera(size_t picture) const {
     const double flat = std::sqrt(1 - z * z);
     const double outwards[3] = {flat * std::cos(angle), flat * std::sin(angle), z};
     double up[3] = {0, 0, 1}, right[3];
-    cross3(up, outwards, right);  // no view is from straight above
+    cross3(up, outwards, right);  // no camera is straight above
     for (double& x : right) x /= flat;
-    Camera camera = camera_at(around_, kDistance, outwards, right);
-    camera.fx = camera.fy = focal_[picture / kSides];
-    camera.width = std::floor(2 * camera.fx / std::sqrt(kDistance * kDistance - 1)) + 2 * kBorderPx;
-    camera.height = camera.x1 = camera.y1 = camera.width;
-    camera.cx = camera.width / 2 + random_uniform(0, picture, 0) - 0.5;
-    camera.cy = camera.height / 2 + random_uniform(0, picture, 1) - 0.5;
-    camera.near_depth = around_.radius;
-    return camera;
+    const double focal = focal_[picture / kSides];
+    const double size =
+        std::floor(2 * focal / std::sqrt(kDistance * kDistance - 1)) + 2 * kBorderPx;
+    return camera_at(around_, kDistance, outwards, right,
+                     {.fx = focal,
+                      .fy = focal,
+                      .cx = size / 2 + random_uniform(0, picture, 0) - 0.5,
+                      .cy = size / 2 + random_uniform(0, picture, 1) - 0.5,
+                      .width = size,
+                      .height = size,
+                      .near_depth = around_.radius});
 }
 
 void FirstSelected::add(size_t picture, Span<const float> shares, Span<const int64_t> leaf_offset) {
@@ -100,7 +105,7 @@ std::vector<float> FirstSelected::growth() const {
     std::vector<float> growth;
     for (size_t g = 0; g < footprint_.size(); ++g) {
         double log_px2_of[kSizes];
-        double log_ratio[kSizes];  // of the level's loss to the largest acceptable one
+        double log_ratio[kSizes];  // log of (loss of level 1 / largest acceptable loss)
         for (size_t size = 0; size < kSizes; ++size) {
             log_px2_of[size] = std::log(footprint_[g] * focal_[size] * focal_[size]);
             const double of_level = of_level_[size][g] + kLikeAll * mean_of_level[size] + kNothing;
@@ -108,8 +113,8 @@ std::vector<float> FirstSelected::growth() const {
                 of_leaves_[size][g] + (kLikeAll + kOutOfSight) * mean_of_leaves[size] + kNothing;
             log_ratio[size] = std::log(of_level / of_leaves / kAsGood);
         }
-        // Starts at the smallest size, and finds the size with the best sum over all
-        // smaller sizes.
+        // Begin at the smallest size, and choose the size up to which the sum is
+        // smallest.
         double sum = 0, least = INFINITY, first = kMost;
         for (int step = 0; step < kSteps; ++step) {
             const double times = kMost * std::pow(kLeast / kMost, step / (kSteps - 1.0));
@@ -139,8 +144,8 @@ void losses_of_pixels(const PictureColors& colors, size_t width, size_t height,
         for (size_t i = 0; i < 3 * kSamples * width; ++i)
             truth[3 * (y / kSamples * width + i / (3 * kSamples)) + i % 3] +=
                 std::min(colors.truth[3 * kSamples * width * y + i], 1.0f) / (kSamples * kSamples);
-    // An error in a single pixel is hardly visible, so it is distributed over its
-    // neighbours. The border of a picture is empty.
+    // An error in a single pixel is hardly visible, so errors are blurred over adjacent
+    // pixels. The border of a picture is empty, so wrapping around is harmless.
     const auto shared = [](const std::vector<float>& from, size_t i, size_t step) {
         const float before = i < step ? 0.0f : from[i - step];
         return 0.25f * (before + 2 * from[i] + (i + step < from.size() ? from[i + step] : 0.0f));

@@ -1,7 +1,7 @@
 #pragma once
 
-// Finds the size at which each group of level 1 of a smooth asset is no worse than its
-// leaves.
+// Finds, for each group of level 1 of a smooth asset, the size from which on its
+// gaussians look as good as its leaves.
 
 #include <cstdint>
 #include <vector>
@@ -13,44 +13,45 @@
 
 namespace v3dg {
 
-// Compares pictures of the whole asset, because pictures of single groups show edges
-// that other groups hide. The caller draws the pictures, adds their losses, and
-// requests the result.
+// Compares pictures of leaves and of level 1 with a more exact picture. The pictures
+// show the whole asset, because pictures of single groups show edges that other groups
+// hide. The caller draws the pictures, passes the losses to add(), then calls growth().
 class FirstSelected {
   public:
     static constexpr size_t kSides = 8, kSizes = 4;
-    static constexpr int kSamples = 2;  // samples per side of a pixel of the truth
+    static constexpr int kSamples = 2;  // samples per pixel side of the exact picture
 
-    // Takes the leaves' means, (N, 3), and the groups' balls; `group_offset` has the
-    // ranges of the groups' gaussians in level 1.
+    // `means` are those of the leaves, (N, 3); `balls` are those of the groups.
+    // `group_offset` has the ranges of the groups' gaussians in level 1.
     FirstSelected(Span<const float> means, Span<const Ball> balls,
                   Span<const int64_t> group_offset);
 
     static constexpr size_t num_pictures() { return kSides * kSizes; }
     Camera camera(size_t picture) const;
 
-    // Adds the losses that a picture assigns to the leaves: rows of three, of which the
-    // third is unused.
+    // Adds the losses of one picture, distributed over the leaves. `shares` is (N, 3):
+    // the loss of the leaves, the loss of level 1, unused.
     void add(size_t picture, Span<const float> shares, Span<const int64_t> leaf_offset);
 
-    // Returns the factor by which each ball has to grow.
+    // Returns the factor by which each group's ball must grow.
     std::vector<float> growth() const;
 
   private:
     Surroundings around_;
-    std::vector<double> footprint_;  // px² per gaussian of a group at a focal length of 1
-    double focal_[kSizes];           // px
-    std::vector<double> of_leaves_[kSizes], of_level_[kSizes];  // losses of groups
+    // px² per gaussian of each group, at a focal length of 1 px
+    std::vector<double> footprint_;
+    double focal_[kSizes];                                      // focal length of each size, px
+    std::vector<double> of_leaves_[kSizes], of_level_[kSizes];  // losses of each group
 };
 
-// A picture's colours, (height, width, 3), over white.
+// The colours of pictures over white, (height, width, 3).
 struct PictureColors {
     Span<const float> of_leaves, of_level;
-    Span<const float> truth;  // kSamples times as wide and high
+    Span<const float> truth;  // kSamples times as wide and as high
 };
 
-// Computes the error of each pixel, (height, width, 3): of the leaves, of the level,
-// and 0.
+// Computes the loss of each pixel: (height, width, 3), with the loss of the leaves, the
+// loss of level 1, and 0.
 void losses_of_pixels(const PictureColors& colors, size_t width, size_t height, Span<float> losses);
 
 }  // namespace v3dg

@@ -6,9 +6,9 @@
 
 namespace v3dg {
 
-// Fits all groups of one level, each on one thread; the result does not depend on the
-// number of threads. `error` is (groups, 2). Returns early, with rows partly written,
-// once `progress.cancel` is set.
+// Fits all groups of one level, each on one thread. The result does not depend on the
+// number of threads. `error` is (groups, 2). If `progress.cancel` becomes true, it
+// returns early, and some rows are not fitted.
 void fit_level(const FitConfig& config, Span<const FitGroup> groups, const FitTarget& target,
                const GaussianRows<float>& rows, float* error, FitProgress& progress);
 

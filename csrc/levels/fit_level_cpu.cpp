@@ -15,16 +15,16 @@
 
 namespace v3dg {
 
-// The largest size of target pictures that wait at once, in bytes.
+// The largest size of the target pictures in memory, bytes.
 constexpr size_t kTargetBytes = size_t(256) << 20;
 
 void fit_level(const FitConfig& config, Span<const FitGroup> groups, const FitTarget& target,
                const GaussianRows<float>& rows, float* error, FitProgress& progress) {
-    // Pictures that a group keeps.
+    // pictures per group
     const size_t num_pictures = config.num_views > 0 ? config.num_views + kHeldOutViews : 0;
     std::vector<FitImage> images;
-    // Pictures are drawn first, one a (group, view), so that the last levels, with a
-    // group or two, keep all threads busy.
+    // Draw the target pictures first, in parallel over (group, view). So all threads
+    // are busy, even in the last levels with only one or two groups.
     for (size_t first = 0; first < groups.size && !progress.cancel;) {
         size_t last = groups.size;
         if (num_pictures > 0) {

@@ -1,5 +1,5 @@
-// Fits the groups of a level on CUDA, as many at once as their pictures fit into
-// memory, while the host reports progress and passes on a request to cancel.
+// Fits the groups of a level on CUDA, as many at once as memory has room for their
+// target pictures. Meanwhile the host reports progress and checks for cancellation.
 
 #include "levels/fit_level_cuda.h"
 
@@ -17,12 +17,12 @@ namespace cuda {
 
 namespace {
 
-// The largest size of target pictures that wait at once, in bytes; a quarter of the
-// free memory, if that is less.
+// The largest size of the target pictures in memory, bytes. Also limited to a quarter
+// of the free memory.
 constexpr size_t kTargetBytes = size_t(1) << 30;
 constexpr std::chrono::microseconds kBetweenLooks{50};
 
-// Memory that the host and a running kernel both see.
+// Memory that the host and a running kernel can both access.
 class Signals {
   public:
     Signals() {
@@ -36,14 +36,13 @@ class Signals {
     ~Signals() { cudaFreeHost(host_); }
 
     volatile FitSignals& host() { return *host_; }
-    FitSignals* device() const { return host_; }  // the address is the same on the device
+    FitSignals* device() const { return host_; }  // the address is equal on the device
 
   private:
     FitSignals* host_ = nullptr;
 };
 
-// Returns the groups in the order in which they are taken: those that take longest come
-// first.
+// Returns the groups as jobs. Those that take longest come first.
 std::vector<FitJob> jobs_of(const FitConfig& config, Span<const FitGroup> groups) {
     std::vector<FitJob> jobs(groups.size);
     for (size_t g = 0; g < groups.size; ++g)
@@ -62,7 +61,7 @@ size_t target_bytes(const FitConfig& config, const FitJob& job) {
     return num_pictures(config) * job.size * job.size * sizeof(float4);
 }
 
-// Fits jobs whose pictures fit into memory together.
+// Fits jobs whose target pictures fit into memory together.
 class LevelFit {
   public:
     LevelFit(const FitConfig& config, const DeviceFitTarget& target,
@@ -120,7 +119,7 @@ class LevelFit {
             if (progress_.cancel) signals.host().cancel = 1;
             std::this_thread::sleep_for(kBetweenLooks);
         }
-        // Where two blocks finish at once, the one that counted first may report last.
+        // If two blocks finish at once, the lower of their counts may be reported last.
         if (!progress_.cancel) signals.host().groups_done = jobs.size;
         report();
     }

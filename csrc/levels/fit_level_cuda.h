@@ -9,20 +9,20 @@
 namespace v3dg {
 namespace cuda {
 
-// The gaussians that groups should look like, on the device.
+// The gaussians that a fit compares with, in device memory.
 struct DeviceFitTarget {
     GaussianRows<const float> rows;
     float filter_px2;
     bool antialiased;
 };
 
-// As v3dg::fit_level, with rows on the device and `error` on the host. Returns when all
-// is done.
+// Like v3dg::fit_level(), with rows on the device and `error` in host memory. Returns
+// when the fit is finished.
 //
-// Every run gives the same bytes. The number of groups and the device decide how a
-// group is spread over blocks, which changes no order of additions; still, the kernels
-// may round differently, as the CPU does. Groups' pictures are drawn before they are
-// fitted, for as many groups at once as there is memory.
+// Every run gives the same bits. The number of groups and the device determine how many
+// blocks fit a group, but not the order of additions. Still, kernels may be compiled
+// with different rounding. Target pictures are drawn before the fit, for as many groups
+// at once as memory allows.
 void fit_level(const FitConfig& config, Span<const FitGroup> groups, const DeviceFitTarget& target,
                const GaussianRows<float>& rows, float* error, FitProgress& progress, Stream stream);
 

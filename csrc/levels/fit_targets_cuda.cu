@@ -1,4 +1,4 @@
-// Draws targets: pictures of a frame, thousands at once, drawn larger and box-averaged.
+// Draws target pictures: thousands in one frame, larger than needed, then averaged.
 
 #include "levels/fit_targets_cuda.h"
 
@@ -11,16 +11,16 @@ namespace cuda {
 
 namespace {
 
-// Limits of what is drawn in one frame, unless one picture alone exceeds them.
+// The limits of one frame, unless a single picture exceeds them.
 constexpr uint64_t kPixelsAtOnce = uint64_t(1) << 24, kGaussiansAtOnce = uint64_t(1) << 22;
 constexpr unsigned kThreads = 128;
 
-// A picture among those of a frame, with the begins of its parts.
+// A picture in a frame, and where its items, records and tiles begin.
 struct TargetPicture {
     uint32_t job;
     uint32_t first_item, first_record, first_tile;
-    uint64_t picture;      // number among the job's pictures
-    uint64_t first_pixel;  // index in the large picture
+    uint64_t picture;      // index among the pictures of the job
+    uint64_t first_pixel;  // index in the enlarged picture
 };
 
 __global__ void views_kernel(FitConfig config, Span<const FitJob> jobs, uint64_t pictures,
@@ -43,7 +43,7 @@ struct TargetTables {
     Placement* placements;
 };
 
-// Each block prepares a picture, and its threads the items.
+// One block per picture, one thread per item.
 __global__ void pictures_kernel(TargetTables t, unsigned long long num_items,
                                 unsigned long long num_records, ItemList items) {
     if (blockIdx.x == 0 && threadIdx.x == 0) {
@@ -83,7 +83,7 @@ __global__ void pictures_kernel(TargetTables t, unsigned long long num_items,
     }
 }
 
-// Each block averages a picture, and its threads the pixels of the small one.
+// Averages the enlarged pictures. One block per picture, one thread per target pixel.
 __global__ void average_kernel(TargetTables t, float4* targets) {
     const TargetPicture& p = t.pictures[blockIdx.x];
     const FitJob& job = t.jobs[p.job];

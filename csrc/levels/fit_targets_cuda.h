@@ -1,6 +1,6 @@
 #pragma once
 
-// The pictures that groups are fitted to, on CUDA.
+// Target pictures for fitting groups, on CUDA.
 
 #include "draw/frame_cuda.h"
 #include "fit_group/fit_group_math.h"
@@ -9,11 +9,12 @@
 namespace v3dg {
 namespace cuda {
 
-// Writes the views of all pictures of the jobs, which are on the device.
+// Computes the views of all pictures of the jobs. `jobs` are in device memory.
 void make_views(const FitConfig& config, Span<const FitJob> jobs, FitView* views,
                 cudaStream_t stream);
 
-// Draws the pictures, as v3dg::fit_target does, into `targets` (FitGroupsInput).
+// Draws the target pictures of all jobs like v3dg::fit_target(). `targets` has the
+// layout of FitGroupsInput::targets.
 void draw_targets(const FitConfig& config, Span<const FitJob> jobs, const FitJob* jobs_on_device,
                   const DeviceFitTarget& target, const FitView* views, float4* targets,
                   Frame& frame, cudaStream_t stream);

@@ -1,51 +1,59 @@
 #pragma once
 
-// Refines all levels of a bundle together, by pictures of cuts.
+// Refines all levels of a bundle together, by comparing pictures of cuts with the
+// asset.
 
 #include "fit_group/fit_group.h"
 #include "levels/cut_views.h"
 
 namespace v3dg {
 
-// The gaussians of the clusters of a bundle, of all levels.
+// The gaussians of all levels of a bundle.
 struct CutRows {
     GaussianRows<float> rows;
-    Span<const float> radius;  // the largest scale of each gaussian
+    Span<const float> radius;  // largest scale of each gaussian
 };
 
-// The comparison of pictures in a refinement.
+// How a refinement compares pictures.
 struct CutComparison {
-    int windows_per_step;  // windows, 1 to kMostWindows, whose gradients make one step
-    int cuts_per_view;     // cuts that each picture of the target is compared with
+    // windows whose gradients are added up for one step; 1 to kMostWindows
+    int windows_per_step;
+    int cuts_per_view;  // cuts that are compared with each picture of the target
 };
 constexpr int kMostWindows = 32;
 
-// Moves gaussians until pictures of cuts match those of the target: there are
-// config.steps of Adam, each for the gaussians that the step's windows show
-// (cut_views.h). The first `target_count` of them, level 0, are the target's and do not
-// move. A fit (fit_level.h) sees each group alone, from all sides at one size; here a
-// group is seen in cuts: next to groups of its own level and of others, which hide
-// parts of it, at the sizes of the pictures.
+// Moves gaussians so that pictures of cuts match pictures of the target. There are
+// config.steps steps of Adam. Each moves the gaussians that the step's windows show
+// (cut_views.h). The first `target_count` gaussians are level 0; they belong to the
+// target and do not move.
 //
-// Cuts are drawn with the filter of `config`, including level 0, which is drawn without
-// one elsewhere: in small pictures that is a third of the error of cuts. The target's
-// pictures are drawn larger and box-averaged. The loss is that of the fit without
-// D-SSIM; positions move in steps of a part of the radius. The sizes of steps in
-// `config` are for gaussians that one window shows. The sizes, samples and numbers of
-// views in `config` are ignored. The result does not depend on the number of threads.
-// Returns early once `progress.cancel` is set; `progress.groups_done` counts windows.
+// A fit (fit_level.h) sees each group alone, from all sides, at one size. A refinement
+// sees groups in cuts: at several sizes, beside groups of several levels, and partly
+// hidden.
+//
+// All levels are drawn with the filter of `config`. This includes level 0, although it
+// is drawn without a filter elsewhere; in small pictures, aliasing is a third of the
+// error of cuts. Pictures of the target are drawn larger and averaged. The loss is that
+// of a fit without D-SSIM. Steps of positions are relative to the radius. The step
+// sizes in `config` are for a gaussian that one window shows. The image sizes,
+// supersampling and numbers of views in `config` are ignored.
+//
+// The result does not depend on the number of threads. If `progress.cancel` becomes
+// true, it returns early. `progress.groups_done` counts windows.
 void refine_cuts(const FitConfig& config, const CutComparison& comparison, const FitTarget& target,
                  uint64_t target_count, const CutRows& levels, const CutPictures& pictures,
                  FitProgress& progress);
 
-// The visibility of each gaussian.
+// How much windows show of each gaussian.
 struct SeenOfGaussians {
-    Span<double> weight;      // sums of blend weights, as fractions of each picture's pixels
-    Span<int32_t> num_looks;  // windows whose cuts contain it, whether it is visible or not
+    // sum of blend weights, as a fraction of each picture's pixels
+    Span<double> weight;
+    // number of windows whose cuts contain the gaussian, visible or not
+    Span<int32_t> num_looks;
 };
 
-// Draws the window of the first cut of each of config.steps views as refine_cuts does,
-// and adds how much they show of each gaussian.
+// Draws the window of the first cut of each of config.steps views like refine_cuts(),
+// and adds to `seen` how much the windows show of each gaussian.
 void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows,
                 const CutPictures& pictures, const SeenOfGaussians& seen, FitProgress& progress);
 

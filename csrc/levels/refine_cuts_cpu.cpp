@@ -1,4 +1,5 @@
-// One window is drawn at a time, on all threads; views are made some ahead.
+// Refinement on the CPU. Windows are drawn one after another, each on all threads.
+// Views are planned some windows ahead, in parallel.
 
 #include "levels/refine_cuts.h"
 
@@ -44,7 +45,7 @@ class Canvas {
     std::vector<float> values_;
 };
 
-// Puts the slopes of the loss in place of the picture.
+// Replaces the picture by the gradients of the loss.
 void put_slopes(const LossWeights& loss, const Canvas& target, Canvas& picture) {
     const auto width = static_cast<size_t>(picture.width()),
                height = static_cast<size_t>(picture.height());
@@ -70,7 +71,7 @@ void put_slopes(const LossWeights& loss, const Canvas& target, Canvas& picture) 
     });
 }
 
-// A window as it is drawn.
+// A planned window, with its camera and its clusters.
 struct CutWindow {
     PlannedWindow plan;
     Camera camera;
@@ -78,7 +79,7 @@ struct CutWindow {
     std::vector<int32_t> clusters;
 };
 
-// Plans windows, some ahead on all threads.
+// Plans windows, several at once on all threads.
 class Windows {
   public:
     Windows(const CutPictures& pictures, size_t count, size_t cuts_per_view)
@@ -87,7 +88,7 @@ class Windows {
           cuts_per_view_(cuts_per_view),
           views_(kViewSlots),
           windows_(kWindowsAtOnce) {}
-    // Returns a window. Numbers must be asked for in ascending order from 0.
+    // Returns a window. Numbers must be requested in ascending order from 0.
     const CutWindow& operator[](size_t number) {
         if (number % kWindowsAtOnce == 0)
             parallel_for(std::min(kWindowsAtOnce, count_ - number), 1,
@@ -124,11 +125,11 @@ class Targets {
     Targets(const FitTarget& target, uint64_t count)
         : target_(target), count_(count), pictures_(kViewSlots) {}
 
-    // Returns the picture of a window, which is drawn if the window is new.
+    // Returns the picture for a window. It is drawn if the window's view is new.
     const Canvas& picture_of(const CutWindow& window) {
         Canvas& picture = pictures_[window.plan.slot];
         if (!window.plan.is_new) return picture;
-        const Camera larger = enlarged(window.camera, window.samples);
+        const Camera larger = window.camera.scaled(window.samples);
         const Draw<float> whole{.model = target_.model,
                                 .first = 0,
                                 .count = count_,
@@ -178,8 +179,8 @@ class GradientSum {
         parallel_for(index.size(), kGaussiansAtOnce,
                      [&](size_t g) { add_gradient(gradient, g, sum_, index[g]); });
     }
-    // Calls move(i, sum, num_windows) for each gaussian i that windows showed, and
-    // begins the next sum.
+    // Calls move(i, sum, num_windows) for each gaussian i that a window showed, and
+    // resets the sums.
     template <class Move>
     void move_shown(const Move& move) {
         parallel_for(shown_.size(), kGaussiansAtOnce, [&](size_t k) {
@@ -200,20 +201,20 @@ class GradientSum {
     std::vector<uint32_t> shown_;
 };
 
-// The gaussians of one view, their picture, and its backward pass.
+// The gaussians of one window, their picture, and its backward pass.
 class CutFrame {
   public:
     explicit CutFrame(const FitConfig& config)
         : appearance_{config.filter_px2, config.antialiased, false} {}
 
-    // Returns the rows of `count` gaussians, which the caller writes before they are
-    // drawn.
+    // Returns rows for `count` gaussians. The caller must fill them before draw().
     const GaussianRows<float>& start(size_t count, int sh_degree) {
         values_.resize(num_values(sh_degree) * count);
         rows_ = rows_in(values_.data(), count, sh_degree);
         return rows_;
     }
-    // Draws the picture. Before backward(), the caller puts its slopes in its place.
+    // Draws the picture. Before backward(), the caller must replace it by its
+    // gradients.
     Canvas& draw(const Camera& camera) {
         model_.emplace(rows_);
         draw_ = {.model = &model_->planes(),

@@ -1,6 +1,6 @@
-// One step follows another on the caller's stream. All windows of a step are one frame,
-// and go back together. Other threads with streams of their own plan windows, cut them,
-// and draw the pictures of the asset that they are compared with, some steps ahead.
+// Refinement on CUDA. Steps follow each other on the caller's stream. All windows of a
+// step are one frame, with one backward pass. Other threads, with their own streams,
+// plan the windows some steps ahead, compute their cuts, and draw the target pictures.
 
 #include "levels/refine_cuts_cuda.h"
 
@@ -23,15 +23,15 @@ namespace cuda {
 
 namespace {
 
-// Steps that are planned ahead by each thread.
+// The number of steps that each thread plans ahead.
 constexpr unsigned kStepsAhead = 3;
-// A slot's target is overwritten while the steps before it are drawn.
+// A slot's target may be overwritten while the preceding steps are drawn.
 static_assert(kViewSlots >= (kStepsAhead + 1) * kMostWindows, "no step that is drawn reads it");
 constexpr unsigned kMostPlanners = 4;
 
-// Returns the number of threads that plan steps. All windows of a slot have one thread,
-// whose stream the memory of the target belongs to, and no step that is drawn reads a
-// target that is being overwritten.
+// Returns the number of threads that plan steps. It must satisfy two conditions. All
+// windows of a slot belong to one thread, which owns the memory of the slot's target.
+// And no step that is being drawn reads a target that is being overwritten.
 constexpr unsigned num_planners(unsigned windows_per_step) {
     unsigned num = kMostPlanners;
     while (num > 1 && (kViewSlots % (num * windows_per_step) != 0 ||
@@ -40,7 +40,8 @@ constexpr unsigned num_planners(unsigned windows_per_step) {
     return num;
 }
 
-constexpr size_t kMostPixels = kWidestWindowPx * kWidestWindowPx;  // of a window
+// pixels of the largest window
+constexpr size_t kMostPixels = kWidestWindowPx * kWidestWindowPx;
 
 FrameImage image_of(const Camera& camera, const PicturePlanes& planes) {
     const float black[3] = {};
@@ -83,7 +84,7 @@ class StepFrame {
           stream_(stream),
           model_(Span<const GaussianRows<const float>>{&rows, 1}, stream) {}
 
-    // Returns when it is sure that the pictures will be drawn.
+    // Returns when it is certain that the buffers suffice.
     void draw(const DeviceWindows& windows) {
         const std::unique_ptr<Drawing> drawing = frame_.draw(
             batch_of(model_, windows),
@@ -95,9 +96,9 @@ class StepFrame {
         num_slots_ = counters.slots;
         num_items_ = static_cast<unsigned>(counters.items);
     }
-    // Returns the gradients of the gaussians of items, kItemSize an item, whose slopes
-    // by pixels the windows have. Those of items that begin before row `first_wanted`
-    // are undefined.
+    // Returns the gradients of the items' gaussians, with kItemSize rows per item. The
+    // windows must have the gradients of their pixels. The gradients of items that
+    // begin before row `first_wanted` are undefined.
     GaussianRows<float> backward(const DeviceWindows& windows, uint64_t first_wanted) {
         const size_t count = size_t(kItemSize) * num_items_;
         const GaussianRows<float> gradient =
@@ -157,7 +158,7 @@ class StepFrame {
     DeviceBuffer<uint8_t> is_touched_;
 };
 
-// The pictures of all windows of a step, and their slopes.
+// The pictures of all windows of a step, and the gradients of their pixels.
 class Canvases {
   public:
     Canvases(unsigned num_windows, cudaStream_t stream)
@@ -180,7 +181,7 @@ class Canvases {
 // The input of one step.
 struct PlannedStep {
     DeviceWindows windows;
-    unsigned blocks_per_window = 0;  // of kThreads pixels
+    unsigned blocks_per_window = 0;  // blocks of kThreads pixels
     Event made, used;
 };
 
@@ -193,11 +194,11 @@ class TargetPainter {
           stream_(stream),
           model_(Span<const GaussianRows<const float>>{&target.rows, 1}, stream) {}
 
-    // Draws the asset in a window; `windows` is scratch. The pixels are in `picture`,
-    // whose memory belongs to the stream.
+    // Draws the asset in a window. `windows` is temporary memory. The result is in
+    // `picture`, and belongs to the stream.
     ReadPlanes draw(const ClusterTable& table, const AssetView& view, WindowTables& windows,
                     DeviceBuffer<float>& picture) {
-        const Camera camera = enlarged(view.window, view.samples);
+        const Camera camera = view.window.scaled(view.samples);
         const PicturePlanes larger = planes_in(larger_, num_pixels(camera));
         windows.count = 0;
         add_window(table, camera, SelectRule{}, larger, windows);
@@ -233,12 +234,12 @@ class TargetPainter {
     Frame frame_;
 };
 
-// Plans the windows of steps ahead of them: a step waits for the host once, and
-// choosing tolerances takes the host as long as a step takes the device.
+// Plans the windows of steps ahead of time, in other threads. A step waits for the
+// device only once, and choosing the tolerances of a step takes as long as the step on
+// the device.
 class StepsAhead {
   public:
-    // Without a target, each window has a view of its own and nothing to compare it
-    // with.
+    // If `target` is null, each window has its own view, and no target picture.
     StepsAhead(const CutPictures& pictures, const DeviceTable& table, const Canvases& canvases,
                uint64_t num_windows, unsigned windows_per_step, unsigned cuts_per_view,
                const DeviceFitTarget* target, cudaStream_t stream)
@@ -257,7 +258,7 @@ class StepsAhead {
           steps_(kStepsAhead * num_threads_),
           ahead_(num_steps(), num_threads_, kStepsAhead * num_threads_,
                  [this](uint64_t number) { make(number); }) {}
-    // Steps read members until they are done.
+    // Wait: steps on the device read the members.
     ~StepsAhead() { cudaStreamSynchronize(stream_); }
 
     uint64_t num_steps() const {
@@ -340,10 +341,10 @@ class StepsAhead {
     std::vector<Worker> workers_;
     std::vector<View> views_;
     std::vector<PlannedStep> steps_;
-    Ahead ahead_;  // the last member, because its threads use all others
+    Ahead ahead_;  // The last member, because its threads use all others.
 };
 
-// Writes the slopes of the loss by the pixels of a step's windows.
+// Computes the gradients of the loss with respect to the pixels of a step's windows.
 class Comparison {
   public:
     Comparison(const LossWeights& loss, unsigned num_windows, const Canvases& canvases,
@@ -373,7 +374,8 @@ class Comparison {
     DeviceBuffer<float> weights_;
 };
 
-// Returns the grid of kernels that handle the gaussians of clusters from `first` on.
+// Returns the grid of kernels that process the gaussians of the clusters from `first`
+// on.
 dim3 grid_of_clusters(const ClusterTable& table, size_t first) {
     int64_t most = 1;
     for (size_t c = first; c < table.num_clusters(); ++c)
@@ -404,7 +406,8 @@ void refine_cuts(const FitConfig& config, const CutComparison& comparison,
         offset.begin());
     const dim3 grid = grid_of_clusters(pictures.table, first_moving);
     check(cudaStreamSynchronize(stream),
-          "refine_cuts");  // All streams see the memory that pictures are made of from here on.
+          // From here on, all streams see the memory that pictures are drawn from.
+          "refine_cuts");
     StepsAhead ahead(pictures, table, canvases, uint64_t(config.steps) * windows_per_step,
                      windows_per_step, static_cast<unsigned>(comparison.cuts_per_view), &target,
                      stream);
@@ -432,8 +435,8 @@ void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows,
     const DeviceBuffer<float> grey(3 * rows.size, stream);
     if (rows.size > 0)
         check(cudaMemsetAsync(grey.data(), 0, grey.bytes(), stream), "cudaMemsetAsync");
-    // The gradient with respect to a colour says how much is seen of a gaussian,
-    // whatever its own colour is.
+    // The gradient with respect to a grey colour measures how much of a gaussian is
+    // visible.
     GaussianRows<const float> rows_in_grey = rows;
     rows_in_grey.sh = grey.data();
     rows_in_grey.sh_degree = 0;

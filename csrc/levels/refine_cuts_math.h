@@ -1,6 +1,6 @@
 #pragma once
 
-// Formulas of refine_cuts, for both of its halves.
+// Formulas of refine_cuts() and weigh_cuts(), for the CPU and CUDA.
 
 #include <cfloat>
 #include <vector>
@@ -12,21 +12,13 @@
 
 namespace v3dg {
 
-// Returns the camera with its resolution multiplied.
-V3DG_HD inline Camera enlarged(Camera camera, int factor) {
-    for (double* px : {&camera.fx, &camera.fy, &camera.cx, &camera.cy, &camera.width,
-                       &camera.height, &camera.x0, &camera.y0, &camera.x1, &camera.y1})
-        *px *= factor;
-    return camera;
-}
-
 // Returns the number of pixels of a camera's picture.
 inline size_t num_pixels(const Camera& camera) {
     return static_cast<size_t>(camera.width) * static_cast<size_t>(camera.height);
 }
 
-// Returns value k of a pixel of the target, averaged over `samples` x `samples` pixels;
-// `width` is that of the small picture.
+// Returns value k of a pixel, averaged over `samples` x `samples` pixels of a larger
+// picture. `width` is the width of the small picture.
 V3DG_HD inline float box_average(const float* plane, size_t width, size_t num_values, size_t k,
                                  size_t x, size_t y, int samples) {
     const auto side = static_cast<size_t>(samples);
@@ -37,12 +29,12 @@ V3DG_HD inline float box_average(const float* plane, size_t width, size_t num_va
     return sum / static_cast<float>(samples * samples);
 }
 
-// The values of one pixel: premultiplied colour and alpha.
+// The values of one pixel: premultiplied colour, and alpha.
 struct PixelValues {
     float value[4];
 };
 
-// The memory of a picture: colour with three channels, and alpha.
+// The planes of a picture: colour with three channels, and alpha.
 struct ReadPlanes {
     const float *color, *alpha;
 
@@ -51,8 +43,8 @@ struct ReadPlanes {
     }
 };
 
-// Puts the slopes of the loss in place of the differences of a pixel, as if the picture
-// had the weight 1. Returns the pixel's loss.
+// Replaces the differences between two pictures at a pixel by the gradients of the
+// loss, as if the picture's weight were 1. Returns the pixel's loss.
 V3DG_HD inline float put_slopes(const LossWeights& loss, PixelValues& pixel) {
     float sum = 0;
     for (int k = 0; k < 4; ++k) {
@@ -63,23 +55,24 @@ V3DG_HD inline float put_slopes(const LossWeights& loss, PixelValues& pixel) {
     return sum;
 }
 
-// Returns the weight of a picture, which is by its relative loss, not by its absolute
-// one. Otherwise small pictures, in which levels have larger errors, would improve at
-// the cost of large ones. A picture whose loss is below kLeastLoss is right, and its
-// absolute loss counts.
+// Returns the weight of a picture: one over its loss. So the sum over pictures measures
+// relative losses. Otherwise large pictures would get worse, because coarse levels have
+// larger absolute errors in small pictures. If the loss per pixel is below kLeastLoss,
+// the picture is accurate enough, and the weight hardly grows further.
 constexpr double kLeastLoss = 1e-4;
 V3DG_HD inline float weight_of_picture(double loss_sum, double num_pixels) {
     return static_cast<float>(1 / (loss_sum + kLeastLoss * num_pixels));
 }
 
-// Puts the slopes of the sum of a picture's first channel in place of a pixel.
+// Sets the gradient of a pixel for the loss "sum of the first channel".
 V3DG_HD inline void put_sum_slopes(float color[3], float& alpha) {
     for (int k = 0; k < 3; ++k) color[k] = k == 0 ? 1.0f : 0.0f;
     alpha = 0;
 }
 
-// Returns the step of a gaussian that `num_windows` of the step's windows show: the
-// noise of a sum of n gradients, relative to the sum, falls with the root of n.
+// Returns the step sizes for a gaussian that `num_windows` of the step's windows show.
+// The relative noise of a sum of n gradients falls with sqrt(n), so the step grows with
+// it.
 V3DG_HD inline FitStep step_of_windows(FitStep step, int num_windows) {
     const float factor = ::sqrtf(static_cast<float>(num_windows));
     for (float* size :
@@ -88,12 +81,13 @@ V3DG_HD inline FitStep step_of_windows(FitStep step, int num_windows) {
     return step;
 }
 
-// The moments of Adam: value k of gaussian i of n is at k * n + i.
+// The moments of Adam. Value k of gaussian i, out of n gaussians, is at index k * n +
+// i.
 struct Moments {
     float *m, *v;
 };
 
-// Adds gradients of a gaussian, row `from`, to those in row `to`.
+// Adds the gradient in row `from` of `source` to row `to` of `sum`.
 V3DG_HD inline void add_gradient(const GaussianRows<const float>& source, size_t from,
                                  const GaussianRows<float>& sum, size_t to) {
     for (size_t k = 0; k < 3; ++k) sum.means[3 * to + k] += source.means[3 * from + k];
@@ -104,15 +98,16 @@ V3DG_HD inline void add_gradient(const GaussianRows<const float>& source, size_t
     for (size_t k = 0; k < num_sh; ++k) sum.sh[num_sh * to + k] += source.sh[num_sh * from + k];
 }
 
-// Moves gaussian i by a step; its gradient is row g of `gradient`. The position moves
-// in fractions of `radius`, scales by their logarithm and opacity by its logit, both
-// within the range of a fit.
+// Performs one step of Adam for gaussian i. Its gradient is row g of `gradient`. Steps
+// of positions are relative to `radius`. Scales move in their logarithm and opacities
+// in their logit, within the ranges of a fit.
 V3DG_HD inline void move_gaussian(const GaussianRows<float>& rows, size_t i,
                                   const GaussianRows<const float>& gradient, size_t g, float radius,
                                   const FitStep& step, float beta2, const Moments& moments) {
     size_t moment = i;
     const auto moved = [&](float value, float slope, float size) {
-        if (!(::fabsf(slope) <= FLT_MAX)) slope = 0;  // the moments would never forget it
+        // a NaN or infinity would stay in the moments
+        if (!(::fabsf(slope) <= FLT_MAX)) slope = 0;
         const float next = adam_step(value, slope, moments.m[moment], moments.v[moment], size,
                                      beta2, step.correction1, step.correction2);
         moment += rows.size;
@@ -141,7 +136,7 @@ V3DG_HD inline void move_gaussian(const GaussianRows<float>& rows, size_t i,
     }
 }
 
-// Copies gaussian `from` to row `to`.
+// Copies row `from` of `source` to row `to`.
 V3DG_HD inline void copy_gaussian(const GaussianRows<const float>& source, size_t from,
                                   const GaussianRows<float>& rows, size_t to) {
     copy_shape(source, from, rows, to);
@@ -149,27 +144,27 @@ V3DG_HD inline void copy_gaussian(const GaussianRows<const float>& source, size_
     for (size_t k = 0; k < num_sh; ++k) rows.sh[num_sh * to + k] = source.sh[num_sh * from + k];
 }
 
-// Copies a gaussian in grey, of SH degree 0. The gradient with respect to that colour
-// says how much is seen of it, whatever its own colour is.
+// Copies a gaussian with grey colour of SH degree 0. The gradient with respect to this
+// colour then measures how much of the gaussian is visible.
 V3DG_HD inline void copy_in_grey(const GaussianRows<const float>& source, size_t from,
                                  const GaussianRows<float>& rows, size_t to) {
     copy_shape(source, from, rows, to);
     for (size_t k = 0; k < 3; ++k) rows.sh[3 * to + k] = 0;
 }
 
-// Returns the fraction of a picture that a gaussian fills, from the gradient of the
-// picture's sum by the colour of a gaussian that copy_in_grey made.
+// Returns the fraction of a picture that a gaussian covers. `gradient` is that of the
+// picture's sum with respect to the colour of a gaussian from copy_in_grey().
 V3DG_HD inline double blend_weight(float gradient, size_t num_pixels) {
     return static_cast<double>(gradient) / (kShBase0 * static_cast<double>(num_pixels));
 }
 
-// Returns the number of values of a gaussian.
+// Returns the number of values per gaussian.
 V3DG_HD inline size_t num_values(int sh_degree) {
     return 11 + 3 * static_cast<size_t>(num_sh_bases(sh_degree));
 }
 
-// Returns `count` rows in one block of memory, num_values() for each gaussian. Values
-// that must be aligned to 16 bytes come first.
+// Divides a block of memory into rows of `count` gaussians, with num_values() floats
+// per gaussian. Values that must be aligned to 16 bytes come first.
 V3DG_HD inline GaussianRows<float> rows_in(float* memory, size_t count, int sh_degree) {
     const size_t num_sh = 3 * static_cast<size_t>(num_sh_bases(sh_degree));
     float* rest = memory + (4 + num_sh) * count;
@@ -182,7 +177,7 @@ V3DG_HD inline GaussianRows<float> rows_in(float* memory, size_t count, int sh_d
             .sh_degree = sh_degree};
 }
 
-// Returns the gaussians of clusters.
+// Returns the indices of the gaussians of clusters.
 inline std::vector<uint32_t> gaussians_of(const ClusterTable& table,
                                           const std::vector<int32_t>& clusters) {
     std::vector<uint32_t> gaussians;

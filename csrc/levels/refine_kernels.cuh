@@ -1,9 +1,8 @@
 #pragma once
 
-// The kernels of refine_cuts and weigh_cuts: they handle the pixels of windows and the
-// gaussians of clusters before and after drawing and its backward pass. A row of blocks
-// has a window where pixels are handled; where gaussians are, a block has up to
-// kItemSize of those of a cluster.
+// The kernels of refine_cuts() and weigh_cuts(), for the work before and after drawing
+// and its backward pass. In kernels of pixels, a row of blocks processes one window. In
+// kernels of gaussians, a block processes up to kItemSize gaussians of one cluster.
 
 #include "base/launch.cuh"
 #include "levels/cut_windows_cuda.h"
@@ -16,7 +15,8 @@ namespace {
 
 constexpr unsigned kThreads = 256;
 
-// Averages a picture that is `samples` times as wide, a thread a pixel.
+// Averages a picture that is `samples` times as wide and high. One thread per pixel of
+// the result.
 __global__ void average_kernel(PicturePlanes larger, PicturePlanes picture, unsigned width,
                                unsigned height, int samples) {
     const size_t pixel = size_t(blockIdx.x) * kThreads + threadIdx.x;
@@ -27,7 +27,7 @@ __global__ void average_kernel(PicturePlanes larger, PicturePlanes picture, unsi
     picture.alpha[pixel] = box_average(larger.alpha, width, 1, 0, x, y, samples);
 }
 
-// A pixel of a window and its place there.
+// The pixel of a thread in a window.
 struct WindowPixel {
     const FrameImage& image;
     size_t width, height, pixel;
@@ -40,8 +40,9 @@ struct WindowPixel {
     __device__ bool is_in_window() const { return pixel < width * height; }
 };
 
-// Writes the slopes of pixels as if windows had the weight 1, a thread each, and the
-// loss of each block. `planes` has room for `most_pixels` of each window.
+// Computes the gradients of pixels as if all windows had the weight 1, and the loss of
+// each block. One thread per pixel. `planes` has room for `most_pixels` pixels per
+// window.
 __global__ void __launch_bounds__(kThreads)
     compare_kernel(const WindowTables* windows, LossWeights loss, size_t most_pixels, float* planes,
                    double* loss_of_block) {
@@ -68,7 +69,8 @@ __global__ void __launch_bounds__(kThreads)
     loss_of_block[size_t(w) * gridDim.x + blockIdx.x] = sum;
 }
 
-// Computes the weights of windows from the losses of their blocks, a block each.
+// Computes the weight of each window from the losses of its blocks. One block per
+// window.
 __global__ void __launch_bounds__(kThreads)
     weigh_kernel(const WindowTables* windows, const double* loss_of_block, unsigned num_blocks,
                  float* weight) {
@@ -86,7 +88,7 @@ __global__ void __launch_bounds__(kThreads)
     weight[blockIdx.x] = weight_of_picture(sum, static_cast<double>(image.width) * image.height);
 }
 
-// Multiplies the slopes of windows by their weights, a thread a pixel.
+// Multiplies the gradients of each window by its weight. One thread per pixel.
 __global__ void __launch_bounds__(kThreads)
     weigh_slopes_kernel(const WindowTables* windows, size_t most_pixels, const float* weight,
                         float* planes) {
@@ -98,7 +100,7 @@ __global__ void __launch_bounds__(kThreads)
     slopes.alpha[p.pixel] *= weight[w];
 }
 
-// Writes the slopes of the sum of one channel, a thread a pixel.
+// Writes the gradients of the loss "sum of the first channel". One thread per pixel.
 __global__ void __launch_bounds__(kThreads)
     sum_slope_kernel(const WindowTables* windows, size_t most_pixels, float* planes) {
     const WindowPixel p(*windows, blockIdx.y);
@@ -107,7 +109,7 @@ __global__ void __launch_bounds__(kThreads)
     put_sum_slopes(out.color + 3 * p.pixel, out.alpha[p.pixel]);
 }
 
-// The places of a cluster's gaussians in the gradients of a step, window by window.
+// Where the gradients of a cluster's gaussians are, in each window of a step.
 struct ShownCluster {
     const int32_t* item_of_cluster;
     const uint32_t* num_items;
@@ -115,7 +117,7 @@ struct ShownCluster {
     unsigned num_windows;
 
     // Calls visit(window, row) for each window that shows gaussian `i` of cluster `c`,
-    // in the order of the windows; row `row` of the gradients is its.
+    // in the order of windows. `row` is the gaussian's row in the gradients.
     template <class Visit>
     __device__ void for_each_window(size_t c, size_t i, const Visit& visit) const {
         size_t first = 0;
@@ -127,8 +129,8 @@ struct ShownCluster {
     }
 };
 
-// Moves the gaussians of clusters from `first_cluster` on, by the sum of their
-// gradients, which takes the place of the first one.
+// Moves the gaussians of the clusters from `first_cluster` on. Their gradients are
+// summed over the windows; the sum overwrites the first of them.
 __global__ void __launch_bounds__(kItemSize)
     move_kernel(ShownCluster shown, Span<const int64_t> offset, size_t first_cluster,
                 GaussianRows<float> rows, GaussianRows<float> gradient, const float* radius,
@@ -149,7 +151,8 @@ __global__ void __launch_bounds__(kItemSize)
                   step_of_windows(step, num_windows), beta2, moments);
 }
 
-// Adds what windows show of all gaussians, and counts the windows that have a cluster.
+// Adds how much windows show of each gaussian, and counts the windows whose cuts
+// contain it.
 __global__ void __launch_bounds__(kItemSize)
     weight_kernel(ShownCluster shown, const WindowTables* windows, Span<const int64_t> offset,
                   GaussianRows<const float> gradient, double* weight, int32_t* num_looks) {

@@ -9,8 +9,8 @@ namespace v3dg {
 
 constexpr double kAdamBeta1 = 0.9, kAdamEpsilon = 1e-15;
 
-// Returns the value after a step. `beta2` is the decay of `v`; `correction1` and
-// `correction2` are 1 / (1 - beta^step).
+// Returns the value after a step, and updates the moments `m` and `v`. `beta2` is the
+// decay of `v`. `correction1` and `correction2` are 1 / (1 - beta^step).
 template <class V, class T>
 V3DG_HD V3DG_INLINE V adam_step(V value, V gradient, V& m, V& v, T step_size, T beta2,
                                 T correction1, T correction2) {

@@ -1,21 +1,20 @@
 #pragma once
 
-// The bits of floats as numbers that ascend as the floats do, for sorting and
-// selecting.
+// Conversions between floats and integers of the same order, for sorting and selecting.
 
 #include <cstdint>
 
 namespace v3dg {
 namespace cuda {
 
-// Returns bits that ascend as unsigned numbers as the finite values do. -0 counts as 0,
-// as it does in comparisons.
+// Converts a finite float to an unsigned integer, such that integers compare like the
+// floats. -0 and 0 give the same integer.
 __device__ inline uint32_t ascending_bits(float value) {
     const uint32_t bits = __float_as_uint(value + 0.0f);
     return bits ^ (bits >> 31 ? 0xffffffffu : 0x80000000u);
 }
 
-// Returns the value that has these ascending bits.
+// Converts an integer from ascending_bits() back to the float.
 __device__ inline float value_of_bits(uint32_t ascending) {
     return __uint_as_float(ascending ^ (ascending >> 31 ? 0x80000000u : 0xffffffffu));
 }

@@ -1,6 +1,6 @@
 #pragma once
 
-// Balls and boxes.
+// Balls and axis-aligned boxes.
 
 #include <cmath>
 
@@ -13,12 +13,12 @@ struct Ball {
     float x, y, z, radius;
 };
 
-// A box with lower and upper corners.
+// A box with lower and upper corner.
 struct Box {
     float lo[3], hi[3];
 };
 
-// Returns a box that contains nothing.
+// Returns an empty box.
 V3DG_HD inline Box no_box() {
     return {{INFINITY, INFINITY, INFINITY}, {-INFINITY, -INFINITY, -INFINITY}};
 }

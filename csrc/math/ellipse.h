@@ -1,24 +1,24 @@
 #pragma once
 
-// The ellipse that a gaussian covers on the image, and its extent in rows of pixels.
-// rasterize/rasterize_math.h has its falloff over a pixel.
+// The ellipse of a gaussian on the image, and its extent in rows of pixels.
+// rasterize/rasterize_math.h has the falloff at a pixel.
 
 #include "math/gaussian.h"
 
 namespace v3dg {
 
-// Alpha at offset d from the centre is 2^(log2_opacity - |L d|²) with L = [[l11, l12],
-// [0, l22]].
+// A gaussian on the image. At offset d from the centre, alpha is 2^(log2_opacity - |L
+// d|²) with L = [[l11, l12], [0, l22]].
 template <class V>
 struct Ellipse {
-    V u, v;  // px
+    V u, v;  // centre, px
     V l11, l12, l22;
     V log2_opacity;
     V depth;
 };
 
-// The first and the last pixel that something covers, in x and in y. A box is empty if
-// a first pixel is after its last one.
+// A box of pixels: the first and the last column, and the first and the last row. It is
+// empty if a first one is after the last one.
 template <class I>
 struct PixelBox {
     I x0, x1, y0, y1;
@@ -26,15 +26,15 @@ struct PixelBox {
     V3DG_HD V3DG_INLINE auto holds_pixels() const { return (x0 <= x1) & (y0 <= y1); }
 };
 
-// The ellipse |L d|² = reach, prepared for computing its extent in a row of pixels.
+// The ellipse |L d|² = reach, in a form for computing its extent in a row of pixels.
 template <class V>
 struct EllipseRows {
     V reach;
     V inverse;  // 1 / l11
     V slope;    // dx / dy of the line through the centres of the rows' extents
     V l22;
-    // The height relative to the centre at which the ellipse extends farthest right. It
-    // extends farthest left at the opposite height.
+    // The y of the rightmost point of the ellipse, relative to its centre. The leftmost
+    // point has the opposite y.
     V rightmost;
 };
 
@@ -50,12 +50,13 @@ V3DG_HD V3DG_INLINE EllipseRows<V> ellipse_rows(V l11, V l12, V l22, V log2_opac
     return e;
 }
 
-// Sets x0 to x1, the extent that the ellipse may have between the heights y0 <= y1, all
-// relative to its centre. The extent includes a margin, so that the blend step alone
-// decides. The result is undefined if the ellipse's box does not meet the heights.
+// Computes the extent x0 to x1 of the ellipse between the rows y0 <= y1, relative to
+// its centre. A margin makes the extent slightly too large, so that only the blend step
+// decides. The result is undefined if the bounding box of the ellipse does not overlap
+// the rows.
 //
-// Four callers derive the cells of a grid that a gaussian may reach from this extent.
-// They round differently on purpose; each one documents why.
+// Four callers derive from this extent which cells of a grid a gaussian may reach. They
+// round differently; each documents why.
 template <class V>
 V3DG_HD V3DG_INLINE void row_extent(const EllipseRows<V>& e, V y0, V y1, V& x0, V& x1) {
     const V a = min_of(max_of(e.rightmost, y0), y1), b = min_of(max_of(-e.rightmost, y0), y1);

@@ -1,7 +1,7 @@
 #pragma once
 
-// A gaussian, the memory layouts for many of them, and the reach of one. Its alpha at a
-// pixel is in rasterize/rasterize_math.h.
+// A gaussian, the memory layouts of many gaussians, and the reach of a gaussian.
+// rasterize/rasterize_math.h has its alpha at a pixel.
 
 #include <cstddef>
 #include <cstdint>
@@ -11,14 +11,15 @@
 
 namespace v3dg {
 
-constexpr double kMinAlpha = 1.0 / 255;     // contributions below this are skipped
-constexpr double kMaxAlpha = 0.999;         // alpha is clamped to this
-constexpr double kMinTransmittance = 1e-4;  // a pixel with gsplat's stopping rule stops before this
+constexpr double kMinAlpha = 1.0 / 255;  // smaller alphas are not blended
+constexpr double kMaxAlpha = 0.999;      // alpha is clamped to this
+// with gsplat's stop rule, a pixel stops before it is this dark
+constexpr double kMinTransmittance = 1e-4;
 constexpr double kLog2MinAlpha = -7.994353436858858;
-// Here the alpha of a gaussian with opacity 1 has fallen to 1/255.
+// At this distance, in standard deviations, the alpha of an opaque gaussian is 1/255.
 constexpr double kReachSigmas = 3.33;
 constexpr double kLn2 = 0.6931471805599453;
-// sqrt(log2(e) / 2): exp(-d²/2) = 2^-(scale d)².
+// sqrt(log2(e) / 2). With this scale, exp(-d² / 2) = 2^-(scale d)².
 constexpr double kFalloffScale = 0.8493218002880191;
 
 template <class V>
@@ -29,9 +30,9 @@ struct Gaussian3d {
     V opacity;
 };
 
-// Gaussians as rows, the layout of the Python interface, on the host or on a device:
-// (N, 3), (N, 4), (N, 3), (N,) and (N, bases, 3). T is const for read-only rows. On a
-// device, quaternions and SH coefficients begin at a multiple of 16 bytes.
+// Gaussians in the layout of the Python interface, on the host or on a device: (N, 3),
+// (N, 4), (N, 3), (N,) and (N, bases, 3). T is const if they are only read. On a
+// device, quaternions and SH coefficients are aligned to 16 bytes.
 template <class T>
 struct GaussianRows {
     T *means, *quats, *scales, *opacities, *sh;
@@ -50,7 +51,7 @@ struct GaussianRows {
     }
 };
 
-// Copies row `from`, except its SH coefficients, to row `to`.
+// Copies row `from` of `source` to row `to`, without SH coefficients.
 template <class T>
 V3DG_HD inline void copy_shape(const GaussianRows<const T>& source, size_t from,
                                const GaussianRows<T>& rows, size_t to) {
@@ -62,9 +63,9 @@ V3DG_HD inline void copy_shape(const GaussianRows<const T>& source, size_t from,
     rows.opacities[to] = source.opacities[from];
 }
 
-// Gaussians in the layout of the CPU's rasterizer: one plane per attribute. Planes end
-// with `kPlanePadding` elements of padding, so that a vector load may read beyond the
-// last gaussian.
+// Gaussians in the layout of the CPU rasterizer: one plane per component. A plane ends
+// with kPlanePadding extra elements, so that a vector load may read beyond the last
+// gaussian.
 constexpr size_t kPlanePadding = 16;
 template <class T>
 struct GaussianPlanes {
@@ -72,11 +73,11 @@ struct GaussianPlanes {
     const T* quat[4];
     const T* scale[3];
     const T* opacity;
-    const T* sh[3 * kMaxShBases];  // base by base, three channels each
+    const T* sh[3 * kMaxShBases];  // basis by basis, three channels each
     int sh_degree;
 };
 
-// Colours of a bundle's clusters, which replace the colours of their gaussians.
+// Colours of a bundle's clusters. They replace the colours of the clusters' gaussians.
 struct Palette {
     const float* sh = nullptr;           // (C, 3) SH coefficients of degree 0; null: no palette
     const int64_t* first_row = nullptr;  // first gaussian of each cluster, ascending
@@ -96,9 +97,8 @@ struct Palette {
     }
 };
 
-// Gaussians in the layout of CUDA frames: four planes of (N, 4) that together hold a
-// PackedGaussian per row, and the SH coefficients as rows that begin `sh_stride` floats
-// apart.
+// Gaussians in the layout of CUDA frames. Four planes of (N, 4) contain a
+// PackedGaussian per row. SH coefficients are rows that begin `sh_stride` floats apart.
 struct PackedPlanes {
     const float* plane[4];
     const float* sh;
@@ -106,9 +106,9 @@ struct PackedPlanes {
     Palette palette;
 };
 
-// Returns an upper bound of a gaussian's reach in standard deviations, not below that
-// of extent_of(). It is negative if the gaussian is too faint to be drawn, and NaN if
-// the opacity is invalid.
+// Returns an upper bound on the reach of a gaussian, in standard deviations, which is
+// not below that of extent_of(). It is negative if the gaussian is too faint to be
+// drawn, and NaN if the opacity is invalid.
 V3DG_HD inline float reach_in_sigmas(float opacity) {
     if (opacity < float(kMinAlpha)) return -1.0f;
     const float sigmas =
@@ -116,8 +116,8 @@ V3DG_HD inline float reach_in_sigmas(float opacity) {
     return opacity <= 1 ? sigmas : NAN;
 }
 
-// Returns an upper bound of a gaussian's reach from its mean, in the units of its
-// model. It may be NaN also for a gaussian without area.
+// Returns an upper bound on the reach of a gaussian from its mean, in model space. It
+// may be NaN if a scale is not positive.
 V3DG_HD inline float reach_of(const Gaussian3d<float>& g) {
     const float sigmas = reach_in_sigmas(g.opacity);
     if (sigmas < 0) return -1.0f;
@@ -126,9 +126,9 @@ V3DG_HD inline float reach_of(const Gaussian3d<float>& g) {
     return least > 0 ? most * sigmas : NAN;
 }
 
-// A gaussian in the form that is fastest to project, for models that are projected
+// A gaussian in the form that is fastest to project, for models that are drawn
 // repeatedly. Its covariance is F Fᵀ with F = [f[0] f[3] 0; f[1] f[4] f[6]; f[2] f[5]
-// f[7]]; the longest column is first.
+// f[7]]. The longest column of F is the first.
 struct PackedGaussian {
     float mean[3];
     float reach;
@@ -136,7 +136,8 @@ struct PackedGaussian {
     float log2_opacity;
 };
 
-// These operations round exactly as written, for any compiler options.
+// Return a * b and a + b, without floating-point contraction under any compiler
+// options.
 V3DG_HD inline double product_of(double a, double b) {
 #ifdef __CUDA_ARCH__
     return __dmul_rn(a, b);
@@ -152,7 +153,7 @@ V3DG_HD inline double sum_of(double a, double b) {
 #endif
 }
 
-// Returns 1 / b for use in quotient_of().
+// Returns 1 / b as input for quotient_of().
 V3DG_HD inline double inverse_of(double b) {
 #ifdef __CUDA_ARCH__
     double r;
@@ -164,9 +165,9 @@ V3DG_HD inline double inverse_of(double b) {
     return 1 / b;
 #endif
 }
-// Returns a / b. Precondition: the numbers are far from the limits of doubles, as are
-// all that result from float32. It equals a device's division without the handling of
-// other numbers.
+// Returns a / b; `inverse` is inverse_of(b). Precondition: the numbers are far from the
+// limits of doubles, as are all numbers that result from float32. The result equals
+// that of a device's division, which also handles other numbers.
 V3DG_HD inline double quotient_of(double a, double b, double inverse) {
 #ifdef __CUDA_ARCH__
     const double q = __dmul_rn(a, inverse);
@@ -187,14 +188,14 @@ V3DG_HD inline float rounded(double x) {
 #endif
 }
 
-// Packs a gaussian. Every rounding is explicit, so that all kernels that pack a
-// gaussian get the same bits.
+// Packs a gaussian. Every rounding is explicit, so that all kernels compute the same
+// bits.
 V3DG_HD inline PackedGaussian pack_gaussian(const Gaussian3d<float>& g) {
     PackedGaussian out{};
     for (int k = 0; k < 3; ++k) out.mean[k] = g.mean[k];
     out.log2_opacity = log2_of(g.opacity);
     out.reach = reach_of(g);
-    // These are the columns of the rotation, as in rotation_of_quat().
+    // The columns of the rotation matrix, as in rotation_of_quat().
     const double w = g.quat[0], x = g.quat[1], y = g.quat[2], z = g.quat[3];
     const double xx = product_of(x, x), yy = product_of(y, y), zz = product_of(z, z),
                  wx = product_of(w, x), wz = product_of(w, z), xz = product_of(x, z);
@@ -208,7 +209,8 @@ V3DG_HD inline PackedGaussian pack_gaussian(const Gaussian3d<float>& g) {
         {product_of(s, ::fma(w, y, xz)), product_of(s, ::fma(y, z, -wx)),
          ::fma(sum_of(xx, yy), -s, 1.0)},
     };
-    // Indices are constants, so that the compiler can use registers.
+    // Sort by scale. Indices are compile-time constants, so that the compiler can use
+    // registers.
     float scale[3] = {g.scale[0], g.scale[1], g.scale[2]};
     for (int pass = 0; pass < 3; ++pass) {
         const int k = pass % 2;
@@ -224,8 +226,8 @@ V3DG_HD inline PackedGaussian pack_gaussian(const Gaussian3d<float>& g) {
     }
     for (int k = 0; k < 3; ++k)
         for (int i = 0; i < 3; ++i) column[k][i] = product_of(column[k][i], scale[k]);
-    // Rotate columns 1 and 2 by a Givens rotation so that column 2 begins with 0; F Fᵀ
-    // does not change. These are the shortest columns, so their rounding errors are
+    // Rotate columns 1 and 2 by a Givens rotation, so that column 2 begins with 0. This
+    // does not change F Fᵀ. These columns are the shortest, so the rounding errors are
     // smallest.
     const double a0 = column[1][0], b0 = column[2][0],
                  length = sqrt_of(::fma(a0, a0, product_of(b0, b0)));

@@ -7,20 +7,20 @@
 
 namespace v3dg {
 
-// Factors of red, green and blue, which are not negative, and of the opacity, 0 to 1.
+// The factors of red, green and blue, at least 0, and of the opacity, 0 to 1.
 struct InstanceFactors {
     float color[3] = {1, 1, 1};
     float opacity = 1;
 };
 
-// Returns whether a gaussian of an instance with this factor of the opacity may be
-// drawn.
+// Returns whether an instance with these factors may be visible.
 V3DG_HD inline bool may_show(const InstanceFactors& factors) {
     return factors.opacity >= static_cast<float>(kMinAlpha);
 }
 
-// Multiplies a colour, as color_of_coefficients() computes it. A channel that overflows
-// becomes 0, so that it does not spread to pixels on which the gaussian has no weight.
+// Multiplies a colour from color_of_coefficients() by factors. A channel that overflows
+// becomes 0. An infinite channel would make pixels NaN in which the gaussian has weight
+// 0.
 template <class V>
 V3DG_HD V3DG_INLINE void tint(const float factor[3], V color[3]) {
     using L = Lane<V>;
@@ -30,8 +30,9 @@ V3DG_HD V3DG_INLINE void tint(const float factor[3], V color[3]) {
     }
 }
 
-// Returns the SH coefficient of a colour that is multiplied by a factor. The factor
-// also multiplies the 1/2 of every colour, which changes the constant basis.
+// Returns the SH coefficient of a colour that is multiplied by a factor. Every colour
+// is 1/2 plus a sum. The factor also multiplies the 1/2, which changes the coefficient
+// of degree 0.
 V3DG_HD inline double tinted_coefficient(int basis, double coefficient, double factor) {
     const double tinted = factor * coefficient;
     return basis == 0 ? tinted + (factor - 1) * 0.5 / kShBase0 : tinted;

@@ -1,8 +1,8 @@
 #pragma once
 
-// The elementary operations that formulas use, for a scalar (scalar.h) and, in sources
-// compiled per instruction set, for a SIMD vector (simd.h). A formula written with
-// these operations and `mask ? a : b` works for both.
+// The elementary operations of formulas, for scalars (scalar.h) and, in sources that
+// are compiled per instruction set, for SIMD vectors (simd.h). A formula with these
+// operations and `mask ? a : b` works for both.
 
 #include <type_traits>
 
@@ -11,7 +11,7 @@
 
 namespace v3dg {
 
-// Converts bits that hold an integer below 2^24 to a number.
+// Converts bits that are an integer below 2^24 to a floating-point number.
 template <class V>
 V3DG_HD V3DG_INLINE V float_of_number(Bits<V> bits) {
     if constexpr (std::is_arithmetic<V>::value)
@@ -20,7 +20,7 @@ V3DG_HD V3DG_INLINE V float_of_number(Bits<V> bits) {
         return __builtin_convertvector((decltype(V{} < V{}))bits, V);
 }
 
-// Returns whether a comparison holds in any lane.
+// Returns whether a comparison is true in any lane.
 template <class Mask>
 V3DG_HD V3DG_INLINE bool is_any(Mask holds) {
     if constexpr (std::is_arithmetic<Mask>::value) return holds != 0;
@@ -51,15 +51,15 @@ V3DG_HD V3DG_INLINE V min_of(V a, V b) {
     return a < b ? a : b;
 }
 
-// Returns the same number in every lane. Zero is subtracted, not added, because the
-// subtraction preserves every number; so the compiler removes it.
+// Returns a vector with the same number in every lane. x - 0 preserves every number,
+// including -0, so the compiler removes the subtraction; x + 0 would change -0.
 template <class V>
 V3DG_HD V3DG_INLINE V all_lanes(Lane<V> x) {
     if constexpr (std::is_arithmetic<V>::value) return x;
     return x - V{};
 }
 
-// Clamps x to [low, high], which are numbers; NaN stays NaN.
+// Clamps x to [low, high]. NaN stays NaN; the limits must not be NaN.
 template <class V>
 V3DG_HD V3DG_INLINE V cut_to(Lane<V> low, Lane<V> high, V x) {
 #ifdef __CUDA_ARCH__

@@ -1,15 +1,16 @@
 #pragma once
 
-// Rotations from quaternions (w, x, y, z). The length of a quaternion does not matter.
-// A zero quaternion is not a rotation; one that is not finite gives a matrix of NaN.
+// Rotations by quaternions (w, x, y, z), which may have any length but zero. A
+// quaternion that is not finite gives a matrix of NaN.
 
 #include "math/lanes.h"
 
 namespace v3dg {
 
-// Squared lengths from `least2` to `most2` are computed without underflow or overflow.
-// Multiplying by `up` or `down`, powers of two that cause no rounding, brings a
-// quaternion of any other length into this range, down to the smallest denormal number.
+// The range of squared lengths that are computed without underflow or overflow. For
+// other quaternions, down to the smallest denormal numbers, multiplying by `up` or
+// `down` brings the length into the range. These are powers of two, so nothing is
+// rounded.
 template <class T>
 struct QuatRange {
     static constexpr T least2 = T(0x1p-80), most2 = T(0x1p100), up = T(0x1p100), down = T(0x1p-100);
@@ -24,15 +25,15 @@ V3DG_HD V3DG_INLINE V length2_of_quat(const V q[4]) {
     return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
 }
 
-// Returns whether a squared length is outside of its range; false for NaN.
+// Returns whether a squared length is out of range. False for NaN.
 template <class V>
 V3DG_HD V3DG_INLINE auto is_out_of_range(V length2) {
     using Range = QuatRange<Lane<V>>;
     return (length2 < all_lanes<V>(Range::least2)) | (length2 > all_lanes<V>(Range::most2));
 }
 
-// If the squared length of a quaternion is outside of its range, multiplies it by the
-// power of two that brings it inside. Returns that factor, or 1.
+// If the squared length of a quaternion is out of range, multiplies the quaternion by a
+// power of two that brings it into range. Returns the factor, or 1.
 template <class V>
 V3DG_HD V3DG_INLINE V bring_into_range(V q[4]) {
     using Range = QuatRange<Lane<V>>;
@@ -43,7 +44,7 @@ V3DG_HD V3DG_INLINE V bring_into_range(V q[4]) {
     return factor;
 }
 
-// Normalises the quaternion; a zero quaternion becomes the identity.
+// Normalises a quaternion. A zero quaternion becomes the identity.
 template <class T>
 V3DG_HD V3DG_INLINE void normalise_quat(T q[4]) {
     if (is_out_of_range(length2_of_quat(q))) bring_into_range(q);
@@ -52,8 +53,8 @@ V3DG_HD V3DG_INLINE void normalise_quat(T q[4]) {
     for (int k = 0; k < 4; ++k) q[k] = length2 == 0 ? static_cast<T>(k == 0) : q[k] / length;
 }
 
-// Rounds a quaternion to float32. It is normalised first if float32 cannot represent it
-// or its squared length.
+// Rounds a quaternion to float32. It is normalised first if its squared length is out
+// of the range of float32.
 V3DG_HD V3DG_INLINE void round_quat(double q[4], float out[4]) {
     const double length2 = length2_of_quat(q);
     const bool is_held = length2 >= QuatRange<float>::least2 && length2 <= QuatRange<float>::most2;
@@ -61,8 +62,7 @@ V3DG_HD V3DG_INLINE void round_quat(double q[4], float out[4]) {
     for (int k = 0; k < 4; ++k) out[k] = static_cast<float>(q[k]);
 }
 
-// Computes the row-major rotation matrix of a quaternion; `s` is 2 over its squared
-// length.
+// Computes the row-major rotation matrix of a quaternion. `s` is 2 / squared length.
 template <class V>
 V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V s, V r[9]) {
     const V w = q[0], x = q[1], y = q[2], z = q[3];
@@ -77,10 +77,9 @@ V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V s, V r[9]) {
     r[8] = 1 - s * (x * x + y * y);
 }
 
-// Computes the rotation matrix of the normalised quaternion. Lengths out of range are
-// rare; their lanes are computed a second time. The other lanes keep their first
-// result, so that its rounding depends neither on their neighbours nor on how the
-// compiler contracts the formula in the branch.
+// Computes the row-major rotation matrix of a quaternion of any length. Lengths out of
+// range are rare; such lanes are computed a second time. The other lanes keep their
+// first result, so that its rounding does not depend on their neighbours.
 template <class V>
 V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V r[9]) {
     const V n2 = length2_of_quat(q);
@@ -98,8 +97,8 @@ V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V r[9]) {
     }
 }
 
-// Computes the gradient of a quaternion through its normalisation, from the gradient of
-// the rotation matrix. Precondition: its squared length is in range.
+// Computes the gradient of a quaternion from the gradient of its rotation matrix.
+// Precondition: the squared length `n2` is in range.
 template <class V>
 V3DG_HD V3DG_INLINE void rotation_of_quat_in_range_vjp(const V q[4], V n2, const V g[9], V g_q[4]) {
     const V s = n2 > V{} ? 2 / n2 : V{};
@@ -111,8 +110,8 @@ V3DG_HD V3DG_INLINE void rotation_of_quat_in_range_vjp(const V q[4], V n2, const
         s * (x * (g[1] + g[3]) + z * (g[5] + g[7]) + w * (g[2] - g[6]) - 2 * y * (g[0] + g[8]));
     const V d_z =
         s * (x * (g[2] + g[6]) + y * (g[5] + g[7]) + w * (g[3] - g[1]) - 2 * z * (g[0] + g[4]));
-    // The matrix does not depend on the length of the quaternion, so the gradient is
-    // orthogonal to it.
+    // The matrix does not depend on the length of the quaternion. So remove the
+    // component of the gradient along the quaternion.
     const V along = (w * d_w + x * d_x + y * d_y + z * d_z) * (s / 2);
     g_q[0] = d_w - along * w;
     g_q[1] = d_x - along * x;
@@ -120,8 +119,8 @@ V3DG_HD V3DG_INLINE void rotation_of_quat_in_range_vjp(const V q[4], V n2, const
     g_q[3] = d_z - along * z;
 }
 
-// As rotation_of_quat_in_range_vjp(), for any length. The gradient grows as one over
-// the length, up to the largest float.
+// Like rotation_of_quat_in_range_vjp(), for quaternions of any length. The gradient is
+// in proportion to 1 / length, up to the largest float.
 template <class V>
 V3DG_HD V3DG_INLINE void rotation_of_quat_vjp(const V q[4], const V g[9], V g_q[4]) {
     const V n2 = length2_of_quat(q);

@@ -1,6 +1,6 @@
 #pragma once
 
-// The elementary operations that formulas need, for a scalar on the host or the device.
+// The elementary operations of formulas, for scalars on the host or a device.
 
 #include <cmath>
 #include <cstdint>
@@ -11,8 +11,8 @@
 
 namespace v3dg {
 
-// These are constants because nvcc does not allow calls of the host's constexpr
-// functions in device code.
+// Variables, because nvcc does not allow calls of the host's constexpr functions in
+// device code.
 template <class T>
 constexpr T kLargest = std::numeric_limits<T>::max();
 template <class T>
@@ -39,11 +39,11 @@ V3DG_HD inline int floor_to_int(float x) {
     return static_cast<int>(::floorf(x));
 #endif
 }
-// Returns 1 / x with a relative error below 1e-6, for positive x; below the smallest
-// normal number, the result for that number. The accuracy suffices for margins.
+// Returns 1 / x with a relative error below 1e-6, which suffices for margins. x must be
+// positive; denormal numbers count as the smallest normal number.
 V3DG_HD inline float rough_reciprocal(float x) {
 #ifdef __CUDA_ARCH__
-    float inverse;  // omits the handling of numbers outside the range
+    float inverse;  // skips the handling of numbers out of range
     asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(fmaxf(x, 1.17549435e-38f)));
     return inverse;
 #else
@@ -59,7 +59,7 @@ V3DG_HD inline float rough_sqrt(float x) {
     return ::sqrtf(x);
 #endif
 }
-// Returns a b + c clamped to [0, 1]; NaN becomes 0.
+// Returns a * b + c, clamped to [0, 1]. NaN becomes 0.
 V3DG_HD inline float saturated_fma(float a, float b, float c) {
 #ifdef __CUDA_ARCH__
     float x;
@@ -70,21 +70,22 @@ V3DG_HD inline float saturated_fma(float a, float b, float c) {
     return x > 0 ? (x < 1 ? x : 1.0f) : 0.0f;
 #endif
 }
-// Returns `bits` shifted left by the integer nearest to 8 x, for x in [0, 1]; ties are
-// rounded either way.
+// Returns `bits` shifted left by round(8 x), for x in [0, 1]. Ties may be rounded
+// either way.
 V3DG_HD inline uint32_t shifted_by_eighths(uint32_t bits, float x) {
     const float number = 8 * x + 8388608.0f;  // adding 2^23 rounds to an integer
     uint32_t last_bits;
     std::memcpy(&last_bits, &number, sizeof last_bits);
 #ifdef __CUDA_ARCH__
-    return __funnelshift_l(0u, bits, last_bits);  // uses the last five bits
+    // uses the last five bits of the shift
+    return __funnelshift_l(0u, bits, last_bits);
 #else
     return bits << (last_bits & 31);
 #endif
 }
 V3DG_HD inline float exp2_in_range(float x) {
 #ifdef __CUDA_ARCH__
-    float y;  // exp2f without its handling of results below 2^-126
+    float y;  // unlike exp2f(), flushes results below 2^-126 to 0
     asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
     return y;
 #else
@@ -109,7 +110,7 @@ struct LaneOf {
 template <class V>
 using Lane = typename LaneOf<V>::type;
 
-// A 32-bit integer, or a vector with one per lane of V.
+// A 32-bit integer, or a vector with one 32-bit integer per lane of V.
 template <class V>
 struct BitsOf {
     using type = uint32_t;

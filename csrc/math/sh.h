@@ -1,6 +1,6 @@
 #pragma once
 
-// Real spherical harmonics of degree 0 to 3, with the order and signs of .ply assets.
+// Real spherical harmonics of degrees 0 to 3, with the order and signs of .ply assets.
 // The colour of a gaussian is max(0, 1/2 + sum of coefficient * basis(view direction)).
 
 #include "math/vec.h"
@@ -8,8 +8,8 @@
 namespace v3dg {
 
 constexpr int kMaxShDegree = 3, kMaxShBases = 16;
-constexpr double kShBase0 = 0.28209479177387814;  // the same in every direction
-// The degree of plain colours: three numbers, possibly negative, in place of
+constexpr double kShBase0 = 0.28209479177387814;  // the constant basis of degree 0
+// The degree of plain colours: three numbers, possibly negative, instead of
 // coefficients.
 constexpr int kPlainColor = -1;
 
@@ -44,7 +44,7 @@ V3DG_HD V3DG_INLINE void sh_bases(int degree, V x, V y, V z, V basis[kMaxShBases
     basis[15] = T(-0.5900435899266435) * x * (xx - 3 * yy);
 }
 
-// Computes the gradient of the unit direction from that of the bases.
+// Computes the gradient of the unit direction from the gradients `g` of the bases.
 template <class V>
 V3DG_HD V3DG_INLINE void sh_bases_vjp(int degree, V x, V y, V z, const V g[kMaxShBases],
                                       V g_dir[3]) {
@@ -80,11 +80,12 @@ V3DG_HD V3DG_INLINE void sh_bases_vjp(int degree, V x, V y, V z, const V g[kMaxS
     g_dir[2] = gz;
 }
 
-// Computes the colour for a direction of any length, from the eye to the gaussian in
-// model space. A channel that is not finite becomes 0, so that it does not spread to
-// pixels where the gaussian has no weight. `sh(k)` returns the k-th coefficient of one
-// gaussian or of one per lane, basis by basis, three channels each; each coefficient is
-// requested once, in this order.
+// Computes the colour of a gaussian. `direction` is from the eye to the gaussian, in
+// model space, and may have any length. A channel that is not finite becomes 0;
+// otherwise it would make pixels NaN in which the gaussian has weight 0.
+//
+// sh(k) returns the k-th coefficient, of one gaussian or of one per lane: basis by
+// basis, three channels each. Each coefficient is requested once, in this order.
 template <class V, class Coefficient>
 V3DG_HD V3DG_INLINE void color_of_coefficients(int degree, const V direction[3],
                                                const Coefficient& sh, V color[3]) {
@@ -115,14 +116,14 @@ V3DG_HD V3DG_INLINE void color_of_coefficients(int degree, const V direction[3],
     }
 }
 
-// As color_of_coefficients(), for coefficients in memory.
+// Like color_of_coefficients(), for coefficients in memory.
 template <class V>
 V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V direction[3], const V* sh, V color[3]) {
     color_of_coefficients(degree, direction, [&](int k) { return sh[k]; }, color);
 }
 
-// Adds to `d_direction` and sets `d_sh` from the gradient of the colour. `d_sh` may
-// alias `sh`.
+// Propagates the gradient of the colour: adds to `d_direction`, and sets `d_sh`, which
+// may be the same memory as `sh`.
 template <class V>
 V3DG_HD V3DG_INLINE void color_of_sh_vjp(int degree, const V direction[3], const V* sh,
                                          const V color[3], const V d_color[3], V d_direction[3],

@@ -1,9 +1,9 @@
 #pragma once
 
 // The operations of scalar.h for SIMD vectors, as wide as the instruction set of the
-// compilation. They exist only in sources that are compiled once per instruction set,
-// and are always inlined, so that the linker cannot share them with other sources.
-// Formulas include lanes.h.
+// compilation allows. They exist only in sources that are compiled once per instruction
+// set. They are always inlined, so that the linker cannot share them between
+// instruction sets. Formulas include lanes.h instead of this file.
 
 #include <cmath>
 #include <cstdint>
@@ -37,7 +37,7 @@ template <class T>
 constexpr int kLanes = kVectorBytes / static_cast<int>(sizeof(T));
 
 typedef int32_t IntVec32 __attribute__((vector_size(kVectorBytes)));
-// Integer arithmetic on it may wrap.
+// unsigned: its arithmetic may wrap
 typedef uint32_t BitsVec32 __attribute__((vector_size(kVectorBytes)));
 
 template <>
@@ -73,8 +73,8 @@ V3DG_INLINE Vec<double> sqrt_of(Vec<double> x) {
     return x;
 }
 
-// Returns a bit mask in which bit i is set if the comparison holds in lane i. Compilers
-// differ in the type of 64-bit lanes.
+// Returns a mask whose bit i is set if a comparison is true in lane i. The conversion
+// uses the size of lanes, because compilers differ in the type of 64-bit lanes.
 template <class Mask>
 V3DG_INLINE unsigned bits_of(Mask mask) {
     if constexpr (sizeof(mask[0]) == 4) {
@@ -91,20 +91,20 @@ V3DG_INLINE unsigned bits_of(Mask mask) {
     return bits;
 }
 
-// Returns a bit mask of the lanes' sign bits.
+// Returns a mask of the lanes' sign bits.
 template <class V>
 V3DG_INLINE unsigned sign_bits_of(V x) {
     using Mask = decltype(x < x);
 #if defined(__SSE2__)
-    // The instruction reads only the signs.
+    // The instruction reads only the sign bits.
     if constexpr (sizeof(x[0]) == 4) return bits_of((Mask)x);
 #endif
     return bits_of((Mask)x >> (8 * sizeof(x[0]) - 1));
 }
 
-// Returns 2^x for x in [-126, 127], with a relative error below 2^-22; undefined for
-// other x. The integer part of x becomes the exponent. A polynomial with minimal
-// maximum relative error on [-1/2, 1/2] gives the rest.
+// Returns 2^x for x in [-126, 127], with a relative error below 2^-22. Undefined for
+// other x. The integer part of x becomes the exponent. A minimax polynomial on [-1/2,
+// 1/2] computes the rest.
 V3DG_INLINE Vec<float> exp2_in_range(Vec<float> x) {
     // 1.5 * 2^23: adding it rounds to an integer.
     const Vec<float> magic = Vec<float>{} + 12582912.0f;
@@ -122,9 +122,9 @@ V3DG_INLINE Vec<double> exp2_in_range(Vec<double> x) {
     return x;
 }
 
-// Returns log2 of positive normal x, with an error below 2e-7 * max(1, |log2 x|).
+// Returns log2(x) for positive normal x, with an error below 2e-7 * max(1, |log2 x|).
 V3DG_INLINE Vec<float> log2_of(Vec<float> x) {
-    // x = m * 2^k with m in [sqrt(1/2), sqrt(2)); the polynomial is fitted to atanh((m
+    // x = m * 2^k with m in [sqrt(1/2), sqrt(2)). The polynomial is fitted to atanh((m
     // - 1) / (m + 1)).
     const IntVec32 bits = (IntVec32)((BitsVec32)x - 0x3f3504f3u);
     const IntVec32 k = bits >> 23;
@@ -184,7 +184,7 @@ V3DG_INLINE void store(T* p, Vec<T> v) {
 }
 
 #if defined(__SSE2__)
-// One instruction each, replacing the templates in lanes.h.
+// Versions with a single instruction, which replace the templates in lanes.h.
 V3DG_INLINE Vec<float> max_of(Vec<float> a, Vec<float> b) {
 #if defined(__AVX512F__)
     return (Vec<float>)_mm512_max_ps((__m512)a, (__m512)b);

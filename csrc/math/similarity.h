@@ -1,8 +1,8 @@
 #pragma once
 
-// Poses of instances, and a camera in the coordinates of an instance: composed in
-// double precision, then rounded. Decisions depend on the results, so sources that call
-// these functions are compiled without contraction.
+// Poses of instances, and the camera in the coordinates of an instance. They are
+// computed in double precision, then rounded. Decisions depend on the results, so
+// sources that use these functions are compiled without floating-point contraction.
 
 #include <cfloat>
 
@@ -18,8 +18,8 @@ struct Pose {
     double scale;
 };
 
-// Returns whether a pose is valid. An instance is not drawn if its pose is not finite,
-// its scale is not positive, or its quaternion is zero.
+// Returns whether a pose is valid: it is finite, its scale is positive, and its
+// quaternion is not zero. An instance with an invalid pose is not drawn.
 V3DG_HD inline bool is_placed(const Pose& pose) {
     double sum = pose.scale;
     for (int k = 0; k < 3; ++k) sum += fabs(pose.position[k]);
@@ -32,10 +32,11 @@ V3DG_HD inline bool is_placed(const Pose& pose) {
     return pose.scale > 0.0 && sum <= DBL_MAX && !is_zero && is_finite;
 }
 
-// The camera in the coordinates of an instance.
+// A camera in the coordinates of an instance. A point p of the instance is at scale *
+// (axes p + origin) in camera coordinates.
 struct InstanceAxes {
     double axes[9],
-        origin[3];  // camera coordinates of a point p, divided by the scale: axes p + origin
+        origin[3];  // camera coordinates of the instance's origin, divided by the scale
     double eye[3];
 };
 
@@ -56,13 +57,13 @@ V3DG_HD inline InstanceAxes axes_of_instance(const CameraPose& camera, const Pos
             out.axes[3 * row + k] = axis;
         }
         out.origin[row] = origin * inverse_scale;
-        // The cut is exact for any eye as long as squared distances are finite.
+        // Clamp, so that squared distances are finite. The cut is exact for any eye.
         out.eye[row] = min_of(max_of(eye * inverse_scale, -1e18), 1e18);
     }
     return out;
 }
 
-// Returns the transform that projection needs.
+// Returns the transform from the instance's model space to view space.
 V3DG_HD inline ModelView<float> model_view_from_instance(const InstanceAxes& in, const Pose& pose) {
     double linear[9], translation[3];
     for (int k = 0; k < 9; ++k) linear[k] = pose.scale * in.axes[k];

@@ -1,6 +1,6 @@
 #pragma once
 
-// SSIM of a pixel and the L1 loss, for CPU and CUDA and for whole pictures.
+// The SSIM of a pixel, and the gradient of the L1 loss, for the CPU and CUDA.
 
 #include "math/lanes.h"
 
@@ -8,8 +8,8 @@ namespace v3dg {
 
 constexpr int kSsimRadius = 5;
 
-// Returns the weight, in the normalised Gaussian window of 11 x 11 with sigma 1.5, of
-// the pixel at distance `offset`.
+// Returns the weight of a pixel at distance `offset` along one axis, in the normalised
+// Gaussian window of 11 x 11 pixels with sigma 1.5.
 template <class T>
 V3DG_HD V3DG_INLINE T ssim_weight(int offset) {
     const T weight[kSsimRadius + 1] = {T(0.2660117248617943),   T(0.21300553771125366),
@@ -18,13 +18,13 @@ V3DG_HD V3DG_INLINE T ssim_weight(int offset) {
     return weight[offset < 0 ? -offset : offset];
 }
 
-// The sums over the window around a pixel, for a picture x and its target y.
+// Weighted sums over the window of a pixel, for a picture x and its target y.
 template <class T>
 struct SsimSums {
     T x, y, xx, yy, xy;
 };
 
-// Structural similarity (Wang et al. 2004, constants 0.01² and 0.03²), and its
+// The structural similarity (Wang et al. 2004, constants 0.01² and 0.03²), and its
 // derivatives with respect to the sums of x, x² and xy.
 template <class T>
 struct Ssim {

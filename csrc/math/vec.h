@@ -1,6 +1,6 @@
 #pragma once
 
-// Products of vectors of three.
+// Dot and cross products.
 
 #include "math/lanes.h"
 

@@ -1,8 +1,7 @@
 #pragma once
 
-// The pose of a camera in the world, and the transform from a model to view space. Both
-// are the same for every camera model; camera/camera.h has the parts that depend on the
-// model.
+// The pose of a camera in the world, and the transform from model space to view space.
+// They do not depend on the camera model (camera/camera.h).
 
 #include <cstdint>
 #include <cstring>
@@ -11,26 +10,25 @@
 
 namespace v3dg {
 
-// Position and orientation of a camera in the world, in double precision.
+// The position and orientation of a camera in the world, in double precision.
 struct CameraPose {
-    double rotation[9];     // world to camera, rows
-    double translation[3];  // of world to camera
-    double eye[3];          // the camera's position in the world
+    double rotation[9];     // world to camera, row major
+    double translation[3];  // world to camera
+    double eye[3];          // position of the camera in the world
 };
 
-// Transform from model space to view space: view = linear * (model - eye) +
-// translation, with linear = uniform scale * rotation. Subtracting the eye first
-// preserves the precision of points near it, however far from the origin both are.
+// The transform from model space to view space: linear * (point - eye) + translation,
+// where `linear` is a uniform scale times a rotation. Subtracting the eye first
+// preserves the precision of nearby points, even far from the origin.
 template <class T>
 struct ModelView {
     T linear[9];            // row major
-    T translation[3];       // remainder after rounding `eye` to 24 bits, in view space
-    T eye[3], eye_rest[3];  // their sum is the camera's position in model space
+    T translation[3];       // the rest of the eye after rounding to 24 bits, in view space
+    T eye[3], eye_rest[3];  // eye + eye_rest: position of the camera in model space
 };
 
-// Returns the leading 24 bits of a number, which a float can represent. The function
-// masks bits instead of casting, because GCC 12 replaces (double)(float)x by x in
-// vectorised code.
+// Returns the leading 24 bits of a number, which a float can represent. Bits are
+// masked, because GCC 12 replaces (double)(float)x by x in vectorised code.
 V3DG_HD inline double leading_bits(double x) {
     uint64_t bits;
     std::memcpy(&bits, &x, sizeof bits);
@@ -39,7 +37,7 @@ V3DG_HD inline double leading_bits(double x) {
     return x;
 }
 
-// Sets the eye, in double precision. `translation` is from view = linear * model +
+// Sets the eye and the translation of a view. `translation` is that of linear * point +
 // translation.
 template <class T>
 V3DG_HD inline void set_eye(const double linear[9], const double translation[3],
@@ -54,7 +52,7 @@ V3DG_HD inline void set_eye(const double linear[9], const double translation[3],
     for (int row = 0; row < 3; ++row) view.translation[row] = T(rest[row]);
 }
 
-// Transforms a point of the model to view space.
+// Transforms a point from model space to view space.
 template <class V, class T>
 V3DG_HD V3DG_INLINE void to_view(const ModelView<T>& mv, const V point[3], V p[3]) {
     const V x = point[0] - mv.eye[0], y = point[1] - mv.eye[1], z = point[2] - mv.eye[2];
@@ -63,16 +61,17 @@ V3DG_HD V3DG_INLINE void to_view(const ModelView<T>& mv, const V point[3], V p[3
                mv.translation[i];
 }
 
-// The vector from the eye to a point, both in model space.
+// Computes the vector from the eye to a point, in model space.
 template <class V, class T>
 V3DG_HD V3DG_INLINE void from_eye(const ModelView<T>& mv, const V point[3], V direction[3]) {
     for (int k = 0; k < 3; ++k) direction[k] = point[k] - mv.eye[k] - mv.eye_rest[k];
 }
 
 // Computes the position of a camera: the point that its world-to-camera matrix maps to
-// 0. The rotation in the matrix may have float32 rounding errors.
+// 0. The rotation may have rounding errors of float32.
 V3DG_HD inline void eye_of(const double viewmat[16], double eye[3]) {
-    // The columns of the inverse rotation are cross products of its rows.
+    // The columns of the inverse are cross products of the rows, divided by the
+    // determinant.
     double determinant = 0.0;
     for (int a = 0; a < 3; ++a) {
         const int b = (a + 1) % 3, c = (a + 2) % 3;

@@ -1,7 +1,7 @@
 #pragma once
 
-// The ellipses of all gaussians on an image, including those that are not drawn, for
-// training.
+// The 2D ellipses of all gaussians, including those that are not drawn. Training uses
+// them to decide where to add and to remove gaussians.
 
 #include <cstdint>
 
@@ -10,18 +10,17 @@
 
 namespace v3dg {
 
-// Arrays of N gaussians. All values are zero for a gaussian that is not visible: it is
-// nearer than the near plane or farther than the far depth, its alpha is below 1/255
-// everywhere, it is outside of the image, or it reaches at most `min_radius_px` from
-// its centre.
+// One row per gaussian. All values of a gaussian are zero if it is not visible: its
+// depth is outside of the near and far limits, its alpha is below 1/255 everywhere, it
+// is outside of the image, or its radius is at most `min_radius_px`.
 template <class T>
 struct Ellipses {
     T* centers;    // (N, 2) px
     T* depths;     // (N,)
-    T* conics;     // (N, 3) inverse covariances as xx, xy, yy, 1 / px²
-    T* opacities;  // (N,) as used for blending, including compensation
-    // (N, 2) distance from the centre, px, up to which alpha is 1/255 or more, rounded
-    // up.
+    T* conics;     // (N, 3) inverse covariances as xx, xy, yy; 1 / px²
+    T* opacities;  // (N,) used for blending: includes the antialiasing factor
+    // (N, 2) half width and half height, px, of the box in which alpha is at least
+    // 1/255; rounded up.
     int32_t* radii;
 };
 
@@ -64,7 +63,7 @@ struct EllipsesInput {
     }
 
   private:
-    // Rounds up. The result is undefined for NaN.
+    // Rounds up to an integer, at most 2^30. The result is undefined for NaN.
     static V3DG_HD int32_t rounded_up(T x) {
         const auto whole = static_cast<int32_t>(min_of(max_of(x, T(0)), T(1 << 30)));
         return whole + (T(whole) < x ? 1 : 0);

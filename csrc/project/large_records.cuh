@@ -1,6 +1,7 @@
 #pragma once
 
-// Large records, which cover many tiles. They are listed in batches for tile_bin.
+// Large records: projected gaussians that cover many tiles. The functions below pass
+// them to tile_bin in batches.
 
 #include "frame/tile_list.h"
 #include "project/warp_space.cuh"
@@ -8,8 +9,8 @@
 namespace v3dg {
 namespace cuda {
 
-// Returns one of `count` parts of a large record: a part of its rows of tiles. The
-// record of an empty part is kNoRecord.
+// Splits the rows of tiles of a large record evenly into `count` parts, and returns one
+// part. The record of an empty part is kNoRecord.
 __device__ inline LargeRecord part_of(LargeRecord large, int part, int count) {
     const int top = large.box.y0 / kFrameTileHeight,
               rows = static_cast<int>(tile_rows_of(large.box));
@@ -20,9 +21,10 @@ __device__ inline LargeRecord part_of(LargeRecord large, int part, int count) {
     return large;
 }
 
-// Writes the item's large records from the queue, in whole batches. An incomplete batch
-// stays in the queue, or is padded at the end of the item. A batch that covers very
-// many tiles is written as several batches, each with a part of every record.
+// Moves the item's large records from the queue to the output, in whole batches. An
+// incomplete batch stays in the queue, unless `is_end` is set; then it is padded. A
+// batch that covers very many tiles is split into several batches, each with a part of
+// every record.
 template <class Model>
 __device__ void write_large(WarpSpace<Model>& space, FrameCounters& counters,
                             const ProjectOutput& out, bool is_end) {

@@ -1,5 +1,5 @@
-// Packs gaussians into the planes that frames read: the rows of an asset, and the pages
-// of a pool, which are rows or codes.
+// Packs gaussians into the planes that frames read. The input is the rows of an asset,
+// or the pages of a pool, as rows or as codes.
 
 #include "base/launch.cuh"
 #include "math/gaussian.h"
@@ -11,7 +11,7 @@ namespace cuda {
 
 namespace {
 
-// Packs a gaussian into row `i` of four planes with `num_rows` rows.
+// Packs one gaussian into row `row` of four planes with `num_rows` rows each.
 __device__ void pack_row(const Gaussian3d<float>& gaussian, const float* sh, float4* planes,
                          size_t num_rows, size_t row) {
     const PackedGaussian p = pack_gaussian(gaussian);
@@ -32,17 +32,16 @@ __device__ Gaussian3d<float> gaussian_of(const GaussianRows<const float>& rows, 
     return gaussian;
 }
 
-// One thread per gaussian.
 __global__ void pack_kernel(GaussianRows<const float> rows, float4* planes) {
     const size_t g = blockIdx.x * size_t(blockDim.x) + threadIdx.x;
     if (g < rows.size)
         pack_row(gaussian_of(rows, g), rows.sh + g * rows.num_sh(), planes, rows.size, g);
 }
 
-// Decodes a row of a page of codes; `sh` has room for all coefficients.
+// Decodes a row of a coded page. `sh` must have room for all SH coefficients.
 __device__ Gaussian3d<float> decoded(const PageCodes<const uint32_t>& codes, size_t row,
                                      float* sh) {
-    // Becomes the last cluster that begins at or before the row.
+    // Find the last cluster that begins at or before the row.
     size_t cluster = codes.num_clusters() - 1;
     while (static_cast<size_t>(codes.offset[cluster]) > row) --cluster;
     const uint32_t* words = codes.ranges(cluster);
@@ -55,7 +54,8 @@ __device__ Gaussian3d<float> decoded(const PageCodes<const uint32_t>& codes, siz
     return gaussian;
 }
 
-// One block per page. The coefficients of degree 0 are in the planes.
+// One block per page. `sh` receives the coefficients of degree 1 and above; `planes`
+// receive the colour of degree 0.
 __global__ void pack_pages_kernel(const PageRows* pages, float4* planes, size_t num_rows, float* sh,
                                   int sh_stride) {
     const PageRows page = pages[blockIdx.x];

@@ -1,6 +1,6 @@
-// Backward pass of projection. Each block processes an item, each thread one of its
-// records. SH coefficients are loaded into shared memory, one row per gaussian, where
-// the kernel overwrites them with their gradients.
+// The backward pass of projection on CUDA. A block processes an item, a thread one
+// record. A block loads the SH coefficients of its gaussians into shared memory and
+// overwrites them there with their gradients.
 
 #include <type_traits>
 
@@ -14,8 +14,10 @@ namespace cuda {
 namespace {
 
 constexpr int kThreads = kItemSize;
-constexpr uint32_t kFewSlots = 16;  // up to this many are summed by a thread, more by a warp
-constexpr int kWordsAtOnce = 6;     // floats that a thread loads before it stores the first one
+// One thread sums up to this many slots of a record; a warp sums more.
+constexpr uint32_t kFewSlots = 16;
+// SH words that a thread loads before it stores the first one
+constexpr int kWordsAtOnce = 6;
 
 template <class Value>
 __device__ void add_slot(const Value* of_slot, uint32_t i, Value& sum) {
@@ -26,8 +28,8 @@ __device__ void add_slot(const Value* of_slot, uint32_t i, Value& sum) {
     sum += slot;
 }
 
-// Sums `num` slots in their order or, if there are many, in another fixed order. All
-// lanes of the warp take part. Returns whether any slot was written.
+// Sums `num` slots in a fixed order, so that the bits of the result are reproducible.
+// All lanes of the warp must call it. Returns whether any slot was written.
 template <class Value>
 __device__ bool sum_of_slots(const GradientSlots& slots, const Value* of_slot, uint32_t first,
                              uint32_t num, Value& sum) {
@@ -102,7 +104,8 @@ __device__ void store_row(float* rows, uint64_t i, const float* row) {
     for (int k = 0; k < kWidth; ++k) rows[kWidth * i + k] = row[k];
 }
 
-// How a row of SH coefficients is copied. The stride is odd to avoid bank conflicts.
+// The layout of a row of SH coefficients in shared memory. The stride is odd, which
+// avoids bank conflicts.
 template <int kDegree>
 struct ShRow {
     static constexpr int kValues = 3 * num_sh_bases(kDegree);
@@ -111,8 +114,7 @@ struct ShRow {
     static constexpr int kStride = kWords | 1;
 };
 
-// The gaussians of a block: of the only model, kItemSize after another, or of an item
-// of a batch.
+// The gaussians that a block processes: those of an item.
 struct BlockRows {
     uint64_t first;  // row of the first gaussian
     int count;
@@ -126,8 +128,8 @@ __device__ BlockRows rows_of_block(const ProjectBackwardInput& in, const ItemBat
     const uint64_t first = static_cast<uint64_t>(blockIdx.x) * kItemSize;
     return {first, static_cast<int>(min(static_cast<uint64_t>(kItemSize), in.rows.size - first))};
 }
-// They are asked with a compile-time constant, so that those of a single picture stay
-// in constant memory.
+// The template parameter lets the compiler read the view of a single picture from
+// constant memory.
 template <bool kIsBatch>
 __device__ const ModelView<float>& view_of_block(const ProjectBackwardInput& in,
                                                  const ItemBatch& batch) {
@@ -149,7 +151,7 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
     using Row = ShRow<kDegree>;
     using Word = typename Row::Word;
     Word* sh_rows = reinterpret_cast<Word*>(shared_memory());
-    __shared__ bool is_used[kThreads];  // whether any gradient reaches the gaussian
+    __shared__ bool is_used[kThreads];  // whether the gaussian has a gradient
     const BlockRows block = rows_of_block<kIsBatch>(in, batch);
     const uint64_t first = block.first,
                    first_record = static_cast<uint64_t>(blockIdx.x) * kItemSize;
@@ -160,10 +162,10 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
 
     const uint64_t record = first_record + threadIdx.x;
     const bool is_record = threadIdx.x < in.item_records[blockIdx.x];
-    const uint64_t i = is_record ? in.source[record] : 0;  // the gaussian of the record
+    const uint64_t i = is_record ? in.source[record] : 0;  // gaussian of the record
     Gaussian3d<float> g{};
     float color[3] = {0, 0, 0};
-    if (is_record) {  // early, so that it arrives while the slots are summed
+    if (is_record) {  // The loads are in flight while the slots are summed.
         load_row(in.rows.means, i, g.mean);
         load_row(in.rows.quats, i, g.quat);
         load_row(in.rows.scales, i, g.scale);
@@ -203,7 +205,8 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
     }
     __syncthreads();
 
-    // Gradients go to the gaussians' own rows, or in a batch to those of their item.
+    // Without a batch, the output row of a gaussian is its row in the model. In a
+    // batch, each item has rows of its own.
     const uint64_t first_out = kIsBatch ? first_record : first;
     if (used) {
         const ModelView<float>& view = view_of_block<kIsBatch>(in, batch);
@@ -244,7 +247,8 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
                         : Word{};
 }
 
-// Writes the sizes of the gradients of the gaussians' centres. `sizes` starts as zeros.
+// Sums the sizes of the gradients of each gaussian's centre. `sizes` must be zero
+// initially.
 __global__ void __launch_bounds__(kThreads)
     center_sizes_kernel(ProjectBackwardInput in, GradientSlots slots, CenterSize<float>* sizes) {
     const uint64_t record = static_cast<uint64_t>(blockIdx.x) * kItemSize + threadIdx.x;

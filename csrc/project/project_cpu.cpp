@@ -1,6 +1,6 @@
-// Projection on the CPU, forward and backward, a vector of gaussians at a time. In the
-// forward pass the lanes are neighbours in the planes. Compiled once for each
-// instruction set.
+// Projection on the CPU, forward and backward. Each step processes a vector of
+// gaussians. In the forward pass, the lanes are adjacent gaussians in memory. Compiled
+// once per instruction set.
 
 #include "project/project.h"
 
@@ -12,12 +12,13 @@
 namespace v3dg {
 namespace V3DG_ISA {
 
-// Gaussians in planes.
+// Reads gaussians from planes (one array per component).
 template <class T>
 struct PlaneSource {
     const GaussianPlanes<T>& m;
 
-    // Loads the gaussians from row i on; planes are padded, so all lanes may be read.
+    // Loads a vector of gaussians that starts at row i. All lanes may be read, because
+    // planes are padded.
     V3DG_INLINE Gaussian3d<Vec<T>> load_gaussians(uint64_t i, uint64_t) const {
         Gaussian3d<Vec<T>> g;
         for (int k = 0; k < 3; ++k) g.mean[k] = load(m.mean[k] + i);
@@ -32,7 +33,8 @@ struct PlaneSource {
     }
 };
 
-// Gaussians of one cluster as codes. Lanes beyond its end repeat its last gaussian.
+// Reads the coded gaussians of one cluster. Lanes beyond the end of the cluster repeat
+// its last gaussian.
 struct CodeSource {
     using V = Vec<float>;
 
@@ -61,7 +63,7 @@ struct CodeSource {
     }
 
   private:
-    // Loads `width` integers of each row; rows begin `stride` integers apart.
+    // Loads the first `width` words of each row. Rows begin `stride` words apart.
     static V3DG_INLINE void load_words(const uint32_t* rows, int width, uint64_t stride,
                                        uint64_t count, Bits<V>* words) {
         for (int lane = 0; lane < kLanes<float>; ++lane) {
@@ -71,15 +73,15 @@ struct CodeSource {
     }
 };
 
-// Returns the number of tiles that contain the pixels from `first` to `last` on one
+// Returns the number of tiles that the pixels from `first` to `last` touch along one
 // axis.
 template <class I>
 static V3DG_INLINE I tiles_of(I first, I last) {
     return last / kTileSize - first / kTileSize + 1;
 }
 
-// Loads the colours of the clusters of the gaussians from `at` on, for the lanes in
-// `kept`.
+// Loads the palette colours of gaussians `at`, `at` + 1, ... for the lanes whose bits
+// are set in `kept`. Other lanes become 0.
 template <class V>
 static V3DG_INLINE void load_palette(const Palette& palette, uint64_t at, unsigned kept, V sh[3]) {
     for (int k = 0; k < 3; ++k) sh[k] = V{};
@@ -90,7 +92,7 @@ static V3DG_INLINE void load_palette(const Palette& palette, uint64_t at, unsign
     }
 }
 
-// Writes the records of the `count` gaussians from `at` on whose bits are set in
+// Writes the records of those gaussians `at`, `at` + 1, ... whose bits are set in
 // `lanes`.
 template <class Source, class T, class V, class I>
 static V3DG_INLINE void write_records(const Source& from, const Draw<T>& draw, uint64_t at,
@@ -119,7 +121,7 @@ static V3DG_INLINE void write_records(const Source& from, const Draw<T>& draw, u
     }
 }
 
-// project() for rows of one source, beginning at row `first`.
+// Implements project() for one source. `first` is the row of the first gaussian.
 template <class Source, class T>
 static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t first, uint64_t count,
                            const Intrinsics<T>& camera, const Window& window, Record<T>* records,
@@ -156,8 +158,8 @@ static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t fir
         reach.drawn += __builtin_popcount(drawn_bits);
         top = min_of(top, drawn ? box.y0 : top);
         bottom = max_of(bottom, drawn ? box.y1 : bottom);
-        // The product may overflow for gaussians that are not drawn, because their
-        // boxes can be very large.
+        // Masked before the multiplication: the boxes of gaussians that are not drawn
+        // can be so large that the product overflows.
         const I columns = drawn ? tiles_of(box.x0, box.x1) : I{},
                 rows = drawn ? tiles_of(box.y0, box.y1) : I{};
         entries += columns * rows;
@@ -182,7 +184,7 @@ static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t fir
     return num_records;
 }
 
-// project() for codes, a cluster at a time.
+// Implements project() for codes, one cluster after another.
 static size_t project_codes(const Draw<float>& draw, uint64_t skip, uint64_t count,
                             const Intrinsics<float>& camera, const Window& window,
                             Record<float>* records, uint32_t* source, uint32_t source_base,
@@ -218,8 +220,8 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Intrins
                         records, source, source_base, reach);
 }
 
-// The gaussians are scattered, so lanes are filled one by one. This costs little
-// compared to the arithmetic.
+// The gaussians of adjacent records are scattered in memory, so the lanes are filled
+// one by one. This costs little compared to the arithmetic.
 template <class T>
 void project_backward(const Draw<T>& draw, const uint32_t* source,
                       const RecordGradient<T>* d_records, size_t count, const Intrinsics<T>& camera,
@@ -235,7 +237,7 @@ void project_backward(const Draw<T>& draw, const uint32_t* source,
         Ellipse<V> d{};
         V d_color[3] = {};
         for (size_t i = 0; i < kWidth; ++i) {
-            // Unused lanes repeat the first gaussian with zero gradients.
+            // Unused lanes repeat the first gaussian; their gradients are zero.
             const size_t at = done + (i < lanes ? i : 0);
             const uint64_t s = draw.first + source[at];
             for (int k = 0; k < 3; ++k) g.mean[k][i] = m.mean[k][s];

@@ -1,16 +1,16 @@
-// Projects the items of a frame: the kernels, and how a warp processes an item.
+// Projects the items of a frame on CUDA.
 //
 // A warp processes one item at a time. It tests the bounding spheres of 32 gaussians at
-// a time (sphere_test.cuh). Gaussians that may reach a pixel centre enter a queue, and
-// are projected as soon as the queue has 32 of them (write_records.cuh). So no lane
-// idles for a gaussian that is not drawn, and records are in order without
-// synchronisation between warps. If nearly all of 32 gaussians pass, the next ones are
-// projected without the test, which would cost more than it saves.
+// once (sphere_test.cuh). Gaussians that pass the test enter a queue. When the queue
+// has 32 gaussians, the warp projects them (write_records.cuh). So all lanes do useful
+// work, and the records of an item are in order without synchronisation between warps.
+// If nearly all of 32 gaussians pass, the warp projects the next gaussians without the
+// test, which would cost more than it saves.
 //
-// In a shared item a warp processes one gaussian at a time, in front of up to 32
-// placements. Many distant instances of a small cluster thus become a few items with
-// full warps, which read each gaussian once. Shared items have a separate kernel,
-// because they need more registers.
+// A shared item is one cluster that several placements draw. A warp then processes one
+// gaussian at a time for up to 32 placements. Many distant instances of a small cluster
+// thus become a few items with full warps, and each gaussian is read once. Shared items
+// have a kernel of their own, because they need more registers.
 
 #include "project/project_cuda.h"
 
@@ -27,18 +27,18 @@ namespace cuda {
 
 namespace {
 
-constexpr unsigned kBlocks = 4;  // per multiprocessor
-// An item is tested by rows if at least kManySmall of its first 32 gaussians have a
-// reach below kSmall px.
+constexpr unsigned kBlocks = 4;  // resident blocks per multiprocessor
+// drop_missed_rows() is applied to an item if at least kManySmall of its first 32
+// gaussians have a half extent below kSmall px.
 constexpr float kSmall = 3;
 constexpr unsigned kManySmall = 4;
-// If at least kNearlyAll of 32 gaussians pass the sphere test, the next ones are not
-// tested, as long as at least kMany of 32 become records.
+// If at least kNearlyAll of 32 gaussians pass the sphere test, the next gaussians skip
+// the test. The test resumes when fewer than kMany of 32 gaussians become records.
 constexpr unsigned kNearlyAll = 22, kMany = 12;
 
-// Projects the item whose tables the warp has loaded. `factors` are those of its
-// placement, or of all placements that share the item; null unless the source has
-// factors. Returns its number of records.
+// Projects the item whose tables the warp has loaded, and returns its number of
+// records. `factors` are those of the item's placement or, in a shared item, of all its
+// placements. `factors` is null if the source has no factors.
 template <class Source, bool kIsShared>
 __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const Placement* sharers,
                                  const InstanceFactors* factors, FrameCounters& counters,
@@ -61,7 +61,7 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
     };
     const float reach_scale = sees ? reach_scale_of() : 0;
     unsigned head = 0, waiting = 0;
-    uint32_t record = tables.item.record;  // index of the next record
+    uint32_t record = tables.item.record;  // index of the next record to write
     ItemTraits traits{.are_small = false, .have_shade = Source::has_shade(tables.model)};
     bool are_tested = true;
     const typename Source::Place start = Source::start(tables);
@@ -102,8 +102,8 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
             __syncwarp();
             const bool are_nearly_all = !kIsShared && __popc(come) >= kNearlyAll;
             if (waiting < 32 && first + kRound < count && !are_nearly_all) continue;
-            // After the last gaussian, the queue may contain up to two iterations'
-            // worth.
+            // After the last gaussian, more than 32 gaussians may be left in the queue;
+            // the next iterations project them.
             const unsigned taken = min(waiting, 32u);
             may_reach = lane < taken;
             if (may_reach) mine = space.queue[(head + lane) % kQueue];
@@ -116,7 +116,7 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
                                              mine, record, counters, out, num_in_frustum);
         record += num_records;
         are_tested = are_tested || num_records < kMany;
-        __syncwarp();  // the queue and the records are written next
+        __syncwarp();  // the next iteration overwrites the queue and the records
     }
     write_large(space, counters, out, true);
     return record - tables.item.record;
@@ -136,7 +136,8 @@ __device__ void report_item(const ItemTables<Model>& tables, unsigned item, unsi
 __device__ void report_counts(FrameCounters& counters, unsigned num_in_frustum,
                               unsigned num_records) {
     num_in_frustum = warp_sum(num_in_frustum);
-    if (threadIdx.x % 32 != 0 || num_in_frustum == 0) return;  // a record is always in the frustum
+    // A record is always in the frustum, so without in_frustum there are no records.
+    if (threadIdx.x % 32 != 0 || num_in_frustum == 0) return;
     atomicAdd(&counters.in_frustum, static_cast<unsigned long long>(num_in_frustum));
     atomicAdd(&counters.records, static_cast<unsigned long long>(num_records));
 }
@@ -162,10 +163,11 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     Loaded loaded;
     Source::prepare();
     space.tiles.count = 0;
-    __syncwarp();  // A warp without an item skips to its next read.
-    // The number of visible gaussians per item varies widely, so warps claim items from
-    // a counter. A warp claims its next item when it starts with one, to hide the
-    // latency.
+    // A warp without an item skips the loop and reads the tile queue at once.
+    __syncwarp();
+    // Warps claim items from a counter, because the number of visible gaussians per
+    // item varies widely. A warp claims its next item when it starts the current one,
+    // to hide the latency of the atomic operation.
     for (unsigned i = blockIdx.x * kWarps + threadIdx.x / 32; i < num_items;) {
         const uint32_t item_word = load_word(in.items.items[i]);
         const unsigned next = take_next(taken, gridDim.x * kWarps);
@@ -186,8 +188,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     report_counts(*in.items.counters, num_in_frustum, num_records);
 }
 
-// Most frames have few shared items, so a warp searches 32 items at a time for shared
-// ones.
+// Most frames have few shared items, so a warp examines 32 items at once to find them.
 template <class Source>
 __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     project_shared_kernel(ProjectInput in, const typename Source::Model* models,
@@ -202,7 +203,8 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     Loaded loaded;
     Source::prepare();
     space.tiles.count = 0;
-    __syncwarp();  // A warp without an item reads it next.
+    // A warp without an item skips the loop and reads the tile queue at once.
+    __syncwarp();
     for (unsigned first = blockIdx.x * kWarps + threadIdx.x / 32; first < num_items;
          first += 32 * stride) {
         const unsigned mine = first + threadIdx.x % 32 * stride;
@@ -229,7 +231,8 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
 
 }  // namespace
 
-// `SharedSource` is never faded, because shared items have weight 1.
+// `SharedSource` reads the models of shared items. It never fades, because shared items
+// have weight 1.
 template <class Source, class SharedSource>
 static void project_from(const typename Source::Model* models, const ProjectInput& in,
                          const ProjectOutput& out, int taken, cudaStream_t stream) {

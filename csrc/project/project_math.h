@@ -1,12 +1,13 @@
 #pragma once
 
-// Projects one gaussian for one camera: its ellipse on the image, the pixels that it
-// may reach, and the gradients of the ellipse.
+// Projects one gaussian with one camera: its ellipse on the image, the pixels that it
+// may reach, and the gradients.
 //
-// This is EWA projection (Zwicker et al. 2001) as 3D Gaussian Splatting uses it (Kerbl
+// This is EWA projection (Zwicker et al. 2001) as used by 3D Gaussian Splatting (Kerbl
 // et al. 2023), for any camera model (camera/camera.h). The 2D covariance is A Aᵀ +
-// filter I with A = J W R S (2x3), where J is the model's Jacobian. Its determinant is
-// |a1 x a2|² plus positive terms, so nothing cancels, however thin the gaussian is.
+// filter I with the 2x3 matrix A = J W R S; J is the Jacobian of the camera model. Its
+// determinant is |a1 x a2|² plus positive terms, so no digits cancel, however thin the
+// gaussian is.
 
 #include "camera/camera.h"
 #include "frame/draw_list.h"
@@ -17,24 +18,24 @@
 
 namespace v3dg {
 
-// Intermediate results of the projection, which the gradients use again.
+// Intermediate results of the projection. The backward pass reuses them.
 template <class V, ProjectingModel C = Intrinsics<Lane<V>>>
 struct Projection {
-    V p[3];          // view space
-    V linear_rs[9];  // view-space linear part times the gaussian's rotation and scales
+    V p[3];          // mean, in view space
+    V linear_rs[9];  // W R S: the gaussian's axes in view space
     V a1[3], a2[3];
-    typename C::template Point<V> at;  // the Jacobian at p
+    typename C::template Point<V> at;  // determines the Jacobian at p
     V c11, c12, c22, det0, det;
 };
 
-// The limit of a limited filter: this multiple of the gaussian's own variance, which is
-// the square root of its determinant. With it, a round gaussian keeps at least a fifth
-// of its opacity. Without it, many tiny gaussians that together cover an area would all
-// fall below the smallest alpha that is drawn, and vanish.
+// The upper limit of a limited filter, as a multiple of the square root of the
+// determinant of the gaussian's own 2D covariance. A round gaussian then keeps at least
+// a fifth of its opacity. Without the limit, the alphas of many tiny gaussians that
+// together cover an area could all fall below 1/255, and the area would vanish.
 constexpr float kMostFilterOfVariance = 4;
 
-// Sets the ellipse with covariance A Aᵀ + filter I, except its opacity. `s` contains
-// the rows a1 and a2 of A, p and the Jacobian.
+// Returns the ellipse with covariance A Aᵀ + filter I, without its opacity. `s` must
+// contain p, the Jacobian, and the rows a1 and a2 of A.
 template <class V, ProjectingModel C>
 V3DG_HD V3DG_INLINE Ellipse<V> ellipse_of_axes(const C& cam, Lane<V> most_filter_px2,
                                                bool is_limited, Projection<V, C>& s) {
@@ -59,10 +60,10 @@ V3DG_HD V3DG_INLINE Ellipse<V> ellipse_of_axes(const C& cam, Lane<V> most_filter
     return e;
 }
 
-// Returns the ellipse of a gaussian. Precondition: s.p is set, at a positive depth.
-// `filter_px2` is added to both variances. With `antialiased` the opacity is multiplied
-// by sqrt(det before / det after), which preserves the integral of the gaussian over
-// the image.
+// Returns the ellipse of a gaussian. Precondition: s.p is set, and its depth is
+// positive. `filter_px2` is added to both variances. If `antialiased`, the opacity is
+// multiplied by sqrt(determinant before / after adding the filter), which preserves the
+// gaussian's integral over the image.
 template <class V, class T, ProjectingModel C>
 V3DG_HD V3DG_INLINE Ellipse<V> project_gaussian(const Gaussian3d<V>& g, const ModelView<T>& mv,
                                                 const C& cam, T filter_px2, bool antialiased,
@@ -84,15 +85,16 @@ V3DG_HD V3DG_INLINE Ellipse<V> project_gaussian(const Gaussian3d<V>& g, const Mo
     return e;
 }
 
-// Multiplies the opacity by the weight of a level that fades in or out.
+// Multiplies the opacity by `weight`, the weight of a cluster that fades in or out.
 template <class V>
 V3DG_HD V3DG_INLINE void fade(Lane<V> weight, Ellipse<V>& e) {
     e.log2_opacity += log2_of(weight);
 }
 
-// Sets the distance from the centre, px, up to which alpha is 1/255 or more: |L d|² is
-// at most log2 of (alpha at the centre / (1/255)). Returns whether the depth is finite
-// and alpha reaches 1/255 at all; if not, the extent is undefined.
+// Sets half_x and half_y: the half size, px, of the box in which alpha can be at least
+// 1/255. That is where |L d|² <= log2(255 alpha), with alpha at the centre. Returns
+// false, and leaves the box undefined, if the depth is not finite or alpha is below
+// 1/255 everywhere.
 template <class V, ProjectingModel C>
 V3DG_HD V3DG_INLINE auto extent_of(V opacity, const Ellipse<V>& e, const Projection<V, C>& s,
                                    V& half_x, V& half_y) {
@@ -105,8 +107,8 @@ V3DG_HD V3DG_INLINE auto extent_of(V opacity, const Ellipse<V>& e, const Project
            (s.det > V{}) & (s.det < huge) & (half_x < huge) & (half_y < huge) & (e.depth < huge);
 }
 
-// The version of project_gaussian() for packed gaussians. Precondition: s.p is set. It
-// does not change s.linear_rs.
+// Like project_gaussian(), for packed gaussians. Precondition: s.p is set. Leaves
+// s.linear_rs unset.
 template <ProjectingModel C>
 V3DG_HD V3DG_INLINE Ellipse<float> project_packed(const PackedGaussian& g,
                                                   const ModelView<float>& mv, const C& cam,
@@ -114,7 +116,7 @@ V3DG_HD V3DG_INLINE Ellipse<float> project_packed(const PackedGaussian& g,
                                                   const Appearance<float>& look,
                                                   Projection<float, C>& s) {
     s.at = cam.linearized(limits, s.p);
-    float row1[3], row2[3];  // rows of the Jacobian times the view rotation
+    float row1[3], row2[3];  // J W, the Jacobian times the view rotation
     for (int k = 0; k < 3; ++k)
         cam.times_jacobian(s.at, mv.linear[k], mv.linear[3 + k], mv.linear[6 + k], row1[k],
                            row2[k]);
@@ -130,37 +132,36 @@ V3DG_HD V3DG_INLINE Ellipse<float> project_packed(const PackedGaussian& g,
     return e;
 }
 
-// Returns whether no pixel centre is within `half` of `center` on one axis, with the
-// margin of pixel_span().
+// Returns whether no pixel centre is within `half` of `center` along one axis, with the
+// same margin as pixel_span().
 template <class T>
 V3DG_HD V3DG_INLINE bool misses_centers(T center, T half) {
     const T from_center = center - T(0.5);
     return abs_of(from_center - round_of(from_center)) > half * T(1 + 1e-5) + T(2e-3);
 }
 
-// Returns whether the interval of half width `half` around `center` intersects (0,
-// size).
+// Returns whether the interval [center - half, center + half] intersects (0, size).
 template <class V>
 V3DG_HD V3DG_INLINE auto meets_image(V center, V half, Lane<V> size) {
     return (center + half > V{}) & (center - half < all_lanes<V>(size));
 }
 
-// Sets `low` and `high` such that the pixels from ceil(low) to floor(high) are those
-// with centres within `half` of `center`, plus a margin, so that the blend step alone
-// decides. For any arguments, NaN included, `low` is in [0, size] and `high` in [-1,
-// size - 1], so neither overflows an integer.
+// Computes the range of pixels, along one axis, whose centres are within `half` of
+// `center`: from ceil(low) to floor(high). A margin makes the range slightly too large,
+// so that only the blend step decides. For any input, including NaN, `low` is in [0,
+// size] and `high` in [-1, size - 1], so converting them to integers is safe.
 template <class V>
 V3DG_HD V3DG_INLINE void pixel_span(V center, V half, Lane<V> size, V& low, V& high) {
     using T = Lane<V>;
     const V margin = half * T(1e-5) + T(2e-3);
-    // If the first argument is NaN, min_of() and max_of() return the second.
+    // min_of(x, y) and max_of(x, y) return y if x is NaN.
     low = min_of(max_of(center - half - margin - T(0.5), V{}), all_lanes<V>(size));
     high = max_of(min_of(center + half + margin - T(0.5), all_lanes<V>(size - 1)),
                   all_lanes<V>(T(-1)));
 }
 
-// Returns the pixels of the camera's image whose centres are in the box of an ellipse
-// of this extent.
+// Returns the pixels of the image whose centres are in an ellipse's bounding box, which
+// is given by its half sizes.
 template <class V, ProjectingModel C>
 V3DG_HD V3DG_INLINE auto pixel_box(const Ellipse<V>& e, V half_x, V half_y, const C& camera) {
     V low_x, high_x, low_y, high_y;
@@ -172,14 +173,14 @@ V3DG_HD V3DG_INLINE auto pixel_box(const Ellipse<V>& e, V half_x, V half_y, cons
 }
 
 // Computes the gradients of the gaussian's mean, quaternion, scales and opacity from
-// those of its ellipse.
+// `d`, the gradients of its ellipse.
 template <class V, class T, ProjectingModel C>
 V3DG_HD V3DG_INLINE Gaussian3d<V> project_gaussian_vjp(const Gaussian3d<V>& g,
                                                        const ModelView<T>& mv, const C& cam,
                                                        T filter_px2, bool antialiased,
                                                        const Projection<V, C>& s,
                                                        const Ellipse<V>& e, const Ellipse<V>& d) {
-    // Propagate from the ellipse to the covariance; c11 enters only through det.
+    // From the ellipse to the covariance. c11 affects the ellipse only through det.
     const V d_l11 = d.l11 - d.l12 * (s.c12 / s.c22);
     const V half = 1 / (2 * s.c22);
     const V d_c22 = (d_l11 * e.l11 - d.l22 * e.l22) * half - d.l12 * e.l12 / s.c22;
@@ -187,7 +188,8 @@ V3DG_HD V3DG_INLINE Gaussian3d<V> project_gaussian_vjp(const Gaussian3d<V>& g,
     V d_det = -d_l11 * e.l11 / (2 * s.det);
     V d_det0 = V{};
     Gaussian3d<V> out;
-    // log2_opacity = log2(opacity) + log2(det0 / det) / 2
+    // log2_opacity = log2(opacity) + log2(det0 / det) / 2; the last term if
+    // antialiased.
     out.opacity = d.log2_opacity / (T(kLn2) * g.opacity);
     if (antialiased) {
         d_det -= d.log2_opacity / (T(2 * kLn2) * s.det);
@@ -205,7 +207,7 @@ V3DG_HD V3DG_INLINE Gaussian3d<V> project_gaussian_vjp(const Gaussian3d<V>& g,
             2 * (d_det0 * into_a2[k] + (filter_px2 * d_det + d_c22) * s.a2[k]) + d_c12 * s.a1[k];
     }
 
-    V d_m[9], d_p[3];  // of linear_rs and p
+    V d_m[9], d_p[3];  // gradients of linear_rs and p
     cam.linearized_vjp(s.at, s.p, s.linear_rs, s.a1, s.a2, d_image, d_p, d_m);
     for (int i = 0; i < 3; ++i)
         out.mean[i] = mv.linear[i] * d_p[0] + mv.linear[3 + i] * d_p[1] + mv.linear[6 + i] * d_p[2];

@@ -1,13 +1,13 @@
 #pragma once
 
-// The sources from which the project kernels read gaussians: rows, planes of packed
-// gaussians, or codes.
+// The sources from which the projection kernels read gaussians: rows, packed planes, or
+// codes.
 //
-// A source computes a gaussian in steps, because most gaussians reach no pixel centre.
-// fetch() loads what the bounding sphere depends on; sphere() returns mean and reach;
-// project() returns ellipse and colour, for a Projection whose p is set; shade()
-// replaces the colour, for models for which has_shade() is true. The factors of
-// instances are applied afterwards.
+// A source computes a gaussian in steps, because most gaussians reach no pixel centre
+// and need only the first steps. fetch() loads the data of the bounding sphere.
+// sphere() returns the mean and the radius. project() returns the ellipse and the
+// colour; p of the Projection must be set. shade() replaces the colour; it is called if
+// has_shade() is true. The kernel applies the factors of instances afterwards.
 
 #include "base/launch.cuh"
 #include "project/project_cuda.h"
@@ -16,21 +16,22 @@
 namespace v3dg {
 namespace cuda {
 
-// The tables of an item.
+// The tables of one item: its placement, image and model.
 template <class Model>
 struct ItemTables {
     alignas(16) Placement placement;
     alignas(16) FrameImage image;
     alignas(16) Model model;
     DrawItem item;
-    Intrinsics<float>::Limits limits;  // of the image's camera
+    Intrinsics<float>::Limits limits;  // limits of the image's camera
 };
 
 __device__ inline float4 load4(const float* rows, uint32_t row) {
     return __ldg(reinterpret_cast<const float4*>(rows) + row);
 }
 
-// `sh(k)` is the k-th coefficient, as in color_of_coefficients().
+// Sets `color` for the view direction. sh(k) returns the k-th coefficient (see
+// color_of_coefficients()).
 template <int kDegree, class Coefficient>
 __device__ void color_of(const Coefficient& sh, const float mean[3], const ModelView<float>& view,
                          float color[3]) {
@@ -39,8 +40,8 @@ __device__ void color_of(const Coefficient& sh, const float mean[3], const Model
     color_of_coefficients(kDegree, direction, sh, color);
 }
 
-// Loads each coefficient at its use, because there are not enough registers for all of
-// them.
+// Like color_of(), for coefficients in memory. Each coefficient is loaded where it is
+// used, because registers cannot hold all of them.
 template <int kDegree>
 __device__ void color_of_row(const float* row, const float mean[3], const ModelView<float>& view,
                              float color[3]) {
@@ -54,12 +55,12 @@ __device__ void color_of_row(const float* row, const float mean[3], const ModelV
     color_of<kDegree>(coefficient, mean, view, color);
 }
 
-// The base of sources with a row for each gaussian.
+// The base of sources that have a row for each gaussian.
 template <class RowModel>
 struct OfRows {
     using Model = RowModel;
     using Fetched = float4;
-    struct Place {};  // a row needs no further state
+    struct Place {};  // rows are addressed directly
     static constexpr bool kFades = false;
     static constexpr bool kTints = false;
 
@@ -70,7 +71,7 @@ struct OfRows {
     }
 };
 
-// Unpacked gaussians, in the caller's memory.
+// Reads unpacked gaussians from the caller's memory.
 struct RowSource : OfRows<GaussianRows<const float>> {
     static __device__ bool has(const Model&) { return true; }
     static __device__ bool has_shade(const Model& m) { return m.sh_degree > 0; }
@@ -95,7 +96,7 @@ struct RowSource : OfRows<GaussianRows<const float>> {
         gaussian.quat[1] = quat.y;
         gaussian.quat[2] = quat.z;
         gaussian.quat[3] = quat.w;
-        const float* sh = m.sh + 3 * size_t(g);  // used only if there is a single coefficient
+        const float* sh = m.sh + 3 * size_t(g);  // used only for degree 0
         if (m.sh_degree == 0)
             color_of_row<0>(sh, gaussian.mean, view, color);
         else if (m.sh_degree == kPlainColor)
@@ -119,7 +120,7 @@ struct RowSource : OfRows<GaussianRows<const float>> {
     }
 };
 
-// PackedGaussian, which is fastest to project.
+// Reads packed gaussians, the fastest source.
 struct PackedSource : OfRows<PackedPlanes> {
     static __device__ bool has(const Model& m) { return m.plane[0] != nullptr; }
     static __device__ bool has_palette(const Model& m) { return m.palette.sh != nullptr; }
@@ -150,17 +151,18 @@ struct PackedSource : OfRows<PackedPlanes> {
     }
 };
 
-// Coded gaussians. The results have the same bits as those of decoding to rows and
-// packing the rows.
+// Reads coded gaussians. The results have the same bits as if the codes were decoded to
+// rows and then packed.
 struct CodeSource {
     using Model = CodedGaussians;
     using Fetched = uint4;
     static constexpr bool kFades = false;
     static constexpr bool kTints = false;
     struct Place {
-        uint32_t cluster, end;  // cluster of a row, and end of the cluster's rows
+        // cluster of the current row, and the end of that cluster's rows
+        uint32_t cluster, end;
     };
-    // Values that depend only on the code of the opacity.
+    // Values that depend only on the code of the opacity. A table holds them.
     struct OpacityEntry {
         float reach_in_sigmas, log2_opacity;
     };
@@ -174,7 +176,7 @@ struct CodeSource {
         __shared__ OpacityEntry entries[kMostOpacity + 1];
         return entries;
     }
-    // Fills the table of opacities. Called by the whole block.
+    // Fills the table of OpacityEntry. All threads of the block must call it.
     static __device__ void prepare() {
         for (unsigned code = threadIdx.x; code <= kMostOpacity; code += blockDim.x) {
             const float opacity = static_cast<float>(code) * kOpacityStep;
@@ -182,7 +184,8 @@ struct CodeSource {
         }
         __syncthreads();
     }
-    // Returns the place of the item's first gaussian. Called by the whole warp.
+    // Returns the place of the item's first gaussian. All lanes of the warp must call
+    // it.
     static __device__ Place start(const ItemTables<Model>& in) {
         const Span<const int64_t>& offset = in.model.codes.offset;
         const uint32_t next = in.item.cluster + 1 + threadIdx.x % 32;
@@ -191,7 +194,8 @@ struct CodeSource {
         const uint32_t cluster = in.item.cluster + __popc(__ballot_sync(kAllLanes, is_before));
         return {cluster, static_cast<uint32_t>(__ldg(offset.data + cluster + 1))};
     }
-    // Advances the place to a row of the same cluster or of a later one.
+    // Moves the place forward to the cluster of row g. Rows must not decrease from call
+    // to call.
     static __device__ void advance(const Model& m, Place& place, uint32_t g) {
         while (g >= place.end)
             place.end = static_cast<uint32_t>(__ldg(m.codes.offset.data + ++place.cluster + 1));
@@ -273,13 +277,13 @@ struct CodeSource {
     }
 };
 
-// A source for frames in which some instances have factors of colours or opacities.
+// A source for frames in which instances have factors of colours or opacities.
 template <class Source>
 struct Tinted : Source {
     static constexpr bool kTints = true;
 };
 
-// A source for frames in which some items have weights below 1.
+// A source for frames in which items have weights below 1.
 template <class Source>
 struct Faded : Source {
     static constexpr bool kFades = true;

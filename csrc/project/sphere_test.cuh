@@ -1,7 +1,8 @@
 #pragma once
 
-// Tests that show, before projection, that a gaussian reaches no pixel centre, or none
-// in a row. They only save work: their result never contradicts the blend step.
+// Tests before projection that find gaussians, or rows of pixels, without any pixel
+// centre to draw. The tests only save work: whatever they discard, the blend step would
+// discard as well.
 
 #include "project/project_math.h"
 #include "project/sources.cuh"
@@ -11,14 +12,13 @@ namespace cuda {
 
 // The result of testing the bounding sphere of a gaussian.
 struct SphereTest {
-    bool may_reach;       // it may reach a pixel centre; also true for NaN
-    bool misses_centers;  // it is in the frustum but reaches no pixel centre
-    float half;           // upper bound on its reach from the centre, px
+    bool may_reach;       // may reach a pixel centre; also true for NaN
+    bool misses_centers;  // is in the frustum, but reaches no pixel centre
+    float half;           // upper bound on the half extent, px
 };
 
-// Tests a gaussian at p in view space; `is_faint` says whether its instance has an
-// opacity below 1. It has no branches, because in a warp some lane would take each of
-// them.
+// Tests a gaussian at p in view space. `is_faint`: its instance has an opacity below 1.
+// The function has no branches, because the lanes of a warp would diverge.
 template <class Source>
 __device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, const float p[3],
                                   float reach, float reach_scale, bool is_faint) {
@@ -29,8 +29,8 @@ __device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, 
     const float from_x = fabsf(u - middle_x), from_y = fabsf(v - middle_y);
     const bool is_outside = !(cam.depth_of(p) >= cam.near_depth) | (reach < 0) |
                             (from_x - half >= middle_x) | (from_y - half >= middle_y);
-    // If its centre is in the image, it certainly is in the frustum, unless
-    // antialiasing, a fade or its instance makes it too faint.
+    // A gaussian whose centre is in the image is in the frustum, unless antialiasing, a
+    // fade or its instance makes it too faint to draw.
     const bool is_faded = (Source::kFades && in.item.weight < 1) || is_faint;
     const bool is_inside =
         (from_x < middle_x) & (from_y < middle_y) & !in.item.appearance.antialiased & !is_faded;
@@ -39,8 +39,8 @@ __device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, 
         .may_reach = !(is_outside | misses), .misses_centers = misses && !is_outside, .half = half};
 }
 
-// Removes the first and the last row of a box if the ellipse misses all pixel centres
-// of that row, with a margin, so that the blend step alone decides.
+// Removes the first and the last row from a pixel box if the ellipse reaches no pixel
+// centre in that row. A margin covers rounding, so that only the blend step decides.
 __device__ inline void drop_missed_rows(const Ellipse<float>& e, const Projection<float>& s,
                                         float image_width, PixelBox<int>& box) {
     const float slope = quotient_of(s.c12, s.c22), u = e.u - 0.5f;
@@ -48,8 +48,8 @@ __device__ inline void drop_missed_rows(const Ellipse<float>& e, const Projectio
     const float reach = e.log2_opacity - static_cast<float>(kLog2MinAlpha) + 1e-4f;
     const auto misses = [&](int row) {
         const float dy = static_cast<float>(row) + 0.5f - e.v;
-        // Alpha has its maximum in this row here. Rounding yields the nearest pixel
-        // centre, whether or not that is inside the image.
+        // In this row, alpha has its maximum at `middle`. Rounding gives the pixel
+        // centre that is nearest to it, even if that is outside of the image.
         const float middle = slope * dy + u;
         const float t1 = e.l11 * fmaxf(fabsf(middle - round_of(middle)) - margin, 0.0f),
                     t2 = e.l22 * dy;

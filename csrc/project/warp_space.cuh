@@ -1,7 +1,6 @@
 #pragma once
 
-// The shared memory of a warp that projects an item: the tables of the item, and the
-// queues.
+// The shared memory of a warp that projects an item: the item's tables, and the queues.
 
 #include "base/launch.cuh"
 #include "frame/count_tile.cuh"
@@ -12,33 +11,33 @@ namespace v3dg {
 namespace cuda {
 
 constexpr unsigned kWarps = 8;
-constexpr unsigned kQueue = 64;        // at most 31 gaussians are queued when 32 are added
-constexpr unsigned kMostWaiting = 64;  // at most 31 large records are queued when 32 are added
+constexpr unsigned kQueue = 64;  // up to 31 gaussians remain queued when 32 are added
+// up to 31 large records remain queued when 32 are added
+constexpr unsigned kMostWaiting = 64;
 
-// A gaussian in the queue.
+// A gaussian in the queue of a warp.
 struct Queued {
     float p[3];  // view space
-    // Index in the item; in a shared item 32 times that, plus the index of the sharer.
+    // Index of the gaussian in the item. In a shared item: 32 times the index, plus the
+    // index of the placement among the sharers.
     uint32_t place;
 };
 
-// The shared memory of a warp.
 template <class Model>
 struct WarpSpace {
     ItemTables<Model> tables;
     alignas(16) Queued queue[kQueue];
-    // The ellipses of records: each lane writes one, and then they are copied
-    // contiguously.
+    // The ellipses of up to 32 records. Each lane writes one; then the warp copies them
+    // to global memory with coalesced stores.
     float4 ellipses[kEllipseVectors * 32];
-    // The queue of the item's large records: their boxes and their indices among the
-    // item's records.
+    // The queue of large records: pixel boxes, and indices among the item's records.
     RecordBox boxes[kMostWaiting];
     uint8_t large[kMostWaiting];
     unsigned num_large;
     WaitingTiles tiles;
 };
 
-// Copies a table with a warp, one 32-bit word per lane.
+// Copies a table to shared memory with a warp: lane i copies the i-th 32-bit word.
 template <class T>
 __device__ uint32_t load_word(const T& from) {
     static_assert(sizeof(T) <= 32 * sizeof(uint32_t), "a warp copies a table");
@@ -53,12 +52,14 @@ __device__ void store_word(T& to, uint32_t word) {
     if (lane < sizeof(T) / sizeof(uint32_t)) reinterpret_cast<uint32_t*>(&to)[lane] = word;
 }
 
-// Which tables the warp has loaded.
+// The image and the model whose tables are in the warp's shared memory.
 struct Loaded {
     uint32_t image = ~0u, model = ~0u;
 };
 
-// Stores the tables of an item; each lane holds one 32-bit word of them.
+// Stores the tables of an item in shared memory. Lane i passes the i-th 32-bit word of
+// the item and of the placement. The image and the model are loaded only if they differ
+// from those of the last item.
 template <class Model>
 __device__ void store_tables(ItemTables<Model>& tables, uint32_t item_word, uint32_t placement_word,
                              const ProjectInput& in, const Model* models, Loaded& loaded) {

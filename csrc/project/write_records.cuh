@@ -1,6 +1,6 @@
 #pragma once
 
-// Projects the gaussians in the lanes of a warp, and writes a record for each that
+// Projects one gaussian per lane of a warp, and writes a record for each gaussian that
 // reaches a pixel centre.
 
 #include "project/large_records.cuh"
@@ -13,15 +13,14 @@ namespace cuda {
 
 // Properties of an item's gaussians.
 struct ItemTraits {
-    bool are_small;   // decided by the first 32 gaussians
-    bool have_shade;  // whether project() does not set the final colour
+    bool are_small;   // the gaussians are small on the image, judged by the first 32
+    bool have_shade;  // shade() sets the final colour
 };
 
-// Computes the record of gaussian g at p in view space, except for its pixels, which
-// are returned in `box`. Returns whether it reaches a pixel centre. If gaussians are
-// not small, the few that miss all centres in their box count as reaching one. There is
-// no early return for gaussians that reach none, nor for lanes without a gaussian,
-// because other lanes of the warp go on.
+// Computes the record of gaussian g, whose mean is p in view space, and its pixel
+// `box`. Returns whether the gaussian reaches a pixel centre; if !traits.are_small, a
+// few that reach none are included. There is no early return, not even if the lane has
+// no gaussian (!is_one), because all lanes of a warp stay together.
 template <class Source>
 __device__ bool project_one(const ItemTables<typename Source::Model>& in,
                             const ModelView<float>& view, typename Source::Place place, uint32_t g,
@@ -34,7 +33,7 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in,
     if constexpr (Source::kTints) fade(factors->opacity, e);
     float half_x, half_y;
     const Intrinsics<float>& cam = in.image.camera;
-    // The sphere test has shown that the gaussian is not too faint.
+    // Pass 1 as opacity: the sphere test has removed gaussians that are too faint.
     bool is_in_frustum = is_one & extent_of(1.0f, e, s, half_x, half_y);
     is_in_frustum &= meets_image(e.u, half_x, cam.width) & meets_image(e.v, half_y, cam.height);
     num_in_frustum += is_in_frustum;
@@ -48,10 +47,10 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in,
     return reaches_pixel;
 }
 
-// Writes the records of the lanes' gaussians, in lane order, and counts them in tiles.
-// Returns the number of records. `sharers` are the placements of a shared item, and
-// `factors` those of these placements; for other items, those of its placement. They
-// are null unless the source has factors.
+// Writes the records of the lanes' gaussians from index `first` on, in lane order, and
+// adds them to the counts of tiles. Returns the number of records. `sharers` are the
+// placements of a shared item. `factors` are those of the sharers or, if the item is
+// not shared, of its placement; null if the source has no factors.
 template <class Source, bool kIsShared>
 __device__ unsigned write_records(WarpSpace<typename Source::Model>& space,
                                   const Placement* sharers, const InstanceFactors* factors,
@@ -61,7 +60,7 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space,
                                   unsigned& num_in_frustum) {
     const auto& in = space.tables;
     const unsigned lane = threadIdx.x % 32;
-    // A lane without a gaussian computes an existing one, and discards it.
+    // A lane without a gaussian computes a valid one, and discards the result.
     const uint32_t place = has_one ? mine.place : kIsShared ? __ffs(in.item.sharers) - 1 : 0;
     const uint32_t g = in.item.first + (kIsShared ? place / 32 : place);
     const ModelView<float>& view = kIsShared ? sharers[place % 32].view : in.placement.view;
@@ -91,7 +90,7 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space,
         const uint32_t depth =
             entry_depth(r.depth, in.image.camera.near_depth, out.records.depth_mask);
         out.few[first + rank] = is_large ? kManyTiles : few_tiles(depth, tile, blocks);
-        if (out.source != nullptr) {  // non-null if the frame keeps a tape
+        if (out.source != nullptr) {  // the frame keeps a tape for the backward pass
             out.source[first + rank] = g;
             out.records.box[first + rank] = pixels();
         }

@@ -1,4 +1,4 @@
-// Codebooks by Lloyd's algorithm, initialised from the density of values; palettes by
+// Codebooks by Lloyd's algorithm, starting from the density of the values. Palettes by
 // repeatedly cutting sets in two.
 
 #include "quantize/codebook.h"
@@ -15,12 +15,12 @@ namespace {
 
 constexpr size_t kBins = 4096;
 constexpr int kRounds = 16;
-// The fraction of a table's entries that is spread evenly over the range, so that rare
-// values have a close entry.
+// The share of a table's entries that are evenly distributed over the range, so that
+// rare values have a close entry.
 constexpr double kEven = 0.25;
 
-// Distributes entries with a density proportional to the cube root of the values'
-// density, which is optimal for many entries (Panter and Dite).
+// Initialises a table. The density of entries is proportional to the cube root of the
+// density of values, which is optimal for many entries (Panter and Dite).
 void guess_codebook(const std::vector<double>& ordered, Span<double> table) {
     const double low = ordered.front(), width = (ordered.back() - low) / kBins;
     std::vector<double> density(kBins, 0.0);
@@ -28,7 +28,7 @@ void guess_codebook(const std::vector<double>& ordered, Span<double> table) {
         density[std::min(static_cast<size_t>((value - low) / width), kBins - 1)] += 1.0;
     for (double& count : density) count = std::cbrt(count);
     const double total = std::accumulate(density.begin(), density.end(), 0.0);
-    double before = 0.0;  // fraction of the entries below a bin
+    double before = 0.0;  // share of the entries below a bin
     size_t entry = 0;
     for (size_t bin = 0; bin < kBins; ++bin) {
         const double share = (1 - kEven) * density[bin] / total + kEven / kBins;
@@ -41,11 +41,11 @@ void guess_codebook(const std::vector<double>& ordered, Span<double> table) {
     }
 }
 
-// A part of an order of rows; one vector represents all of them.
+// A range of rows, which one vector represents.
 struct Part {
     size_t first, last;
     double error;  // sum of squared distances to the mean
-    size_t axis;   // axis with the largest part of that error
+    size_t axis;   // axis with the largest part of the error
     uint32_t number;
     std::vector<double> mean;
 

@@ -1,6 +1,7 @@
 #pragma once
 
-// Few values that represent many: codebooks of numbers, and palettes of vectors.
+// Codebooks: few numbers that represent many. Palettes: few vectors that represent
+// many.
 
 #include <cstdint>
 #include <vector>
@@ -11,21 +12,22 @@ namespace v3dg {
 
 constexpr size_t kCodebookSize = 256;
 
-// Fills a table of kCodebookSize with ascending numbers near the values, by Lloyd's
-// algorithm. If there are at most that many different values, the table consists of
-// them, and its last entries repeat the largest.
+// Fills a table of kCodebookSize ascending numbers that represent the values, by
+// Lloyd's algorithm. If there are at most kCodebookSize different values, the table
+// consists of these, and the largest is repeated at the end.
 void make_codebook(Span<const double> values, Span<double> table);
 
-// K vectors of `width` elements that represent N vectors, and the label of each vector.
+// K vectors of some width that represent N vectors.
 struct VectorPalette {
-    std::vector<double> vectors;   // [K * width], ordered by the first row with each label
-    std::vector<uint32_t> labels;  // [N]
+    // [K * width] ordered by the first row with each label
+    std::vector<double> vectors;
+    std::vector<uint32_t> labels;  // [N] index of the vector that represents each row
 };
 
-// Computes a palette of at least one and at most `size` vectors. The set with the
+// Computes a palette of 1 to `size` vectors. Repeatedly, the set of vectors with the
 // largest squared error is cut in two, at its mean along its widest axis, until there
-// are enough sets or all are exact. This avoids nearest-neighbour searches among tens
-// of thousands of vectors: it takes O(N width log K) steps, and is deterministic.
+// are enough sets or all errors are 0. This takes O(N width log K) steps, without
+// searches for nearest neighbours, and is deterministic.
 VectorPalette make_palette(Span<const float> vectors, size_t width, size_t size);
 
 }  // namespace v3dg

@@ -1,6 +1,6 @@
 #pragma once
 
-// The ranges of a cluster in the layout of a page.
+// The ranges of a cluster, in the layout of a page.
 
 #include <cstring>
 
@@ -8,13 +8,13 @@
 
 namespace v3dg {
 
-// The ranges of a cluster as stored in a page.
+// The ranges of a cluster, as stored in a page.
 struct CodedRanges {
     ClusterCode code{};
     uint16_t sh_steps[9]{};
 };
 
-// Returns the ranges that decoding the cluster's gaussians uses.
+// Returns the ranges in the form that decoding uses.
 inline ClusterRanges decoded(const CodedRanges& coded, int sh_degree) {
     return ranges_of(coded.code, coded.sh_steps, sh_degree);
 }

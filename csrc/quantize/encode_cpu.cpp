@@ -1,5 +1,5 @@
-// Encodes pages. Each thread processes one cluster at a time: first its ranges, then
-// the codes of its gaussians.
+// Encodes pages. A thread processes one cluster at a time: first its ranges, then the
+// codes of its gaussians.
 
 #include <algorithm>
 #include <stdexcept>
@@ -17,7 +17,7 @@ namespace {
 constexpr size_t kClustersAtOnce = 16;
 constexpr double kMostPosition = 0x1p126, kMostColorValue = 32768, kMostShValue = 1024;
 
-// The 24 rotations that map a cube onto itself, w x y z, not normalised.
+// The 24 rotations that map a cube onto itself: quaternions w, x, y, z, not normalised.
 constexpr int8_t kCubeRotations[24][4] = {
     {1, 0, 0, 0},  {0, 1, 0, 0},   {0, 0, 1, 0},  {0, 0, 0, 1},   {1, 1, 1, 1},   {1, 1, 1, -1},
     {1, 1, -1, 1}, {1, 1, -1, -1}, {1, -1, 1, 1}, {1, -1, 1, -1}, {1, -1, -1, 1}, {1, -1, -1, -1},
@@ -25,11 +25,11 @@ constexpr int8_t kCubeRotations[24][4] = {
     {0, 1, 1, 0},  {0, 1, -1, 0},  {0, 1, 0, 1},  {0, 1, 0, -1},  {0, 0, 1, 1},   {0, 0, 1, -1},
 };
 
-// A gaussian in double precision. Its axes are permuted so that its rotation can be
+// A gaussian in double precision. Its axes are permuted such that its rotation can be
 // coded.
 struct Prepared {
-    double mean[3], quat[3], color[3];  // x, y, z of the quaternion, in units of its step
-    uint32_t scale_bits[3];             // relative to kLeastScaleBits
+    double mean[3], quat[3], color[3];  // quat: x, y, z, in units of kQuatStep
+    uint32_t scale_bits[3];             // bits of the float, relative to kLeastScaleBits
 };
 
 double clamped(double x, double least, double most) { return std::min(std::max(x, least), most); }
@@ -42,7 +42,7 @@ uint32_t code_of(double value, double first, double step, uint32_t most) {
                     : 0;
 }
 
-// Returns a number below 65,504 as a half, rounded by `round`, such as std::floor.
+// Converts a number below 65,504 to a half. `round` is a function such as std::floor.
 uint16_t half_of(double x, double (*round)(double)) {
     const int exponent = x == 0 ? -14 : std::max(std::ilogb(x), -14);
     const double fraction = round(std::ldexp(x, 10 - exponent));
@@ -51,8 +51,8 @@ uint16_t half_of(double x, double (*round)(double)) {
     return static_cast<uint16_t>((fraction < 0 ? 0x8000u : 0u) | std::min(bits, 0x7bffu));
 }
 
-// Returns a step as a half, in units of kStepUnit. Steps below the smallest normal half
-// become 0, because such small ranges are invisible.
+// Converts a step to a half, in units of kStepUnit. A step below the smallest normal
+// half becomes 0, because ranges that small are invisible.
 uint16_t step_half(double step, double (*round)(double)) {
     return step < kStepUnit * 0x1p-14 ? uint16_t(0) : half_of(step / kStepUnit, round);
 }
@@ -69,9 +69,9 @@ void check_is_finite(const GaussianRows<const float>& in, size_t row) {
             std::to_string(row));
 }
 
-// Sets the scales, as bits of floats, and the quaternion's x, y and z. The axes stay as
-// they are if the quaternion can be coded with them, so that encoding a decoded
-// gaussian gives the same codes; otherwise they are permuted.
+// Sets the scales, as bits of floats, and x, y, z of the quaternion. The axes are
+// permuted only if the quaternion cannot be coded as it is. So encoding a decoded
+// gaussian gives the same codes.
 void prepare_shape(const float* quat, const float* scale, Prepared& out) {
     double length2 = 0, q[4] = {1, 0, 0, 0};
     for (int k = 0; k < 4; ++k) length2 += double(quat[k]) * quat[k];
@@ -131,15 +131,15 @@ struct Range {
     double magnitude() const { return std::max(std::abs(first), std::abs(last)); }
 };
 
-// Returns the step of a range of float32 numbers, coded as multiples from `first` on,
-// at most `most` steps. It exceeds the ideal step by at most the rounding error of the
-// last number, so that decoded gaussians get the same steps again.
+// Returns the step of a range of float32 numbers that are coded as first + code * step,
+// with code <= most. It exceeds the exact step by at most the rounding error of the
+// last number. So decoded gaussians lead to the same step.
 double step_of(const Range& range, double first, uint32_t most) {
     return (range.last - first + float_spacing(range.magnitude()) / 2) / most;
 }
 
-// Returns the ranges of a cluster. They are rounded inwards to values that a
-// ClusterCode can store, so that the first and the last code occur.
+// Returns the ranges of a cluster, rounded inwards to values that a ClusterCode can
+// store. So the first and the last code of each range occur.
 ClusterCode ranges_of(const std::vector<Prepared>& cluster) {
     Range mean[3], color[3];
     uint32_t least = ~0u, most = 0;
@@ -155,11 +155,11 @@ ClusterCode ranges_of(const std::vector<Prepared>& cluster) {
         out.mean_first[k] = static_cast<float>(mean[k].first);
         const double finest = 2 * float_spacing(mean[k].magnitude());
         double step = std::max(step_of(mean[k], mean[k].first, kMostMean), finest);
-        if (step > 0) {  // a zero step means that all values are equal
+        if (step > 0) {  // 0 means that all values are equal
             const int exponent = std::ilogb(step);
             step = std::ldexp(std::floor(std::ldexp(step, 11 - exponent)), exponent - 11);
         }
-        // A step below 2^-100 becomes 0, because products with it would not be normal
+        // A step below 2^-100 becomes 0, because its products might not be normal
         // numbers.
         const bool is_point = code_of(mean[k].last, mean[k].first, step, 1) == 0 || step < 0x1p-100;
         out.mean_step[k] = is_point ? 0 : static_cast<float>(step);
@@ -196,7 +196,8 @@ void encode(const Prepared& g, float opacity, const ClusterRanges& ranges, uint3
     record[3] = color[0] >> 4 | color[1] << 5 | color[2] << 14 | quat[2] << 23;
 }
 
-// Computes brightness, orange and green of a coefficient.
+// Converts a coefficient from red, green, blue to three channels: brightness, orange
+// and green.
 void channels_of(const float* rgb, double out[3]) {
     const double r = rgb[0], g = rgb[1], b = rgb[2];
     out[0] = clamped((r + 2 * g + b) / 4, -kMostShValue, kMostShValue);
@@ -208,10 +209,10 @@ int most_sh_code(int sh_degree, int basis, int channel) {
     return (1 << (sh_bits(sh_degree, basis, channel) - 1)) - 1;
 }
 
-// Computes the steps as halves: the largest value of each band and channel, divided by
-// the square of the largest code. A channel is dropped if its values are below 2^-11 of
-// the brightness, which is less than the smallest step of the brightness, because red,
-// green and blue in float32 cannot represent it.
+// Computes the step of each band and channel as a half: the largest value divided by
+// the square of the largest code. A channel with values below 2^-11 of the brightness
+// is dropped. This is less than the smallest step of the brightness, and would be lost
+// when converting to red, green and blue in float32.
 void sh_steps_of(const GaussianRows<const float>& in, uint16_t* steps) {
     const int num_bases = num_sh_bases(in.sh_degree);
     double most[9] = {};
@@ -232,7 +233,7 @@ void sh_steps_of(const GaussianRows<const float>& in, uint16_t* steps) {
 }
 
 void encode_sh(const float* sh, const float* step, int sh_degree, uint32_t* words) {
-    uint64_t bits = 0;  // bits that do not yet fill an integer
+    uint64_t bits = 0;  // bits that do not fill a word yet
     int num_bits = 0;
     for (int basis = 1; basis < num_sh_bases(sh_degree); ++basis) {
         double value[3];

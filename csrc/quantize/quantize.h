@@ -1,8 +1,8 @@
 #pragma once
 
-// Gaussians as codes of few bits: pages of bundles, pages on the host, and slots of a
-// pool. This is the codec "quantized" of v3dg/bundle/codec.py; docs/extending.md
-// describes how to add another one.
+// Gaussians as codes of few bits: in pages of bundles, in pages on the host, and in
+// slots of a pool. This is the codec "quantized" of v3dg/bundle/codec.py.
+// docs/extending.md describes how to add a codec.
 
 #include <cstring>
 
@@ -13,13 +13,13 @@
 
 namespace v3dg {
 
-// A page of K clusters: a record of codes per gaussian; the codes of the higher
-// coefficients; and the ranges of the clusters. T is const for a page that is only
-// read.
+// A coded page of K clusters. It consists of one record per gaussian, then the codes of
+// the SH coefficients above degree 0, then the ranges of the clusters. T is const if
+// the page is only read.
 template <class T>
 struct PageCodes {
     Span<const int64_t> offset;  // [K + 1] first row of each cluster, ascending
-    T* words;                    // size: page_bytes()
+    T* words;                    // page_bytes() bytes
     int sh_degree;
 
     V3DG_HD size_t num_clusters() const { return offset.size - 1; }
@@ -50,12 +50,12 @@ V3DG_HD inline void decode_row(const uint32_t* record, const uint32_t* sh_words,
     out.opacities[row] = g.opacity;
 }
 
-// Pages of a bundle on the host, in the layout of its file. It borrows codes and
-// offsets and owns the ranges.
+// The coded pages of a bundle on the host, in the layout of its file. It borrows the
+// codes and offsets, and owns the ranges.
 class CodedPages {
   public:
-    // words: all P pages; first_cluster: [P + 1]; offset: [C + 1]. Throws
-    // std::invalid_argument, naming the cluster, where ranges are not are_valid().
+    // `words` are all P pages, first_cluster is [P + 1], offset is [C + 1]. Throws
+    // std::invalid_argument, which names the cluster, unless all ranges are valid.
     CodedPages(const uint32_t* words, Span<const int64_t> first_cluster, Span<const int64_t> offset,
                int sh_degree);
     const Codes& codes() const { return codes_; }
@@ -68,19 +68,18 @@ class CodedPages {
     Codes codes_;
 };
 
-// Memory for the codes of pages that come and go; frames read it like a single bundle.
-// It is divided into slots for one page each, with the same numbers of rows and
-// clusters. The rows of all slots are contiguous, and so are their clusters, used or
-// not. A page's ranges move with the page, and within a page gaussians and clusters are
-// stored as in the bundle, so no other code needs to know where the page is.
+// The memory of a pool that keeps codes. Frames read it like the codes of a single
+// bundle. It is divided into slots of equal size, each for one page. The rows of all
+// slots are contiguous, and so are their clusters. The ranges of a cluster contain the
+// location of its codes. So no other code needs to know in which slot a page is.
 struct CodeSlots {
     uint32_t *records, *sh;
     unsigned char* ranges;
-    int64_t* offset;  // see Codes::offset; it stays ascending when a slot is written
+    int64_t* offset;  // see Codes::offset; stays ascending when a slot is written
     uint32_t range_size, sh_stride;
     size_t num_clusters;
 
-    // Returns the codes of the pages of a bundle.
+    // Returns the codes for drawing a bundle of this SH degree.
     Codes codes(int sh_degree) const {
         return {.records = records,
                 .sh = sh,
@@ -92,7 +91,7 @@ struct CodeSlots {
     }
 };
 
-// Bytes of a slot for each row, and for each cluster.
+// The bytes of a slot per row, and per cluster.
 constexpr size_t slot_row_bytes(int sh_degree) {
     return 4 * (kRecordWords + num_sh_words(sh_degree));
 }
@@ -103,8 +102,9 @@ constexpr size_t slot_cluster_bytes(int sh_degree) {
 // A page, and the slot that it is written to.
 struct SlotPage {
     PageCodes<const uint32_t> page;
-    size_t row, cluster;  // first of the slot
-    size_t num_clusters;  // clusters in the slot; those beyond the page's are empty
+    size_t row, cluster;  // first row and cluster of the slot
+    // clusters of the slot; those that the page does not have become empty
+    size_t num_clusters;
 };
 
 // Writes the ranges and the offset of the k-th cluster of a slot.
@@ -124,40 +124,41 @@ V3DG_HD inline void write_cluster(const SlotPage& from, size_t k, const CodeSlot
                 range_bytes(page.sh_degree));
 }
 
-// Clusters to decode, in any order, and their rows in the result.
+// Clusters to decode, in any order, and where their gaussians are written.
 struct DecodeInput {
     Codes codes;
     Span<const int32_t> cluster;  // [S]
-    Span<const int64_t> offset;   // [S + 1] first row in the result, ascending from 0
+    // [S + 1] first row of each cluster in the result, ascending from 0
+    Span<const int64_t> offset;
 };
 
 namespace cpu {
-// Encodes gaussians to the nearest step of the ranges of their clusters. Gaussians that
+// Encodes gaussians, rounded to the steps of their cluster's ranges. Gaussians that
 // were decoded from a page give the same page again. A scale of 0 becomes 2^-14 of the
 // gaussian's largest scale. Scales are clamped to [2^-64, 2^64], means to 2^126,
-// colours to 32,768, higher coefficients to 1,024 and opacities to [0, 1]. Throws
+// colours to 32,768, other SH coefficients to 1,024, opacities to [0, 1]. Throws
 // std::invalid_argument if a value is not finite.
 void encode_page(const GaussianRows<const float>& in, const PageCodes<uint32_t>& page);
 
 // Decodes the gaussians of a page. Throws std::invalid_argument, which names the
-// cluster, if ranges are not are_valid().
+// cluster, unless all ranges are valid.
 void decode_page(const PageCodes<const uint32_t>& page, const GaussianRows<float>& out);
 
 // Decodes the gaussians of clusters.
 void decode(const DecodeInput& in, const GaussianRows<float>& out);
 
-// Writes a page, whose ranges must be are_valid(), to its slot.
+// Writes a page to its slot. The ranges of the page must be valid.
 void write_slot(const SlotPage& from, const CodeSlots& to);
 }  // namespace cpu
 
-// The CPU and CUDA give the same bits. The codes and `out` are on the device, all other
-// arrays on the host. Work is queued on the stream. Throws std::runtime_error if CUDA
-// reports an error.
+// Like cpu::decode(), with the same bits. The codes and `out` are on the device, all
+// other arrays in host memory. Work is enqueued on the stream. Throws
+// std::runtime_error if CUDA reports an error.
 namespace cuda {
 void decode(const DecodeInput& in, const GaussianRows<float>& out, Stream stream);
 
-// As cpu::write_slot() for several pages. The array `pages` is in memory that the
-// device can read; its pages and the slots are in device memory.
+// Like cpu::write_slot(), for several pages. `pages` must be readable by the device;
+// the memory of the pages and the slots is on the device.
 void write_slots(const SlotPage* pages, size_t num_pages, const CodeSlots& to, Stream stream);
 }  // namespace cuda
 

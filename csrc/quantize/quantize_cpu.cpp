@@ -23,8 +23,8 @@ CodedRanges ranges_at(const uint32_t* words, int sh_degree) {
     return out;
 }
 
-// Returns ranges that are_valid(). Otherwise throws std::invalid_argument, which names
-// the cluster.
+// Returns the ranges of a cluster. Throws std::invalid_argument, which names the
+// cluster, if they are not valid.
 ClusterRanges valid_ranges(const uint32_t* words, int sh_degree, size_t cluster,
                            const char* whose) {
     const CodedRanges coded = ranges_at(words, sh_degree);
@@ -57,7 +57,8 @@ CodedPages::CodedPages(const uint32_t* words, Span<const int64_t> first_cluster,
              .sh_degree = sh_degree,
              .range_size = range_bytes(sh_degree),
              .sh_stride = static_cast<uint32_t>(sh_degree)} {
-    std::vector<uint64_t> place(first_cluster.size, 0);  // offset of each page, in integers
+    // offset of each page, in words
+    std::vector<uint64_t> place(first_cluster.size, 0);
     const auto page_at = [&](size_t p) {
         const auto first = static_cast<size_t>(first_cluster[p]),
                    last = static_cast<size_t>(first_cluster[p + 1]);

@@ -1,4 +1,5 @@
-// Each thread decodes one gaussian, and each block writes one page to its slot.
+// Decodes gaussians with one thread each, and writes pages to slots with one block
+// each.
 
 #include "base/launch.cuh"
 #include "quantize/quantize.h"
@@ -13,8 +14,7 @@ constexpr unsigned kBlockSize = 128;
 __global__ void decode_kernel(DecodeInput in, GaussianRows<float> out) {
     const size_t row = blockIdx.x * size_t(kBlockSize) + threadIdx.x;
     if (row >= out.size) return;
-    // This finds the last cluster that begins at or before the gaussian; it is never
-    // empty.
+    // Find the last cluster that begins at or before the row. It is never empty.
     size_t first = 0, last = in.cluster.size - 1;
     while (first < last) {
         const size_t middle = first + (last - first + 1) / 2;
@@ -29,7 +29,7 @@ __global__ void decode_kernel(DecodeInput in, GaussianRows<float> out) {
     decode_row(in.codes.record_of(ranges, from), in.codes.sh_of(ranges, from), ranges, out, row);
 }
 
-// Each block writes one page.
+// One block per page.
 __global__ void write_slots_kernel(const SlotPage* pages, CodeSlots to) {
     const SlotPage from = pages[blockIdx.x];
     const size_t first = from.page.first_row(), count = from.page.end_row() - first;

@@ -1,12 +1,12 @@
 #pragma once
 
-// The codes of a gaussian: 128 bits for all that SH degree 0 needs, and more bits for
-// the higher degrees, relative to the ranges of its cluster. docs/format.md describes
-// the layout for authors of readers.
+// The codes of a gaussian, relative to the ranges of its cluster. A record of 128 bits
+// has all values up to SH degree 0; higher degrees need more bits. docs/format.md
+// describes the layout for authors of readers.
 //
-// Every device and every instruction set decodes to the same bits, whether or not
-// products and sums are contracted: a step has so few bits that its product with a code
-// is exact in float32, so only the sum is rounded.
+// Decoding gives the same bits on every device and instruction set, with or without
+// floating-point contraction. A step has so few bits that its product with a code is
+// exact in float32; so only the sum is rounded.
 
 #include "base/span.h"
 #include "math/gaussian.h"
@@ -14,23 +14,25 @@
 namespace v3dg {
 
 constexpr int kRecordWords = 4;
-constexpr int kPageAlignment = 16;  // bytes, so that one load instruction reads a record
+constexpr int kPageAlignment = 16;  // bytes; a record is loaded with one instruction
 
 constexpr uint32_t kMostMean = 4095, kMostScale = 1023, kMostColor = 511, kMostOpacity = 255;
-// A rotation is multiplied by one of the 24 rotations of a cube such that w becomes the
-// largest component; the others are then at most sin(22.5 degrees), which is 255 steps.
-// A coded quaternion has the length sqrt(kQuatLength2).
+// The code of a rotation. The rotation is multiplied by one of the 24 rotations of a
+// cube, such that w becomes the largest component. The other components are then at
+// most sin(22.5 degrees), which are 255 steps. A coded quaternion has the length
+// sqrt(kQuatLength2).
 constexpr int32_t kZeroQuat = 255, kQuatLength2 = 444016;
 constexpr float kQuatStep = 0.0015007235f;  // 1 / sqrt(kQuatLength2)
 constexpr float kOpacityStep = 1.0f / 255;
-// Scales are coded by the bits of the float, which grow approximately like the
-// logarithm, from 2^-64 to 2^64.
+// The codes of scales, from 2^-64 to 2^64. A code represents bits of the float, which
+// grow approximately like its logarithm.
 constexpr uint32_t kLeastScaleBits = 63u << 23, kMostScaleBits = (191u << 23) - 1;
 constexpr int kScaleFirstShift = 14, kScaleStepShift = 4;
-// In this unit, the steps of small ranges are normal numbers in 16 bits.
+// The unit of the steps of colours. With it, the steps of small ranges are normal
+// numbers in 16 bits.
 constexpr float kStepUnit = 0.00390625f;  // 2^-8
 
-// The ranges of a cluster, as stored in a page. Halves are float16.
+// The ranges of a cluster, as stored in a page. A half is a float16.
 struct ClusterCode {
     float mean_first[3], mean_step[3];  // steps have 12 significant bits
     uint16_t color_first[3];            // halves
@@ -39,17 +41,17 @@ struct ClusterCode {
 };
 static_assert(sizeof(ClusterCode) == 40, "a format of files");
 
-// Returns the bytes of a cluster's ranges: a ClusterCode, and three halves per band
+// Returns the bytes of a cluster's ranges: a ClusterCode, then three halves per SH band
 // above degree 0.
 V3DG_HD constexpr int cluster_code_bytes(int sh_degree) {
     return static_cast<int>(sizeof(ClusterCode)) + (6 * sh_degree + 3) / 4 * 4;
 }
 
-// Returns the number of 32-bit integers for a gaussian's coefficients above degree 0.
+// Returns the 32-bit words per gaussian for SH coefficients above degree 0.
 V3DG_HD constexpr int num_sh_words(int sh_degree) { return 2 * sh_degree; }
 
-// Returns the number of bits of a coefficient's brightness (channel 0), orange (1) or
-// green (2).
+// Returns the bits of one channel of an SH coefficient: 0 brightness, 1 orange, 2
+// green.
 V3DG_HD constexpr int sh_bits(int sh_degree, int basis, int channel) {
     return sh_degree == 1   ? 7
            : sh_degree == 2 ? (channel == 0 ? 7 : 6 - channel)
@@ -58,24 +60,25 @@ V3DG_HD constexpr int sh_bits(int sh_degree, int basis, int channel) {
 }
 V3DG_HD constexpr int band_of(int basis) { return basis < 4 ? 1 : basis < 9 ? 2 : 3; }
 
-// Returns the bytes of a page: codes of gaussians, codes of their coefficients, and
-// ranges of clusters, padded to 16.
+// Returns the bytes of a page: records of gaussians, codes of their SH coefficients,
+// and ranges of clusters, padded to a multiple of 16.
 V3DG_HD constexpr size_t page_bytes(size_t num_gaussians, size_t num_clusters, int sh_degree) {
     return (4 * (kRecordWords + num_sh_words(sh_degree)) * num_gaussians +
             cluster_code_bytes(sh_degree) * num_clusters + kPageAlignment - 1) /
            kPageAlignment * kPageAlignment;
 }
 
-// Converts a finite half.
+// Converts a finite half to a float.
 V3DG_HD inline float float_of_half(uint32_t half) {
     const uint32_t exponent = half >> 10 & 31, fraction = half & 1023;
-    const float size = exponent == 0 ? static_cast<float>(fraction) * 5.9604645e-8f  // 2^-24
+    // 2^-24
+    const float size = exponent == 0 ? static_cast<float>(fraction) * 5.9604645e-8f
                                      : float_of_bits((exponent + 112) << 23 | fraction << 13);
     return half & 0x8000 ? -size : size;
 }
 
-// The ranges of a cluster, prepared for decoding, and the locations of its codes. In
-// tables each has range_bytes() bytes.
+// The ranges of a cluster in the form that decoding uses, and where its codes are. In a
+// table of ranges, an element has range_bytes() bytes.
 struct alignas(16) ClusterRanges {
     float mean_first[3];
     uint32_t scale_first;
@@ -83,22 +86,22 @@ struct alignas(16) ClusterRanges {
     uint32_t scale_step;
     float color_first[3], color_step[3];
     uint32_t record_base, sh_base;  // see Codes
-    float sh_step[9];               // band by band, three channels each
+    float sh_step[9];               // [band][channel]
 };
 V3DG_HD constexpr uint32_t range_bytes(int sh_degree) { return 64 + (3 * sh_degree + 3) / 4 * 16; }
 static_assert(range_bytes(3) == sizeof(ClusterRanges), "all of it");
 
 // The gaussians of a bundle as codes, on the host or on a device. Row r of cluster c
-// has four integers of `records` from index 4 (record_base + r) on, and two integers
-// per degree of `sh` from index 2 (sh_base + sh_stride r) on; the sums in parentheses
+// has four words of `records`, from index 4 (record_base + r) on. It has two words per
+// SH degree of `sh`, from index 2 (sh_base + sh_stride r) on. The sums in parentheses
 // are modulo 2^32.
 struct Codes {
     const uint32_t *records, *sh;
-    const unsigned char* ranges;  // [C]
+    const unsigned char* ranges;  // [C] ClusterRanges, range_size bytes each
     Span<const int64_t> offset;   // [C + 1] number of gaussians before each cluster
     int sh_degree;
-    uint32_t range_size;  // range_bytes() or larger
-    uint32_t sh_stride;   // sh_degree or larger
+    uint32_t range_size;  // at least range_bytes(sh_degree)
+    uint32_t sh_stride;   // at least sh_degree
 
     V3DG_HD size_t num_clusters() const { return offset.size - 1; }
     V3DG_HD V3DG_INLINE const ClusterRanges& ranges_of(uint32_t cluster) const {
@@ -112,8 +115,8 @@ struct Codes {
     }
 };
 
-// Returns the ranges of a ClusterCode. `sh_steps` are the halves after it, three per
-// band.
+// Returns the ranges in the form that decoding uses. `sh_steps` are the halves that
+// follow the ClusterCode, three per band.
 V3DG_HD inline ClusterRanges ranges_of(const ClusterCode& code, const uint16_t* sh_steps,
                                        int sh_degree) {
     ClusterRanges out{};
@@ -132,20 +135,20 @@ V3DG_HD inline ClusterRanges ranges_of(const ClusterCode& code, const uint16_t* 
 template <class V>
 V3DG_HD V3DG_INLINE V exact_sqrt(V x) {
 #ifdef __CUDA_ARCH__
-    return __fsqrt_rn(x);  // for any compiler options
+    return __fsqrt_rn(x);  // exactly rounded with any compiler options
 #else
     return sqrt_of(x);
 #endif
 }
 
-// Returns `num_bits` bits of each lane's integer as a number.
+// Returns the bits [first, first + num_bits) of each lane's word as a number.
 template <class V>
 V3DG_HD V3DG_INLINE V number_at(Bits<V> word, int first, int num_bits) {
     return float_of_number<V>(word >> first & ((1u << num_bits) - 1));
 }
 
-// Decodes one gaussian, or one per lane, with its coefficients of degree 0. The result
-// is finite if the ranges are_valid().
+// Decodes one gaussian, or one per lane, and its SH coefficients of degree 0. The
+// result is finite if the ranges are valid.
 template <class V>
 V3DG_HD V3DG_INLINE void decode(const Bits<V> record[kRecordWords], const ClusterRanges& ranges,
                                 Gaussian3d<V>& g, V color[3]) {
@@ -164,14 +167,14 @@ V3DG_HD V3DG_INLINE void decode(const Bits<V> record[kRecordWords], const Cluste
             y = number_at<V>(c, 19, 9) - float(kZeroQuat),
             z = number_at<V>(d, 23, 9) - float(kZeroQuat);
     g.quat[0] =
-        // The operands are integers.
+        // the operands are integers, so the sum is exact
         exact_sqrt(float(kQuatLength2) - x * x - y * y - z * z) * kQuatStep;
     g.quat[1] = x * kQuatStep;
     g.quat[2] = y * kQuatStep;
     g.quat[3] = z * kQuatStep;
 }
 
-// Returns `num_bits` bits of an array of integers, from bit `first` on.
+// Returns the bits [first, first + num_bits) of an array of words.
 template <class B>
 V3DG_HD V3DG_INLINE B bits_at(const B* words, int first, int num_bits) {
     const int word = first / 32, shift = first % 32;
@@ -180,9 +183,9 @@ V3DG_HD V3DG_INLINE B bits_at(const B* words, int first, int num_bits) {
     return bits & ((1u << num_bits) - 1);
 }
 
-// Decodes the coefficients above degree 0, three channels each, of one gaussian or of
-// one per lane. A code is a signed number that represents its signed square, so that
-// small values have small steps.
+// Decodes the SH coefficients above degree 0 of one gaussian, or of one per lane, three
+// channels each. A code is a signed number n that represents n |n| steps, so that small
+// values have a fine resolution.
 template <class V>
 V3DG_HD V3DG_INLINE void decode_sh(const Bits<V>* words, const float* step, int sh_degree, V* sh) {
     int first = 0;
@@ -206,7 +209,7 @@ V3DG_HD V3DG_INLINE void decode_sh(const Bits<V>* words, const float* step, int 
     }
 }
 
-// Returns whether every gaussian that these ranges can produce is finite.
+// Returns whether all gaussians that these ranges can produce are finite.
 V3DG_HD inline bool are_valid(const ClusterCode& code, const uint16_t* sh_steps, int sh_degree) {
     bool valid = true;
     const auto is_finite_half = [](uint32_t half) { return (half >> 10 & 31) != 31; };

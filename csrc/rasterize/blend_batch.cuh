@@ -2,13 +2,14 @@
 
 // Blends a batch of records, nearest first, over the pixels of a tile.
 //
-// Many gaussians cover only a few pixels. Therefore a warp processes 32 records that
-// may reach its sub-tile at once: each lane computes a bit mask of the pixels that one
-// record reaches, and the masks are transposed, so that each pixel then visits only its
-// own records. Where gaussians cover many pixels, a lane blends two neighbouring
-// pixels, which share most of their records and the loads and computations for a row. A
-// sub-tile then has 16 x 4 pixels, otherwise 8 x 4. Both ways give a pixel the same
-// bits.
+// Many gaussians cover only a few pixels. Therefore a warp does not test every record
+// at every pixel of its sub-tile. It processes 32 records at once: each lane computes a
+// bit mask of the pixels that one record reaches. The masks are then transposed, so
+// that each pixel visits only its own records.
+//
+// If gaussians cover many pixels, a lane blends two adjacent pixels, which share most
+// records, loads and terms of a row. A sub-tile then has 16 x 4 pixels, otherwise 8 x
+// 4. A pixel gets the same bits in both cases.
 
 #include <type_traits>
 
@@ -21,7 +22,7 @@ namespace cuda {
 static_assert(SubTile<2>::kColumns == 2 && SubTile<2>::kHeight == 4 && kEntryBlockSize == 4,
               "place_of(), subs_of(), publish_alive() and reached_cells() know this");
 
-// The pixels of a sub-tile that a lane blends.
+// The pixels that a lane blends.
 template <int kPixels>
 struct BlendedPixels {
     float x[kPixels], y;  // pixel centres
@@ -47,9 +48,9 @@ __device__ inline void store(const float (&from)[2], float* to) {
     *reinterpret_cast<float2*>(to) = {from[0], from[1]};
 }
 
-// Load the vectors of the record at an address in shared memory. No clobber orders
-// these loads after plain stores: only copy_async() writes records, and the code waits
-// for it.
+// Load a vector of a record from an address in shared memory. The asm has no memory
+// clobber, so plain stores are not ordered before it. This is safe: only copy_async()
+// writes records, and the caller has waited for it.
 template <int kVector>
 __device__ float4 vector_at(uint32_t place) {
     float4 v{};
@@ -78,8 +79,8 @@ __device__ inline void list_record(uint32_t place, uint32_t record) {
 }
 
 // Loads an element of BlendShared::list. The code that writes the list ends with a
-// memory clobber. This load zero-extends to 32 bits; after a plain load nvcc would
-// extend the number again.
+// memory clobber. The load extends the element to 32 bits; after a plain load, nvcc
+// would add an instruction for this.
 __device__ inline uint32_t listed_at(uint32_t place) {
     uint32_t listed = 0;
 #ifdef __CUDA_ARCH__
@@ -88,7 +89,7 @@ __device__ inline uint32_t listed_at(uint32_t place) {
     return listed;
 }
 
-// Returns the lowest `count` bits, fewer than 32, in one instruction.
+// Returns the lowest `count` bits, in one instruction. Precondition: `count` < 32.
 __device__ inline uint32_t low_bits(uint32_t bits, uint32_t count) {
     uint32_t low = 0;
 #ifdef __CUDA_ARCH__
@@ -97,24 +98,24 @@ __device__ inline uint32_t low_bits(uint32_t bits, uint32_t count) {
     return low;
 }
 
-// Returns a mask with a bit for each of the tile's blocks inside a sub-tile.
+// Returns a mask of the tile's blocks that are inside a sub-tile.
 template <int kPixels>
 __device__ uint32_t blocks_of_sub(unsigned sub) {
     return ((1u << SubTile<kPixels>::kBlocks) - 1) << SubTile<kPixels>::kBlocks * sub;
 }
 
-// Returns a mask of the sub-tiles that contain one of the blocks. The bit of a sub-tile
-// is that of its first block.
+// Returns a mask of the sub-tiles that contain any of `blocks`. The bit of a sub-tile
+// is the bit of its first block.
 template <int kPixels>
 __device__ uint32_t subs_of(uint32_t blocks) {
     blocks |= blocks >> 1;
     return kPixels == 1 ? blocks & 0x55555555u : (blocks | blocks >> 2) & 0x11111111u;
 }
 
-// Clears the bits of the sub-tile's blocks whose pixels have all stopped.
+// Clears the bits of blocks in s.alive_blocks if all pixels of the block have stopped.
 template <int kPixels>
 __device__ void publish_alive(bool is_alive, unsigned sub, BlendShared& s) {
-    constexpr int kAcross = kEntryBlockSize / kPixels;  // lanes across a block of pixels
+    constexpr int kAcross = kEntryBlockSize / kPixels;  // lanes per row of a block
     const uint32_t alive = __ballot_sync(kAllLanes, is_alive);
     uint32_t dead = 0;
 #pragma unroll
@@ -126,11 +127,11 @@ __device__ void publish_alive(bool is_alive, unsigned sub, BlendShared& s) {
         atomicAnd(&s.alive_blocks, ~(dead << SubTile<kPixels>::kBlocks * sub));
 }
 
-// Transposes bits: bit j of lane i becomes bit i of lane j.
+// Transposes a matrix of bits: bit j of lane i becomes bit i of lane j.
 __device__ inline uint32_t transpose_bits(uint32_t bits) {
     const unsigned lane = threadIdx.x % 32;
-    // Halves and bytes are exchanged as units: first between lanes 16 apart, then 8
-    // apart.
+    // Exchange whole 16-bit halves between lanes i and i ^ 16, then bytes between lanes
+    // i and i ^ 8.
     bits =
         __byte_perm(bits, __shfl_xor_sync(kAllLanes, bits, 16), (lane & 16) != 0 ? 0x3276 : 0x5410);
     bits =
@@ -148,8 +149,8 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
     return bits;
 }
 
-// Returns the stopping rule in a register. nvcc would load it for each gaussian if it
-// were read from a kernel argument.
+// Returns the stop rule in a register. If the rule were a kernel argument, nvcc would
+// load it again for each gaussian.
 template <class Stop>
 __device__ Stop stop_of(const BlendShared& s) {
     if constexpr (std::is_same_v<Stop, StopsBefore>)
@@ -158,15 +159,15 @@ __device__ Stop stop_of(const BlendShared& s) {
         return {s.stops_behind};
 }
 
-// Blends the batch over a sub-tile. Called by a whole warp.
+// Blends the batch over one sub-tile. All lanes of the warp must call it.
 template <int kPixels, bool kWithDepth, class Stop>
 __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
     const Stop stop = stop_of<Stop>(s);
     unsigned lane = threadIdx.x % 32;
-    // The asm hides the lane index from the compiler, which would otherwise keep values
-    // derived from it in registers between batches and spill others.
+    // The asm hides the lane index from the compiler. Otherwise the compiler would keep
+    // values that depend on the lane in registers between batches, and spill others.
     asm volatile("" : "+r"(lane));
-    // The list is in reverse order, from its end to its beginning.
+    // The list is filled from its end to its beginning.
     constexpr uint32_t kEach = sizeof(s.list[0][0]);
     const auto list =
         static_cast<uint32_t>(__cvta_generic_to_shared(s.list[threadIdx.x / 32] + kBlendBatch));
@@ -182,7 +183,8 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
         listed += __popc(reaching);
     }
     __syncwarp();
-    asm volatile("" ::: "memory");  // listed_at() relies on this clobber
+    // orders the list's stores before the loads of listed_at()
+    asm volatile("" ::: "memory");
 
     using Sub = SubTile<kPixels>;
     const float corner_x = static_cast<float>(left + sub % Sub::kColumns * Sub::kWidth) + 0.5f;
@@ -196,8 +198,8 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
     load(pixels.transmittance + place, p.transmittance);
     for (int c = 0; c < 3; ++c) load(pixels.color[c] + place, p.color[c]);
     if (kWithDepth) load(s.depth + place, p.depth);
-    // If one of two pixels has stopped, it is moved infinitely far away from all
-    // gaussians.
+    // If one of a lane's two pixels has stopped, that pixel is moved to infinity, so
+    // that no gaussian reaches it.
     constexpr float kNowhere = INFINITY;
     bool alive = false;
     for (int k = 0; k < kPixels; ++k) {
@@ -206,8 +208,8 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
         else
             p.x[k] = kNowhere;
     }
-    // The last lane has the first record of a group, which becomes the highest bit in
-    // the masks of pixels.
+    // The last lane takes the first record of a group of 32, so that this record
+    // becomes the highest bit in the masks of pixels.
     uint32_t last_of_group = list - 31 * kEach;
     for (; listed > 0; listed -= 32, last_of_group -= 32 * kEach) {
         uint32_t bits = 0;
@@ -218,14 +220,14 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
         }
         bits = transpose_bits(bits);
         if (!alive) bits = 0;
-        // The index of the next record is computed ahead; after the last record it is
-        // unused.
+        // Load the next index ahead of its use. After the last record, the loaded value
+        // is not used.
         int highest = 31 - __clz(static_cast<int>(bits));
         uint32_t next = listed_at(last_of_group + kEach * highest);
         while (bits != 0) {
-            // The record is read as vectors (frame/record.cuh). If it were copied to a
-            // Record first, nvcc would round the falloff differently than in the
-            // version for the other number of pixels, and than in the backward pass.
+            // Read the record as vectors. If it were copied to a Record first, nvcc
+            // would round the falloff differently than for the other number of pixels,
+            // and than in the backward pass.
             const float4 a = vector_at<0>(next), b = vector_at<1>(next);
             const float2 c = rest_at(next);
             bits = low_bits(bits, highest);
@@ -246,9 +248,8 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
             }
             if (!alive) bits = 0;
         }
-        // With StopsBefore, a pixel that has stopped keeps more light than the stopping
-        // threshold, so it seems to go on. Therefore lanes whose two pixels have
-        // stopped may reach this test.
+        // With StopsBefore, a stopped pixel keeps a transmittance above the threshold,
+        // so `alive` may be true although both pixels of the lane have stopped.
         if (kPixels > 1) alive = p.x[0] != kNowhere || p.x[kPixels - 1] != kNowhere;
         __syncwarp();
     }
@@ -261,15 +262,15 @@ __device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
     publish_alive<kPixels>(alive, sub, s);
 }
 
-// Blends the batch over the sub-tiles that contain one of the blocks `reached`. Called
-// by the whole block.
+// Blends the batch over the sub-tiles that contain any of the blocks in `reached`. All
+// threads of the block must call it.
 template <int kPixels, bool kWithDepth, class Stop>
 __device__ void blend_batch(uint32_t reached, int left, int top, BlendShared& s) {
     const uint32_t subs = subs_of<kPixels>(reached), lane = threadIdx.x % 32;
-    // Each lane represents the sub-tile of its bit, and counts the sub-tiles before
-    // that.
+    // Lane i stands for the sub-tile whose bit in `subs` is i, and counts the sub-tiles
+    // before it.
     const uint32_t before = subs >> lane & 1 ? __popc(subs & ((1u << lane) - 1)) : ~0u;
-    // Each warp starts with its own sub-tile, and claims further ones when it is done.
+    // Warp w starts with the w-th sub-tile. A warp that is done claims the next one.
     uint32_t taken = threadIdx.x / 32;
     for (;;) {
         const uint32_t bit = __ballot_sync(kAllLanes, before == taken);

@@ -1,7 +1,7 @@
 #pragma once
 
-// Takes pieces from a tile's list, nearest first, and sorts them. Entries that cover
-// only stopped pixels are skipped.
+// Takes pieces from a tile's list, nearest first, and sorts each piece. Entries that
+// cover only stopped pixels are skipped.
 
 #include "frame/record.cuh"
 #include "rasterize/tile_lists.cuh"
@@ -11,57 +11,62 @@ namespace cuda {
 
 constexpr int kBlendThreads = 128;
 constexpr int kBlendWarps = kBlendThreads / 32;
-constexpr int kWindow = kEntriesAtOnce * kBlendThreads;  // entries read together
-constexpr int kPiece = 3 * kWindow / 2;                  // most entries sorted together
-constexpr int kLog2SpreadAgain = 10;  // buckets of a list that is spread a second time
-constexpr int kLog2Sort = 9;          // buckets of a piece
-constexpr uint32_t kMostAlike = 12;   // a bucket with more entries is crowded
-// The largest number of sampled entries, one per thread, that may be in crowded
-// buckets.
+// entries that are read together
+constexpr int kWindow = kEntriesAtOnce * kBlendThreads;
+constexpr int kPiece = 3 * kWindow / 2;  // most entries that are sorted together
+// log2 of the buckets when a list is spread a second time
+constexpr int kLog2SpreadAgain = 10;
+constexpr int kLog2Sort = 9;         // log2 of the buckets for sorting a piece
+constexpr uint32_t kMostAlike = 12;  // a bucket with more entries is crowded
+// If more of the sampled entries (one per thread) are in crowded buckets, a piece is
+// sorted with finer buckets.
 constexpr uint32_t kMostCrowded = kBlendThreads / 4;
-constexpr int kFewEntries = 64;   // at most this many entries are sorted without buckets
-constexpr int kBlendBatch = 192;  // records blended together
-// The range of the first level is a guess. Each further level resolves at least 4 bits,
-// first of the depth (26 bits), then of the order (28 bits).
+constexpr int kFewEntries = 64;   // up to this many entries are sorted without buckets
+constexpr int kBlendBatch = 192;  // records that are blended together
+// How often a list can be spread in turn. The range of the first level is estimated.
+// Each further level resolves at least 4 bits: first of the depth (26 bits), then of
+// the order (28 bits).
 constexpr int kMostSpreadLevels = 1 + 26 / 4 + 28 / 4 + 2;
 constexpr uint32_t kNoBucket = ~0u;
 
-// The pixels that a warp blends together: kPixels of a row per lane.
+// The pixels that a warp blends together. Each lane has kPixels adjacent pixels of a
+// row.
 template <int kPixels>
 struct SubTile {
     static constexpr int kWidth = 8 * kPixels, kHeight = 4, kColumns = kFrameTileWidth / kWidth;
     static constexpr int kCount = kColumns * kFrameTileHeight / kHeight;
-    static constexpr int kBlocks = kWidth / kEntryBlockSize;  // blocks of the tile in a row
+    // blocks per sub-tile; all are in one row of the tile's blocks
+    static constexpr int kBlocks = kWidth / kEntryBlockSize;
 };
 constexpr int kFrameTilePixels = kFrameTileWidth * kFrameTileHeight;
 
 static_assert(2 * kFewEntries <= kBlendThreads, "two threads rank an entry");
 
-// A part of the list, up to `end`, in bucket order. It is in the entries or in the
-// scratch.
+// A part of the list that is in bucket order, and ends before `end`. It is in
+// lists.entries or in scratch memory.
 struct SpreadLevel {
     uint32_t end;
     bool in_scratch;
     Buckets buckets;
 };
 
-// The counters of warps that filter a window of a list together. There are three: one
-// is filled while the previous one is still read and the next one is cleared.
+// Counters for filtering a window of a list with several warps. There are three in
+// turn: one is in use, the previous one may still be read, and the next one is cleared.
 struct ListWindow {
     uint32_t taken;
     uint32_t end;  // first entry behind the window
 };
 
-// The state of a tile's pixels, in areas of 8 x 4. In areas of odd columns the upper
-// and lower halves are exchanged, so that the pixels of half a warp are in different
-// banks, with one pixel per lane and with two.
+// The state of a tile's pixels, in areas of 8 x 4 pixels. In areas of odd columns, the
+// upper and lower halves are exchanged. Then the pixels of half a warp are in different
+// banks, with one pixel per lane as with two.
 struct TilePixels {
     alignas(float2) float transmittance[kFrameTilePixels];
     alignas(float2) float color[3][kFrameTilePixels];
 };
 
 struct BlendShared {
-    EntryKey key[kPiece];  // keys of the piece, unordered
+    EntryKey key[kPiece];  // the entries of the piece, in any order
     union {
         SpreadShared<kLog2SpreadAgain> spreading;
         struct {
@@ -69,36 +74,38 @@ struct BlendShared {
             uint32_t warp_sum[kBlendWarps];
             uint16_t by_bucket[kPiece];
         };
-        float4 record[kRecordVectors][kBlendBatch];  // records without their boxes
+        // the batch's records, without their boxes
+        float4 record[kRecordVectors][kBlendBatch];
     };
-    uint16_t sorted[kPiece];       // indices into `key`
-    uint32_t blocks[kBlendBatch];  // live blocks that each record of the batch may reach
-    // The records of the batch that may reach a warp's sub-tile, as addresses in shared
-    // memory. They fill the array from its end backwards; the first element stays
-    // unused, and is only loaded ahead of time.
+    uint16_t sorted[kPiece];  // indices into `key`
+    // live blocks that each record of the batch may reach
+    uint32_t blocks[kBlendBatch];
+    // Per warp: the records that may reach its sub-tile, as addresses in shared memory.
+    // An array is filled from its end to its beginning. Its first element is never set,
+    // but may be loaded ahead.
     uint16_t list[kBlendWarps][kBlendBatch + 1];
     TilePixels pixels;
-    uint32_t alive_blocks;  // bits as in blocks_of(TileEntry)
-    uint32_t reached[2];    // blocks that the batch reaches; one element per parity of the batch
-    // The sum over records of the number of blocks they reach; one element per parity
-    // of the batch.
+    uint32_t alive_blocks;  // one bit per block, as in blocks_of(TileEntry)
+    uint32_t reached[2];    // blocks that a batch reaches, for even and odd batches
+    // The number of blocks that each record reaches, summed over a batch; for even and
+    // odd batches.
     uint32_t num_covered[2];
-    uint32_t subs_taken;  // sub-tiles claimed so far
+    uint32_t subs_taken;  // number of sub-tiles claimed so far
     ListWindow window[3];
-    uint32_t lowest, highest;  // range of depths in the piece
+    uint32_t lowest, highest;  // range of key_depth() in the piece
     uint32_t crowded;          // number of sampled entries in crowded buckets
     float stops_behind;        // StopsBehind::transmittance, or kStopsBefore
     SpreadLevel level[kMostSpreadLevels];
-    // Sums of weight * depth, in the order of TilePixels. Frames without depth do not
-    // allocate this member.
+    // Sums of weight * depth, in the order of TilePixels. This member must be the last
+    // one: frames without depth do not allocate it.
     alignas(float2) float depth[kFrameTilePixels];
 };
 static_assert(sizeof(BlendShared) < 1 << 15,
               "`list` has 16 bits; a block's memory begins within the lower half");
 static_assert(kBlendBatch % 32 == 0, "a warp takes 32 records");
 
-// Returns the end of the bucket that contains entry `first`; the entries up to `last`
-// are in bucket order.
+// Returns the end of the bucket that contains entry `first`. The entries up to `last`
+// must be in bucket order.
 __device__ inline uint32_t end_of_bucket(const TileEntry* entries, uint32_t first, uint32_t last,
                                          const Buckets& buckets) {
     const uint32_t bucket = buckets.of(entries[first].key);
@@ -111,9 +118,8 @@ __device__ inline uint32_t end_of_bucket(const TileEntry* entries, uint32_t firs
     return last;
 }
 
-// Adds the entries of [first, end) that cover live pixels to the piece, up to the
-// bucket `beyond`, exclusively. Returns the index at which it stopped and the number of
-// entries in the piece.
+// Adds to the piece the entries of [first, end) that cover live pixels and whose bucket
+// is before `beyond`. Returns the index at which it stopped, and the size of the piece.
 __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, uint32_t end,
                                     const Buckets& buckets, uint32_t beyond, uint32_t held,
                                     uint32_t window_number, BlendShared& s) {
@@ -170,8 +176,8 @@ __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, ui
     return {min(end, window.end), held + window.taken};
 }
 
-// Returns whether the first entry is blended before the second. If their rounded depths
-// are equal and not exact, the depths of the records decide.
+// Returns whether entry `first` is blended before entry `second`. If their depths are
+// equal, but rounded, the depths of the records decide.
 __device__ inline bool precedes(EntryKey first, EntryKey second, const RecordPlanes& records) {
     const TileEntry one{first}, other{second};
     if (records.depth_of(one) != records.depth_of(other) || records.is_exact(other))
@@ -182,8 +188,8 @@ __device__ inline bool precedes(EntryKey first, EntryKey second, const RecordPla
     return depth_a != depth_b ? depth_a < depth_b : a < b;
 }
 
-// Returns how many of the entries [first, last) of by_bucket precede the one at index
-// p.
+// Returns how many of the elements [first, last) of by_bucket precede the element at
+// index p.
 __device__ inline uint32_t count_before(uint32_t p, uint32_t first, uint32_t last,
                                         const RecordPlanes& records, const BlendShared& s) {
     const auto entry_at = [&](uint32_t j) { return TileEntry{s.key[s.by_bucket[j]]}; };
@@ -194,7 +200,7 @@ __device__ inline uint32_t count_before(uint32_t p, uint32_t first, uint32_t las
         return before;
     }
     const uint32_t depth = records.depth_of(entry);
-    uint32_t num_alike = 0, last_alike = 0;  // entries other than p
+    uint32_t num_alike = 0, last_alike = 0;  // entries of equal depth, other than p
     for (uint32_t j = first; j < last; ++j) {
         const uint32_t other = records.depth_of(entry_at(j));
         before += other < depth;
@@ -203,8 +209,8 @@ __device__ inline uint32_t count_before(uint32_t p, uint32_t first, uint32_t las
             last_alike = j;
         }
     }
-    // Lanes that have to look up records do so together. Most have one other entry of
-    // equal depth.
+    // Lanes that must load records do so in the same iterations. Most lanes have one
+    // other entry of equal depth.
     for (uint32_t j = last_alike; num_alike > 0; --j) {
         if (records.depth_of(entry_at(j)) != depth || j == p) continue;
         before += precedes(entry_at(j).key, entry.key, records);
@@ -213,8 +219,8 @@ __device__ inline uint32_t count_before(uint32_t p, uint32_t first, uint32_t las
     return before;
 }
 
-// These functions sort the piece by buckets. The counters start as 0, then hold the
-// begin of each bucket, and in the end the begin of the next one.
+// The steps of sorting a piece by buckets. The counters of buckets are 0 first. Then
+// they hold the first index of each bucket, and in the end that of the next bucket.
 template <class SomeBuckets>
 __device__ void count_buckets(const SomeBuckets& buckets, uint32_t* bucket, uint32_t count,
                               BlendShared& s) {
@@ -237,7 +243,7 @@ __device__ void sort_buckets(const SomeBuckets& buckets, uint32_t* bucket,
     __syncthreads();
 }
 
-// Sorts the piece.
+// Sorts the piece: sets s.sorted.
 __device__ inline void sort_piece(const RecordPlanes& records, uint32_t count, BlendShared& s) {
     const Buckets buckets = buckets_over(s.lowest, s.highest, kLog2Sort, false);
     const bool few = count <= kFewEntries;
@@ -253,14 +259,14 @@ __device__ inline void sort_piece(const RecordPlanes& records, uint32_t count, B
         for (int i = threadIdx.x; i < 1 << kLog2Sort; i += kBlendThreads) s.bucket[i] = 0;
     }
     __syncthreads();
-    if (threadIdx.x == 0) {  // the next piece starts with this value
+    if (threadIdx.x == 0) {  // reset for the next piece
         s.lowest = ~0u;
         s.highest = 0;
     }
     if (few) return;
     count_buckets(buckets, s.bucket, count, s);
-    // A sample shows whether most entries share their bucket with many others, each of
-    // which costs a comparison.
+    // An entry is compared with all others in its bucket. A sample of entries shows
+    // whether most buckets are crowded, so that finer buckets are faster.
     const bool is_crowded =
         threadIdx.x < count && s.bucket[buckets.of(s.key[threadIdx.x])] > kMostAlike;
     if (is_crowded) atomicAdd(&s.crowded, 1u);
@@ -275,7 +281,7 @@ __device__ inline void sort_piece(const RecordPlanes& records, uint32_t count, B
         scan_buckets<1 << kLog2Sort, kBlendThreads>(s.finer, s.warp_sum);
         sort_buckets(finer, s.finer, records, count, s);
     }
-    if (threadIdx.x == 0) s.crowded = 0;  // the next piece starts with this value
+    if (threadIdx.x == 0) s.crowded = 0;  // reset for the next piece
 }
 
 }  // namespace cuda

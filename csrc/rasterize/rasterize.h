@@ -1,7 +1,7 @@
 #pragma once
 
 // Blends the lists of tiles into pictures, front to back, and computes the gradients of
-// records from those of pictures.
+// records.
 
 #include <cstddef>
 #include <cstdint>
@@ -16,16 +16,16 @@
 
 namespace v3dg {
 
-// Blends one tile's sorted entries, front to back, and writes the pixels of the tile
-// that are inside the picture's window.
+// Blends the sorted entries of one tile, front to back, and writes the tile's pixels
+// inside the picture's window. (left, top) is the tile's first pixel.
 V3DG_DECLARE_PER_ISA(template <class T>
                      void rasterize_tile(const Record<T>* records, EntryFormat format,
                                          const uint64_t* entry, size_t count, int left, int top,
                                          const Picture<T>& picture))
 
-// Writes the gradients of a tile's sorted entries, in their order, to `d_entry`.
-// `size`, unless null, receives the sizes of the gradients with respect to the centres.
-// Both must be zero on entry. Adds to `d_background` (3).
+// Computes the gradients of a tile's sorted entries, in their order. Unless `size` is
+// null, it also computes the absolute gradients of their centres. `d_entry` and `size`
+// must be zero initially. Adds the gradient of the background (3) to `d_background`.
 V3DG_DECLARE_PER_ISA(template <class T> void rasterize_tile_backward(
     const Record<T>* records, EntryFormat format, const uint64_t* entry, size_t count, int left,
     int top, const Picture<T>& picture, const PictureGradient<T>& d_picture,
@@ -33,52 +33,53 @@ V3DG_DECLARE_PER_ISA(template <class T> void rasterize_tile_backward(
 
 namespace cuda {
 
-// The data that the forward pass leaves for the backward pass; all pointers are to
-// device memory.
+// The results of the forward pass that the backward pass needs, in device memory.
 struct RasterTape {
     // The records of each tile in blending order, without those that could not change
     // any pixel. The array is as long as the entries; the records of tile t begin at
     // tile_first[t].
     uint32_t* order;
-    // [num_tiles] Number of elements that were written to `order` for each tile.
+    // [num_tiles] number of records of each tile in `order`
     uint32_t* blended;
 };
 
-// Returns the largest number of plans for blending in parts. A frame with a tape has
-// one plan per tile.
+// Returns the required number of plans if tiles may be blended in parts. With a tape,
+// there is one plan per tile instead.
 uint32_t most_plans(uint32_t num_tiles);
 
-// Blends each tile's list into the pictures of lists.images; writes every pixel.
-// Overwrites lists.entries and lists.scratch. Does nothing if the counters exceed a
-// capacity. The result does not depend on the order of entries in a tile's list. `tape`
-// may be null.
+// Blends the list of each tile into the pictures of lists.images, and writes every
+// pixel. The entries of a list may be in any order. Overwrites lists.entries and
+// lists.scratch. Does nothing if a counter exceeds its capacity. `tape` may be null.
 void rasterize(const FrameLists& lists, const RasterTape* tape, Stream stream);
 
-// Drawn pictures, the lists they were blended from, and their gradients, all on the
-// device.
+// Drawn pictures, the lists that they were blended from, and the gradients of the
+// pictures, in device memory.
 struct RasterizeBackwardInput {
-    FrameImage image;  // of the only picture; unused where there is a batch
+    FrameImage image;  // of the only picture; unused with a PictureBatch
     RecordPlanes records;
-    const unsigned long long* tile_first;  // [num_tiles + 1] indices into `order`
-    const uint32_t* order;                 // records of each tile, front to back
-    const uint32_t* blended;  // [num_tiles] number of them, up to where all pixels had stopped
-    const TilePlan* plans;    // [num_tiles] in the order in which blocks process the tiles
-    PictureGradient<float> d_picture;  // of the only picture
+    // [num_tiles + 1] first element of each tile in `order`
+    const unsigned long long* tile_first;
+    const uint32_t* order;  // records of each tile, front to back
+    // [num_tiles] number of records in `order` until all pixels had stopped
+    const uint32_t* blended;
+    const TilePlan* plans;  // [num_tiles] in the order in which blocks process tiles
+    // of the only picture; unused with a PictureBatch
+    PictureGradient<float> d_picture;
 };
 
-// The pictures of a batch, without depth.
+// Several pictures without depth.
 struct PictureBatch {
     const FrameImage* images;
     const PictureGradient<float>* d_pictures;
-    uint32_t num_tiles;  // of all pictures together
+    uint32_t num_tiles;  // total over all pictures
 };
 
-// Writes the slots and the gradient of the background (3) of one picture.
+// Computes the gradients of the slots and of the background (3) of one picture.
 // `d_background_of_tile` is scratch memory, (num_tiles, 3).
 void rasterize_backward(const RasterizeBackwardInput& in, const GradientSlots& slots,
                         float* d_background_of_tile, float* d_background, Stream stream);
-// Writes the slots of all pictures of a batch, without sizes. The image and the
-// gradient of `in` are unused.
+// Computes the gradients of the slots of all pictures of a batch, without sizes.
+// Ignores the image and the gradient of `in`.
 void rasterize_backward(const RasterizeBackwardInput& in, const PictureBatch& batch,
                         const GradientSlots& slots, Stream stream);
 

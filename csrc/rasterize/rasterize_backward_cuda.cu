@@ -1,9 +1,10 @@
-// Each block processes a tile, each warp 8 x 4 of its pixels, each lane one pixel. They
-// visit the tile's list front to back, as the forward pass did.
+// The backward pass of blending on CUDA. A block processes a tile, a warp 8 x 4 pixels,
+// a lane one pixel. They visit the tile's list front to back, like the forward pass.
 //
-// The sums over a warp's pixels are computed for kHeld gaussians at once: each lane
-// stores the contribution of its pixel to each of them, then each lane sums a row of 8
-// pixels for one gaussian. This costs a fifth of a reduction across lanes per gaussian.
+// The gradient of a gaussian is a sum over pixels. A warp computes the sums of kHeld
+// gaussians at once: each lane stores its pixel's contribution to each gaussian; then
+// each lane adds up a row of 8 pixels for one gaussian. This costs a fifth of a warp
+// reduction per gaussian.
 
 #include <cmath>
 
@@ -19,10 +20,10 @@ namespace {
 
 constexpr int kWarps = kFrameTileWidth * kFrameTileHeight / 32;
 constexpr int kThreads = 32 * kWarps;
-constexpr int kWarpWidth = 8, kWarpHeight = 4;  // px
+constexpr int kWarpWidth = 8, kWarpHeight = 4;  // px; the pixels of a warp
 constexpr int kWarpColumns = kFrameTileWidth / kWarpWidth;
-constexpr int kBatch = 192;  // entries
-constexpr int kPairs = 768;  // (entry, warp) pairs of a batch
+constexpr int kBatch = 192;  // entries that are blended together
+constexpr int kPairs = 768;  // most (entry, warp) pairs of a batch
 constexpr int kHeld = 8;     // gaussians whose sums a warp computes together
 constexpr int kGradientValues = sizeof(RecordGradient<float>) / sizeof(float);
 constexpr int kSizeValues = sizeof(CenterSize<float>) / sizeof(float);
@@ -30,49 +31,51 @@ constexpr int kSizeValues = sizeof(CenterSize<float>) / sizeof(float);
 template <bool kWithSize>
 constexpr int kValuesOf = kGradientValues + (kWithSize ? kSizeValues : 0);
 static_assert(kHeld * kWarpHeight == 32 && kWarpHeight == 4, "a lane sums one row of one gaussian");
-constexpr int kTogether = 2;  // gaussians blended without a branch between them
+constexpr int kTogether = 2;  // gaussians that are blended without a branch in between
 static_assert(kPairs >= kWarps, "one entry fits");
 static_assert(kBatch <= 255 && kBatch % 32 == 0 && kHeld % kTogether == 0, "");
 
-// The contribution of one pixel to the gradient of a gaussian.
+// One pixel's contribution to the gradient of a gaussian.
 struct Share {
     float d_exponent, weight;
 };
 constexpr int kShareStride = 33;  // elements per gaussian; odd, to avoid bank conflicts
-constexpr int kRowsStride = 40;   // row sums of a value, padded to avoid bank conflicts
+constexpr int kRowsStride = 40;   // row sums per value, padded to avoid bank conflicts
 static_assert(kRowsStride * kValuesOf<true> * sizeof(float) <= kHeld * kShareStride * sizeof(Share),
               "");
 
-// The data of a batch's entries, which must stay until their pairs are summed.
+// The data of a batch that is needed until its pairs are summed.
 struct Batch {
     uint32_t slot[kBatch];
     uint32_t first_pair[kBatch];
-    uint32_t took_part[kBatch];  // bit k: the k-th warp that may blend the entry did blend it
+    // bit k: the k-th warp of those that may blend the entry did blend it
+    uint32_t took_part[kBatch];
 };
 
 template <bool kWithSize>
 struct Shared {
-    Record<float> record[kBatch + 1];      // the last record is invisible
-    uint32_t warps[kBatch];                // bit w: warp w may blend the entry
-    uint8_t list[kWarps][kBatch + kHeld];  // entries that a warp may blend, padded with kBatch
+    Record<float> record[kBatch + 1];  // the last record is invisible
+    uint32_t warps[kBatch];            // bit w: warp w may blend the entry
+    // indices of entries that a warp may blend, padded with kBatch
+    uint8_t list[kWarps][kBatch + kHeld];
     uint32_t pairs_of_warp[kBatch / 32];
-    uint32_t alive;  // bit w: warp w has a pixel that has not stopped
+    uint32_t alive;  // bit w: a pixel of warp w has not stopped
     float4 d_color[kWarps][kWarpHeight]
-                  // Gradients by colour and depth; the spare column avoids bank
-                  // conflicts.
+                  // Gradients with respect to colour and depth. The extra column avoids
+                  // bank conflicts.
                   [kWarpWidth + 1];
     Share share[kWarps][kHeld * kShareStride];
-    Batch batch[2];  // one batch is blended while the other one is summed
+    Batch batch[2];  // one batch is blended while the previous one is summed
     float pair[kPairs][kValuesOf<kWithSize>];
     float d_background[kWarps][3];
 };
 
 static_assert(sizeof(Shared<true>) <= 99 * 1024, "the most that a block can have on every device");
 
-// Returns the parts of the tile that the record may reach, one bit per warp. It
-// compares without rounding to pixel centres. A tile marks the slots of every record
-// that it lists for a warp, so this comparison decides which gaussians get zero
-// gradients.
+// Returns the warps whose pixels the record may reach, one bit per warp. Nothing is
+// rounded to pixel centres. A tile marks the gradient slots of all records that it
+// lists for a warp; so this test decides which gaussians have gradients, which may be
+// zero.
 __device__ uint32_t warps_of(const Record<float>& g, int left, int top) {
     const int x0 = max(g.x0 - left, 0) / kWarpWidth,
               x1 = min(g.x1 - left, kFrameTileWidth - 1) / kWarpWidth;
@@ -80,7 +83,8 @@ __device__ uint32_t warps_of(const Record<float>& g, int left, int top) {
               y1 = min(g.y1 - top, kFrameTileHeight - 1) / kWarpHeight;
     const EllipseRows<float> ellipse = ellipse_rows(g.l11, g.l12, g.l22, g.log2_opacity);
     const float u = g.u - left,
-                v = g.v - top;  // relative to the tile's corner; pixel centres are at 1/2
+                // relative to the tile's corner; pixel centres are at 1/2
+        v = g.v - top;
     uint32_t warps = 0;
     for (int y = y0; y <= y1; ++y) {
         float low, high;
@@ -98,13 +102,14 @@ struct PixelGradient {
     float x, y;
     float d_color[3], d_depth, d_weight;
     float total,
-        // Sums over gaussians of weight * (gradient with respect to that weight): all
-        // of them, and those so far.
+        // Sums of weight * (gradient with respect to the weight): over all gaussians,
+        // and over those visited so far.
         running;
     float transmittance;
 };
 
-// Reads the pixel at (column, row) of the picture, and adds to `d_background`.
+// Reads the pixel at (column, row) of the picture. Adds its gradient of the background
+// to `d_background`.
 __device__ PixelGradient read_pixel(const FrameImage& image,
                                     const PictureGradient<float>& d_picture, int column, int row,
                                     float d_background[3]) {
@@ -139,9 +144,9 @@ __device__ PixelGradient read_pixel(const FrameImage& image,
     return p;
 }
 
-// Sums over the warp's pixels for the gaussians that it holds. `entry` is the index in
-// the batch of this lane's gaussian, (left, top) the centre of the warp's first pixel.
-// The lane index is row of pixels * kHeld + gaussian.
+// Adds up the contributions of the warp's pixels to the gradients of `held` gaussians.
+// `entry` is the index, in the batch, of the lane's gaussian; lane = kHeld * (row of
+// pixels) + gaussian. (left, top) is the centre of the warp's first pixel.
 template <bool kWithDepth, bool kWithSize>
 __device__ void add_up(Shared<kWithSize>& s, Batch& batch, int warp, int held, int entry,
                        float left, float top) {
@@ -169,8 +174,8 @@ __device__ void add_up(Shared<kWithSize>& s, Batch& batch, int warp, int held, i
     }
     const Ellipse<float> d = falloff_vjp(l11, l12, l22, sums.of_falloff(f));
 
-    // The row sums overwrite the contributions: lane l sums the values l / kHeld, l /
-    // kHeld + 4, ...
+    // The sums of rows overwrite the contributions. Lane l then adds up the values l /
+    // kHeld, l / kHeld + 4, and so on.
     constexpr int kValues = kValuesOf<kWithSize>;
     const float value[kValuesOf<true>] = {
         d.u,   d.v,      d.l11,    d.l12,    d.l22,  d.log2_opacity,
@@ -193,7 +198,7 @@ __device__ void add_up(Shared<kWithSize>& s, Batch& batch, int warp, int held, i
     __syncwarp();
 }
 
-// Blends one gaussian over the pixel.
+// Blends one gaussian over the pixel, and returns the contribution to its gradient.
 template <bool kWithDepth>
 __device__ Share blend_vjp(const Record<float>& g, PixelGradient& p) {
     const Falloff<float> f = falloff_at(p.x, p.y, g.u, g.v, g.l11, g.l12, g.l22, g.log2_opacity);
@@ -206,7 +211,7 @@ __device__ Share blend_vjp(const Record<float>& g, PixelGradient& p) {
     return {exponent_vjp(alpha, before, weight, by_weight, p.total - p.running), weight};
 }
 
-// Blends the batch over this warp's pixels.
+// Blends the batch over the pixels of this warp.
 template <bool kWithDepth, bool kWithSize>
 __device__ void blend_batch_vjp(Shared<kWithSize>& s, Batch& batch, int warp, int num,
                                 PixelGradient& p, float left, float top) {
@@ -228,7 +233,8 @@ __device__ void blend_batch_vjp(Shared<kWithSize>& s, Batch& batch, int warp, in
     for (int first = 0; first < count && alive; first += kHeld) {
         const int held = min(kHeld, count - first);
         for (int h = 0; h < held; h += kTogether) {
-            Share share[kTogether];  // stored last, so that all loads can be issued first
+            // stored only after all loads, so that these overlap
+            Share share[kTogether];
 #pragma unroll
             for (int k = 0; k < kTogether; ++k)
                 share[k] = blend_vjp<kWithDepth>(s.record[list[first + h + k]], p);
@@ -241,7 +247,8 @@ __device__ void blend_batch_vjp(Shared<kWithSize>& s, Batch& batch, int warp, in
     if (!alive && lane == 0) atomicAnd(&s.alive, ~(1u << warp));
 }
 
-// Sums the pairs of a batch's entries into their slots, as `thread` of `num_threads`.
+// Adds up the pairs of a batch's entries, and writes the slots. The work is divided
+// among `num_threads` threads.
 template <bool kWithSize>
 __device__ void add_up_pairs(const Shared<kWithSize>& s, const Batch& batch, int num, int thread,
                              int num_threads, const GradientSlots& slots) {
@@ -263,8 +270,8 @@ __device__ void add_up_pairs(const Shared<kWithSize>& s, const Batch& batch, int
     }
 }
 
-// The only picture, and one of a batch. They are asked with a compile-time constant, so
-// that a single picture stays in constant memory.
+// Return the image and the gradient of a picture: the only one, or one of a batch. The
+// template parameter lets the compiler read a single picture from constant memory.
 template <bool kIsBatch>
 __device__ const FrameImage& image_of(const RasterizeBackwardInput& in, const PictureBatch& batch,
                                       uint32_t image) {
@@ -278,7 +285,7 @@ __device__ const PictureGradient<float>& gradient_of(const RasterizeBackwardInpu
     return in.d_picture;
 }
 
-// `d_background_of_tile` is null for a batch.
+// One block per tile. `d_background_of_tile` is null for a batch.
 template <bool kWithDepth, bool kWithSize, bool kIsBatch>
 __global__ void __launch_bounds__(kThreads, 2)
     rasterize_backward_kernel(RasterizeBackwardInput in, PictureBatch batch, GradientSlots slots,
@@ -286,7 +293,9 @@ __global__ void __launch_bounds__(kThreads, 2)
     Shared<kWithSize>& s = *reinterpret_cast<Shared<kWithSize>*>(shared_memory());
     const int lane = threadIdx.x % 32;
     const int warp = __shfl_sync(kAllLanes, static_cast<int>(threadIdx.x) / 32,
-                                 0);  // shows the compiler that all lanes agree
+                                 // tells the compiler that the value is uniform in the
+                                 // warp
+                                 0);
     const uint32_t tile = in.plans[blockIdx.x].tile;
     const uint32_t number = in.plans[blockIdx.x].image;
     const FrameImage& image = image_of<kIsBatch>(in, batch, number);
@@ -324,7 +333,8 @@ __global__ void __launch_bounds__(kThreads, 2)
     const int i = threadIdx.x;
     int first = 0, num = 0;
     for (int turn = 0;; turn ^= 1) {
-        // Some warps load a batch while the others sum the previous one.
+        // Some warps sum the pairs of the previous batch, while the others load this
+        // one.
         const bool goes_on = first < count && s.alive != 0;
         Batch& entries = s.batch[turn];
         uint32_t end_pair = 0;
@@ -351,7 +361,7 @@ __global__ void __launch_bounds__(kThreads, 2)
             for (int w = 0; w < warp; ++w) end_pair += s.pairs_of_warp[w];
             entries.first_pair[i] = end_pair - __popc(s.warps[i]);
         }
-        // The entries of the batch are those whose pairs fit.
+        // The batch ends with the last entry whose pairs fit.
         num = __syncthreads_count(i < min(kBatch, count - first) && end_pair <= kPairs);
         blend_batch_vjp<kWithDepth, kWithSize>(s, entries, warp, num, p, warp_left + 0.5f,
                                                warp_top + 0.5f);
@@ -370,7 +380,7 @@ void start(const RasterizeBackwardInput& in, const GradientSlots& slots,
 
 constexpr int kSumThreads = 256;
 
-// One block per channel.
+// Adds up the gradients of the background of all tiles. One block per channel.
 __global__ void sum_over_tiles_kernel(const float* of_tile, uint32_t num_tiles, float* total) {
     __shared__ float of_warp[kSumThreads / 32];
     float sum = 0;

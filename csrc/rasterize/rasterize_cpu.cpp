@@ -1,4 +1,4 @@
-// Blends a tile, and computes the gradients of its records, on one thread.
+// Blends one tile, and computes the gradients of its records, on one CPU thread.
 
 #include "rasterize/rasterize.h"
 
@@ -16,8 +16,8 @@ static void blend_entries(const Record<T>* records, EntryFormat format, const ui
     });
 }
 
-// Calls visit(index in the tile, index in the picture) for the tile's pixels inside the
-// window.
+// Calls visit(index in the tile, index in the picture) for each pixel of the tile that
+// is inside the window.
 template <class Visit>
 static V3DG_INLINE void for_each_pixel(int left, int top, const Window& window,
                                        const Visit& visit) {
@@ -89,7 +89,8 @@ static void backward(const Record<T>* records, EntryFormat format, const uint64_
         grad.d_weight[p] = d_weight;
         grad.total[p] = total + d_weight * (1 - t);
     });
-    constexpr size_t kPrefetch = 48;  // records ahead, enough for a prefetch to arrive in time
+    // Distance of prefetching, in records; long enough for the data to arrive.
+    constexpr size_t kPrefetch = 48;
     const BlockPixels<T> pixels;
     uint64_t alive = clear_tile(tile, left, top, picture.window, Extra::kNothing);
     for (size_t i = 0; i < count && alive != 0; ++i) {

@@ -1,13 +1,11 @@
-// Each block blends a tile, front to back; its warps process the tile's sub-tiles one
-// after another.
+// Blending on CUDA. A block blends a tile, front to back; its warps process sub-tiles.
 //
-// A list is sorted in pieces, nearest first. Entries that cover only pixels that have
-// stopped by then are dropped before sorting, and their records are never loaded. A
-// list that does not fit into a piece is first spread over buckets of depth: in place
-// if it fits into shared memory, else into scratch memory, one chunk of the size of
-// shared memory at a time. A bucket that is longer than a window is spread again. A
-// list that is much longer than a block's share of the frame's entries is blended in
-// parts of the tile, concurrently.
+// A list is sorted in pieces, nearest first. Before sorting, entries that cover only
+// stopped pixels are dropped, and their records are never loaded. A list that is longer
+// than a piece is first spread over buckets of depth (spread_lists_cuda.cu). A bucket
+// that is longer than a window is spread again. If the list of a tile is much longer
+// than a block's share of all entries, several blocks blend parts of the tile
+// concurrently.
 
 #include "rasterize/rasterize.h"
 
@@ -21,16 +19,16 @@ namespace v3dg {
 namespace cuda {
 namespace {
 
-constexpr int kBlocks = 8;  // blocks per multiprocessor with 228 KiB, in frames without depth
-// The average number of blocks per record from which two pixels per lane are faster.
-// Measured: 4, 7 and 10 differ by 1 %.
+// resident blocks per multiprocessor with 228 KiB of shared memory, without depth
+constexpr int kBlocks = 8;
+// From this average number of blocks per record on, a lane blends two pixels. Values of
+// 4, 7 and 10 differ by 1 % of the time.
 constexpr int kBlocksForPairs = 5;
 
 static_assert(kBlocks * (offsetof(BlendShared, depth) + 1024) <= 228 << 10,
               "the driver keeps 1024 of each");
 
-// Returns a mask of the blocks in a part of a tile: the whole tile, its left or right
-// half, or a quarter.
+// Returns a mask of the blocks in a part of a tile: all of it, a half or a quarter.
 __device__ uint32_t blocks_of_part(int part, int log2_parts) {
     if (log2_parts == 0) return ~0u;
     return (log2_parts == 1 ? 0x0f0f0f0fu : 0x0f0fu) << (4 * (part & 1) + 16 * (part >> 1));
@@ -68,8 +66,8 @@ __device__ void blend_piece(const RecordPlanes& records, uint32_t count, int lef
         if (threadIdx.x == 0) s.reached[turn ^ 1] = s.num_covered[turn ^ 1] = 0;
         const int num_records = min(count - first, static_cast<uint32_t>(kBlendBatch));
         const uint32_t reached = s.reached[turn];
-        // Larger sub-tiles would leave some warps idle if there are fewer of them than
-        // warps.
+        // If there are fewer large sub-tiles than warps, small sub-tiles keep all warps
+        // busy.
         if (s.num_covered[turn] >= kBlocksForPairs * num_records &&
             __popc(subs_of<2>(reached)) >= kBlendWarps)
             blend_batch<2, kWithDepth, Stop>(reached, left, top, s);
@@ -80,15 +78,15 @@ __device__ void blend_piece(const RecordPlanes& records, uint32_t count, int lef
     if (threadIdx.x < 2) s.reached[threadIdx.x] = s.num_covered[threadIdx.x] = 0;
 }
 
-// Blends the list of a tile. Returns how many of its entries were not dropped. If the
-// list is in windows, which are in scratch memory, `window_ends` contains their ends;
-// otherwise it is null.
+// Blends the list of a tile. Returns the number of entries that were not dropped. If
+// the list is divided into windows, `window_ends` has their ends, and the list is in
+// scratch memory; otherwise `window_ends` is null.
 template <bool kWithDepth, class Stop>
 __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, TileEntry* scratch,
                                uint32_t count, const TilePlan& plan, const Buckets& spread_buckets,
                                const uint32_t* window_ends, uint32_t* order, int left, int top,
                                BlendShared& s) {
-    int depth = 0;  // number of levels
+    int depth = 0;  // number of levels in use
     if (count > kPiece && window_ends == nullptr) {
         if (threadIdx.x == 0) s.level[0] = {count, plan.in_scratch, spread_buckets};
         depth = 1;
@@ -121,7 +119,7 @@ __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, 
                 continue;
             }
             if (room < kWindow) break;
-            // The window gets as many whole buckets as fit.
+            // Take as many whole buckets as fit into the window.
             const uint32_t beyond = level.buckets.of(from[done + kWindow].key);
             const uint2 taken = take_window(from, done, done + kWindow, level.buckets, beyond, held,
                                             num_windows++, s);
@@ -130,7 +128,7 @@ __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, 
                 held = taken.y;
                 continue;
             }
-            // Not even one bucket fits.
+            // Not even one bucket fits: spread it again.
             const uint32_t end = end_of_bucket(from, done, level.end, level.buckets);
             const Buckets buckets =
                 find_buckets<kBlendThreads>(from, done, end, false, false, s.spreading);
@@ -151,7 +149,7 @@ __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, 
     return blended;
 }
 
-// Returns the destination of the image, which is an element of lists.images.
+// Returns where an image is drawn. `image` must be an element of lists.images.
 __device__ const PicturePlanes& planes_of(const FrameLists& lists, const FrameImage& image) {
     return image.planes.color != nullptr ? image.planes : lists.planes[&image - lists.images];
 }
@@ -165,8 +163,8 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
     const int left = in_image % image.tile_columns * kFrameTileWidth;
     const int top = in_image / image.tile_columns * kFrameTileHeight;
     const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
-    // A thread initialises and writes one pair of pixels of each sub-tile that it
-    // processes.
+    // Calls visit() for the pairs of pixels that a thread initialises and writes: one
+    // pair in each of its sub-tiles.
     using Sub = SubTile<2>;
     const auto for_each_pair = [&](const auto& visit) {
         for (int sub = warp; sub < Sub::kCount; sub += kBlendWarps)
@@ -236,7 +234,8 @@ __global__ void __launch_bounds__(kBlendThreads, kBlocks)
     if (lists.plans[blockIdx.x].tile == kNoTile) return;
     const int part = lists.plans[blockIdx.x].part;
     const TilePlan& plan = lists.plans[blockIdx.x - part];
-    if (part > 0 && !plan.in_windows) return;  // the first part blends the whole tile
+    // Without windows, the first part blends the whole tile.
+    if (part > 0 && !plan.in_windows) return;
     const uint32_t own_blocks = blocks_of_part(part, plan.in_windows ? plan.log2_parts : 0);
     const Buckets buckets{
         .lowest = plan.lowest, .last = plan.last_bucket, .shift = plan.shift, .by_order = false};

@@ -1,7 +1,7 @@
 #pragma once
 
-// Blends one tile, front to back. A batch of records is sorted into the blocks that
-// they may change; then each block blends its own records, with its pixels in
+// Blends one tile on the CPU, front to back. The records of a batch are assigned to the
+// blocks that they may change. Then each block blends its records, with its pixels in
 // registers.
 
 #include <cstddef>
@@ -12,14 +12,14 @@
 namespace v3dg {
 namespace V3DG_ISA {
 
-// The batch size is large enough that a block has several records in a batch, and small
-// enough that the batch stays in the first-level cache.
+// The largest number of records in a batch. It is large enough that a block has several
+// records, and small enough that the batch fits into the L1 cache.
 constexpr int kBatchSize = 256;
-// The limit on the blocks that a batch reaches in total. With large records, it keeps
-// batches short, so that few records are loaded that turn out to be hidden.
+// The largest number of (record, block) pairs in a batch. With large records it keeps
+// batches short, so that fewer records are loaded that turn out to be hidden.
 constexpr int kBatchBlocks = 1024;
 
-// The first part of a record, which blending reads; its centre is in px from the tile's
+// The first part of a record, which blending reads. The centre is in px from the tile's
 // corner.
 template <class T>
 struct BatchRecord {
@@ -37,8 +37,8 @@ struct BatchRecord {
     }
 };
 
-// Prefetches a record into the second-level cache, which supports more outstanding
-// lines than the first-level cache. A record may straddle two lines.
+// Prefetches a record into the L2 cache, which supports more outstanding cache lines
+// than the L1 cache. A record may straddle two cache lines.
 template <class T>
 V3DG_INLINE void prefetch_record(const Record<T>* record) {
     constexpr int kRead = 0, kSecondLevel = 2;
@@ -46,32 +46,33 @@ V3DG_INLINE void prefetch_record(const Record<T>* record) {
     __builtin_prefetch(reinterpret_cast<const char*>(record + 1) - 1, kRead, kSecondLevel);
 }
 
-// Records of a tile, front to back, and their indices by block.
+// A batch of records of a tile, front to back, and the records of each block.
 template <class T>
 struct Batch {
     int size;
-    const Record<T>* source[1 + kBatchSize];  // valid from index 1
+    const Record<T>* source[1 + kBatchSize];  // index 1 is the first record
     uint64_t blocks[kBatchSize];              // blocks that each record may change
     BatchRecord<T> record[kBatchSize];
     uint16_t count[kTileBlocks * kTileBlocks];
     uint8_t place[kTileBlocks * kTileBlocks][kBatchSize];
 };
 
-// A record of a tile's list, and the blocks that its box meets.
+// A record of a tile's list, and the blocks that its box touches.
 template <class T>
 struct Listed {
     const Record<T>* record;
     uint64_t blocks;
 };
 
-// Adds records from index i on until the batch is full. Only records whose boxes meet
-// live blocks are added, and only those are loaded from memory. The loop is
-// branch-free, because the outcome is unpredictable.
+// Adds records to the batch, from index i on, until it is full. Returns the index of
+// the next record. Only records whose boxes touch live blocks are added, and loaded.
+// The loop has no branch, because it would be mispredicted often.
 template <class T, class ListedAt>
 V3DG_INLINE size_t take_live(size_t i, size_t count, uint64_t alive, const ListedAt& listed_at,
                              Batch<T>& batch) {
     int size = 0, num_blocks = 0;
-    batch.source[0] = listed_at(i).record;  // prefetched while the batch is empty
+    // Prefetch this record while the batch is empty.
+    batch.source[0] = listed_at(i).record;
     for (; i < count && size < kBatchSize && num_blocks < kBatchBlocks; ++i) {
         const Listed<T> g = listed_at(i);
         const uint64_t blocks = g.blocks & alive;
@@ -85,8 +86,8 @@ V3DG_INLINE size_t take_live(size_t i, size_t count, uint64_t alive, const Liste
     return i;
 }
 
-// Restricts the blocks of each record to those that its ellipse reaches, and sorts the
-// records into the blocks.
+// Reduces the blocks of each record to those that its ellipse reaches, and appends the
+// record to their lists.
 template <class T>
 V3DG_INLINE void sort_into_blocks(int left, int top, Batch<T>& batch) {
     uint8_t many[kBatchSize];
@@ -109,7 +110,7 @@ V3DG_INLINE void sort_into_blocks(int left, int top, Batch<T>& batch) {
     }
 }
 
-// Blends a batch's records over one block. Returns whether any of its pixels goes on.
+// Blends the batch over one block. Returns whether any pixel of the block goes on.
 template <class T, Extra kExtra, class Stop>
 V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels<T>& pixels,
                              Stop stop, TilePlanes<T>& tile) {
@@ -132,8 +133,8 @@ V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels
             const Falloff<V> f = falloff_at(
                 x, y, all_lanes<V>(g.u) - block_u, all_lanes<V>(g.v) - block_v, all_lanes<V>(g.l11),
                 all_lanes<V>(g.l12), all_lanes<V>(g.l22), all_lanes<V>(g.log2_opacity));
-            // Where a vector covers a whole block, few vectors are missed, so the test
-            // does not pay.
+            // Skip vectors without any contribution. If a vector covers the whole
+            // block, there are few of them, so the test is left out.
             if (kLanes<T> < kBlockPixels && bits_of(contributes(f)) == 0) continue;
             const V weight = blend_weight(alpha_of(f), t, stop);
             red += weight * all_lanes<V>(g.color[0]);
@@ -153,8 +154,8 @@ V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels
     return goes_on;
 }
 
-// Blends `count` records front to back over a tile, which is cleared first.
-// listed_at(i) returns record i.
+// Clears the tile, and blends `count` records front to back. listed_at(i) returns
+// record i.
 template <class T, Extra kExtra, class Stop, class ListedAt>
 V3DG_INLINE void blend_tile(size_t count, int left, int top, const Window& window, Stop stop,
                             TilePlanes<T>& tile, const ListedAt& listed_at) {

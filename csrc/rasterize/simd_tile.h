@@ -1,12 +1,12 @@
 #pragma once
 
-// The inner loops of the rasterizer, on one tile of 32 x 32 pixels that stays in the
-// first-level cache.
+// The inner loops of blending on the CPU. They process one tile of 32 x 32 pixels,
+// which fits into the L1 cache.
 //
-// A tile has 8 x 8 blocks of 4 x 4 pixels. Two 64-bit masks have a bit per block: the
-// blocks that a gaussian may touch, and the live blocks, which have a pixel that has
-// not stopped. A gaussian whose mask contains no live block costs a few integer
-// operations.
+// A tile has 8 x 8 blocks of 4 x 4 pixels. A 64-bit mask has a bit per block. One mask
+// has the blocks that a gaussian may touch. Another has the live blocks: those with a
+// pixel that has not stopped. If the masks of a gaussian and of live blocks do not
+// overlap, the gaussian costs only a few integer operations.
 
 #include <cstdint>
 
@@ -21,10 +21,10 @@ namespace V3DG_ISA {
 constexpr int kBlockPixels = kBlockSize * kBlockSize;
 constexpr int kTilePixels = kTileSize * kTileSize;
 
-// The optional sum per pixel besides colour and transmittance.
+// What is summed per pixel besides colour and transmittance.
 enum class Extra { kNothing, kDepth, kCount };
 
-// The planes of a tile, block after block, 16 pixels each.
+// The pixels of a tile, block by block, 16 pixels each.
 template <class T>
 struct TilePlanes {
     alignas(64) T transmittance[kTilePixels];
@@ -32,19 +32,21 @@ struct TilePlanes {
     alignas(64) T extra[kTilePixels];  // sum of weight * depth, or number of gaussians
 };
 
-// The gradients per pixel that the backward pass reads, and its running sums.
+// The gradients of a tile's pixels, as the backward pass reads them.
 template <class T>
 struct TileGradient {
     alignas(64) T d_color[3][kTilePixels];
-    alignas(64) T d_depth[kTilePixels];  // gradient with respect to the sum of weight * depth
+    // gradient with respect to the sum of weight * depth
+    alignas(64) T d_depth[kTilePixels];
     alignas(
-        // The gradient that all weights share, through alpha and the hidden background.
+        // The part of the gradient with respect to a weight that is equal for all
+        // gaussians: from alpha and from the hidden background.
         64) T d_weight[kTilePixels];
-    alignas(64) T total[kTilePixels];  // sum over gaussians of weight * (gradient with respect to
-                                       // that weight)
+    // sum over gaussians of weight * (gradient with respect to the weight)
+    alignas(64) T total[kTilePixels];
 };
 
-// Returns the blocks of the tile at (left, top) that the record's pixel box touches.
+// Returns the blocks of the tile at (left, top) that the record's box touches.
 template <class T>
 V3DG_INLINE uint64_t blocks_of(const Record<T>& g, int left, int top) {
     const int x0 = (g.x0 > left ? g.x0 - left : 0) >> 2;
@@ -54,13 +56,13 @@ V3DG_INLINE uint64_t blocks_of(const Record<T>& g, int left, int top) {
     return EntryFormat::blocks_of(static_cast<uint64_t>(x0 | x1 << 3 | y0 << 6 | y1 << 9));
 }
 
-// If fewer blocks are touched, the exact test does not pay.
+// The number of touched blocks from which on the exact test pays off.
 constexpr int kFewBlocks = 5;
 
-// Returns those of `blocks` that the ellipse itself reaches, not only its box. For each
-// row of blocks, it computes the ellipse's extent in x over the row's pixel centres,
-// with the margin of row_extent(). It rounds by truncation, which is one instruction
-// per vector on every instruction set.
+// Returns those of `blocks` that the ellipse reaches. For each row of blocks, it
+// computes the extent of the ellipse in x over the rows of pixel centres, with the
+// margin of row_extent(). Rounding truncates, because that is a single instruction on
+// every instruction set.
 template <class T>
 V3DG_INLINE uint64_t blocks_of_ellipse(const Record<T>& g, int left, int top, uint64_t blocks) {
     if (__builtin_popcountll(blocks) < kFewBlocks) return blocks;
@@ -86,14 +88,14 @@ V3DG_INLINE uint64_t blocks_of_ellipse(const Record<T>& g, int left, int top, ui
 }
 
 // Returns the live blocks of the tile that the record may change. Precondition: its box
-// meets the tile.
+// touches the tile.
 template <class T>
 V3DG_INLINE uint64_t live_blocks(const Record<T>& g, int left, int top, uint64_t alive) {
     return blocks_of_ellipse(g, left, top, blocks_of(g, left, top) & alive);
 }
 
-// Clears the planes to an empty picture and returns the blocks that have a pixel inside
-// the window. Pixels outside count as stopped.
+// Clears a tile. Returns the blocks that have a pixel inside the window. Pixels outside
+// of the window are marked as stopped.
 template <class T>
 inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, const Window& window,
                            Extra extra) {
@@ -116,11 +118,11 @@ inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, const Window&
     return alive;
 }
 
-// The pixel centres of a block.
+// The positions of a block's pixel centres.
 template <class T>
 struct BlockPixels {
     alignas(64) T x[kBlockPixels], y[kBlockPixels];  // relative to the block's corner
-    // The corner of each block in the tile, the same in every lane.
+    // offset of each row or column of blocks, repeated in every lane
     alignas(64) T corner[kTileBlocks][kLanes<T>];
     BlockPixels() {
         for (int k = 0; k < kTileBlocks; ++k)
@@ -132,10 +134,10 @@ struct BlockPixels {
     }
 };
 
-// Computes the gradients of one record. It performs the same steps on the same numbers
-// as blend_block(), front to back, so that the same pixels take part: `tile` starts
-// empty again, and its color[0] holds the running sum. Returns false if no pixel of the
-// tile takes part. Writes `size` only if kWithSize is set.
+// Computes the gradients of one record. Returns false if no pixel contributes. It
+// repeats the steps of blend_block() on the same numbers, front to back, so that the
+// same pixels contribute; before the first record, `tile` must be cleared.
+// tile.color[0] holds a running sum. Writes `size` only if kWithSize.
 template <class T, bool kWithDepth, bool kWithSize = false>
 V3DG_INLINE bool blend_record_vjp(const Record<T>& g, uint64_t blocks, int left, int top,
                                   const BlockPixels<T>& pixels, const TileGradient<T>& grad,

@@ -1,7 +1,7 @@
-// Plans the order in which tiles are blended, and the number of parts of each, and
-// spreads long lists over buckets of depth. A list is spread in place if it fits into
-// shared memory, else into scratch memory, one chunk of the size of shared memory at a
-// time. The list of a tile in parts is spread into windows.
+// Plans the order in which tiles are blended, and the number of parts of each tile.
+// Spreads long lists over buckets of depth. A list is spread in place if it fits into
+// shared memory. Otherwise it is spread into scratch memory, in chunks that fit into
+// shared memory. The list of a tile with several parts is spread into windows.
 
 #include "rasterize/spread_lists_cuda.h"
 
@@ -15,10 +15,10 @@ namespace v3dg {
 namespace cuda {
 namespace {
 
-constexpr int kLog2Spread = 11;    // most buckets of a list
+constexpr int kLog2Spread = 11;    // log2 of the most buckets of a list
 constexpr int kPlanThreads = 256;  // one thread per tile
 constexpr int kSpreadThreads = 1024;
-constexpr int kMostParts = 4;  // parts of a tile
+constexpr int kMostParts = 4;  // most parts of a tile
 
 static_assert(kPiece % (3 * kMostParts) == 0 && (kPiece / 3 & (kPiece / 3 - 1)) == 0,
               "kPiece and kPiece / kMostParts begin classes of plan_kernel");
@@ -27,13 +27,14 @@ __device__ uint32_t count_of(const FrameLists& lists, uint32_t tile) {
     return static_cast<uint32_t>(lists.tile_first[tile + 1] - lists.tile_first[tile]);
 }
 
-// The rules by which two kernels, with a thread per tile, plan the tiles. Plans are
-// ordered by falling load, so that no block starts a long list at the end. Plans of one
-// class, whose loads differ by less than half an octave, are in any order. If few tiles
-// have most of the entries, as for an asset in the middle of a picture, they are
-// blended in parts, each by a block that drops entries outside of its part.
-// `num_places` blocks run concurrently, and no block should get much more than its
-// share of the load.
+// The rules of planning. Plans are ordered by falling load, so that no block starts a
+// long list at the end. Plans of one class are in any order: their loads differ by less
+// than half an octave.
+//
+// If few tiles have most of the entries, as when an asset is in the middle of a
+// picture, these tiles are divided into parts. A block blends one part, and drops the
+// entries of other parts. `num_places` blocks run concurrently; no block should get
+// much more than its share of the load.
 struct PlanRules {
     uint32_t share;
     bool has_parts;
@@ -51,16 +52,16 @@ struct PlanRules {
         const int octave = 31 - __clz(static_cast<int>(load));
         return kPlanClasses - 1 - 2 * octave - static_cast<int>(load >> (octave - 1) & 1);
     }
-    // Behind a plan of a lower load there is no plan of a list longer than kPiece: a
-    // part has at least half a share, and the loads of a class differ by less than half
-    // of the smallest.
+    // Returns the load from which on a list may be longer than kPiece. No plan behind
+    // the first smaller load has such a list, because a part has at least half a share,
+    // and the loads of a class differ by less than half of the smallest.
     __device__ uint32_t least_of_long() const {
         constexpr uint32_t kLongest = kPiece, kLeastOfPart = kPiece / kMostParts;
         return has_parts ? max(min(share / 3, kLongest), kLeastOfPart) : kLongest;
     }
 };
 
-// Counts the plans per class.
+// Counts the plans of each class. One thread per tile.
 __global__ void __launch_bounds__(kPlanThreads)
     count_plans_kernel(FrameLists lists, uint32_t num_places) {
     await_kernel_before();
@@ -79,7 +80,7 @@ __global__ void __launch_bounds__(kPlanThreads)
         atomicAdd(&lists.plan_counts[threadIdx.x], in_block[threadIdx.x]);
 }
 
-// Writes the plans. The plans of a class are contiguous, ordered by block.
+// Writes the plans, one thread per tile. The plans of a class are contiguous.
 __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, uint32_t num_places) {
     await_kernel_before();
     __shared__ uint32_t place[kPlanClasses], in_block[kPlanClasses], num_planned;
@@ -91,7 +92,8 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, ui
     const int log2_parts = rules.log2_parts_of(count), own_class = rules.class_of(count);
     if (threadIdx.x < kPlanClasses) in_block[threadIdx.x] = 0;
     __syncthreads();
-    uint32_t before = 0;  // plans of earlier tiles in the block
+    // number of plans of this class that other tiles of the block took before
+    uint32_t before = 0;
     if (tile < lists.num_tiles) before = atomicAdd(&in_block[own_class], 1u << log2_parts);
     __syncthreads();
     if (threadIdx.x < 32) {
@@ -125,7 +127,7 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, ui
         lists.plans[i].tile = kNoTile;
 }
 
-// Allocates entries in the scratch memory. Called by the whole block.
+// Allocates entries in scratch memory. All threads of the block must call it.
 __device__ unsigned long long take_scratch(FrameCounters& counters, uint32_t count) {
     __shared__ unsigned long long first;
     if (threadIdx.x == 0)
@@ -136,16 +138,16 @@ __device__ unsigned long long take_scratch(FrameCounters& counters, uint32_t cou
     return taken;
 }
 
-// The smallest number of entries in a window of a list in windows; a window may exceed
-// it by up to a bucket.
+// The smallest number of entries in a window. A window consists of whole buckets, so it
+// may have more, by less than a bucket.
 constexpr uint32_t kWindowEntries = 3 * kWindow / 4;
 
 __device__ uint32_t num_window_ends(uint32_t count) {
     return (count + kWindowEntries - 1) / kWindowEntries;
 }
 
-// Returns the number of entries that a list in windows occupies, including the ends of
-// its windows, which follow the list.
+// Returns the number of entries that a list needs if it is spread into windows: the
+// list, followed by the ends of its windows.
 __device__ uint32_t room_in_windows(uint32_t count) {
     static_assert(sizeof(TileEntry) == 2 * sizeof(uint32_t), "two ends in the place of an entry");
     return count + num_window_ends(count) / 2 + 1;
@@ -154,11 +156,11 @@ __device__ uint32_t room_in_windows(uint32_t count) {
 struct SpreadSpace {
     SpreadShared<kLog2Spread> even;
     uint32_t finer[1 << kLog2Spread];
-    TileEntry chunk[1];  // the size depends on the device
+    TileEntry chunk[1];  // rest of the shared memory
 };
 
-// Returns whether a bucket has more than `most` entries. The counter of a bucket holds
-// the begin of the next one.
+// Returns whether any bucket has more than `most` entries. bucket[b] must hold the
+// first index of the bucket after b.
 __device__ bool has_longer(const uint32_t (&bucket)[1 << kLog2Spread], uint32_t most) {
     bool is_long = false;
     for (uint32_t b = threadIdx.x; b < 1 << kLog2Spread; b += kSpreadThreads)
@@ -166,13 +168,13 @@ __device__ bool has_longer(const uint32_t (&bucket)[1 << kLog2Spread], uint32_t 
     return __syncthreads_or(is_long);
 }
 
-// Writes the ends of windows. A window ends with the bucket that reaches the next
+// Writes the ends of windows. A window ends with the bucket that contains the next
 // multiple of kWindowEntries entries.
 __device__ void write_window_ends(const uint32_t (&bucket)[1 << kLog2Spread], uint32_t count,
                                   uint32_t* window_ends) {
     for (uint32_t w = threadIdx.x; w < num_window_ends(count); w += kSpreadThreads) {
         const uint32_t least = min((w + 1) * kWindowEntries, count);
-        uint32_t b = 0;  // the first bucket that ends there or later
+        uint32_t b = 0;  // first bucket that ends at `least` or later
 #pragma unroll
         for (uint32_t step = 1u << (kLog2Spread - 1); step > 0; step /= 2)
             if (bucket[b + step - 1] < least) b += step;
@@ -180,10 +182,12 @@ __device__ void write_window_ends(const uint32_t (&bucket)[1 << kLog2Spread], ui
     }
 }
 
-// Spreads a list into windows of whole buckets, to memory for room_in_windows()
-// entries. Called by the whole block. Returns whether windows are possible. They are
-// not if all entries have the same rounded depth: the order within one depth depends on
-// where pieces begin, which differs between the parts of a tile.
+// Spreads a list into windows of whole buckets. `to` must have room for
+// room_in_windows() entries. All threads of the block must call it.
+//
+// Returns false if the list has no windows, because a bucket is too long or all entries
+// have the same rounded depth. Then windows must not be used: the order of equal depths
+// depends on where pieces begin, which differs between the parts of a tile.
 __device__ bool spread_into_windows(const TileEntry* from, uint32_t count, TileEntry* to,
                                     SpreadSpace& space) {
     SpreadShared<kLog2Spread>& s = space.even;
@@ -197,11 +201,11 @@ __device__ bool spread_into_windows(const TileEntry* from, uint32_t count, TileE
     spread<kSpreadThreads>(from, to, 0, count, finer, space.finer, s.warp_sum);
     const bool has_windows = !has_longer(space.finer, kWindow - kWindowEntries);
     if (has_windows) write_window_ends(space.finer, count, reinterpret_cast<uint32_t*>(to + count));
-    __syncthreads();  // the next list overwrites these counters
+    __syncthreads();  // the next list overwrites the counters
     return has_windows;
 }
 
-// The number of entries in each bucket for each chunk of a list, two counts per word.
+// The number of entries per chunk of a list and bucket, two 16-bit counts per word.
 struct ChunkCounts {
     uint32_t* words;
     uint32_t stride;  // words per chunk
@@ -214,17 +218,18 @@ struct ChunkCounts {
     }
 };
 
-// As spread(), for a list that does not fit into shared memory. The list passes through
-// shared memory in chunks, so that entries of a bucket are written contiguously. Shared
-// memory has room for `most` entries: a chunk, followed by the counts of all chunks if
-// these are few enough; otherwise each chunk is counted when it is read.
+// Like spread(), for a list that does not fit into shared memory. The list is processed
+// in chunks, so that the entries of a bucket are written contiguously. `most` entries
+// fit into shared memory: one chunk and, if there are few chunks, the counts of all
+// chunks. Otherwise each chunk is counted when it is read.
 __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t count,
                                  uint32_t most, const Buckets& buckets, SpreadSpace& space) {
     SpreadShared<kLog2Spread>& s = space.even;
     uint32_t (&of_chunk)[1 << kLog2Spread] = space.finer;
     TileEntry* chunk = space.chunk;
     const uint32_t num_buckets = buckets.last + 1,
-                   counts_room = num_buckets / 4;  // room for the counts of a chunk, in entries
+                   // the counts of one chunk, in units of entries
+        counts_room = num_buckets / 4;
     uint32_t num_chunks = 1;
     const auto size_of_chunk = [&] { return (count + num_chunks - 1) / num_chunks; };
     const auto has_room = [&] { return size_of_chunk() + num_chunks * counts_room <= most; };
@@ -252,8 +257,8 @@ __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t 
         place_buckets<kSpreadThreads>(from, 0, count, buckets, s.bucket, s.warp_sum);
     }
 
-    // Returns the begin of a bucket in the chunk. The counter of a bucket holds the
-    // begin of the next one.
+    // Returns the first index of a bucket in the chunk. of_chunk[b] holds that of the
+    // next bucket.
     const auto begin_of = [&](uint32_t b) { return b > 0 ? of_chunk[b - 1] : 0; };
     for (uint32_t k = 0; k < num_chunks; ++k) {
         const uint32_t first = k * size, last = min(first + size, count);
@@ -281,10 +286,11 @@ __device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t 
     }
 }
 
-// Spreads the list of a plan's tile if it is long: in place if it has at most
-// `most_held` entries, which fit into shared memory, else into scratch memory. The list
-// of a tile in parts is spread into windows, in scratch memory, by the block of the
-// first part. Called by the whole block.
+// Spreads the list of a plan's tile if it is longer than a piece. All threads of the
+// block must call it. A list of at most `most_held` entries fits into shared memory,
+// and is spread in place; a longer list is spread into scratch memory. The list of a
+// tile with several parts is spread into windows in scratch memory, once, for the first
+// part.
 __device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t count,
                             uint32_t most_held, SpreadSpace& space) {
     static_assert(offsetof(SpreadSpace, finer) % sizeof(TileEntry) == 0,
@@ -334,8 +340,8 @@ __device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t co
     }
 }
 
-// Spreads the long lists. A block claims its next plan when it starts with the current
-// one.
+// Spreads long lists. A block claims its next plan when it starts the current one, to
+// hide the latency of the atomic operation.
 __global__ void __launch_bounds__(kSpreadThreads, 2)
     spread_kernel(FrameLists lists, uint32_t most_held, uint32_t num_places) {
     __shared__ uint32_t next_of_block;
@@ -353,12 +359,12 @@ __global__ void __launch_bounds__(kSpreadThreads, 2)
         if (threadIdx.x == 0) next_of_block = next;
         __syncthreads();
         i = next_of_block;
-        __syncthreads();  // the next iteration writes it
+        __syncthreads();  // the next iteration overwrites it
     }
 }
 
-// Returns the number of entries that fit into shared memory for a block of
-// spread_kernel; two blocks share a multiprocessor.
+// Returns the number of entries that fit into the shared memory of a block of
+// spread_kernel. Two blocks share a multiprocessor.
 uint32_t most_held() {
     // The driver reserves 1024 bytes per block.
     const size_t of_two = shared_memory_of_multiprocessor() / 2 - 2048;
@@ -368,8 +374,8 @@ uint32_t most_held() {
 }  // namespace
 
 uint32_t most_plans(uint32_t num_tiles, uint32_t num_places) {
-    // A tile of one share has one additional plan, a tile of two shares has three, and
-    // there are num_places shares.
+    // A tile is divided into two or four parts if its load is one or two shares. There
+    // are num_places shares, so this many plans are added at most.
     return num_tiles + (kMostParts - 1) * num_places / 2 + 1;
 }
 

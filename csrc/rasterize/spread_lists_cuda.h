@@ -1,18 +1,18 @@
 #pragma once
 
-// Plans of tiles, and the spreading of long lists into bucket order.
+// Plans how tiles are blended, and spreads long lists over buckets of depth.
 
 #include "frame/tile_list.h"
 
 namespace v3dg {
 namespace cuda {
 
-// Plans the blending of each tile by `num_places` concurrent blocks, and spreads each
-// list that is longer than a piece over buckets of depth, as its plan says.
+// Plans the blending of all tiles by `num_places` concurrent blocks. Spreads each list
+// that is longer than a piece over buckets of depth, as described by its plan.
 void spread_lists(const FrameLists& lists, uint32_t num_places, cudaStream_t stream);
 
-// Returns the largest number of plans with this many concurrent blocks, if tiles may be
-// blended in parts.
+// Returns the required number of plans, if `num_places` concurrent blocks may blend
+// tiles in parts.
 uint32_t most_plans(uint32_t num_tiles, uint32_t num_places);
 
 }  // namespace cuda

@@ -1,6 +1,6 @@
 #pragma once
 
-// Spreads the list of a tile over buckets of depth.
+// Buckets of depth, and the spreading of a tile's list over them.
 
 #include "base/scan.cuh"
 #include "frame/tile_list.h"
@@ -12,24 +12,23 @@ using EntryKey = unsigned long long;  // a TileEntry as an integer
 
 constexpr int kEntriesAtOnce = 4;  // loads in flight per thread
 
-// Buckets of entries. They have equal width in the bits of the depths, which are
-// logarithmic over octaves and linear within one. If all depths are equal, the width is
-// equal in the bits of the order.
+// Buckets for the entries of a list. Their widths are equal in the bits of depths,
+// which are logarithmic over octaves and linear within an octave. If all depths are
+// equal, the widths are equal in the bits of key_order() instead.
 struct Buckets {
-    uint32_t lowest, last;  // `last` is the index of the last bucket
+    uint32_t lowest, last;  // `last`: index of the last bucket
     int shift;
     bool by_order;
 
     __device__ uint32_t part_of(EntryKey key) const {
         return by_order ? key_order({key}) : key_depth({key});
     }
-    // Returns the bucket of a key. Keys outside of the range belong to the first or the
-    // last bucket.
+    // Returns the bucket of a key. A key outside of the range belongs to the first or
+    // the last bucket.
     __device__ uint32_t of(EntryKey key) const {
         return min((max(part_of(key), lowest) - lowest) >> shift, last);
     }
-    // Returns the part of a key at which a bucket begins; no key is before the first
-    // bucket.
+    // Returns the smallest part_of() of a key in the bucket; 0 for the first bucket.
     __device__ uint32_t begin_of(uint32_t bucket) const {
         return bucket == 0 ? 0 : lowest + (bucket << shift);
     }
@@ -44,14 +43,14 @@ __device__ inline Buckets buckets_over(uint32_t lowest, uint32_t highest, int lo
             .by_order = by_order};
 }
 
-// Buckets for entries that are concentrated in few of the even buckets (Buckets of all
-// entries). The bucket of an entry follows from the rank that it would have if the
-// entries of its even bucket were spread uniformly over that.
+// Buckets for lists whose entries are concentrated in few buckets of equal width
+// (`even`). The bucket of an entry follows from its estimated rank. The estimate
+// assumes that the entries of one even bucket are uniformly distributed in it.
 struct FinerBuckets {
     Buckets even;
-    const uint32_t* first;  // first entry of each even bucket
+    const uint32_t* first;  // index of the first entry of each even bucket
     uint32_t count;         // number of entries
-    int shift;              // right shift from ranks to buckets
+    int shift;              // log2 of the ranks per bucket
 
     __device__ uint32_t of(EntryKey key) const {
         const uint32_t bucket = even.of(key);
@@ -76,7 +75,7 @@ struct SpreadShared {
     uint32_t warp_sum[32];
 };
 
-// Turns counts into the index of each bucket's first entry.
+// Replaces counts by prefix sums: the index of each bucket's first entry.
 template <int kCount, int kBlock>
 __device__ void scan_buckets(uint32_t* bucket, uint32_t* warp_sum) {
     constexpr int kEach = kCount / kBlock;
@@ -101,7 +100,7 @@ __device__ void scan_buckets(uint32_t* bucket, uint32_t* warp_sum) {
     __syncthreads();
 }
 
-// Calls visit(entry) for the entries of [first, last) that one thread processes.
+// Calls visit(entry) for those of the entries [first, last) that this thread processes.
 template <int kBlock, class Visit>
 __device__ void for_each_entry(const TileEntry* entries, uint32_t first, uint32_t last,
                                const Visit& visit) {
@@ -118,13 +117,14 @@ __device__ void for_each_entry(const TileEntry* entries, uint32_t first, uint32_
     }
 }
 
-// Returns buckets for entries [first, last): for the range of all of them, or of a
-// sample if `roughly`; as many buckets as possible if `finely`.
+// Returns buckets for the entries [first, last). If `roughly`, their range is estimated
+// from a sample. If `finely`, there are as many buckets as possible.
 template <int kBlock, int kLog2Buckets>
 __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32_t last,
                                 bool roughly, bool finely, SpreadShared<kLog2Buckets>& s) {
     if (threadIdx.x < 4) s.range[threadIdx.x] = threadIdx.x % 2 == 0 ? ~0u : 0u;
-    uint32_t low[2] = {~0u, ~0u}, high[2] = {0, 0};  // ranges of depths and orders
+    // ranges of key_depth() and key_order()
+    uint32_t low[2] = {~0u, ~0u}, high[2] = {0, 0};
     const auto widen = [&](TileEntry e) {
         const uint32_t part[2] = {key_depth(e), key_order(e)};
         for (int i = 0; i < 2; ++i) {
@@ -133,7 +133,8 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
         }
     };
     if (roughly) {
-        // A list that is spread has at least as many entries as the block has threads.
+        // One sample per thread. Such a list has at least as many entries as the block
+        // has threads.
         widen(entries[first + static_cast<uint32_t>(static_cast<unsigned long long>(last - first) *
                                                     threadIdx.x / kBlock)]);
     } else {
@@ -149,8 +150,8 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
         }
     }
     __syncthreads();
-    // This gives about 64 entries per bucket. With few buckets, entries that are
-    // written together more likely stay together in the cache.
+    // About 64 entries per bucket. With few buckets, entries that are written to the
+    // same cache line more likely stay together in the cache.
     const int log2_buckets =
         finely ? kLog2Buckets
                : min(max(31 - __clz(static_cast<int>(last - first)) - 6, 4), kLog2Buckets);
@@ -159,8 +160,8 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
     return buckets_over(range[0], range[1], log2_buckets, by_order);
 }
 
-// Counts entries [first, last) into buckets, and turns the counts into the index of
-// each bucket's first entry.
+// Counts the entries [first, last) per bucket, and computes the index of each bucket's
+// first entry.
 template <int kBlock, int kCount, class SomeBuckets>
 __device__ void place_buckets(const TileEntry* entries, uint32_t first, uint32_t last,
                               const SomeBuckets& buckets, uint32_t (&bucket)[kCount],
@@ -173,8 +174,8 @@ __device__ void place_buckets(const TileEntry* entries, uint32_t first, uint32_t
     scan_buckets<kCount, kBlock>(bucket, warp_sum);
 }
 
-// Copies entries [first, last) into bucket order. At the end, the counter of a bucket
-// holds the begin of the next bucket.
+// Copies the entries [first, last) into bucket order. In the end, bucket[b] is the
+// first index of the bucket after b.
 template <int kBlock, int kCount, class SomeBuckets>
 __device__ void spread(const TileEntry* from, TileEntry* to, uint32_t first, uint32_t last,
                        const SomeBuckets& buckets, uint32_t (&bucket)[kCount], uint32_t* warp_sum) {

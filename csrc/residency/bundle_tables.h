@@ -1,7 +1,7 @@
 #pragma once
 
-// The tables of a bundle on a device. They stay there while a scene that uses them is
-// resident (v3dg/residency.py).
+// The tables of a bundle on a device. They stay there as long as a scene that uses them
+// is resident (v3dg/residency.py).
 
 #include "base/device.h"
 #include "residency/cluster_bounds.h"
@@ -9,29 +9,28 @@
 namespace v3dg {
 namespace cuda {
 
-// The tables of a bundle that kernels read; all pointers point to device memory.
+// The tables of a bundle that kernels read, in device memory.
 struct BundleOnDevice {
     ClusterTable table;
     ClusterAppearance appearance;
     Span<const ClusterBounds> bounds;
-    // A byte per ClusterBounds. Bit k says that its cluster k is drawn together with
-    // the cluster before it, because the rows of both are adjacent and their appearance
-    // is equal.
+    // One byte per ClusterBounds. Bit k is set if its cluster k can be drawn together
+    // with the cluster before it: their rows are adjacent and their appearance is
+    // equal.
     const uint8_t* joins;
     ClusterRuns runs;
 };
 
-// Returns BundleOnDevice::joins: a byte per kClustersOfBounds clusters.
+// Returns BundleOnDevice::joins: one byte per kClustersOfBounds clusters.
 std::vector<uint8_t> joins_of_clusters(const ClusterTable& table,
                                        const ClusterAppearance& appearance);
 
-// The tables of one bundle on the device that is current when they are made. They never
-// change, so all scenes, threads and streams of that device share them. The owner keeps
-// them alive until all work that reads them is done.
+// The tables of one bundle, on the device that is current at construction. They are
+// immutable, so all scenes, threads and streams of the device share them. The owner
+// must keep them alive until all work that reads them is done.
 class BundleTables {
   public:
-    // Returns after the tables have arrived on the device; the host memory may then be
-    // reused.
+    // Returns when the tables are on the device. The caller may then reuse host memory.
     BundleTables(const ClusterTable& table, const ClusterAppearance& appearance,
                  cudaStream_t stream);
     BundleTables(const BundleTables&) = delete;

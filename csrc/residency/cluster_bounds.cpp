@@ -1,4 +1,4 @@
-// Computes the bounds of each eight neighbouring clusters, and of the runs of clusters.
+// Computes the bounds of every kClustersOfBounds clusters, and of runs of clusters.
 
 #include "residency/cluster_bounds.h"
 
@@ -11,11 +11,12 @@ namespace v3dg {
 
 namespace {
 
-// The square of this radius is far above the range where float32 loses digits.
+// The smallest radius for which runs are tested. Its square is far above the range
+// where float32 loses precision.
 constexpr float kLeastRunRadius = 1e-15f;
 
-// Returns a ball that contains the centres of the balls; a ball at the origin if there
-// are none.
+// Returns a ball that contains the centres of the balls. Without any, it is at the
+// origin.
 Ball ball_of_centers(Span<const Ball> balls) {
     double middle[3] = {0, 0, 0}, radius2 = 0;
     for (const Ball& b : balls) {
@@ -84,7 +85,8 @@ std::vector<ClusterBounds> bounds_of_clusters(const ClusterTable& table) {
 ClusterRuns runs_of_clusters(const ClusterTable& table) {
     const size_t count = table.num_clusters();
     ClusterRuns runs{};
-    std::vector<size_t> ends;  // the ends of the runs, counted in bounds, the last run first
+    // ends of the runs, in units of kClustersOfBounds clusters; last run first
+    std::vector<size_t> ends;
     size_t left = (count + kClustersOfBounds - 1) / kClustersOfBounds;
     for (size_t size = 1; left > 0; size *= ends.size() > 1 ? 2 : 1) {
         ends.push_back(left);

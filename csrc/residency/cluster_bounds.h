@@ -1,7 +1,7 @@
 #pragma once
 
-// Bounds of neighbouring clusters that hold for every view, so that selection can skip
-// several clusters at once. The tests that use the bounds are in select/bounds_math.h.
+// Bounds on runs of adjacent clusters that hold for every view, so that selection can
+// skip several clusters at once. select/bounds_math.h has the tests that use them.
 
 #include <vector>
 
@@ -20,30 +20,31 @@ struct ClusterBounds {
     float least_own_radius;
     float least_own_weight;
     int32_t least_own_level;
-    bool has_leaf;  // some cluster has no own group
-    bool has_root;  // some cluster has no parent group
+    bool has_leaf;  // a cluster has no own group
+    bool has_root;  // a cluster has no parent group
 };
 
-// [ceil(C / kClustersOfBounds)]
+// Returns the bounds of every kClustersOfBounds clusters: [ceil(C /
+// kClustersOfBounds)].
 std::vector<ClusterBounds> bounds_of_clusters(const ClusterTable& table);
 
 constexpr uint32_t kMostRuns = 24;
 
-// The clusters of a table, divided into a few runs that selection tests with one
-// distance to the whole bundle. A table is ordered by level, so most runs of a distant
-// instance are too fine, and some runs of a near one are too coarse. Sizes halve from
-// run to run: each run has as many clusters as all runs after it together. The last run
-// has the clusters of one ClusterBounds.
+// The clusters of a table, divided into a few runs. Selection tests a run with one
+// distance to the whole bundle. A table is ordered by level. So most runs are too fine
+// for a distant instance, and some are too coarse for a near instance. Sizes halve from
+// run to run: a run has as many clusters as all runs after it. The last run has the
+// clusters of one ClusterBounds.
 struct ClusterRuns {
     uint32_t count;
-    uint32_t begin[kMostRuns + 1];  // first cluster of each run, a multiple of kClustersOfBounds,
-                                    // and the end of the last one
-    Ball groups;                    // contains the centres of the balls of all groups
-    float least_distance;           // distance from a ball from which on the tests are valid
-    int32_t least_level;            // smallest level of all groups
-    // Two bounds on radius times square root of weight: the largest value among the
-    // parent groups, or NaN if a cluster has none, and the smallest value among the own
-    // groups, or 0 if a cluster has none.
+    // first cluster of each run, a multiple of kClustersOfBounds; and the end
+    uint32_t begin[kMostRuns + 1];
+    Ball groups;           // contains the centres of the balls of all groups
+    float least_distance;  // smallest distance to a ball for which the tests are valid
+    int32_t least_level;   // smallest level of all groups
+    // Bounds on radius * sqrt(weight) for each run. most_parent: the largest value of
+    // the parent groups; NaN if a cluster has no parent group. least_own: the smallest
+    // value of the own groups; 0 if a cluster has no own group.
     float most_parent[kMostRuns];
     float least_own[kMostRuns];
 };

@@ -1,7 +1,7 @@
 #pragma once
 
-// The tables of a bundle that selection reads: its groups, its clusters, and the
-// locations of their pages.
+// The tables of a bundle that selection reads: its groups, its clusters, and where
+// their pages are.
 
 #include <cstdint>
 #include <vector>
@@ -13,13 +13,13 @@
 
 namespace v3dg {
 
-// G groups, C clusters. The index -1 means no group.
+// The tables of a bundle with G groups and C clusters. The group -1 means none.
 struct ClusterTable {
-    Span<const Ball> ball;     // [G] contains the balls of the groups below it
-    Span<const float> weight;  // [G] per px2, never decreasing towards the root
-    // [G] level of the clusters that the group makes; ascending to the root
+    Span<const Ball> ball;     // [G] contains the balls of the groups below
+    Span<const float> weight;  // [G] 1 / gaussians; never decreases towards the root
+    // [G] level of the clusters that the group makes; ascending
     Span<const int32_t> level;
-    // [C] group that made the cluster; -1: none, and the cluster always fits
+    // [C] group that made the cluster; -1: none, the cluster is a leaf
     Span<const int32_t> own_group;
     Span<const int32_t> parent_group;  // [C] group that replaces the cluster; -1: none
     Span<const Box> box;               // [C] contains what the cluster draws, without the filter
@@ -28,7 +28,7 @@ struct ClusterTable {
     Span<const int32_t> top_cluster;   // clusters that no group replaces
     Box bounds;                        // contains all boxes
     float pad_px;                      // reach of the filter, plus a pixel
-    PageTable pages;                   // locations of the gaussians
+    PageTable pages;                   // where the gaussians are
 
     V3DG_HD size_t num_clusters() const { return own_group.size; }
     V3DG_HD int64_t num_gaussians(size_t c) const { return offset[c + 1] - offset[c]; }
@@ -40,24 +40,24 @@ struct ClusterTable {
     V3DG_HD int64_t first_row(size_t c) const {
         return pages.is_whole() ? offset[c] : offset[c] + pages.shift[page_of(c)];
     }
-    // Returns the index of a cluster among those in memory. Precondition: its page is
-    // resident.
+    // Returns the index of a cluster among the clusters in memory. Precondition: its
+    // page is resident.
     V3DG_HD uint32_t place_of(size_t c) const {
         const auto place = static_cast<uint32_t>(c);
         return pages.cluster_shift.empty() ? place : place + pages.cluster_shift[page_of(c)];
     }
-    // Whether the rows of a cluster begin where the rows of the cluster before it end,
-    // wherever pages lie in memory.
+    // Returns whether the rows of a cluster always follow the rows of the cluster
+    // before it, wherever their pages are in memory.
     V3DG_HD bool follows(size_t c) const {
         return pages.is_whole() || page_of(c) == page_of(c - 1);
     }
 };
 
-// The filter of a level 0 that has none, when it is drawn in a cut with a fade. It is
-// the default filter of coarser levels.
+// The filter, px², of level 0 in a cut with a fade, if level 0 has no filter of its
+// own. It is the default filter of coarser levels.
 constexpr float kFadeFilterPx2 = 0.05f;
 
-// How the clusters of a bundle are drawn.
+// The filter of each cluster, and whether the cluster is antialiased.
 struct ClusterAppearance {
     Span<const float> filter_px2;     // [C]
     Span<const uint8_t> antialiased;  // [C]
@@ -65,19 +65,19 @@ struct ClusterAppearance {
     V3DG_HD Appearance<float> operator[](size_t c) const {
         return {filter_px2[c], antialiased[c] != 0, false};
     }
-    // Returns the appearance of a cluster in a cut with a fade. Such a cut filters
-    // level 0, too, because its gaussians must not appear and vanish between samples.
+    // Returns the appearance of a cluster in a cut with a fade. Level 0 then has a
+    // filter, too; otherwise its gaussians could appear and vanish between pixels.
     V3DG_HD Appearance<float> faded(const ClusterTable& table, size_t c) const {
         if (table.own_group[c] >= 0 || filter_px2[c] > 0.0f) return (*this)[c];
         return {kFadeFilterPx2, true, true};
     }
 };
 
-// The tables of a bundle on the host. It borrows the arrays that the constructor gets,
-// and owns the arrays that it derives from them.
+// The tables of a bundle on the host. It borrows the arrays that are passed to the
+// constructor, and owns the arrays that it computes from them.
 class HostTable {
   public:
-    // `table` contains the arrays from `ball` to `offset`, and the pages.
+    // `table` must have the arrays from `ball` to `offset`, and the pages.
     HostTable(const ClusterTable& table, const ClusterAppearance& appearance);
     HostTable(const HostTable&) = delete;
     HostTable& operator=(const HostTable&) = delete;

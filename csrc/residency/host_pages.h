@@ -1,6 +1,6 @@
 #pragma once
 
-// The slots of a page pool on the host. Slots hold either rows, in planes that the
+// The slots of a page pool on the host. They have either rows, in planes that all
 // bundles of the pool share, or codes.
 
 #include <memory>
@@ -16,10 +16,10 @@ class HostPages {
   public:
     explicit HostPages(const PagePool& pool);
 
-    // Copies pages to their slots.
+    // Copies arriving pages to their slots.
     void apply(const PagePool& pool, const std::vector<PageChange>& changes);
-    // Return the gaussians of a bundle. One of the two results is null, depending on
-    // PagePool::keeps_codes().
+    // Return the gaussians of a bundle, as planes or as codes. Depending on
+    // PagePool::keeps_codes(), one of the two is null.
     const GaussianPlanes<float>* planes(size_t bundle) const {
         return planes_.empty() ? nullptr : &planes_[bundle];
     }
@@ -31,17 +31,18 @@ class HostPages {
     void write_rows(const PageSource& source, const PageChange& change);
 
     Buffer<float> storage_;
-    size_t stride_ = 0;                          // length of a plane
-    std::vector<GaussianPlanes<float>> planes_;  // one per bundle; they differ in the SH degree
+    size_t stride_ = 0;  // length of a plane
+    // one per bundle: SH degrees may differ
+    std::vector<GaussianPlanes<float>> planes_;
 
     Buffer<uint32_t> records_, sh_;
     Buffer<unsigned char> ranges_;
     std::vector<int64_t> offset_;
     CodeSlots slots_{};
-    std::vector<Codes> codes_;  // one per bundle; they differ in the SH degree
+    std::vector<Codes> codes_;  // one per bundle: SH degrees may differ
 };
 
-// Memory for blocks on the host.
+// Memory for the blocks of a pool on the host.
 class HostBlocks : public BlockMemory {
   public:
     unsigned char* allocate(size_t bytes) override { return blocks_.emplace_back(bytes).data(); }

@@ -1,6 +1,6 @@
 #pragma once
 
-// The instances of a scene: bundle, pose, importance and factors of each.
+// The instances of a scene: the bundle, pose, importance and factors of each.
 
 #include <cstdint>
 
@@ -10,9 +10,9 @@
 
 namespace v3dg {
 
-// I similarity transforms p -> scale * rotation p + position. An instance is not drawn
-// if its pose is not finite, its scale is not positive, its quaternion is zero, or its
-// opacity is below the smallest alpha that is drawn.
+// Instances of bundles. Each transforms a point p to scale * rotation p + position. An
+// instance is not drawn if its pose is not finite, its scale is not positive, its
+// quaternion is zero, or its opacity is below the smallest alpha that is drawn.
 struct InstanceTable {
     Span<const int32_t> bundle;                // [I] index of the bundle in the scene
     Span<const double> position;               // [I * 3]
@@ -24,7 +24,8 @@ struct InstanceTable {
     V3DG_HD Pose pose(size_t i) const {
         return {position.data + 3 * i, quaternion.data + 4 * i, scale[i]};
     }
-    // Whether an instance is drawn: it has a pose, and is not transparent.
+    // Returns whether an instance is drawn: its pose is valid, and it is not
+    // transparent.
     V3DG_HD bool is_drawn(size_t i) const {
         return is_placed(pose(i)) && (factors.size == 0 || may_show(factors[i]));
     }

@@ -1,6 +1,6 @@
 #pragma once
 
-// Tracks which pages of a pool have begun to fade in, and when.
+// Records when the pages of a pool begin to fade in.
 
 #include <cstdint>
 #include <vector>
@@ -9,32 +9,30 @@
 
 namespace v3dg {
 
-// Whether pages that become resident are drawn at full weight at once, or fade in.
+// Whether arriving pages are drawn with full weight at once, or fade in.
 enum class Arrive { at_once, fading };
 
-// A page, by its index among the pages of all bundles, and the frame after which it
-// begins to fade in.
+// The frame after which a page begins to fade in. `page` counts over all bundles.
 struct Arrival {
     uint32_t page;
     int32_t begins;
 };
 
-// Decides when pages begin to fade in. A page waits until the page above it has faded
-// in, so in every frame a page has faded in at most as far as the page above it. The
-// state depends only on the changes of each frame.
+// Decides when pages begin to fade in. A page begins when the page above it has faded
+// in. So in every frame, a page has faded in at most as far as the page above it. The
+// result depends only on the page changes of each frame.
 class PageArrivals {
   public:
-    // The coarsest pages count as faded in from the start.
+    // The coarsest pages are faded in from the start.
     explicit PageArrivals(const PagePolicy& policy);
 
     // Begins the next frame. `changes` are the page changes before it. With
-    // Arrive::at_once all pages count as faded in.
+    // Arrive::at_once, all pages are faded in at once.
     void advance(const std::vector<PageChange>& changes, Arrive arrive);
     int32_t frame() const { return frame_; }
-    // Returns the pages whose state changed with the last frame, each once.
+    // Returns the pages whose begin changed in the last call of advance(), each once.
     const std::vector<Arrival>& changed() const { return changed_; }
-    // Returns the frame after which each page begins to fade in, as PageTable::begins:
-    // [P] for the pages of all bundles.
+    // Returns the begins of the pages of all bundles, [P], as in PageTable::begins.
     const std::vector<int32_t>& begins() const { return begins_; }
 
   private:
@@ -43,7 +41,7 @@ class PageArrivals {
     };
     const PagePolicy& policy_;
     std::vector<int32_t> begins_;
-    std::vector<Waiting> waiting_;  // in the order in which they became resident
+    std::vector<Waiting> waiting_;  // in the order of arrival
     std::vector<Arrival> changed_;
     int32_t frame_ = 0, last_begin_ = 0;
 };

@@ -1,7 +1,7 @@
 #pragma once
 
-// Blocks of host memory that hold pages after reading and before they are copied to
-// their slots. Blocks come in a few sizes, so that little of their memory is unused.
+// Blocks of host memory. A block holds a page after it was read, until it is copied to
+// its slot. Blocks have a few different sizes, so that little memory is unused.
 
 #include <algorithm>
 #include <cstddef>
@@ -9,7 +9,7 @@
 
 namespace v3dg {
 
-// Allocates memory for blocks; the kind of memory depends on the device.
+// Allocates memory for blocks. The kind of memory depends on the device.
 struct BlockMemory {
     virtual ~BlockMemory() = default;
     // The memory is freed with this object.
@@ -18,8 +18,9 @@ struct BlockMemory {
 
 class PageBlocks {
   public:
-    // Allocates about `num_bytes` in at most `most_blocks` blocks for pages whose sizes
-    // are distributed like `samples`, plus four blocks for the largest page.
+    // Allocates blocks of about `num_bytes` in total, but at most `most_blocks` blocks.
+    // Their sizes are distributed like the page sizes in `samples`. Also allocates four
+    // blocks for the largest page.
     void allocate(const std::vector<size_t>& samples, size_t most_page_bytes, size_t num_bytes,
                   size_t most_blocks, BlockMemory& memory) {
         constexpr size_t kNumSizes = 8, kLeast = 64;
@@ -56,7 +57,7 @@ class PageBlocks {
     size_t num_blocks() const { return num_blocks_; }
     size_t num_bytes() const { return num_bytes_; }
 
-    // Returns a block of at least this many bytes, or null if none is free.
+    // Returns a block of at least this many bytes, or null if there is no free one.
     unsigned char* take(size_t bytes) {
         for (Size& size : sizes_) {
             if (size.size < bytes || size.free.empty()) continue;

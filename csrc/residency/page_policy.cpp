@@ -1,7 +1,6 @@
-// Turns the needs of a view into decisions. note() marks resident pages as used and
-// collects absent ones, choose() orders the absent pages for reading, and bring()
-// assigns slots to pages that were read and evicts the pages that were unused for
-// longest.
+// Implements the decisions of page_policy.h. note() marks resident pages as used, and
+// collects absent pages. choose() orders the absent pages for reading. bring() assigns
+// slots to pages that were read, and evicts the pages that were unused for longest.
 
 #include "residency/page_policy.h"
 
@@ -18,36 +17,35 @@ namespace v3dg {
 
 namespace {
 
-// The priority of a page is at least this multiple of the priorities of the pages below
-// it.
+// The priority of a page is at least this many times that of the pages below it.
 constexpr float kAbove = 2.0f;
-// Priorities near the eye have no upper bound. They are clamped to this value, so that
-// a page above such a page can still be more urgent.
+// The largest priority. Priorities near the eye are unbounded; they are clamped, so
+// that a page above can still have a higher priority.
 constexpr float kMostPriority = 1073741824.0f;
-constexpr size_t kMostLeaving = 4096;            // slots to be evicted that one search collects
-constexpr size_t kMostChosen = size_t(1) << 14;  // pages to be read before the next choice
+constexpr size_t kMostLeaving = 4096;            // slots to evict that one search collects
+constexpr size_t kMostChosen = size_t(1) << 14;  // pages to read before the next choice
 constexpr int32_t kRootSlot = -2;
 constexpr int32_t kNoSlot = -1;
-constexpr size_t kAhead = 16;  // needs whose memory is prefetched ahead
+constexpr size_t kAhead = 16;  // distance of prefetching, in needs
 
 // A key is a priority of at least 1/2, rounded down to a sixteenth of a power of two:
-// the exponent of a float and the upper four of its 23 mantissa bits.
+// the exponent of the float and the upper four of its 23 mantissa bits.
 constexpr uint32_t kNumKeys = 1024;
 constexpr uint32_t kKeyShift = 19;
 constexpr uint32_t kFirstKey = 0x3f000000u >> kKeyShift;
-// The key of priority 1. A page with a lower key is not missing from the view: it is
-// requested ahead of use.
+// The key of priority 1. The cut does not miss a page with a lower key: the page is
+// only requested ahead of use.
 constexpr uint32_t kKeyOfMissed = (0x3f800000u >> kKeyShift) - kFirstKey;
 
-// A disk reads faster in large requests. Neighbours in a file are neighbours in space
-// and of one level, so they are mostly of similar urgency. Therefore neighbouring pages
-// of about this many bytes form a stretch, which is as urgent as its most urgent wanted
-// page.
+// The approximate bytes of a stretch: adjacent pages that are read together, because
+// disks are faster with large requests. Pages that are adjacent in the file are close
+// in space and have equal levels, so their priorities are mostly similar. A stretch has
+// the key of its most urgent wanted page.
 constexpr size_t kStretchBytes = size_t(512) << 10;
 constexpr uint32_t kNoStretch = UINT32_MAX;
 
 uint32_t key_of(float priority) {
-    uint32_t bits;  // the bits of positive floats are ordered like the floats
+    uint32_t bits;  // the bits of positive floats compare like the floats
     std::memcpy(&bits, &priority, sizeof bits);
     return std::clamp(bits >> kKeyShift, kFirstKey, kFirstKey + kNumKeys - 1) - kFirstKey;
 }
@@ -161,7 +159,7 @@ void PagePolicy::touch(uint32_t& last, uint32_t value, Counts& counts) {
     last = value;
 }
 
-// Marks the page of a slot as used by the noted view, and the pages above it as needed.
+// Marks the page in a slot as used by the noted view, and the pages above it as needed.
 void PagePolicy::use(int32_t slot, bool is_needed) {
     for (; slot >= 0; slot = uses_[slot].above, is_needed = true) {
         Use& slot_use = uses_[slot];
@@ -171,8 +169,8 @@ void PagePolicy::use(int32_t slot, bool is_needed) {
     }
 }
 
-// Returns the topmost page that failed among this page and those above it; -1 if none
-// failed.
+// Searches this page and the pages above it for pages that failed. Returns the topmost
+// of these, or -1.
 int32_t PagePolicy::block_above(int32_t id) const {
     int32_t blocked = -1;
     for (; id >= 0; id = pages_[id].parent)
@@ -180,8 +178,8 @@ int32_t PagePolicy::block_above(int32_t id) const {
     return blocked;
 }
 
-// Adds an absent page and the absent pages above it to the wanted pages. Returns how
-// many of these pages the cut misses that were not counted as missing before.
+// Adds an absent page, and the absent pages above it, to the wanted pages. Returns how
+// many of them the cut misses and were not counted before.
 size_t PagePolicy::ask(const PageRequest& request, bool has_failures) {
     auto id = static_cast<int32_t>(id_of(request.bundle, request.page));
     const int32_t blocked = has_failures ? block_above(id) : -1;
@@ -228,9 +226,9 @@ void PagePolicy::note(Span<const PageRequest> needs, size_t num_left_out, bool h
     num_needed_ = needed_.now;
 }
 
-// Replaces the key of each wanted page by the key of its stretch, and sorts the pages
-// in file order. No stretch contains both a page and a page below it, and the stretch
-// of a page is more urgent than the stretches of the pages below it.
+// Sorts the wanted pages in the order of the file, and replaces the key of each page by
+// the key of its stretch. A stretch never has both a page and a page below it. The
+// stretch of a page is more urgent than those of the pages below.
 void PagePolicy::find_stretches() {
     std::sort(wanted_.begin(), wanted_.end(), [](const Wanted& a, const Wanted& b) {
         return a.bundle != b.bundle ? a.bundle < b.bundle : a.page < b.page;
@@ -239,7 +237,7 @@ void PagePolicy::find_stretches() {
     uint32_t bundle = UINT32_MAX;
     size_t pages_of_stretch = 1;
     size_t number = 0;        // number of the stretch in its bundle
-    int32_t least_above = 0;  // first page above the pages of the stretch
+    int32_t least_above = 0;  // first of the pages above the pages of the stretch
     for (const Wanted& w : wanted_) {
         const auto id = static_cast<int32_t>(id_of(w.bundle, w.page));
         if (w.bundle != bundle)
@@ -257,7 +255,7 @@ void PagePolicy::find_stretches() {
         least_above = std::min(least_above, page.parent);
         key_of_stretch_.back() = std::max(key_of_stretch_.back(), w.key);
     }
-    // A page lies behind those below it in the file, so the key of a stretch is final
+    // In the file, a page follows the pages below it. So the key of a stretch is final
     // when the loop reaches its first page.
     for (Wanted& w : wanted_) {
         const Page& page = pages_[id_of(w.bundle, w.page)];
@@ -267,7 +265,7 @@ void PagePolicy::find_stretches() {
             uint32_t& key_above = key_of_stretch_[above.stretch];
             key_above = std::min(std::max(key_above, key + 1), kNumKeys - 1);
         }
-        // Pages that are requested ahead wait until no missed page is left.
+        // Pages that are requested ahead come after all pages that the cut misses.
         w.key = w.key < kKeyOfMissed ? std::min(key, kKeyOfMissed - 1) : key;
     }
 }
@@ -285,8 +283,8 @@ void PagePolicy::choose(size_t under_way, std::vector<PageRequest>& todo) {
     const size_t unneeded = num_old(needed_), unused = num_old(used_);
     const size_t room = num_missed > unused ? std::min(num_missed, unneeded) : unused;
     const size_t most = std::min(room > under_way ? room - under_way : 0, kMostChosen);
-    // The list begins with the least urgent pages; as many of these are left out as
-    // there is no room for.
+    // The list begins with the least urgent pages. Leave out those for which there is
+    // no room.
     size_t num_left_out = wanted_.size() > most ? wanted_.size() - most : 0;
     todo.resize(wanted_.size() - num_left_out);
     uint32_t end = 0;
@@ -321,7 +319,7 @@ void PagePolicy::evict(uint32_t s, PagesComing& out) {
     free_slots_.push_back(s);
 }
 
-// Collects slots that may be evicted; called when no slot is free.
+// Collects slots that may be evicted. Called when no slot is free.
 void PagePolicy::find_leaving() {
     for (uint32_t s = 0; s < slots_.size(); ++s)
         if (may_go(s)) leaving_.push_back({uses_[s].last_used, s});
@@ -333,8 +331,8 @@ void PagePolicy::find_leaving() {
     has_none_leaving_ = leaving_.empty();
 }
 
-// Removes slots that were used again from the front of the heap. Returns whether a slot
-// remains that may be evicted.
+// Removes slots that have been used since from the front of the heap. Returns whether a
+// slot is left that may be evicted.
 bool PagePolicy::has_leaving() {
     while (!leaving_.empty()) {
         const Leaving& first = leaving_.front();
@@ -345,9 +343,9 @@ bool PagePolicy::has_leaving() {
     return false;
 }
 
-// Evicts a page unless a slot is free. `is_missed` says whether the slot is for a page
-// that the cut misses or for a page requested ahead. Returns whether there is a free
-// slot.
+// Evicts a page unless a slot is free. Returns whether a slot is free then.
+// `is_missed`: the slot is for a page that the cut misses, not for a page that is
+// requested ahead.
 bool PagePolicy::make_room(bool is_missed, PagesComing& out) {
     if (!free_slots_.empty()) return true;
     if (!has_leaving() && !has_none_leaving_) find_leaving();

@@ -1,14 +1,14 @@
 #pragma once
 
 // The decisions of a page pool: which pages are read, which become resident, which are
-// evicted, and in what order. The policy knows neither threads nor bytes: one thread at
-// a time calls it and reports which pages were read.
+// evicted, and in which order. The policy uses no threads and no files. One thread at a
+// time calls it, and tells it which pages were read.
 //
-// The memory holds rows of gaussians and entries of clusters. First come those of the
-// coarsest pages of all bundles, which are never evicted; then slots of one size, each
-// of which fits any other page. At every moment the set of resident pages is closed
-// towards the root: a page becomes resident after the page above it, and is evicted
-// only when no page below it is resident.
+// The memory of a pool has rows of gaussians and entries of clusters. It begins with
+// the coarsest pages of all bundles, which are never evicted. Then follow slots of
+// equal size. Any other page fits into a slot. A page becomes resident only after the
+// page above it, and is evicted only when no page below it is resident. So with each
+// page, all pages above it are resident.
 
 #include <atomic>
 #include <cstdint>
@@ -21,8 +21,8 @@
 
 namespace v3dg {
 
-// A partly resident bundle: its tables and the source of its pages. Only the tables of
-// groups and clusters are read, and only by the constructor.
+// A bundle of which only some pages are resident. Only the constructor reads the table:
+// its groups and clusters.
 struct PagedBundle {
     ClusterTable table;
     std::shared_ptr<const PageSource> source;
@@ -40,62 +40,63 @@ struct PoolMemory {
     }
 };
 
-// The division of the memory: the coarsest pages first, then slots of one size.
+// The division of the memory: first the coarsest pages, then slots of equal size.
 struct SlotPlan {
     size_t first_slot_row = 0, first_slot_cluster = 0;
     size_t num_slots = 0, slot_rows = 1, slot_clusters = 1;
 
     size_t num_rows() const { return first_slot_row + num_slots * slot_rows; }
     size_t num_clusters() const { return first_slot_cluster + num_slots * slot_clusters; }
-    // Returns the number of cluster entries of a page of `num_clusters` clusters that
-    // begins at entry `cluster`: all entries of its slot, or, for a coarsest page, one
-    // per cluster.
+    // Returns the number of cluster entries that belong to a page of `num_clusters`
+    // clusters at entry `cluster`. A page in a slot has all entries of the slot, a
+    // coarsest page has one per cluster.
     size_t num_clusters_at(size_t cluster, size_t num_clusters) const {
         return cluster < first_slot_cluster ? num_clusters : slot_clusters;
     }
-    // [num_clusters() + 1] the first row of each cluster entry while all slots are
+    // Returns [num_clusters() + 1] the first row of each cluster entry if all slots are
     // empty, ascending.
     std::vector<int64_t> empty_offsets() const;
 };
 
-// A page that becomes resident or is evicted.
+// A page that becomes resident, or that is evicted.
 struct PageChange {
     uint32_t bundle, page;
-    int64_t row;                 // first row of the page; kAbsentPage: it is evicted
+    int64_t row;                 // first row of the page; kAbsentPage if it is evicted
     size_t cluster;              // first cluster entry of the page
-    const unsigned char* bytes;  // content of a page that becomes resident, else null
+    const unsigned char* bytes;  // content of the page; null if it is evicted
 };
 
 enum class PageState : uint8_t { absent, loading, loaded, resident, failed };
 
-// A page that has been read and is not yet resident.
+// A page that was read, and is not resident yet.
 struct LoadedPage {
     uint32_t bundle, page;
     unsigned char* block;
-    float priority = 0;  // priority in the last view that requested it
+    float priority = 0;  // in the last view that requested the page
 };
 
-// The result of PagePolicy::bring() for loaded pages.
+// The result of PagePolicy::bring().
 struct PagesComing {
-    std::vector<PageChange> changes;      // to be applied in this order
+    std::vector<PageChange> changes;      // in the order in which they must be applied
     std::vector<unsigned char*> dropped;  // blocks of pages that are no longer wanted
-    size_t bytes = 0;                     // size of the pages that become resident
-    size_t num_left = 0;  // pages that wait only because of the bytes allowed per frame
+    size_t bytes = 0;                     // total size of the pages that become resident
+    // pages that wait only because of the limit on bytes per frame
+    size_t num_left = 0;
 
     void clear();
 };
 
-// Any thread may call the const functions, except missing() and needed(). Only the
-// deciding thread may call those two and all other functions.
+// Any thread may call the const functions except missing() and needed(). All other
+// functions belong to the deciding thread.
 class PagePolicy {
   public:
-    // Throws std::invalid_argument if there is no room for the coarsest pages and one
-    // more page of each bundle.
+    // Throws std::invalid_argument if the memory has no room for the coarsest page and
+    // one more page of each bundle.
     PagePolicy(const std::vector<PagedBundle>& bundles, const PoolMemory& memory);
 
     size_t num_slots() const { return slots_.size(); }
     const SlotPlan& plan() const { return plan_; }
-    // Returns the coarsest page of a bundle, without its bytes.
+    // Returns the coarsest page of a bundle, without its content.
     PageChange root(size_t bundle) const;
     size_t num_pages() const { return slot_of_page_.size; }
     size_t most_page_bytes() const { return most_page_bytes_; }
@@ -104,35 +105,35 @@ class PagePolicy {
     uint32_t id_of(size_t bundle, size_t page) const {
         return bundles_[bundle].first_page + static_cast<uint32_t>(page);
     }
-    // Returns the index of the page above; negative if there is none.
+    // Returns the index of the page above, or a negative number if there is none.
     int32_t page_above(uint32_t id) const { return pages_[id].parent; }
 
-    // Any thread may read the state of a page. Reading threads change it from absent to
-    // loading, and from loading to loaded or failed.
+    // Returns the state of a page, which any thread may read. Reading threads change it
+    // from absent to loading, and from loading to loaded or failed.
     std::atomic<PageState>& state(size_t bundle, size_t page) const {
         return states_[id_of(bundle, page)];
     }
     void forget_failures();
-    // Allocates memory for this many loaded pages, so that bring() never allocates.
+    // Allocates memory for `num_loaded` pages, so that bring() need not allocate.
     void reserve(size_t num_loaded) { left_.reserve(num_loaded); }
 
     // Notes the pages that the cut of a frame needs, absent or resident, in any order.
-    // `num_left_out` is the number of further needs that the list had no room for.
-    // `has_failures` says whether some pages cannot be read.
+    // `num_left_out` is the number of needs for which the list had no room.
+    // `has_failures` tells whether some pages cannot be read.
     void note(Span<const PageRequest> needs, size_t num_left_out, bool has_failures);
-    // Sets `todo` to the pages to read next for the noted view. The most urgent stretch
-    // comes last and each stretch is in descending order, because readers take pages
-    // from the end, and pages above must come before those below. The list has at most
-    // as many pages as there is room for besides the `under_way` pages that are loading
-    // or loaded.
+    // Sets `todo` to the absent pages of the noted view, in the order of reading:
+    // readers take pages from the end. The most urgent stretch comes last. Within a
+    // stretch, pages are in descending order, so that a page above is read before the
+    // pages below it. The list is limited to the free memory; `under_way` pages that
+    // are loading or loaded use some of it.
     void choose(size_t under_way, std::vector<PageRequest>& todo);
-    // Return how many pages the noted view misses, and how many slots it would occupy.
+    // Return how many pages the noted view misses, and how many slots it would use.
     size_t missing() const { return missing_; }
     size_t needed() const { return missing_ + num_needed_; }
 
-    // Assigns slots to loaded pages, the most urgent first, up to a total of about
-    // `most_bytes`, but to at least one page. Pages that remain in `loaded` wait for a
-    // later frame, or for a page above them that is still being read.
+    // Assigns slots to loaded pages, the most urgent first. The total is about
+    // `most_bytes`, but at least one page. Pages that stay in `loaded` wait for a later
+    // frame, or for a page above them that is still being read.
     void bring(std::vector<LoadedPage>& loaded, size_t most_bytes, PagesComing& out);
 
   private:
@@ -140,28 +141,32 @@ class PagePolicy {
         std::shared_ptr<const PageSource> source;
         uint32_t first_page = 0;
         size_t root_row = 0, root_cluster = 0;
-        // Maxima over all pages except the coarsest.
+        // Largest values over all pages except the coarsest.
         size_t most_rows = 1, most_clusters = 1, most_bytes = 1;
     };
     struct Page {
-        int32_t parent = -1;   // index among the pages of all bundles; -1: a coarsest page
-        uint32_t stamp = 0;    // the last view that requested the page
-        float priority = 0;    // its priority in that view
-        uint32_t stretch = 0;  // its stretch in that view, if the page is wanted
+        // index among the pages of all bundles; -1 for a coarsest page
+        int32_t parent = -1;
+        uint32_t stamp = 0;  // last view that requested the page
+        float priority = 0;  // priority in that view
+        // stretch of the page in that view, if the page is wanted
+        uint32_t stretch = 0;
     };
     struct Slot {
         int32_t bundle = -1;
         uint32_t page = 0;
     };
-    // When the page of a slot was last used.
+    // When the page in a slot was last used.
     struct Use {
-        uint32_t last_needed = 0;   // one more than the view that needed it last
-        uint32_t last_used = 0;     // one more than the view that last needed it or nearly did
-        int32_t above = 0;          // slot of the page above; negative: a coarsest page
+        uint32_t last_needed = 0;  // last view that needed the page, plus 1
+        // last view that needed, or nearly needed, the page, plus 1
+        uint32_t last_used = 0;
+        // slot of the page above; negative if that is a coarsest page
+        int32_t above = 0;
         uint32_t num_children = 0;  // number of resident pages directly below
     };
-    // The number of slots whose page this view needed or used, and of those whose page
-    // only the view before did.
+    // The number of slots whose page was last needed (or used) in this view, and in the
+    // view before.
     struct Counts {
         size_t now = 0;
         size_t before = 0;
@@ -169,15 +174,15 @@ class PagePolicy {
     struct Wanted {
         uint32_t bundle;
         uint32_t page;
-        uint32_t key;  // key of the urgency
+        uint32_t key;  // urgency; see kNumKeys
     };
-    // The part of `todo` for pages with one key: the number of free positions, and
-    // their end.
+    // The range of `todo` for pages of one key: the number of unused positions, and the
+    // end.
     struct Places {
         uint32_t count = 0;
         uint32_t end = 0;
     };
-    // A slot whose page may be evicted unless it was used again in the meantime.
+    // A slot whose page may be evicted, unless the page has been used since.
     struct Leaving {
         uint32_t last_used, slot;
 
@@ -195,7 +200,7 @@ class PagePolicy {
     int32_t block_above(int32_t id) const;
     void find_stretches();
     void touch(uint32_t& last, uint32_t value, Counts& counts);
-    // Whether neither this view nor the one before needed or used the page.
+    // Returns whether neither this view nor the one before used the page.
     bool is_old(uint32_t last) const { return last < noted_; }
     size_t num_old(const Counts& counts) const {
         return slots_.size() - counts.now - counts.before;
@@ -213,8 +218,8 @@ class PagePolicy {
     SlotPlan plan_;
     size_t most_page_bytes_ = 1;
 
-    // The slot of each page. A page without a slot is absent, being loaded, or the
-    // coarsest of its bundle.
+    // The slot of each page. Pages that are absent, that are being loaded, or that are
+    // the coarsest of their bundle have no slot.
     Buffer<int32_t> slot_storage_;
     Buffer<Page> page_storage_;
     Span<int32_t> slot_of_page_;
@@ -225,16 +230,18 @@ class PagePolicy {
     std::vector<Use> uses_;
     std::vector<uint32_t> free_slots_;
 
-    uint32_t noted_ = 1;  // one more than the number of noted views
+    uint32_t noted_ = 1;  // number of noted views, plus 1
     Counts needed_, used_;
     size_t missing_ = 0, num_needed_ = 0;
     std::vector<Wanted> wanted_;
     std::vector<uint32_t> key_of_stretch_;
     std::vector<Places> places_of_key_;
-    // A heap with the slot that was unused for longest in front. It persists from frame
-    // to frame: slots that become old later were used later than those in the heap.
+    // A heap of slots that may be evicted; the one that was unused for longest is in
+    // front. It is kept from frame to frame, because slots that become old later were
+    // also used later.
     std::vector<Leaving> leaving_;
-    bool has_none_leaving_ = false;  // no slot can be evicted until the next view is noted
+    // no slot can be evicted before the next view is noted
+    bool has_none_leaving_ = false;
     std::vector<LoadedPage> left_;
 };
 

@@ -1,5 +1,5 @@
-// The facade of a pool: it makes the parts (pool_shared.h lists them), starts and ends
-// the threads, and implements the functions that belong to no single part.
+// Implements page_pool.h: creates the parts of a pool (pool_shared.h lists them),
+// starts and ends its threads, and has the functions that belong to no single part.
 
 #include "residency/page_pool.h"
 
@@ -21,11 +21,12 @@ namespace {
 
 constexpr float kToleranceLeap = 1.189207f;
 constexpr float kLeastToleranceRaised = 1e-6f;
-constexpr size_t kSamples = 1 << 14;  // approximate number of page sizes to sample
-// How long the destructor of a pool waits for its threads.
+// approximate number of pages whose sizes are sampled
+constexpr size_t kSamples = 1 << 14;
+// How long the destructor of a pool waits for the pool's threads.
 constexpr std::chrono::seconds kMostWaitForEnd{2};
 
-// Returns the sizes of about kSamples pages other than the coarsest.
+// Returns the sizes of about kSamples pages, without the coarsest ones.
 std::vector<size_t> sampled_sizes(const PagePolicy& policy, size_t num_bundles) {
     std::vector<size_t> samples;
     const size_t step = policy.num_pages() / kSamples + 1;
@@ -46,12 +47,12 @@ struct PagePool::State {
     static void start_threads(const std::shared_ptr<State>& state);
     void stop_threads();
 
-    // After construction, only the decider sees changes of the policy.
+    // After construction, only the decider accesses changing state of the policy.
     PagePolicy policy;
     std::shared_ptr<BlockMemory> memory;
     int max_sh_degree = 0;
     size_t most_needs = 0;
-    size_t most_bytes = 0;    // total of the blocks and the coarsest pages
+    size_t most_bytes = 0;    // total of all blocks and of the coarsest pages
     size_t most_changes = 0;  // largest number of page changes in a frame
 
     PoolShared shared;
@@ -60,7 +61,7 @@ struct PagePool::State {
     PoolFrames frames;
 };
 
-// Allocates all memory that threads write to, so that no thread can run out of memory.
+// Allocates all memory that the threads write to, so that no thread runs out of memory.
 PagePool::State::State(const std::vector<PagedBundle>& bundles, const PoolLimits& limits,
                        std::shared_ptr<BlockMemory> block_memory)
     : policy(bundles, limits.memory),
@@ -79,9 +80,9 @@ PagePool::State::State(const std::vector<PagedBundle>& bundles, const PoolLimits
     const size_t num_blocks = shared.blocks.num_blocks();
     most_bytes = root_bytes + shared.blocks.num_bytes();
     most_changes = 2 * num_blocks + bundles.size();
-    // The limit on the requests of one frame; those beyond it are left out. Usually a
-    // page has two clusters, each of which may request another page, so eight requests
-    // per slot leave room for larger groups.
+    // Further requests of a frame are left out. A page usually has two clusters, each
+    // of which may request another page. So eight requests per slot leave room for
+    // larger groups.
     most_needs = std::min(policy.num_pages(), 8 * policy.num_slots() + 1024);
     decider.reserve(num_blocks, most_changes);
     shared.read.reserve(num_blocks);
@@ -126,8 +127,8 @@ PagePool::PagePool(const std::vector<PagedBundle>& bundles, const PoolLimits& li
     State::start_threads(state_);
 }
 
-// A thread that waits for a disk forever is abandoned together with the state that it
-// writes to. A child of fork() abandons the whole state, because its copy of the mutex
+// The state outlives the pool in two cases. A thread that waits for a disk for ever is
+// left behind, with the state that it writes to. And in a child of fork(), the mutex
 // must not be destroyed.
 PagePool::~PagePool() {
     if (getpid() != state_->shared.process)

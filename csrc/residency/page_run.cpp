@@ -10,7 +10,8 @@
 
 namespace v3dg {
 
-constexpr size_t kFew = 8;  // pages that a thread reads at once: as many as are hashed in parallel
+// Pages that a thread reads at once; as many hashes are computed in parallel.
+constexpr size_t kFew = 8;
 
 static std::string name_of(const PageRun& run, size_t page) {
     const Span<const int64_t> clusters = run.clusters(page);
@@ -19,8 +20,8 @@ static std::string name_of(const PageRun& run, size_t page) {
            ")";
 }
 
-// Reads `count` pages into contiguous memory, and calls use(page, bytes) for each, up
-// to the first page that cannot be read.
+// Reads `count` pages into contiguous memory, and calls use(page, bytes) for each.
+// Throws PageError for the first page that cannot be read.
 template <class Use>
 static void read_few(const PosixFile& file, const PageRun& run, size_t first, size_t count,
                      unsigned char* bytes, const Use& use) {
@@ -37,7 +38,7 @@ static void read_few(const PosixFile& file, const PageRun& run, size_t first, si
     }
 }
 
-// Calls read(first page, number of pages) on all threads.
+// Calls read(first page, number of pages) for parts of the run, on all threads.
 template <class Read>
 static void for_few_pages(const PageRun& run, const Read& read) {
     const size_t share = run.size() / static_cast<size_t>(most_threads());

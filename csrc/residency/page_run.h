@@ -1,6 +1,6 @@
 #pragma once
 
-// Neighbouring pages of a bundle's file, read together.
+// Adjacent pages of a bundle's file, which are read together.
 
 #include <cstdint>
 
@@ -12,31 +12,31 @@ namespace v3dg {
 
 struct PageRun {
     size_t first_page;  // index of the first page in the bundle
-    // [n + 1] first cluster of each page, counted from the start of the run, and the
-    // end
+    // [n + 1] first cluster of each page, relative to the first page, and the end
     Span<const int64_t> first_cluster;
-    // index in the bundle of the first gaussian of each cluster of the run, and the end
+    // first gaussian of each cluster, and the end; indices in the bundle
     Span<const int64_t> offset;
-    Span<const int64_t> places;  // [n + 1] offset in bytes of each page in the file, and the end
+    // [n + 1] offset of each page in the file, bytes, and the end
+    Span<const int64_t> places;
     Span<const uint8_t> hashes;  // [n][16]
 
     size_t size() const { return places.size - 1; }
     size_t num_bytes(size_t page) const { return places[page + 1] - places[page]; }
-    // Returns the index in the bundle of the first gaussian of each cluster of a page,
-    // and the end.
+    // Returns the first gaussian of each cluster of a page, and the end; indices in the
+    // bundle.
     Span<const int64_t> clusters(size_t page) const {
         return {offset.data + first_cluster[page],
                 static_cast<size_t>(first_cluster[page + 1] - first_cluster[page] + 1)};
     }
 };
 
-// Reads and verifies all pages and decodes their gaussians. Precondition: each page has
-// at least the bytes that its codec needs. Throws PageError, whose message names the
-// first page that cannot be read, without the file.
+// Reads and verifies all pages, and decodes their gaussians. Precondition: each page
+// has at least the bytes that its codec needs. Throws PageError, which names the first
+// page that cannot be read, but not the file.
 void read_pages(const PosixFile& file, const PageRun& run, PageCodec codec,
                 const GaussianRows<float>& out);
 
-// Reads and verifies the codes of all pages. Throws PageError like read_pages().
+// Reads and verifies all pages, without decoding. Throws like read_pages().
 void read_codes(const PosixFile& file, const PageRun& run, Span<int32_t> words);
 
 }  // namespace v3dg

@@ -1,5 +1,5 @@
-// Reads pages in three steps: neighbours in one system call; page by page if that
-// fails, so that each error names its page; then all hashes together.
+// Reads pages in three steps: adjacent pages in one system call; single pages if that
+// fails, so that the error names the page; then all hashes together.
 
 #include "residency/page_source.h"
 
@@ -69,12 +69,11 @@ static void read_one(const PosixFile& file, Span<const int64_t> places, PageRead
     }
 }
 
-// A gap of at most this many bytes between two pages, the size of one or two pages, is
-// read and discarded: that is faster than a second call.
+// A gap of at most this many bytes between two pages is read and discarded, which is
+// faster than a second system call. It is the size of one or two pages.
 constexpr size_t kMostSkippedBytes = size_t(32) << 10;
 
-// Returns the end of the pages that are read in one call together with the page
-// `first`.
+// Returns the end of the pages that are read in one system call with page `first`.
 static size_t end_of_run(Span<const int64_t> places, Span<const PageReading> pages, size_t first) {
     size_t end = first + 1;
     while (end < pages.size &&
@@ -102,7 +101,7 @@ static void read_run(const PosixFile& file, Span<const int64_t> places, Span<Pag
     try {
         if (file.read_at(first, {pieces, count}) == static_cast<size_t>(place - first)) return;
     } catch (const std::system_error&) {
-        // Reading page by page shows which page failed, and whether the error persists.
+        // Read page by page, to find the page that fails, and whether it fails again.
     }
     for (PageReading& reading : run) read_one(file, places, reading, name_of);
 }
@@ -149,8 +148,7 @@ void FilePages::expect(Span<const PageReading> pages) const {
     }
 }
 
-// Fetches the pages. Returns whether they can be read now; if not, each of them has an
-// error.
+// Fetches the pages. Returns whether they can be read now; if not, sets their errors.
 bool FilePages::fetch(Span<PageReading> pages) const {
     int64_t places[2 * kMostPagesTogether];
     size_t count = 0;

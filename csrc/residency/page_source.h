@@ -1,8 +1,8 @@
 #pragma once
 
-// The source of the pages of a bundle: a file, which may have to be fetched first, or
+// The sources of a bundle's pages: a file, which may have to be fetched first, or
 // memory. Also the codecs of pages (PageCodec). Any thread may read from a source.
-// docs/extending.md says how to add a codec.
+// docs/extending.md describes how to add a codec.
 
 #include <cstdint>
 #include <functional>
@@ -18,38 +18,38 @@
 
 namespace v3dg {
 
-// A page that cannot be read; what() names the file and the page.
+// The error for a page that cannot be read. what() names the file and the page.
 class PageError : public std::runtime_error {
   public:
     PageError(const std::string& text, bool is_damage, int code = 0)
         : std::runtime_error(text), is_damage(is_damage), code(code) {}
-    // true: the content of the file is wrong; false: the system failed to read it
+    // true if the content of the file is wrong; false if the system failed to read it
     const bool is_damage;
     const int code;  // errno of the system call, or 0
 };
 
 constexpr const char* kDamaged = "the file is damaged, copy or build it again";
 
-// A page to be read, and the error if reading failed.
+// A page to read, where to read it to, and the error if reading fails.
 struct PageReading {
     size_t page;
-    unsigned char* bytes;  // has room for the whole page
+    unsigned char* bytes;  // must have room for the whole page
     std::optional<PageError> error;
 };
 // The largest number of pages that are read together. It is a constant, so that reading
-// never allocates.
+// need not allocate.
 constexpr size_t kMostPagesTogether = 64;
 
 // Reads at most kMostPagesTogether pages of a file, in ascending order, and verifies
-// their hashes, several at once. Neighbouring pages are read in one call, including
-// small gaps between them. `places` is [P + 1], the offset of each page and the end;
-// `hashes` is [P][16]. Errors begin with name_of(page).
+// their hashes, several at once. Adjacent pages are read in one system call, with small
+// gaps between them. `places` is [P + 1], the offset of each page and the end; `hashes`
+// is [P][16]. Errors begin with name_of(page).
 void read_verified(const PosixFile& file, Span<const int64_t> places, const uint8_t* hashes,
                    Span<PageReading> pages, const std::function<std::string(size_t)>& name_of);
 
 enum class PageCodec { float32, quantized };
 
-// Reads the pages of a bundle as bytes.
+// A source of the pages of a bundle, as bytes.
 class PageSource {
   public:
     PageSource(const ClusterTable& table, int sh_degree, PageCodec codec);
@@ -62,28 +62,27 @@ class PageSource {
         return first_cluster_[page + 1] - first_cluster_[page];
     }
     size_t first_cluster(size_t page) const { return first_cluster_[page]; }
-    // Returns the [K + 1] first rows in the bundle of the clusters of a page, and the
-    // end.
+    // Returns the first row of each cluster of a page, and the end: [K + 1], indices in
+    // the bundle.
     Span<const int64_t> clusters(size_t page) const;
     int64_t first_row(size_t page) const { return offset_[first_cluster_[page]]; }
     size_t num_rows(size_t page) const {
         return offset_[first_cluster_[page + 1]] - first_row(page);
     }
 
-    // Returns the size of a page, including padding.
+    // Returns the bytes of a page, including padding.
     virtual size_t num_bytes(size_t page) const = 0;
     // Reads at most kMostPagesTogether pages, in ascending order, and verifies them.
-    // Neighbouring pages are fastest.
+    // Adjacent pages are fastest.
     virtual void read_pages(Span<PageReading> pages) const = 0;
     // Reads and verifies one page. Throws PageError.
     void read(size_t page, unsigned char* bytes) const;
-    // Whether the source is so slow that pages should be read only once they are
-    // missed.
+    // Returns whether the source is so slow that pages are not read ahead of use.
     virtual bool is_far() const { return false; }
     // Announces that these pages will be read soon.
     virtual void expect(Span<const PageReading> pages) const { static_cast<void>(pages); }
 
-    // Returns the rows of a page, given its bytes. The rows borrow from `bytes` or from
+    // Converts the bytes of a page to rows. The rows borrow from `bytes` or from
     // `decoded`.
     GaussianRows<const float> rows(size_t page, const unsigned char* bytes,
                                    std::vector<float>& decoded) const;
@@ -95,18 +94,17 @@ class PageSource {
     std::vector<int64_t> offset_;        // [C + 1]
 };
 
-// Fetches parts of a file before they are read. The argument has pairs of numbers: the
-// first byte of a part and its end. Returns an error message, or an empty string.
-// Called on any thread.
+// A function that fetches parts of a file before they are read. The argument has two
+// numbers per part: its first byte and its end. Returns an error text, or an empty
+// string. Any thread may call it.
 using Fetch = std::function<std::string(Span<const int64_t>)>;
 
-// The pages of a file, which stays open while this object exists. The file may be
-// renamed or removed in the meantime; if it is truncated or overwritten, the hashes
-// detect that.
+// The pages of a file, which stays open as long as this object. The file may be renamed
+// or removed meanwhile. If it is truncated or overwritten, the hashes detect that.
 class FilePages : public PageSource {
   public:
-    // `place` is [P + 1], `hash` is [P][16], as docs/format.md describes them. `fetch`
-    // is empty if the whole file is local.
+    // `place` is [P + 1] and `hash` is [P][16] (docs/format.md). `fetch` is empty if
+    // the whole file is local.
     FilePages(const ClusterTable& table, int sh_degree, PageCodec codec, std::string name,
               int descriptor, Span<const int64_t> place, Span<const uint8_t> hash, Fetch fetch);
     size_t num_bytes(size_t page) const override { return place_[page + 1] - place_[page]; }
@@ -125,7 +123,7 @@ class FilePages : public PageSource {
     const Fetch fetch_;
 };
 
-// The pages of gaussians in memory. The gaussians must outlive this object.
+// Pages of gaussians in memory. The gaussians must outlive this object.
 class MemoryPages : public PageSource {
   public:
     MemoryPages(const ClusterTable& table, const GaussianRows<const float>& rows)
@@ -139,7 +137,7 @@ class MemoryPages : public PageSource {
     const GaussianRows<const float> rows_;
 };
 
-// Returns the rows of a page of float32 gaussians; they borrow from its bytes.
+// Returns the rows of a page of float32 gaussians. They borrow from `bytes`.
 GaussianRows<const float> rows_of_page(const unsigned char* bytes, size_t num_gaussians,
                                        int sh_degree);
 

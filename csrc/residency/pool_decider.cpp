@@ -1,5 +1,5 @@
-// A round of deciding: it takes needs and loaded pages under the mutex, decides without
-// the mutex, and hands over the results under the mutex again.
+// The rounds of the decider. A round takes page requests and loaded pages with the
+// mutex held, decides without the mutex, and publishes the results with the mutex held.
 
 #include "residency/pool_decider.h"
 
@@ -9,7 +9,8 @@
 
 namespace v3dg {
 
-// How fast the tolerance follows the fraction of the pool that a view needs.
+// kToleranceStep: the factor of the tolerance per frame. kRoomyShare: the share of the
+// slots below which the tolerance may fall.
 constexpr float kToleranceStep = 1.02f;
 constexpr double kRoomyShare = 0.7;
 
@@ -20,8 +21,8 @@ void PoolDecider::reserve(size_t num_blocks, size_t num_changes) {
     coming_.changes.reserve(num_changes);
 }
 
-// Decides, without the mutex, about the state at the beginning of the round. The next
-// round sees the changes that other threads make meanwhile.
+// Decides about the state at the beginning of the round, without the mutex. Changes
+// that other threads make meanwhile belong to the next round.
 void PoolDecider::decide(PoolShared& shared) {
     ++shared.rounds_begun;
     shared.wants_round = false;
@@ -42,7 +43,7 @@ void PoolDecider::decide(PoolShared& shared) {
                 policy_.choose(under_way, chosen_);
             }
         } catch (const std::bad_alloc&) {
-            is_known = false;  // the next frame reports its needs again
+            is_known = false;  // The next frame requests the same pages again.
         }
         coming_.clear();
         if (bytes_left > 0)
@@ -67,8 +68,8 @@ void PoolDecider::decide(PoolShared& shared) {
     shared.has_changed.notify_all();
 }
 
-// Adapts from the tolerance that the frame used, so several frames in flight together
-// cause only one step.
+// Starts from the tolerance of the frame that reported its needs. So several frames in
+// flight cause only one step.
 void PoolDecider::adapt_tolerance(PoolShared& shared, const FrameNeeds& needs) {
     const size_t slots = policy_.num_slots();
     const size_t needed = shared.needed;

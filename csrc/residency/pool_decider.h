@@ -1,12 +1,12 @@
 #pragma once
 
-// The deciding part of a page pool: which pages are read, become resident, and are
+// The decider of a page pool: it decides which pages are read, become resident, or are
 // evicted.
 //
-// One thread at a time uses the fields: the deciding thread of the pool or, in a pool
-// without threads, the drawing thread, which then calls decide_next_round(). Frames
-// call decide_next_round() and forget_failures(). No function here waits for a file.
-// Only decide_next_round() waits for another thread.
+// One thread at a time uses its fields: the deciding thread or, in a pool without
+// threads, the drawing thread. The drawing thread calls decide_next_round() and
+// forget_failures(). No function waits for a file, and only decide_next_round() waits
+// for another thread.
 
 #include <cstddef>
 #include <vector>
@@ -20,17 +20,16 @@ class PoolDecider {
   public:
     explicit PoolDecider(PagePolicy& policy) : policy_(policy) {}
 
-    // Allocates the memory that decide() needs for this many blocks, so that it never
-    // runs out of memory.
+    // Allocates the memory for decide(), so that decide() never runs out of memory.
     void reserve(size_t num_blocks, size_t num_changes);
 
-    // The deciding thread; returns once the pool has ended.
+    // The main function of the deciding thread. Returns when the pool ends.
     void decide_always(PoolShared& shared) V3DG_EXCLUDES(shared.busy);
-    // Returns once the pool has decided about everything that is known now. Waits for
-    // the deciding thread, or decides in the calling thread if there is none.
+    // Returns when the pool has decided about everything known at the time of the call.
+    // Waits for the deciding thread; without one, the calling thread decides.
     void decide_next_round(PoolShared& shared) V3DG_REQUIRES(shared.busy);
-    // Allows another attempt at pages that could not be read. Must not be called during
-    // a round.
+    // Forgets which pages could not be read, so that they are tried again. Must not be
+    // called during a round.
     void forget_failures(PoolShared& shared) V3DG_REQUIRES(shared.busy);
 
   private:

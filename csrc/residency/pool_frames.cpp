@@ -1,4 +1,4 @@
-// The exchange between a frame and the other threads of a pool, and the tables of
+// The exchange between frames and the other threads of a pool, and the tables of
 // resident pages.
 
 #include "residency/pool_frames.h"
@@ -44,7 +44,7 @@ void PoolFrames::reserve(size_t num_blocks, size_t num_changes, size_t num_frame
     changes_.reserve(num_changes);
     taken_.reserve(num_blocks);
     returned_.reserve(num_blocks);
-    // one more that waits, and one more that is being decided about
+    // two more than frames: one waits for the decider, and one is being decided about
     all_needs_.resize(num_frames + 2);
     for (FrameNeeds& needs : all_needs_) {
         needs.list =
@@ -57,7 +57,8 @@ const std::vector<PageChange>& PoolFrames::begin_frame(PoolShared& shared, bool 
                                                        Arrive arrive) {
     least_of_frame_ = shared.least_tolerance;
     const bool is_first = !std::exchange(has_begun_, true);
-    if (!is_first) take_changes(shared, is_bounded);  // the first frame brings the coarsest pages
+    // the coarsest pages are already in `changes_`
+    if (!is_first) take_changes(shared, is_bounded);
     const bool is_after_look = std::exchange(has_looked_, !is_bounded);
     arrivals_.advance(changes_, is_bounded && !is_after_look ? arrive : Arrive::at_once);
     return changes_;
@@ -86,14 +87,14 @@ void PoolFrames::swap_changes(PoolShared& shared, bool is_bounded) {
     changes_.swap(shared.ready);
     shared.ready_bytes = 0;
     shared.has_noted = false;
-    // A frame that is not bounded waits until the pool has decided about its own view.
-    // If the pool decided about an earlier view in between, that would fill `ready`,
-    // and then no other view could be noted before the next frame.
+    // A frame that is not bounded waits for the decision about its own view. If the
+    // pool decided about an earlier view first, `ready` would be filled, and no other
+    // view could be noted before the next frame.
     if (!is_bounded) forget_noted(shared);
     if (shared.has_to_decide()) shared.to_decide.notify_one();
 }
 
-// Updates the tables for the changes of the frame, and stores their blocks.
+// Updates the tables for the changes of the frame, and remembers their blocks.
 void PoolFrames::apply_changes(PoolShared& shared) {
     for (const PageChange& change : changes_) {
         const PageSource& source = policy_.source(change.bundle);
@@ -110,8 +111,8 @@ void PoolFrames::apply_changes(PoolShared& shared) {
     }
 }
 
-// Hands needs and free blocks to the other threads, and receives needs that were
-// decided about.
+// Passes page requests and free blocks to the other threads, and takes back the memory
+// of page requests that were decided about.
 void PoolFrames::exchange(PoolShared& shared) {
     if (to_note_ != nullptr) {
         if (shared.noted != nullptr) idle_needs_.push_back(shared.noted);
@@ -128,7 +129,7 @@ void PoolFrames::exchange(PoolShared& shared) {
     if (shared.has_to_decide()) shared.to_decide.notify_one();
 }
 
-// Withdraws a noted view that no round has begun with.
+// Withdraws the noted view if no round has started with it.
 void PoolFrames::forget_noted(PoolShared& shared) {
     if (shared.noted != nullptr) idle_needs_.push_back(std::exchange(shared.noted, nullptr));
 }
@@ -168,8 +169,7 @@ NotedView PoolFrames::note_needs(PoolShared& shared, FrameNeeds* needs, bool wai
     return noted;
 }
 
-// Returns how many pages the cut missed, according to the tables of the frame that
-// began last.
+// Returns how many pages the cut missed, by the tables of the current frame.
 size_t PoolFrames::count_absent(const FrameNeeds& needs) const {
     size_t count = needs.num_left_out;
     for (size_t k = 0; k < needs.count; ++k) {
@@ -183,7 +183,7 @@ void PoolFrames::begin_settling(PoolShared& shared) {
     const PoolLock lock(shared);
     exchange(shared);
     forget_noted(shared);
-    // A round that is under way may adapt the tolerance at its end.
+    // Wait: a round in progress may change the tolerance at its end.
     while (shared.is_deciding()) shared.has_changed.wait(shared.busy);
     decider_.forget_failures(shared);
     shared.least_tolerance = 0;

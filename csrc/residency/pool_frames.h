@@ -1,12 +1,11 @@
 #pragma once
 
-// The drawing side of a page pool: the pages that a frame receives and the needs that
-// it returns.
+// The frames of a page pool: the pages that a frame gets, and the page requests that it
+// returns.
 //
-// One thread at a time uses it, the drawing thread; the callers of PagePool ensure
-// that. Hence its fields need no mutex. A function with `waits` set, and a frame that
-// is not bounded, wait for the mutex and for the next round of the decider; nothing
-// else waits.
+// Only one thread at a time uses it, the drawing thread, as callers of PagePool ensure.
+// So its fields need no mutex. Functions with `waits`, and frames that are not bounded,
+// wait for the mutex and for the next round of the decider; no other function waits.
 
 #include <cstddef>
 #include <cstdint>
@@ -23,15 +22,15 @@ class PoolFrames {
   public:
     PoolFrames(const PagePolicy& policy, PoolDecider& decider, size_t num_bundles);
 
-    // Reads the coarsest pages, which the first frame brings. Returns their size,
-    // including padding. Throws PageError.
+    // Reads the coarsest pages, which arrive in the first frame. Returns their total
+    // bytes, including padding. Throws PageError.
     size_t read_roots(BlockMemory& memory);
-    // Allocates the memory of frames, so that exchanges never allocate: room for the
-    // changes and the blocks of a frame, and for the needs of several frames.
+    // Allocates memory for the changes and the blocks of a frame, and for the page
+    // requests of several frames. Exchanges then need not allocate.
     void reserve(size_t num_blocks, size_t num_changes, size_t num_frames, size_t most_needs,
                  BlockMemory& memory);
 
-    // PagePool documents these under the same names.
+    // The functions below are documented in page_pool.h.
     const std::vector<PageChange>& begin_frame(PoolShared& shared, bool is_bounded, Arrive arrive)
         V3DG_EXCLUDES(shared.busy);
     std::vector<unsigned char*> take_blocks();
@@ -60,17 +59,17 @@ class PoolFrames {
     PoolDecider& decider_;
 
     bool has_begun_ = false;
-    bool has_looked_ = false;  // whether the frame before was not bounded
+    bool has_looked_ = false;  // whether the last frame was not bounded
     float least_of_frame_ = 0;
     std::vector<PageChange> changes_;          // changes of the current frame
-    std::vector<unsigned char*> taken_;        // the blocks of those changes
-    std::vector<unsigned char*> returned_;     // blocks that readers can reuse
+    std::vector<unsigned char*> taken_;        // blocks of these changes
+    std::vector<unsigned char*> returned_;     // blocks that readers can use again
     std::vector<std::vector<int64_t>> shift_;  // [P] per bundle
     PageArrivals arrivals_;
 
     std::vector<FrameNeeds> all_needs_;
     std::vector<FrameNeeds*> idle_needs_;
-    FrameNeeds* to_note_ = nullptr;  // needs for the decider, handed over in the next exchange
+    FrameNeeds* to_note_ = nullptr;  // page requests to pass on in the next exchange
     uint64_t num_views_ = 0;         // number of views that were noted
 };
 

@@ -1,5 +1,5 @@
-// Reads batches of the most urgent pages: a batch is taken under the mutex, read
-// without it, and reported under it.
+// Reads batches of the most urgent pages. A batch is taken with the mutex held, read
+// without it, and reported with it held.
 
 #include "residency/pool_readers.h"
 
@@ -12,8 +12,9 @@ namespace v3dg {
 namespace {
 
 constexpr int kTries = 3;
-constexpr size_t kMostAtOnce = 64;  // pages that a thread requests from the disk together
-// The number of bytes of those pages that a thread then reads and hashes together.
+// pages that a thread announces to the disk together
+constexpr size_t kMostAtOnce = 64;
+// The bytes of pages that a thread reads and hashes together.
 constexpr size_t kMostBytesTogether = size_t(512) << 10;
 
 }  // namespace
@@ -43,8 +44,8 @@ bool PoolReaders::read_some(PoolShared& shared, size_t most) const {
     return true;
 }
 
-// Reads all pages in file order: announces all of them to the disk, then reads a few at
-// a time.
+// Reads the pages in the order of the file: announces all of them to the disk, then
+// reads a few at a time.
 void PoolReaders::read_batch(PoolShared& shared, Span<Reading> batch) const {
     std::sort(batch.begin(), batch.end(), [](const Reading& a, const Reading& b) {
         return a.page.bundle != b.page.bundle ? a.page.bundle < b.page.bundle
@@ -55,8 +56,8 @@ void PoolReaders::read_batch(PoolShared& shared, Span<Reading> batch) const {
         pages[k].page = batch[k].page.page;
         pages[k].bytes = batch[k].block;
     }
-    // Calls visit(bundle, pages) for runs of neighbouring pages of a bundle with at
-    // most this many bytes each.
+    // Calls visit(bundle, pages) for runs of pages of one bundle, with at most
+    // `most_bytes` bytes per run, or one page.
     const auto for_each_run = [&](size_t most_bytes, const auto& visit) {
         for (size_t first = 0, end = 0; first < batch.size; first = end) {
             const uint32_t bundle = batch[first].page.bundle;
@@ -76,8 +77,7 @@ void PoolReaders::read_batch(PoolShared& shared, Span<Reading> batch) const {
     });
 }
 
-// Reads pages of a bundle. Pages that succeed are reported at once; the others are
-// tried again.
+// Reads pages of one bundle. Reports pages that succeed, and tries the others again.
 void PoolReaders::read_together(PoolShared& shared, uint32_t bundle,
                                 Span<PageReading> pages) const {
     policy_.source(bundle).read_pages(pages);
@@ -98,7 +98,7 @@ void PoolReaders::read_together(PoolShared& shared, uint32_t bundle,
     }
 }
 
-// Reports that a page is loaded or has failed.
+// Reports that a page was loaded or has failed.
 void PoolReaders::finish(PoolShared& shared, uint32_t bundle, const PageReading& reading) const {
     --shared.num_loading;
     policy_.state(bundle, reading.page) = reading.error ? PageState::failed : PageState::loaded;
@@ -119,7 +119,7 @@ void PoolReaders::finish(PoolShared& shared, uint32_t bundle, const PageReading&
 void PoolReaders::read_always(PoolShared& shared) const {
     const MutexLock lock(shared.busy);
     while (!shared.is_over) {
-        // Taking only a part of the list leaves equal work for the other threads.
+        // Take only a part of the list, so that all threads have work.
         const size_t share = shared.todo.size() / (2 * size_t(shared.limits.num_threads));
         if (read_some(shared, std::clamp<size_t>(share, 1, kMostAtOnce))) continue;
         shared.has_changed.notify_all();

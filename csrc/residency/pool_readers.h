@@ -1,12 +1,11 @@
 #pragma once
 
-// The reading side of a page pool: takes the most urgent pages and reads them into
-// blocks.
+// The readers of a page pool: they read the most urgent pages into blocks.
 //
-// Several threads read at the same time: the reading threads of the pool and the
-// callers of read_some(). They wait for files, but never while they hold the mutex.
-// Their shared state is in PoolShared. From the policy they use only the sources, which
-// never change, and the states of pages, which are atomic.
+// Several threads read concurrently: the reading threads of the pool, and callers of
+// read_some(). They wait for files, but never with the mutex held. Their shared state
+// is in PoolShared. Of the policy they use only the sources, which are immutable, and
+// the states of pages, which are atomic.
 
 #include <cstddef>
 
@@ -21,14 +20,14 @@ class PoolReaders {
   public:
     explicit PoolReaders(const PagePolicy& policy) : policy_(policy) {}
 
-    // A reading thread; returns once the pool has ended.
+    // The main function of a reading thread. Returns when the pool ends.
     void read_always(PoolShared& shared) const V3DG_EXCLUDES(shared.busy);
-    // Reads at most this many of the most urgent pages; releases the mutex meanwhile.
-    // Returns whether there was a page to read, and a block for it.
+    // Reads at most `most` of the most urgent pages, and releases the mutex meanwhile.
+    // Returns whether there was a page to read and a block for it.
     bool read_some(PoolShared& shared, size_t most) const V3DG_REQUIRES(shared.busy);
 
   private:
-    // A page to read, and its destination.
+    // A page to read, and where to read it to.
     struct Reading {
         PageRequest page;
         unsigned char* block;

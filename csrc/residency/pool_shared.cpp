@@ -4,13 +4,15 @@
 
 namespace v3dg {
 
-constexpr int kSpins = 64;  // further attempts before a frame goes on without the mutex
+// attempts to lock before a frame continues without the mutex
+constexpr int kSpins = 64;
 
 PoolShared::PoolShared(const PoolLimits& pool_limits, size_t num_slots)
     : limits(pool_limits),
       has_threads(pool_limits.num_threads > 0 && num_slots > 0),
       most_bytes_a_frame(pool_limits.most_bytes_a_frame),
-      missing(num_slots == 0 ? 0 : 1) {}  // at least one, until the first view is decided about
+      // not 0 before the first view is decided about
+      missing(num_slots == 0 ? 0 : 1) {}
 
 void PoolShared::check_process() const {
     if (getpid() != process)

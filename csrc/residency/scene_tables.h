@@ -18,38 +18,37 @@ struct PoseSpan {
     bool is_on_device;
 };
 
-// The tables of a scene that kernels read; all pointers point to device memory.
+// The tables of a scene that kernels read, in device memory.
 struct SceneOnDevice {
     const BundleOnDevice* bundles;
     InstanceTable instances;
 };
 
-// The bundles and the instances of a scene on the device that is current when it is
-// made.
+// The bundles and instances of a scene, on the device that is current at construction.
 //
-// All work is enqueued on the stream that is passed, which must belong to that device.
-// Several threads and streams take turns: a thread that enqueues reads of the scene on
-// a stream holds lock(stream) meanwhile.
+// Work is enqueued on the stream that is passed, which must belong to the device. A
+// thread that enqueues work which reads the scene must hold lock(stream) meanwhile.
+// This orders the work of several threads and streams.
 class SceneTables {
   public:
     SceneTables() = default;
 
-    // Sets the bundles. Instances refer to them by their index in this list. Uploads
-    // only pointers to the tables. Existing instances keep their indices: to add
-    // bundles, pass a longer list that begins with the previous one. Throws
-    // std::invalid_argument if tables are on another device.
+    // Sets the bundles. An instance refers to a bundle by its index in the list. Only
+    // pointers to the tables are copied to the device. Existing instances keep their
+    // indices: to add bundles, pass a longer list that begins with the current one.
+    // Throws std::invalid_argument if tables are on another device.
     void set_bundles(std::vector<std::shared_ptr<const BundleTables>> bundles, cudaStream_t stream);
-    // Replaces all instances; the caller must call set_poses() afterwards. The host
-    // memory may be reused on return. `factors` is empty if all are 1.
+    // Replaces all instances. The caller must then call set_poses(), and may reuse host
+    // memory on return. `factors` is empty if all are 1.
     void set_instances(Span<const int32_t> bundle, Span<const float> importance,
                        Span<const InstanceFactors> factors, cudaStream_t stream);
-    // Sets the poses. Each component is either in host memory, which may be reused on
-    // return, or in device memory, which must stay unchanged.
+    // Sets the poses of all instances. A component is in host memory, which the caller
+    // may reuse on return, or in device memory, which must not change.
     void set_poses(const PoseSpan& position, const PoseSpan& quaternion, const PoseSpan& scale,
                    cudaStream_t stream);
 
     int device() const { return device_; }
-    // Returns the bytes on the device, without the tables of the bundles, which other
+    // Returns the device memory in bytes, without the tables of bundles, which other
     // scenes may share.
     size_t bytes() const;
     size_t num_bundles() const { return bundles_.size(); }
@@ -58,14 +57,14 @@ class SceneTables {
     size_t num_instances_of(size_t b) const { return num_instances_of_[b]; }
 
     SceneOnDevice on_device() const;
-    // Locks the scene for work that is enqueued on a stream.
+    // Locks the scene for enqueuing work on a stream.
     StreamLock lock(cudaStream_t stream) const { return StreamLock(busy_, stream); }
 
   private:
     const int device_ = current_device();
     mutable StreamMutex busy_;
     std::vector<std::shared_ptr<const BundleTables>> bundles_;
-    std::vector<size_t> num_instances_of_;  // per bundle
+    std::vector<size_t> num_instances_of_;  // number of instances of each bundle
     size_t num_instances_ = 0;
     DeviceBuffer<BundleOnDevice> bundles_on_device_;
     DeviceBuffer<int32_t> bundle_;

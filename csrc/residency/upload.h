@@ -1,6 +1,6 @@
 #pragma once
 
-// Uploads of the tables of bundles to a device.
+// Copies the tables of bundles to a device.
 
 #include <functional>
 #include <vector>
@@ -11,11 +11,10 @@
 namespace v3dg {
 namespace cuda {
 
-// Copies arrays of the host into one allocation on the device.
+// Copies host arrays to one allocation on the device.
 class Upload {
   public:
-    // `span` points to memory of the host; finish() makes it point to memory of the
-    // device.
+    // Adds an array. finish() makes `span` refer to the copy on the device.
     template <class T>
     void add(Span<const T>& span) {
         const size_t first = (num_bytes_ + kAlignment - 1) / kAlignment * kAlignment;
@@ -28,7 +27,7 @@ class Upload {
             span.data = reinterpret_cast<const T*>(start + first);
         });
     }
-    // The same for all arrays of a table.
+    // Adds all arrays of a table.
     void add(ClusterTable& table) {
         add(table.ball);
         add(table.weight);
@@ -42,8 +41,8 @@ class Upload {
         add(table.pages.shift);
         add(table.pages.begins);
     }
-    // Returns after the arrays have arrived on the device; the host memory may then be
-    // reused.
+    // Allocates device memory and copies the arrays. Returns when they are on the
+    // device. The caller may then reuse host memory.
     void finish(DeviceBuffer<unsigned char>& storage, cudaStream_t stream) {
         storage.reserve(num_bytes_, stream);
         for (const auto& move : moves_) move(storage.data(), stream);
@@ -51,7 +50,7 @@ class Upload {
     }
 
   private:
-    static constexpr size_t kAlignment = 256;  // equal to the alignment of the device's allocator
+    static constexpr size_t kAlignment = 256;  // the alignment of CUDA's allocator
 
     size_t num_bytes_ = 0;
     std::vector<std::function<void(unsigned char*, cudaStream_t)>> moves_;

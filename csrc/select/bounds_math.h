@@ -1,8 +1,8 @@
 #pragma once
 
-// Bounds on neighbouring clusters. Where a bound shows that none of the clusters is
-// drawn, none is tested alone. Bounds never change a decision: their margins are larger
-// than the rounding errors on both sides.
+// Bounds on runs of adjacent clusters. If a bound shows that no cluster of a run is
+// drawn, the clusters are not tested one by one. A bound never changes a decision,
+// because its margin exceeds the rounding errors of the bound and of the metric.
 
 #include <cmath>
 #include <cstdint>
@@ -15,12 +15,11 @@
 
 namespace v3dg {
 
-// A relative margin between a metric and a bound on it. It exceeds the rounding errors
-// of both.
+// The relative margin between a metric and its bound.
 constexpr float kBoundMargin = 1e-3f;
 
-// Whether all groups above the clusters certainly fit, so that none of the clusters is
-// drawn.
+// Returns true only if the parent group of each cluster fits the tolerance, so that
+// none of the clusters is drawn.
 V3DG_HD inline bool parents_fit(const ClusterBounds& bounds, const InstanceView& view,
                                 const SelectRule& rule) {
     if (bounds.has_root || rule.footprint == Footprint::paper) return false;
@@ -30,7 +29,7 @@ V3DG_HD inline bool parents_fit(const ClusterBounds& bounds, const InstanceView&
                                   (1.0f - kBoundMargin) * rule.tolerance_px2;
 }
 
-// Whether the own group of each cluster is certainly refined, so that none of the
+// Returns true only if the own group of each cluster is refined, so that none of the
 // clusters is drawn.
 V3DG_HD inline bool owns_are_refined(const ClusterBounds& bounds, const InstanceView& view,
                                      const SelectRule& rule) {
@@ -43,12 +42,13 @@ V3DG_HD inline bool owns_are_refined(const ClusterBounds& bounds, const Instance
            (1.0f + kBoundMargin) * rule.tolerance_px2;
 }
 
-// The tolerances for which a bound has to hold: the tolerance of the rule alone, or
-// also all larger ones.
+// The tolerances for which a bound must hold: that of the rule alone, or that of the
+// rule and all larger ones.
 enum class Tolerances { this_one, from_this_on };
 
-// False only if none of the clusters is drawn at these tolerances. Bounds ignore which
-// pages are absent: a group whose page is absent fits, whatever its bound is.
+// Returns false only if none of the clusters is drawn at these tolerances. The bounds
+// do not consider which pages are resident. A group without a resident page always
+// fits, so owns_are_refined() is used only if all pages are resident.
 V3DG_HD inline bool may_draw(const ClusterTable& table, const ClusterBounds& bounds,
                              const InstanceView& view, const SelectRule& rule,
                              Tolerances tolerances) {
@@ -62,21 +62,24 @@ struct ClusterRange {
     uint32_t first, end;
 };
 
-// A ball whose radius is at most half of its distance covers between pi x2 and
-// kMostOfPi x2 steradians, where x2 is the square of radius over distance.
+// Bounds on the solid angle of a ball, if its radius is at most half its distance. Let
+// x2 be the square of radius / distance. The solid angle is between pi x2 and kMostOfPi
+// x2 steradians.
 constexpr float kMostOfPi = 1.08f;
-// Beyond these limits float32 may lose digits, or squares may overflow.
+// Limits of the test of whole runs. Outside of these, float32 may lose digits, or
+// squares may overflow.
 constexpr float kLeastRunTolerance = 1e-20f, kLeastRunX2 = 1e-30f, kMostRunDistance = 1e18f;
 
-// The clusters that have to be tested one by one. It consists of whole runs; bounds
-// show that no cluster outside of it is drawn at these tolerances.
+// Returns the clusters that must be tested one by one: a contiguous range of whole
+// runs. No cluster outside of the range is drawn at these tolerances.
 V3DG_HD inline ClusterRange clusters_to_ask(const ClusterTable& table, const ClusterRuns& runs,
                                             const InstanceView& view, const SelectRule& rule,
                                             Tolerances tolerances) {
     const float distance = sqrtf(distance2_to(runs.groups, view));
     const float nearest = distance - runs.groups.radius, farthest = distance + runs.groups.radius;
     const float x2 =
-        rule.tolerance_px2 / (float(kPi) * view.px2_per_steradian);  // of the tolerance's ball
+        // (radius / distance)² of a ball whose footprint is the tolerance
+        rule.tolerance_px2 / (float(kPi) * view.px2_per_steradian);
     uint32_t first = 0, last = runs.count;
     if (rule.footprint == Footprint::solid_angle && nearest >= runs.least_distance &&
         farthest <= kMostRunDistance && rule.tolerance_px2 >= kLeastRunTolerance &&

@@ -1,10 +1,10 @@
 // Chooses the tolerance that meets a budget. change_kernel counts by how many gaussians
-// the cuts of neighbouring bins differ (budget_math.h). choose_kernel chooses the
+// the cuts of consecutive bins differ (budget_math.h). choose_kernel then finds the
 // smallest tolerance from which on no cut exceeds the budget.
 //
-// Both run in two rounds. The first round considers no tolerance below half of the last
-// choice, so it need not read the tables of distant instances. The second round does
-// nothing unless the first shows that a smaller tolerance may be the answer.
+// The two kernels run in two rounds. The first round considers only tolerances above
+// half of the last choice, and thus skips the tables of distant instances. The second
+// round considers all tolerances, and runs only if a smaller one may be the answer.
 
 #include "base/scan.cuh"
 #include "select/cut_parts.cuh"
@@ -15,12 +15,12 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kChooseThreads = 1024;
-// The number of bins that one warp of choose_kernel sums.
+// The number of bins that a warp of choose_kernel adds up.
 constexpr uint32_t kWarpBins = (kNumBudgetBins + kChooseThreads - 1) / kChooseThreads * 32;
 constexpr float kMostGuess = 1 << 20;
 
-// Counts by how many gaussians the cut of each bin differs from the cut of the bin
-// before.
+// Counts, for each bin, by how many gaussians its cut differs from the cut of the
+// preceding bin.
 __global__ void change_kernel(PlacedScene scene, SelectRule rule, BudgetRound round,
                               const unsigned* num_parts, Count* change) {
     if (round.is_over()) return;
@@ -57,9 +57,9 @@ __global__ void change_kernel(PlacedScene scene, SelectRule rule, BudgetRound ro
     if (threadIdx.x == 0 && at_first > 0) atomicAdd(&change[0], at_first);
 }
 
-// Chooses the tolerance of the bin after the last one whose cut exceeds the budget;
-// when the budget moves in steps, a tolerance that is not below it. If no bin fits, it
-// sets the number of parts to 0, so that cut_kernel has nothing to do. Runs in one
+// Chooses the first bin from which on no cut exceeds the budget. With
+// BudgetPace::in_steps it may choose a later bin. If every cut exceeds the budget, it
+// sets the number of parts to 0, so that cut_kernel does nothing. Runs in a single
 // block.
 __global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change, CutChoice* choice,
                               BudgetState* state, unsigned* num_parts) {

@@ -1,6 +1,6 @@
 #pragma once
 
-// The state of a budget over consecutive pictures of one camera.
+// The state that a budget keeps between consecutive pictures of one camera.
 
 #include <algorithm>
 #include <memory>
@@ -11,14 +11,15 @@
 
 namespace v3dg {
 
-// The state that consecutive pictures of one camera share: the tolerance of the budget,
-// and for how long nothing has moved. A copy is independent.
+// The last tolerance of a budget, and for how many pictures nothing has moved. Copies
+// are independent.
 class BudgetSteps {
   public:
-    uint32_t last_bin = kNoBin;  // the state of tolerance_of_budget(), on the host
+    // state of tolerance_of_budget(), if it is kept on the host
+    uint32_t last_bin = kNoBin;
 
-    // Returns the rule of the next picture, which shows `scene`. A scene that changes
-    // becomes another object. Without a fade, earlier pictures have no influence.
+    // Returns the rule for the next picture. A changed scene must be a new object.
+    // Without a fade, the rule is returned unchanged.
     SelectRule next(SelectRule rule, const Eyes& eyes, const std::shared_ptr<const void>& scene) {
         if (!rule.fade.is_on()) return rule;
         const bool is_same_scene = !scene_.owner_before(scene) && !scene.owner_before(scene_);
@@ -37,14 +38,14 @@ class BudgetSteps {
     bool has_begun_ = false;
     SelectRule rule_{};
     Eyes eyes_;
-    // does not keep the scene alive, but keeps its address from being reused
+    // Does not keep the scene alive, but ensures that its address is not reused.
     std::weak_ptr<const void> scene_;
     int32_t frames_at_rest_ = 0;
 };
 
-// Returns body(rule, last_bin) for the next picture of the sequence `steps`, and counts
-// the picture unless body throws. If `steps` is null, there is no earlier picture and
-// the rule is unchanged.
+// Calls body(rule, last_bin) for the next picture of a sequence, and returns its
+// result. `steps` is the state of the sequence, which stays unchanged if body throws.
+// If `steps` is null, the picture is the only one, and the rule is unchanged.
 template <class Body>
 auto in_steps(BudgetSteps* steps, const SelectRule& rule, const Eyes& eyes,
               const std::shared_ptr<const void>& scene, const Body& body) {

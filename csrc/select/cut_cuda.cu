@@ -1,18 +1,19 @@
-// The cut of a scene on the device, in two kernels.
+// Selects the cut of a scene on the device, in two kernels.
 //
-// place_kernel has a thread for each instance (place_instances.cuh). The thread
-// transforms the camera into the frame of the instance and chooses the source of its
-// cut: nothing, the top clusters, or the whole table. The kernel divides the work into
-// parts for cut_kernel. A part is up to 256 clusters of one table that bounds could not
-// exclude; or the top clusters of up to 32 neighbouring instances; or the last clusters
-// of their tables, where bounds exclude all but what one lane can test.
+// place_kernel has a thread per instance (place_instances.cuh). A thread transforms the
+// camera into the frame of its instance, and chooses the source of the instance's cut:
+// nothing, the top clusters, or the whole table. The kernel divides the work into parts
+// for cut_kernel. A part is one of three things: up to 256 clusters of one table that
+// bounds could not exclude; the top clusters of up to 32 consecutive instances; or the
+// last clusters of such instances' tables, if one lane per instance suffices.
 //
-// cut_kernel has a block for up to eight parts, one per warp. The block tests which
+// A block of cut_kernel processes up to eight parts, one per warp. It tests which
 // clusters are drawn (cut_parts.cuh), records which pages they need (page_needs.cuh),
-// and writes them at positions given by a prefix sum (write_clusters.cuh).
+// and writes the drawn clusters at positions given by a prefix sum
+// (write_clusters.cuh).
 //
-// With a budget, the kernels of budget_cuda.cu run between these two, in two rounds,
-// each after a place_kernel.
+// With a budget, place_kernel and the kernels of budget_cuda.cu run in two rounds
+// before cut_kernel.
 
 #include "select/select_cuda.h"
 
@@ -30,8 +31,8 @@
 namespace v3dg {
 namespace cuda {
 
-// Where to write the choice of a budget, and the pictures and placements of a frame.
-// Pointers to outputs that are not requested are null.
+// The optional outputs of a cut: the choice of a budget, and the pictures and
+// placements of a frame. Pointers are null if not requested.
 struct Cut::Target {
     EyeImages pictures;
     FrameImage* images;
@@ -41,18 +42,17 @@ struct Cut::Target {
 
 namespace {
 
-constexpr unsigned kCutBlocks = 4;  // blocks per multiprocessor
+constexpr unsigned kCutBlocks = 4;  // resident blocks per multiprocessor
 constexpr unsigned kReportBlocks = 64;
-constexpr unsigned kPlaceBlocks = 12;  // blocks per multiprocessor
+constexpr unsigned kPlaceBlocks = 12;  // resident blocks per multiprocessor
 
-// One thread per bundle.
 __global__ void sides_kernel(const BundleOnDevice* bundles, size_t num_bundles, Eyes eyes,
                              CameraSides* sides) {
     const size_t b = size_t(blockIdx.x) * blockDim.x + threadIdx.x;
     if (b < num_bundles) sides[b] = sides_of_eyes(eyes, bundles[b].table.pad_px);
 }
 
-// One thread per instance. `kAreTwo` says whether there are two eyes.
+// One thread per instance. `kAreTwo`: there are two eyes.
 template <bool kAreTwo>
 __global__ void __launch_bounds__(kPlaceThreads, kAreTwo ? kPlaceBlocks / 2 : kPlaceBlocks)
     place_kernel(PlacedScene scene, Eyes eyes, BundleSides sides, SelectRule rule,
@@ -72,7 +72,8 @@ __global__ void report_kernel(NeedList needs, SelectRule rule, const CutChoice* 
     report_needs(needs, rule, choice);
 }
 
-// `kTells` says whether the kernel records which pages are needed.
+// Tests and writes clusters; see the head of this file. `kTells`: the kernel records
+// which pages are needed.
 template <class Output, bool kTells>
 __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
     cut_kernel(PlacedScene scene, SelectRule rule, const CutChoice* choice,
@@ -85,8 +86,7 @@ __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
     if (num_tickets == 0 && blockIdx.x == 0 && threadIdx.x == 0) output.finish(0, 0);
     if (rule.budget != kNoBudget) rule.tolerance_px2 = choice->tolerance_px2;
     if (!Output::kFades) rule.fade = {};
-    // If there are enough blocks, each of the first blocks processes one ticket and the
-    // others none.
+    // If there is a block for every ticket, each block takes at most one.
     const bool is_enough = num_tickets <= gridDim.x;
     if (is_enough && blockIdx.x >= num_tickets) return;
     for (unsigned ticket = take_ticket(scratch.cut_ticket); ticket < num_tickets;
@@ -118,7 +118,7 @@ __global__ void place_all_kernel(PlacedScene scene, Camera camera, FrameImage im
         placement_of(axes_of_instance(camera, pose), pose, scene.instances.bundle[i], 0);
 }
 
-// One thread per pair. Pairs whose instance is not drawn are left out.
+// One thread per pair. Skips pairs whose instance is not drawn.
 template <class Output>
 __global__ void __launch_bounds__(kCutThreads)
     given_kernel(PlacedScene scene, GivenCut given, CutScratch scratch, Output output) {
@@ -142,8 +142,7 @@ __global__ void __launch_bounds__(kCutThreads)
                    output);
 }
 
-// Returns the number of parts of all tables together if no cluster is excluded by
-// bounds.
+// Returns the number of parts of all instances' tables, if bounds exclude no cluster.
 size_t most_parts(const SceneTables& scene) {
     size_t parts = 0;
     for (size_t b = 0; b < scene.num_bundles(); ++b)
@@ -191,7 +190,7 @@ void Cut::cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule
                              .parts = parts_.reserve(parts, stream)};
     const auto blocks = static_cast<unsigned>(std::clamp<size_t>(parts, 1, 2 * num_places));
     const bool has_budget = rule.budget != kNoBudget;
-    Count* change = zeros + 2 * zeros_of_round(count);  // used with a budget only
+    Count* change = zeros + 2 * zeros_of_round(count);  // used only with a budget
     BudgetState* state = has_budget ? budget_state(stream) : nullptr;
     BundleSides sides{};
     const size_t num_bundles = scene.num_bundles();
@@ -290,7 +289,7 @@ void Cut::select_pairs(const SceneTables& scene, const Eyes& eyes, const SelectR
     const bool has_budget = rule.budget != kNoBudget;
     const bool keeps_bin = has_budget && last_bin != nullptr;
     uint32_t* bin_on_device = keeps_bin ? &budget_state(stream)->last_bin : nullptr;
-    // Most cuts fit into the initial capacity, so the loop runs once.
+    // Repeat with larger buffers if the pairs do not fit. Most cuts fit the first time.
     for (Count capacity = std::max<Count>(1u << 16, pair_instance_.capacity());;
          capacity = counts.pairs) {
         const PairOutput<kFades> output{

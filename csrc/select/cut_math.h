@@ -1,7 +1,7 @@
 #pragma once
 
-// The decision whether a cluster is drawn, and with which weight. select_math.h proves
-// that the decision is exact.
+// Decides whether a cluster is drawn, and with which weight. select_math.h proves that
+// the cut is exact.
 
 #include <cstddef>
 #include <cstdint>
@@ -14,10 +14,10 @@
 
 namespace v3dg {
 
-// Whether the cut consists of the top clusters, which nothing replaces, at full weight,
-// and needs no page. All top groups are tested: with the paper's footprint a group may
-// fail to fit below a group that fits, because that footprint may decrease towards the
-// root.
+// Returns whether the cut of an instance consists of the top clusters, each with weight
+// 1. Then it depends on no page. All top groups must be tested. The paper's footprint
+//    is excluded: it may decrease towards the root, so that a group below a top group
+//    is refined.
 V3DG_HD inline bool tops_fit(const ClusterTable& table, const InstanceView& view,
                              const SelectRule& rule) {
     if (rule.footprint == Footprint::paper) return false;
@@ -26,21 +26,21 @@ V3DG_HD inline bool tops_fit(const ClusterTable& table, const InstanceView& view
     return true;
 }
 
-// The set of clusters that contains the cut of an instance.
+// The clusters among which the cut of an instance is.
 enum class CutSource {
-    nowhere,  // no clusters: the instance is hidden
-    tops,     // the top clusters
-    table,    // all clusters
+    nowhere,  // none: the instance is hidden
+    tops,     // the top clusters: those that no group replaces
+    table,    // all clusters of the table
 };
 
-// Whether the whole instance is culled.
+// Returns whether the whole instance is outside of the frustum.
 V3DG_HD inline bool is_hidden(const ClusterTable& table, const InstanceView& view,
                               const SelectRule& rule) {
     return rule.culls && is_outside(table.bounds, view);
 }
 
-// Returns the source of an instance's cut. The top clusters are tested only if there
-// are at most `most_tops`.
+// Returns the source of an instance's cut. The result is CutSource::tops only if the
+// bundle has at most `most_tops` top clusters.
 V3DG_HD inline CutSource source_of_cut(const ClusterTable& table, const InstanceView& view,
                                        const SelectRule& rule, size_t most_tops) {
     if (is_hidden(table, view, rule)) return CutSource::nowhere;
@@ -48,16 +48,15 @@ V3DG_HD inline CutSource source_of_cut(const ClusterTable& table, const Instance
     return has_few_tops && tops_fit(table, view, rule) ? CutSource::tops : CutSource::table;
 }
 
-// The bins of a budget whose cuts contain a cluster.
+// A range of bins: those whose cuts contain a certain cluster.
 struct BinRange {
     uint32_t first, end;
 
     V3DG_HD bool is_empty() const { return first >= end; }
 };
 
-// Computes the answers about a group anew at each call. The bins of a budget are
-// computed as if all pages were resident, so that the tolerance does not depend on
-// residency.
+// Computes the state of a group at each call. The bins of a budget assume that all
+// pages are resident, so that the tolerance does not depend on residency.
 struct AskedGroups {
     const ClusterTable& table;
     const InstanceView& view;
@@ -67,8 +66,8 @@ struct AskedGroups {
         return min_of(v3dg::refinement(metric_px2(table, g, view, rule), rule),
                       arrival(table.pages, g, rule));
     }
-    // The first bin of a budget in which the group fits, and the first in which it is
-    // no longer refined.
+    // Return the first bin in which the group fits, and the first in which it is not
+    // refined.
     V3DG_HD uint32_t first_fitting(int32_t g) const {
         return bin_of_metric(wanted_metric_px2(table, g, view, rule) * rule.fade.factor,
                              rule.tolerance_px2);
@@ -79,21 +78,20 @@ struct AskedGroups {
     }
 };
 
-// The decision about each cluster of an instance's table. `Groups` is AskedGroups, or a
-// type with the same members that looks up stored answers.
+// The decision about each cluster of one instance. `Groups` is AskedGroups, or a type
+// with the same members that looks up stored results.
 template <class Groups>
 struct InstanceCut {
     const ClusterTable& table;
     const InstanceView& view;
     const SelectRule& rule;
     Groups groups;
-    bool culls;  // whether some of the clusters may lie outside of the frustum
+    bool culls;  // false if all boxes are inside the frustum
 
     V3DG_HD bool is_culled(size_t c) const { return culls && is_outside(table.box[c], view); }
 
-    // Returns the weight of the cluster before culling, out of kWhole: the refinement
-    // of the group above minus the refinement of its own group. The head of
-    // select_math.h proves that the cut is exact.
+    // Returns the weight of a cluster before culling, in units of 1 / kWhole: the
+    // refinement of its parent group minus that of its own group (select_math.h).
     V3DG_HD int32_t weight(size_t c) const {
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
         const int32_t below = own < 0 ? 0 : groups.refinement(own);
@@ -101,14 +99,14 @@ struct InstanceCut {
         return above - below;
     }
 
-    // As weight(), but 0 for clusters that are culled or not in the cut.
+    // Like weight(), but 0 for clusters that are culled or not in the cut.
     V3DG_HD int32_t drawn_weight(size_t c) const {
         const int32_t drawn = weight(c);
         return drawn > 0 && !is_culled(c) ? drawn : 0;
     }
 
-    // Returns the bins of a budget whose cuts contain the cluster; with a fade, those
-    // whose cuts may contain it.
+    // Returns the bins whose cuts contain the cluster. With a fade, the range may be
+    // too large.
     V3DG_HD BinRange bins(size_t c) const {
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
         const BinRange range{own < 0 ? 0 : groups.first_unrefined(own),
@@ -117,7 +115,8 @@ struct InstanceCut {
     }
 };
 
-// Returns the cut of an instance whose answers are computed at each call.
+// Returns the decisions of an instance, with the states of groups computed at each
+// call.
 V3DG_HD inline InstanceCut<AskedGroups> cut_by_asking(const ClusterTable& table,
                                                       const InstanceView& view,
                                                       const SelectRule& rule) {

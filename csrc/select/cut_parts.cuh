@@ -11,50 +11,51 @@ namespace cuda {
 
 using Count = unsigned long long;
 
-constexpr unsigned kLaneClusters = kClustersOfBounds;  // clusters of a table's part for each lane
+// clusters per lane in a part of a table
+constexpr unsigned kLaneClusters = kClustersOfBounds;
 constexpr unsigned kPartSize = 32 * kLaneClusters;
 constexpr unsigned kCutThreads = 256, kCutWarps = kCutThreads / 32;
 static_assert(kLaneClusters == 8, "a byte says which of them are drawn");
 
-// The work of one warp. If `lanes` is zero: clusters [first, first + kPartSize) of one
-// instance's table. Else each set bit k of `lanes` assigns instance + k to a lane,
-// which processes its top clusters or the last clusters of its table.
+// The work of one warp. If `lanes` is 0, the part is clusters [first, first +
+// kPartSize) of one instance. Otherwise each set bit k of `lanes` means that lane k
+// processes instance + k: its top clusters, or the last clusters of its table.
 struct CutPart {
     uint32_t instance, first, lanes;
 };
 
-// Returns the first of a table's last, coarsest clusters, which are few enough for a
-// single lane to test.
+// Returns the index of the first of a table's last clusters: the coarsest ones, which a
+// single lane can test.
 __device__ inline uint32_t last_of_table(const ClusterTable& table) {
     return static_cast<uint32_t>(table.num_clusters() - 1) / kLaneClusters * kLaneClusters;
 }
 
-// A scene, and the output of place_kernel about its instances.
+// A scene, and what place_kernel writes about its instances.
 struct PlacedScene {
     const BundleOnDevice* bundles;
     InstanceTable instances;
-    InstanceView* views;  // written for instances whose tables are tested
-    // For an instance that a single lane processes: a bit for each top cluster that is
-    // drawn, or 0 if the lane tests the last clusters of the table.
+    InstanceView* views;  // set for instances whose tables are tested
+    // For an instance that a single lane processes: one bit per drawn top cluster; or 0
+    // if the lane tests the last clusters of the table.
     uint8_t* tops;
     CutPart* parts;
 };
 
-// The state that one search for the tolerance of a budget leaves for the next search.
+// The state that the search for a budget's tolerance keeps for the next frame.
 struct BudgetState {
-    float guess = 0.0f;  // a tolerance that is probably below the next choice
-    unsigned again = 0;  // nonzero if the guess was too high, so that the second round has to run
-    uint32_t last_bin = kNoBin;  // the state of tolerance_of_budget()
+    float guess = 0.0f;          // a tolerance that is probably below the next choice
+    unsigned again = 0;          // nonzero if the guess was too high: the second round must run
+    uint32_t last_bin = kNoBin;  // state of tolerance_of_budget()
 };
 
-// A round of the search for the tolerance of a budget. The first round considers no
-// tolerance below the guess; the second considers all tolerances. Without a budget
-// there is one round, and no state.
+// A round of the search for a budget's tolerance. The first round considers tolerances
+// from the guess on; the second, all tolerances. Without a budget there is only one
+// round, and `state` is null.
 struct BudgetRound {
     const BudgetState* state;
     bool is_second;
 
-    // Whether there is nothing to do, because the first round found the tolerance.
+    // Returns true if the first round has found the tolerance.
     __device__ bool is_over() const { return is_second && state->again == 0; }
     __device__ float least_tolerance(const SelectRule& rule) const {
         return state == nullptr || is_second ? rule.tolerance_px2
@@ -62,16 +63,15 @@ struct BudgetRound {
     }
 };
 
-// Enqueues the choice of the tolerance. `change` contains kNumBudgetBins zeros before
-// the first round. `num_parts` is on the device, and becomes 0 if no cut fits the
-// budget.
+// Enqueues one round of choosing the tolerance. `change` must have kNumBudgetBins zeros
+// before the first round. `num_parts` is in device memory, and becomes 0 if no cut fits
+// the budget.
 void choose_tolerance(const PlacedScene& scene, const SelectRule& rule, const BudgetRound& round,
                       unsigned num_blocks, unsigned* num_parts, Count* change, CutChoice* choice,
                       BudgetState* state, cudaStream_t stream);
 
-// The weights of a lane's clusters, at most kWhole each, packed in 16 bits from the
-// lowest on. Weights are read by shifting: an index would move the two integers from
-// registers to memory.
+// The weights of a lane's clusters, 16 bits each, from the lowest bits up. Weights are
+// read by shifting. Indexing an array would move it from registers to memory.
 struct alignas(16) LaneWeights {
     uint64_t low, high;
 
@@ -85,13 +85,14 @@ struct alignas(16) LaneWeights {
 };
 static_assert(kLaneClusters == 8 && kWhole < 1 << 16, "two words hold the weights of a lane");
 
-// The clusters of a part that one lane processes. All belong to one instance; a bit for
-// each says whether it is drawn. Weights are set only in cuts with a fade.
+// The clusters of a part that one lane processes. All belong to one instance. Bit k of
+// `drawn` is set if the k-th cluster is drawn. Weights are set only in cuts with a
+// fade.
 struct LaneClusters {
     const BundleOnDevice* bundle;
     uint32_t instance;
-    uint32_t first;  // index in the table
-    bool is_alone;   // whether this lane alone has the instance; else all lanes of the warp have it
+    uint32_t first;  // index of the first cluster in the table
+    bool is_alone;   // each lane has another instance; else the warp has a single one
     bool are_tops;
     unsigned drawn;
     LaneWeights weights;
@@ -99,8 +100,7 @@ struct LaneClusters {
     __device__ int32_t cluster(unsigned k) const {
         return are_tops ? bundle->table.top_cluster[k] : static_cast<int32_t>(first + k);
     }
-    // Returns the number of gaussians in `count` neighbouring clusters from the k-th
-    // on.
+    // Returns the number of gaussians in `count` clusters, from the k-th on.
     __device__ unsigned size(unsigned k, unsigned count = 1) const {
         const int32_t c = cluster(k);
         return static_cast<unsigned>(bundle->table.offset[c + count] - bundle->table.offset[c]);
@@ -108,7 +108,7 @@ struct LaneClusters {
     __device__ const ClusterBounds& bounds() const { return bundle->bounds[first / kLaneClusters]; }
 };
 
-// Returns the clusters of a lane. Those of a table are not tested yet.
+// Returns the clusters that the lane processes. Clusters of a table are not tested yet.
 __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const CutPart& part) {
     const unsigned lane = threadIdx.x % 32;
     const bool is_alone = part.lanes != 0;
@@ -131,30 +131,32 @@ __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const 
     return mine;
 }
 
-// Tests the clusters of the tables that the warps of a block have parts of. Called by
-// the whole block. A lane owns clusters that need a test if their bounds do not exclude
-// all of them. All warps of the block share the tests, a lane per cluster and four
-// owners at a time, so that no warp waits long for one whose part needs more tests.
-// Each owner receives a bit for each of its clusters for which ask(bundle, view,
-// cluster) is positive, and with `kKeepsWeights` also the value itself.
+// Tests the clusters of a block's parts that come from tables. All threads of the block
+// must call it. A lane is an owner if the bounds of its clusters do not exclude all of
+// them. The warps share the tests of all owners, a lane per cluster and four owners at
+// a time, so that no warp waits long for one with more owners.
+//
+// Sets bit k of an owner's `drawn` if ask(bundle, view, cluster) is positive for its
+// k-th cluster. With `kKeepsWeights`, it also stores the values in `weights`.
 template <bool kKeepsWeights, class Ask>
 __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
                              Tolerances tolerances, LaneClusters& mine, const Ask& ask) {
     struct Table {
-        const BundleOnDevice* bundle;  // null: each lane has an instance of its own
-        // first cluster; if each lane has an instance, the instance of the first lane
+        const BundleOnDevice* bundle;  // null if each lane has another instance
+        // first cluster; if `bundle` is null, instance of the first lane
         uint32_t first;
     };
     __shared__ InstanceView views[kCutWarps];
     __shared__ Table tables[kCutWarps];
     __shared__ unsigned num_owners[kCutWarps];
-    __shared__ uint8_t owners[kCutThreads];  // threads that own clusters
-    __shared__ uint8_t drawn[kCutThreads];   // a bit for each of a thread's clusters
+    __shared__ uint8_t owners[kCutThreads];  // indices of threads that own clusters
+    __shared__ uint8_t drawn[kCutThreads];   // [thread] one bit per drawn cluster
     __shared__ LaneWeights weights[kKeepsWeights ? kCutThreads : 1];
     static_assert(kCutThreads <= 256, "a byte says which thread");
     const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
     bool is_owner = false;
-    if (!mine.is_alone && mine.bundle != nullptr) {  // the condition is uniform in the warp
+    // the condition is equal in all lanes of the warp
+    if (!mine.is_alone && mine.bundle != nullptr) {
         const auto* view = reinterpret_cast<const uint32_t*>(scene.views + mine.instance);
         for (unsigned w = lane; w < sizeof(InstanceView) / sizeof *view; w += 32)
             reinterpret_cast<uint32_t*>(views + warp)[w] = view[w];
@@ -188,7 +190,7 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
         if (is_one) {
             const Table& of = tables[owner / 32];
             const bool is_alone = of.bundle == nullptr;
-            // valid only if the owner's lane has an instance of its own
+            // used only if the owner's lane has its own instance
             const uint32_t instance = of.first + owner % 32;
             const BundleOnDevice* bundle =
                 is_alone ? &scene.bundles[scene.instances.bundle[instance]] : of.bundle;

@@ -1,20 +1,19 @@
 #pragma once
 
-// The output lists of a cut: pairs, or the items of a frame. A lane first counts what
-// it will write for its clusters. It writes after a prefix sum has given its position
-// in the list.
+// The output lists of a cut: pairs, or the items of a frame. A lane counts its elements
+// first. It writes them after a prefix sum over all lanes has given their position.
 
 #include "select/cut_parts.cuh"
 
 namespace v3dg {
 namespace cuda {
 
-// The amount that a lane will write.
+// What a lane will write.
 struct WriteCount {
-    unsigned units, gaussians;  // units are elements of the list
+    unsigned units, gaussians;  // `units`: number of list elements
 };
 
-// The list of selected pairs (instance, cluster), with weights if there is a fade.
+// A list of selected pairs (instance, cluster), with weights if there is a fade.
 template <bool kHasFade>
 struct PairOutput {
     static constexpr bool kFades = kHasFade;
@@ -47,9 +46,9 @@ struct PairOutput {
     }
 };
 
-// Neighbouring clusters that are drawn together for the lane's instance; or one cluster
-// that is drawn for all instances of `sharers`, a bit mask that starts at the first
-// instance of the part.
+// One drawn element: adjacent clusters of the lane's instance; or, if `sharers` is not
+// 0, one cluster of several instances. Bit j of `sharers` stands for instance j of the
+// part.
 struct DrawnRun {
     unsigned k, num_clusters;
     uint32_t sharers;
@@ -58,16 +57,18 @@ struct DrawnRun {
     __device__ unsigned gaussians_an_item() const { return kItemSize / num_instances; }
 };
 
-// Whether a warp is faster when it processes a cluster's gaussians one by one, each for
-// all instances at once, than when it processes the instances one by one. An item costs
-// as much as two more rounds.
+// Returns whether a warp draws a cluster of several instances faster as a shared item.
+// In a shared item it processes the gaussians one by one, each for all instances at
+// once. Otherwise it processes the instances one by one, 32 gaussians at a time;
+// starting an item costs as much as two such steps.
 __device__ inline bool is_worth_sharing(unsigned num_gaussians, unsigned num_instances) {
     return num_instances > 1 &&
            num_gaussians <= num_instances * (blocks_for(num_gaussians, 32) + 2);
 }
 
-// Calls visit(DrawnRun) in the lane that writes the run. Called by the whole warp. With
-// a fade, clusters of different weights are not drawn together.
+// Calls visit(DrawnRun) for each drawn element, in the lane that writes it. All lanes
+// of the warp must call it. With a fade, adjacent clusters of different weights are
+// separate.
 template <bool kFades, class Visit>
 __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
     if (!mine.is_alone) {
@@ -99,14 +100,14 @@ __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
     }
 }
 
-// The list of selected clusters as items of a frame. Neighbouring clusters share an
-// item, and so do neighbouring instances of a coarse cluster. Each item is written for
-// every picture.
+// The list of selected clusters as items of a frame. Adjacent clusters of an instance
+// share an item, and so may consecutive instances of one coarse cluster. Each item is
+// written once per picture.
 template <bool kHasFade>
 struct ItemOutput {
     static constexpr bool kFades = kHasFade;
     ItemList items;
-    uint32_t num_pictures, num_placements;  // number of placements in one picture
+    uint32_t num_pictures, num_placements;  // `num_placements`: in one picture
 
     __device__ WriteCount count(const LaneClusters& mine) const {
         WriteCount count{0, 0};

@@ -1,6 +1,6 @@
 #pragma once
 
-// Culling: whether boxes lie outside of the planes that bound what a camera sees.
+// Culling: tests whether boxes are outside of a camera's frustum.
 
 #include <cfloat>
 #include <cmath>
@@ -10,10 +10,12 @@
 
 namespace v3dg {
 
-// The position of a box relative to a plane, in units of the plane's normal.
+// The position of a box relative to a plane, in units of the length of the plane's
+// normal.
 struct PlaneSide {
-    float nearest, farthest;  // signed distances of the box's nearest and farthest corners
-    float reach;  // a bound on how far gaussians extend beyond the box, plus rounding errors
+    float nearest, farthest;  // signed distances of the nearest and farthest corner
+    // how far gaussians may extend beyond the box, plus a margin for rounding errors
+    float reach;
 };
 
 V3DG_HD inline PlaneSide side_of(const Box& box, const InstanceView& view, int p) {
@@ -31,7 +33,8 @@ V3DG_HD inline PlaneSide side_of(const Box& box, const InstanceView& view, int p
             plane.guard * half_depth + 16.0f * FLT_EPSILON * terms};
 }
 
-// Whether no gaussian in the box can touch a pixel. False if a number is NaN.
+// Returns true only if no gaussian in the box can touch a pixel. Returns false if a
+// number is NaN.
 V3DG_HD inline bool is_outside(const Box& box, const InstanceView& view) {
     for (int p = 0; p < kNumPlanes; ++p) {
         const PlaneSide side = side_of(box, view, p);
@@ -40,7 +43,8 @@ V3DG_HD inline bool is_outside(const Box& box, const InstanceView& view) {
     return false;
 }
 
-// Whether no box inside this one is outside of the frustum. False if a number is NaN.
+// Returns true only if is_outside() is false for every box inside this one. Returns
+// false if a number is NaN.
 V3DG_HD inline bool is_inside(const Box& box, const InstanceView& view) {
     for (int p = 0; p < kNumPlanes; ++p) {
         const PlaneSide side = side_of(box, view, p);

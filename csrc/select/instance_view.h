@@ -1,6 +1,6 @@
 #pragma once
 
-// The camera in the coordinates of one instance; selection reads nothing else of a
+// The camera in the coordinates of an instance, which is all that selection reads of a
 // camera.
 
 #include "camera/camera.h"
@@ -8,32 +8,33 @@
 
 namespace v3dg {
 
-// The number of planes that bound what a camera sees.
+// The number of planes of a frustum.
 constexpr int kNumPlanes = Intrinsics<double>::kNumPlanes;
 
 // A camera, or two eyes, in the coordinates and units of one instance. With two eyes,
-// distances are to the nearer one, and the planes enclose both frusta. The struct is
-// aligned so that a thread reads and writes it in few instructions.
+// distances are measured to the nearer eye, and the planes enclose both frusta. The
+// alignment lets a thread access the struct in few instructions.
 struct alignas(16) InstanceView {
     float eye[3], other_eye[3];
     bool has_other_eye;
-    float forward[3];         // the direction of the camera, unit length
-    float px2_per_steradian;  // of the camera, times the importance of the instance
-    Plane plane[kNumPlanes];  // what lies outside of any plane is not drawn
+    float forward[3];         // viewing direction, unit length
+    float px2_per_steradian;  // the camera's value times the instance's importance
+    Plane plane[kNumPlanes];  // a gaussian outside of any plane is not drawn
 };
 
-// The frustum planes of both eyes in camera coordinates, the same for all instances of
-// a bundle.
+// The side planes of a frustum in camera coordinates, around both eyes. They are the
+// same for all instances of a bundle.
 using CameraSides = Intrinsics<double>::Sides;
 
-// Returns planes pad_px outside of the requested part of the image.
+// Returns the side planes around the requested part of the image, moved outwards by
+// pad_px.
 V3DG_HD inline CameraSides sides_of_eyes(const Eyes& eyes, double pad_px) {
     return Intrinsics<double>::sides_of(eyes.camera, eyes.count(), pad_px);
 }
 
-// Transforms the cameras into the coordinates of an instance. `in` has the axes of the
-// first eye, `sides` the planes for the instance's bundle. The CPU and CUDA compile
-// this without contraction, so that both give the same bits.
+// Transforms the camera into the coordinates of an instance. `in` are the axes of the
+// first eye; `sides` belong to the instance's bundle. This is compiled without
+// floating-point contraction, so that the CPU and CUDA compute the same bits.
 V3DG_HD inline InstanceView view_from_instance(const Eyes& eyes, const CameraSides& sides,
                                                const InstanceAxes& in, const Pose& pose,
                                                float importance) {

@@ -1,7 +1,7 @@
 #pragma once
 
-// Finds the pages that a cut needs, and their urgency, if only some pages of a bundle
-// are resident.
+// Finds the pages that a cut needs, and their priorities. Used when only some pages of
+// a bundle are resident.
 
 #include <cfloat>
 #include <cmath>
@@ -13,32 +13,31 @@
 
 namespace v3dg {
 
-// Returns the priority of a group's page: above 1 if this cut would refine the group,
-// at most 1 if only a cut with a smaller tolerance would. A fade raises the priority.
+// Returns the priority of a group's page. It is above 1 if the cut would refine the
+// group, and at most 1 if only a cut with a smaller tolerance would. A fade raises it.
 V3DG_HD inline float priority_of(float metric_px2, const SelectRule& rule) {
     const float ratio = metric_px2 * rule.fade.factor / rule.tolerance_px2;
     if (fits(metric_px2, rule)) return ratio <= 1.0f ? ratio : 0.0f;
     return ratio > 1.0f ? ratio : 1.0f + FLT_EPSILON;
 }
-// Pages are requested ahead of use from this priority on.
+// Pages with at least this priority are requested, which is before they are needed.
 constexpr float kLeastPriority = 0.5f;
 
-// A page that a cut needs, and its priority.
+// A page that a cut needs.
 struct PageNeed {
     int32_t page;  // -1: no page
     float priority;
 };
 
-// Returns the page that an instance needs because of a cluster that is not culled. The
-// pages above that page are needed, too. `priority` maps a group to the priority of its
-// page.
+// Returns the page that an instance needs because of cluster c, which must not be
+// culled. The pages above that page are needed, too. priority(g) returns the priority
+// of group g's page.
 //
-// Once all pages with a priority above 1 and the pages above those are resident, the
-// cut is the same as with every page resident: each cluster of that cut has its page,
-// and a cluster that stands in for finer ones requests their page. It requests that
-// page even when the page is resident, since all of the finer clusters may be culled: a
-// page that was needed only while absent would be loaded and evicted in an endless
-// cycle.
+// When all pages with a priority above 1 are resident, and all pages above them, the
+// cut is the same as if every page were resident. A cluster that is drawn in place of
+// finer clusters requests their page, even if that page is already resident. Otherwise
+// a page whose clusters are all culled would be needed only while it is absent, and
+// would be loaded and evicted again and again.
 template <class Priority>
 V3DG_HD inline PageNeed page_need(const ClusterTable& table, size_t c, const Priority& priority) {
     const int32_t own = table.own_group[c], parent = table.parent_group[c];

@@ -1,8 +1,7 @@
 #pragma once
 
-// Places instances in front of the cameras, chooses the source of each instance's cut,
-// and divides the tables that need tests into parts. Each thread processes one
-// instance.
+// Transforms the cameras into the frame of each instance, chooses the source of the
+// instance's cut, and divides the work into parts. One thread per instance.
 
 #include "base/scan.cuh"
 #include "select/cut_scratch.cuh"
@@ -11,16 +10,16 @@ namespace v3dg {
 namespace cuda {
 
 constexpr unsigned kFewBundles = 8;
-// Parts are kept small if there are few instances, so that a few instances also occupy
-// the whole device.
+// With at most kFewInstances instances, a part has at most kFewLanes lanes, so that the
+// parts occupy the whole device.
 constexpr unsigned kFewInstances = 8192, kFewLanes = 8;
 
-// The frustum sides for each bundle. Computing them per instance would cost eight
-// divisions of doubles each. They are a kernel argument if there are few bundles, and
-// in memory if there are more.
+// The frustum sides for each bundle. Computing them per instance instead would cost
+// eight divisions of doubles. Few bundles fit into a kernel argument; more are in
+// memory.
 struct BundleSides {
     CameraSides few[kFewBundles];
-    const CameraSides* many;  // null if there are few bundles
+    const CameraSides* many;  // null if `few` is used
 
     __device__ CameraSides operator[](size_t bundle) const {
         if (many != nullptr) return many[bundle];
@@ -28,8 +27,8 @@ struct BundleSides {
     }
 };
 
-// Returns the placement of an instance in front of an eye. Of n instances, instance i
-// has placement eye * n + i.
+// Returns the placement of an instance in front of an eye. With n instances, instance i
+// has the index eye * n + i among the placements.
 __device__ inline Placement placement_of(const InstanceAxes& axes, const Pose& pose, int32_t bundle,
                                          unsigned eye) {
     return {.view = model_view_from_instance(axes, pose),
@@ -37,15 +36,15 @@ __device__ inline Placement placement_of(const InstanceAxes& axes, const Pose& p
             .image = eye};
 }
 
-// One record per lane of a warp, staged in shared memory so that the writes to memory
-// coalesce.
+// One record per lane of a warp, in shared memory, so that the warp writes them to
+// global memory with coalesced stores.
 template <class Record>
 struct RecordRow {
     Record* records;
 
     __device__ void set(const Record& mine) const { records[threadIdx.x % 32] = mine; }
-    // Writes the records of the lanes that have one to consecutive positions from
-    // `first` on, as whole rows of memory. All lanes of the warp take part.
+    // Writes the records of the lanes with `has_one` to consecutive positions from
+    // `first` on. All lanes of the warp must call it.
     __device__ void write(bool has_one, Record* first) const {
         constexpr unsigned kVectors = sizeof(Record) / sizeof(uint4);
         static_assert(sizeof(Record) % sizeof(uint4) == 0 && alignof(Record) % sizeof(uint4) == 0,
@@ -60,7 +59,7 @@ struct RecordRow {
             const unsigned v = 32 * k + threadIdx.x % 32;
             if (writers >> v / kVectors & 1) to[v] = from[v];
         }
-        __syncwarp();  // the next records must not overwrite these
+        __syncwarp();  // later calls of set() overwrite the records
     }
 };
 
@@ -68,11 +67,11 @@ struct RecordRow {
 struct Placed {
     CutSource source;
     ClusterRange asked;  // the clusters to test, if the source is the table
-    bool is_alone;       // whether a single lane tests them
+    bool is_alone;       // whether a single lane tests these clusters
 };
 
-// Places instance i, if it exists, and writes its view, its placements and its top
-// clusters. All lanes of the warp take part, with consecutive instances.
+// Places instance i, if it exists: writes its view, its placements and its drawn top
+// clusters. All lanes of the warp must call it, with consecutive instances.
 __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, const Eyes& eyes,
                                         const BundleSides& sides, const SelectRule& rule,
                                         Placement* placements) {
@@ -97,8 +96,8 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
             const InstanceAxes axes = axes_of_instance(eyes.camera[0], pose);
             view =
                 view_from_instance(eyes, sides[bundle], axes, pose, scene.instances.importance[i]);
-            // The placement is staged before the instance is known to be visible, so
-            // that its axes occupy no registers until then.
+            // Store the placement now, before it is known whether the instance is
+            // visible. Then its axes need no registers any more.
             if (placements != nullptr) placement_row.set(placement_of(axes, pose, bundle, 0));
         }
         source = source_of_cut(table, view, rule, kLaneClusters);
@@ -110,7 +109,8 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
             scene.tops[i] = static_cast<uint8_t>(drawn);
             if (drawn == 0) source = CutSource::nowhere;
         }
-        // A budget's tolerance is not known yet, so it is read only here.
+        // With a budget, the tolerance is not known yet, so the bounds must hold for
+        // all larger tolerances as well.
         if (source == CutSource::table) {
             asked = clusters_to_ask(
                 table, scene.bundles[bundle].runs, view, rule,
@@ -136,11 +136,12 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
 }
 
 // Writes the parts of a block's instances behind those of earlier blocks, and clears
-// the states of cut_kernel. Called by the whole block. Returns the number of parts up
-// to and including this block.
+// the states of cut_kernel. All threads of the block must call it. Returns the number
+// of parts up to and including this block.
 //
-// Consecutive instances that a single lane can process, with no full table in between,
-// form one part, which the thread of the first instance writes.
+// Consecutive instances that a single lane each can process form one part, unless an
+// instance with a full table is between them. The thread of the first instance writes
+// it.
 __device__ inline unsigned write_parts(const PlacedScene& scene, const Placed& placed, size_t block,
                                        size_t i, const CutScratch& scratch) {
     const unsigned lane = threadIdx.x % 32, below = (1u << lane) - 1;
@@ -178,9 +179,10 @@ __device__ inline unsigned write_parts(const PlacedScene& scene, const Placed& p
                        .first = placed.asked.first + p * kPartSize,
                        .lanes = 0};
     }
-    // Together, the blocks clear as many tickets as cut_kernel has concurrent blocks.
-    // This block also clears the tickets whose first part is its own, if tickets have
-    // kCutWarps parts.
+    // Clear the states of all tickets that cut_kernel may use. If tickets have
+    // kCutWarps parts, each block clears the tickets that begin with one of its parts.
+    // If tickets have fewer, there are at most num_places tickets, which all blocks
+    // clear together.
     const auto clear = [&](unsigned first, unsigned end, unsigned step) {
         for (unsigned t = first; t < end; t += step)
             scratch.unit_state[t] = scratch.count_state[t] = 0;

@@ -8,17 +8,18 @@
 
 namespace v3dg {
 
-// How the screen area of a ball is measured.
+// The measure of a ball's screen area.
 enum class Footprint {
-    solid_angle,  // the solid angle of the ball, so turning the camera changes nothing
-    paper,        // pi r^2 fx fy / depth^2, for pinholes only; Yang et al., SIGGRAPH 2025
+    // the ball's solid angle, which does not change when the camera rotates
+    solid_angle,
+    paper,  // pi r² fx fy / depth², only for pinholes (Yang et al., SIGGRAPH 2025)
 };
 
-// The budget of a rule without one.
+// The value of SelectRule::budget that means no limit.
 constexpr uint64_t kNoBudget = ~uint64_t(0);
 
-// If a metric is within this factor of the tolerance, both of two levels are drawn,
-// with weights.
+// A fade. If a group's metric is within `factor` of the tolerance, both its finer and
+// its coarser clusters are drawn, with weights that add up to 1.
 struct Fade {
     float factor = 1.0f, inverse = 1.0f;
 
@@ -28,27 +29,29 @@ struct Fade {
     }
 };
 
-// How the tolerance that meets a budget is chosen.
+// How a budget determines the tolerance.
 enum class BudgetPace {
-    at_once,  // from one view alone
-    // also from the tolerance of the frame before, so that slow motion causes no leaps
-    // (budget_steps.h)
+    at_once,  // from the current view alone
+    // from the current view and the tolerance of the last frame, so that slow motion
+    // causes no sudden change (budget_steps.h)
     in_steps,
-    again,  // for a frame that is drawn again: no step, unless the budget requires one
+    // for drawing a frame again: keeps the tolerance, unless the cut exceeds the budget
+    again,
 };
 
-// The requirements that a cut fulfils.
+// The conditions that a cut satisfies.
 struct SelectRule {
     float tolerance_px2;
     Footprint footprint = Footprint::solid_angle;
-    bool culls = true;            // leave out what lies outside of the frustum
-    int32_t min_level = 0;        // finer levels are not drawn
-    uint64_t budget = kNoBudget;  // most gaussians; the tolerance is raised until the cut fits
+    bool culls = true;      // leave out clusters that are outside of the frustum
+    int32_t min_level = 0;  // finer levels are not drawn
+    // largest number of gaussians; the tolerance is raised until the cut has no more
+    uint64_t budget = kNoBudget;
     BudgetPace pace = BudgetPace::at_once;
-    int32_t frames_at_rest = 0;  // in steps: number of frames, including this one, without motion
-    Fade fade = {};  // off with the paper's footprint, which may decrease towards the root
-    // with a fade: the number of the frame, from which the fade of a pool's pages
-    // follows
+    // for in_steps: number of frames without motion, including this one
+    int32_t frames_at_rest = 0;
+    Fade fade = {};  // must be off with Footprint::paper
+    // with a fade: index of the frame, which determines how far pages have faded in
     int32_t frame = 0;
 
     bool operator==(const SelectRule& o) const {

@@ -1,6 +1,6 @@
-// Selection on the CPU. Threads process chunks of instances. The refinement of each
-// group is computed once for an instance and then looked up by its clusters, so the
-// decision is made in two passes (select_math.h).
+// Selection on the CPU. Threads process chunks of instances. For an instance, the
+// refinement of each group is computed once; the clusters then look it up. So the
+// decision about a cluster takes two passes (select_math.h).
 
 #include "select/select.h"
 
@@ -17,11 +17,11 @@ namespace {
 
 constexpr size_t kChunk = 16;
 constexpr size_t kBudgetParts = 16;
-// Finding the runs of a bundle costs about as much as processing one instance, so it
-// pays from this many instances on.
+// The number of instances from which on the runs of a bundle are computed. That costs
+// about as much as processing one instance.
 constexpr size_t kManyInstances = 16;
 
-// The stored answers for the groups of one instance: how far each is refined, and its
+// Stored states of the groups of one instance: how far each group is refined, and its
 // bins.
 struct KnownRefinements {
     const uint16_t* of_group;
@@ -38,11 +38,12 @@ struct KnownBins {
     uint32_t first_unrefined(int32_t g) const { return of_group[g].unrefined; }
 };
 
-// The input, and numbers that all instances share.
+// The input of a selection, and values that all instances share.
 struct View {
     const SelectInput& in;
     std::vector<CameraSides> sides;  // one per bundle
-    std::vector<ClusterRuns> runs;   // one per bundle after find_runs(); empty for few instances
+    // one per bundle, set by find_runs(); empty if there are few instances
+    std::vector<ClusterRuns> runs;
     size_t most_groups = 0, most_clusters = 0;  // largest numbers in any bundle
 
     explicit View(const SelectInput& input) : in(input) {
@@ -63,13 +64,14 @@ struct View {
     }
 };
 
-// A range of clusters of a table, and a range of groups that includes all groups of
-// those clusters.
+// The clusters of a table that must be tested, and a range that contains all of their
+// groups.
 struct Asked {
     ClusterRange clusters, groups;
 };
 
-// An instance in front of the camera. An instance that is not drawn is hidden.
+// An instance in front of the camera. Its source is CutSource::nowhere if it is not
+// drawn.
 struct SeenInstance {
     const ClusterTable& table;
     InstanceView view;
@@ -90,8 +92,8 @@ struct SeenInstance {
         return is_drawn ? source_of_cut(table, view, rule, SIZE_MAX) : CutSource::nowhere;
     }
 
-    // Returns the decision that looks its answers up in `groups`, which is filled in
-    // later.
+    // Returns the decisions of this instance. `groups` has the states of the groups,
+    // which may be filled in later.
     template <class Groups>
     InstanceCut<Groups> cut(const SelectRule& rule, const Groups& groups) const {
         return {table, view, rule, groups, rule.culls && !is_inside(table.bounds, view)};
@@ -99,15 +101,15 @@ struct SeenInstance {
 
     AskedGroups groups(const SelectRule& rule) const { return {table, view, rule}; }
 
-    // Returns the clusters and groups that have to be tested at these tolerances.
+    // Returns the clusters and the groups that must be tested at these tolerances.
     Asked asked(const View& of, size_t i, const SelectRule& rule, Tolerances tolerances) const {
         const ClusterRuns& runs = of.runs[of.in.instances.bundle[i]];
         Asked asked{{0, static_cast<uint32_t>(table.num_clusters())},
                     {0, static_cast<uint32_t>(table.ball.size)}};
         if (runs.count == 0 || !table.pages.is_whole()) return asked;
         asked.clusters = clusters_to_ask(table, runs, view, rule, tolerances);
-        // Most of the clusters belong to most of the groups; then finding the range of
-        // groups costs more than testing all groups.
+        // Most clusters belong to most groups. Finding their range would cost more than
+        // testing all groups.
         if (asked.clusters.end - asked.clusters.first > table.num_clusters() / 2) return asked;
         int32_t first = static_cast<int32_t>(table.ball.size), last = -1;
         for (uint32_t c = asked.clusters.first; c < asked.clusters.end; ++c) {
@@ -121,7 +123,7 @@ struct SeenInstance {
     }
 };
 
-// Scratch memory of a thread.
+// The temporary memory of a thread.
 struct Scratch {
     std::vector<uint16_t> refinement;  // one element per group
     std::vector<int32_t> chosen;       // selected clusters
@@ -133,10 +135,10 @@ struct Scratch {
           priority(view.in.needs.empty() ? 0 : view.most_groups) {}
 };
 
-// Computes the answers for the groups of an instance. The inputs are passed by value:
-// no write can alias them, so the compiler vectorises the first loop. Residency tests
-// would prevent that; therefore a second loop lowers the answers for groups whose page
-// is absent or still fading in.
+// Computes the refinement of an instance's groups. Passing the inputs by value shows
+// the compiler that no write changes them, so it vectorises the first loop. Tests of
+// residency would prevent that. So a second loop handles groups whose page is absent or
+// fading in.
 template <Footprint footprint, bool kFades>
 void ask_groups(ClusterTable table, const InstanceView view, SelectRule rule,
                 const ClusterRange asked, uint16_t* __restrict refinement) {
@@ -164,14 +166,14 @@ void ask_groups(const SeenInstance& seen, const SelectRule& rule, const ClusterR
         ask_groups<Footprint::solid_angle, false>(seen.table, seen.view, rule, asked, refinement);
 }
 
-// The first pass of the decision: writes the clusters of positive weight, and returns
-// their number.
+// The first pass of the decision: writes the clusters with a positive weight, and
+// returns their number.
 size_t find_sufficient(const ClusterTable table, const InstanceView view, const SelectRule rule,
                        const ClusterRange asked, const uint16_t* __restrict refinement,
                        int32_t* __restrict cluster) {
     const InstanceCut<KnownRefinements> cut{table, view, rule, {refinement}, false};
     size_t num_sufficient = 0;
-    // Branch-free: the outcome is unpredictable.
+    // Without a branch, because it would be mispredicted often.
     for (size_t c = asked.first; c < asked.end; ++c) {
         cluster[num_sufficient] = static_cast<int32_t>(c);
         num_sufficient += cut.weight(c) > 0;
@@ -179,8 +181,8 @@ size_t find_sufficient(const ClusterTable table, const InstanceView view, const 
     return num_sufficient;
 }
 
-// Raises a need to a priority; several threads may do so at once. Positive floats have
-// the same order as their bits.
+// Raises `need` to the bits of `priority`, unless it is higher already. Several threads
+// may do so concurrently. The bits of positive floats compare like the floats.
 void raise(uint32_t& need, float priority) {
     uint32_t bits, before = __atomic_load_n(&need, __ATOMIC_RELAXED);
     std::memcpy(&bits, &priority, sizeof bits);
@@ -189,7 +191,7 @@ void raise(uint32_t& need, float priority) {
     }
 }
 
-// Records which pages an instance needs, if its table is tested.
+// Records which pages an instance needs. `needs` has one element per page.
 template <class Cut>
 void tell_needs(const Cut& cut, const SelectRule& rule, Span<uint32_t> needs,
                 std::vector<float>& priority) {
@@ -233,9 +235,8 @@ void select_instance(const View& view, const SelectRule& rule, size_t i, Scratch
     });
 }
 
-// Adds to `change`, for each bin of a budget, the number of gaussians by which the cut
-// of instance i differs from the cut of the bin before. `bins` has room for the bins of
-// the instance's groups.
+// Adds the cut of instance i to `change`: for each bin, by how many gaussians its cut
+// differs from the cut of the preceding bin. `bins` has room for all groups.
 void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins,
                     std::vector<int64_t>& change) {
     const SelectRule& rule = view.in.rule;
@@ -262,13 +263,13 @@ void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins,
     }
 }
 
-// The differences between the numbers of gaussians in the cuts of consecutive bins. The
-// parts have to be summed.
+// For each bin, by how many gaussians its cut differs from the cut of the preceding
+// bin. Several arrays, which must be added.
 using BinChanges = std::vector<std::vector<int64_t>>;
 BinChanges count_changes(const View& view) {
     const size_t num_instances = view.in.instances.bundle.size;
-    // Part p has the instances p, p + kBudgetParts, and so on: neighbours cost about
-    // the same, so this balances the load.
+    // Part p has the instances p, p + kBudgetParts, and so on. Consecutive instances
+    // cost about the same, so this balances the load.
     BinChanges changes(std::min(kBudgetParts, num_instances));
     parallel_for(changes.size(), 1, [&](size_t part) {
         changes[part].assign(kNumBudgetBins + 1, 0);
@@ -279,8 +280,8 @@ BinChanges count_changes(const View& view) {
     return changes;
 }
 
-// Sets the tolerance of `rule` by its budget. Returns whether a cut fits; if none does,
-// `least_count` is the number of gaussians of the coarsest cut.
+// Sets the tolerance of `rule` to meet its budget. Returns whether any cut fits. If
+// none does, `least_count` is the number of gaussians of the coarsest cut.
 bool meet_budget(const View& view, SelectRule& rule, int64_t& least_count) {
     const BinChanges changes = count_changes(view);
     const uint64_t goal_count = goal_of_budget(rule.budget);
@@ -339,7 +340,7 @@ void cpu::choose_tolerances(const SelectInput& in, Span<const uint64_t> budgets,
     View view(in);
     view.find_runs();
     const BinChanges changes = count_changes(view);
-    // Cuts differ at few bins.
+    // A step is a bin at which the number of gaussians changes. There are few.
     struct Step {
         uint32_t bin;
         int64_t count;

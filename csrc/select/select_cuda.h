@@ -1,7 +1,7 @@
 #pragma once
 
-// The contract of selection on CUDA: it computes cuts of a scene on the device, as the
-// items of a frame or as pairs.
+// Selection on CUDA: the interface. It computes the cut of a scene that is on the
+// device, as the items of a frame or as pairs.
 
 #include "frame/draw_list.h"
 #include "frame/image.h"
@@ -14,62 +14,62 @@ namespace cuda {
 struct CutPart;
 struct BudgetState;
 
-// The report of a cut to the host about the pages that it needs.
+// The head of a cut's report to the host about needed pages.
 struct NeedsReport {
-    unsigned count;  // number of needed pages, including those that do not fit into the list
+    // number of needed pages, including those for which the list has no room
+    unsigned count;
     float tolerance_px2;
 };
 
-// Memory for the pages that a cut needs. It is on the device, except for the report,
-// which the device writes to host memory.
+// The memory in which a cut collects the pages that it needs. It is on the device,
+// except for `report` and `reported`, which are in host memory.
 struct NeedList {
-    // The number of pages, then one element per page of all bundles; the cut clears
-    // them.
+    // The number of needed pages, then one element per page of all bundles. The cut
+    // clears this memory first.
     uint32_t* words = nullptr;
     size_t num_words = 0;
-    uint32_t* const* need = nullptr;  // where the elements of each bundle begin
+    uint32_t* const* need = nullptr;  // per bundle: its elements in `words`
     PageRequest* list = nullptr;
-    unsigned capacity = 0;  // of the list, and of the report
+    unsigned capacity = 0;  // of `list` and `reported`
     NeedsReport* report = nullptr;
     PageRequest* reported = nullptr;
 };
 
-// The bundles of a scene that are only partly resident.
+// The bundles of a scene of which only some pages are resident.
 struct PartlyResident {
     const BundleOnDevice* bundles;
-    NeedList needs;  // without a report if none is requested
+    NeedList needs;  // `report` is null if no report is requested
 };
 
-// Cuts scenes on the device that is current when it is constructed, and owns the
-// scratch memory of a cut, which one cut uses at a time. The lock of a scene orders
-// cuts of that scene on any threads and streams; the caller orders cuts of different
-// scenes. Scenes and streams belong to the same device.
+// Computes cuts of scenes on the device that is current at construction. It owns the
+// scratch memory of a cut, so only one cut can run at a time. Cuts of one scene are
+// ordered by the lock of that scene, on any threads and streams; the caller must order
+// cuts of different scenes. Scenes and streams must belong to the same device.
 //
-// No function but select() waits. Memory is allocated only for a scene that is larger
-// than all earlier ones. A graph that captured a cut uses that memory, so the graph is
-// valid until a larger scene is cut.
+// Only select() waits. Memory is allocated only for a scene that is larger than all
+// earlier ones. A graph that captured a cut is valid until a larger scene is cut.
 class Cut {
   public:
-    // Writes the selected clusters as the items of a frame, once for each eye. Instance
-    // i of n becomes placement i of model bundle[i] in image 0, and placement n + i in
-    // the image of a second eye. Writes `pictures` to `images`. The caller clears what
-    // needs to be cleared.
+    // Writes the selected clusters as items of a frame, once per eye, and the
+    // `pictures` to `images`. With n instances, instance i becomes placement i of model
+    // bundle[i] in the first image, and placement n + i in the image of a second eye.
+    // The counters and zeros of `items` must be zero.
     void cut_items(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
                    const EyeImages& pictures, FrameImage* images, Placement* placements,
                    const ItemList& items, cudaStream_t stream,
                    const PartlyResident* resident = nullptr);
 
-    // Returns how many zeros cut_items() needs in items.zeros.
+    // Returns the number of elements that cut_items() needs in items.zeros.
     static size_t num_zeros(const SceneTables& scene, const SelectRule& rule);
 
-    // Writes pairs that were selected earlier, and lie on the device, as items for one
+    // Writes a cut that was selected earlier, and is in device memory, as items for one
     // camera.
     void given_items(const SceneTables& scene, const Camera& camera, const GivenCut& given,
                      const FrameImage& image, FrameImage* images, Placement* placements,
                      const ItemList& items, cudaStream_t stream);
 
-    // Selects clusters as pairs on the host, and waits for them. `last_bin` is as in
-    // SelectInput; if it is null, that state stays on the device.
+    // Selects clusters, waits, and returns them as pairs in host memory. `last_bin` is
+    // as in SelectInput; if it is null, that state is kept on the device.
     void select(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
                 SelectOutput& out, cudaStream_t stream, const PartlyResident* resident = nullptr,
                 uint32_t* last_bin = nullptr);

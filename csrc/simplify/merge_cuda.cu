@@ -1,6 +1,6 @@
-// Each block merges one group in all its rounds. Nodes are in device memory, where the
-// hundreds of nodes of a group stay in the caches. While partners are searched for,
-// nodes are loaded into shared memory in tiles.
+// Merging on CUDA. A block merges one group, in several rounds. Nodes are in device
+// memory; the hundreds of nodes of a group stay in the caches. In the search for
+// partners, nodes are loaded into shared memory in tiles.
 
 #include <algorithm>
 #include <cfloat>
@@ -17,17 +17,19 @@ namespace {
 constexpr int kBlockSize = 256, kWarps = kBlockSize / 32;
 constexpr int kTileSize = 128;  // nodes in shared memory
 constexpr int64_t kMostRows = int64_t(1)
-                              // Rows of the groups that are merged together: 350 MiB of
-                              // scratch memory.
+                              // The largest number of rows that are merged together;
+                              // 350 MiB of scratch memory.
                               << 21;
 
-// The scratch memory for one row of a group.
+// The scratch memory of a group, with one element per row.
 struct Scratch {
     MergeNode* nodes;
     double* row_weight;
     MergePair *pairs, *sorted;
     int *alive, *next,
-        *last;  // A node is identified by its first row; its other rows follow in a linked list.
+        // A node has the number of its first row; its other rows follow in a linked
+        // list.
+        *last;
     uint8_t* is_used;
 
     __device__ Scratch at(int64_t row) const {
@@ -42,7 +44,7 @@ struct Scratch {
     }
 };
 
-// Makes each row a node; returns the inverse squared spacing that normalises distances.
+// Makes each row a node. Returns inverse_spacing2_of() for the group.
 __device__ double start_nodes(const GaussianRows<const float>& in, int64_t first, int count,
                               int64_t wanted, const Scratch& group) {
     double low[3] = {DBL_MAX, DBL_MAX, DBL_MAX}, minus_high[3] = {DBL_MAX, DBL_MAX, DBL_MAX};
@@ -78,7 +80,7 @@ __device__ double start_nodes(const GaussianRows<const float>& in, int64_t first
     return inverse_spacing2_of(low, high, wanted);
 }
 
-// Finds the cheapest partner of each of n nodes.
+// Finds, for each of n nodes, the partner with the lowest cost.
 __device__ void find_partners(const Scratch& group, int n, double inverse_spacing2) {
     __shared__ MergeFeature tile[kTileSize];
     for (int base = 0; base < n; base += kBlockSize) {
@@ -107,7 +109,7 @@ __device__ void find_partners(const Scratch& group, int n, double inverse_spacin
     }
 }
 
-// Sorts the pairs: the position of each is the number of pairs that precede it.
+// Sorts the pairs. The position of a pair is the number of pairs that precede it.
 __device__ void sort_pairs(const Scratch& group, int n) {
     __shared__ MergePair tile[kBlockSize];
     for (int base = 0; base < n; base += kBlockSize) {
@@ -132,8 +134,9 @@ __device__ void sort_pairs(const Scratch& group, int n) {
     }
 }
 
-// Moves the sorted pairs that share no gaussian with an earlier pair, at most
-// `allowed`, to the front of `pairs`; returns their number. Called by one warp.
+// Chooses at most `allowed` of the sorted pairs: those that share no node with an
+// earlier chosen pair. Moves them to the front of `pairs`, and returns their number.
+// One warp calls it.
 __device__ int choose_pairs(const Scratch& group, int n, int64_t allowed) {
     const int lane = static_cast<int>(threadIdx.x % 32);
     int chosen = 0;
@@ -161,7 +164,7 @@ __device__ int choose_pairs(const Scratch& group, int n, int64_t allowed) {
     return chosen;
 }
 
-// Joins the first pairs and marks the nodes that disappear.
+// Joins the chosen pairs, and marks the nodes that disappear.
 __device__ void join_pairs(const Scratch& group, int num_pairs) {
     for (int j = threadIdx.x; j < num_pairs; j += kBlockSize) {
         const MergePair pair = group.pairs[j];
@@ -175,7 +178,7 @@ __device__ void join_pairs(const Scratch& group, int num_pairs) {
     }
 }
 
-// Closes the gaps in the list of nodes. Called by one warp.
+// Removes the nodes that disappeared from the list. One warp calls it.
 __device__ void drop_joined(const Scratch& group, int n) {
     const int lane = static_cast<int>(threadIdx.x % 32);
     int num_kept = 0;
@@ -221,7 +224,7 @@ __global__ void __launch_bounds__(kBlockSize)
     const Scratch group = scratch.at(first - in_offset[first_group]);
     const double inverse_spacing2 = start_nodes(in, first, n, wanted, group);
     __shared__ int num_pairs;
-    // In each round every node finds its cheapest partner, and the cheapest disjoint
+    // In each round, every node finds its cheapest partner; then the cheapest disjoint
     // pairs join.
     while (n > wanted) {
         __syncthreads();
@@ -248,7 +251,7 @@ __global__ void __launch_bounds__(kBlockSize)
 void merge(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
            Span<const int64_t> out_offset, const GaussianRows<float>& out, Stream stream) {
     const size_t num_groups = in_offset.size - 1;
-    // A run consists of the groups that share the scratch memory.
+    // A run is a range of groups that share the scratch memory.
     const auto end_of_run = [&](size_t first) {
         size_t last = first + 1;
         while (last < num_groups && in_offset[last + 1] - in_offset[first] <= kMostRows) ++last;

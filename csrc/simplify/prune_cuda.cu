@@ -1,6 +1,6 @@
-// A block finds the median of a group along one axis; then each block ranks gaussians
-// of one group within their octants, and the rows that are kept are compacted in
-// ascending order.
+// Pruning on CUDA. A block finds the median of a group along one axis. Then blocks rank
+// the gaussians of a group within their octants. In the end, the rows that are kept are
+// compacted in ascending order.
 
 #include <cub/device/device_select.cuh>
 
@@ -19,8 +19,9 @@ namespace {
 constexpr unsigned kBlockSize = 128;
 constexpr unsigned kMostBlocksOfGroup = 64;
 
-// Finds the median of one axis of a group bit by bit, from the highest: of the values
-// that share the bits found so far, those whose next bit is 0 come first.
+// Finds the median of a group along one axis, bit by bit from the highest bit on. At
+// each bit, it counts the values that agree with the median's known bits and have a 0
+// next.
 __global__ void median_kernel(const float* means, const int64_t* in_offset, float* medians) {
     const int64_t first = in_offset[blockIdx.x];
     const int64_t last = in_offset[blockIdx.x + 1];
@@ -83,7 +84,7 @@ __global__ void keep_kernel(const int64_t* in_offset, const int64_t* out_offset,
             const double other = score_of_row[k];
             num_before += octant_of_row[k] < octant;
             num_here += is_here;
-            // Among equal scores, the one with the lower index comes first.
+            // Equal scores are ordered by index.
             rank += is_here && (other > score || (other == score && k < i));
         }
         is_kept[i] = rank < octant_share(num_before, num_here, last - first, wanted);

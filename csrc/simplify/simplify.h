@@ -10,26 +10,29 @@
 
 namespace v3dg {
 
-// Segment g reduces gaussians in_offset[g] .. in_offset[g + 1] to the number that
-// out_offset gives, which is at most the number of inputs. Ties are decided by index,
-// and results do not depend on threads; the CPU and CUDA give the same bits.
+// Segment g has the gaussians from in_offset[g] to in_offset[g + 1]. It is reduced to
+// out_offset[g + 1] - out_offset[g] gaussians, which must not be more. Ties are decided
+// by index. The result has the same bits on the CPU and on CUDA, for any number of
+// threads.
 namespace cpu {
-// Finds the gaussians with the largest opacity * (s1 s2 s3)^(2/3), the same share of
-// each of the eight octants around the medians of a segment (V3DG, section 3.2). kept:
-// [out_offset[S]], the rows in ascending order.
+// Keeps the gaussians with the largest opacity * (s1 s2 s3)^(2/3) in each of the eight
+// octants around the medians of a segment, the same share of each octant (V3DG, section
+// 3.2). `kept` becomes the rows, in ascending order: [out_offset[S]] for S segments.
 void prune(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
            Span<const int64_t> out_offset, Span<int64_t> kept);
 
-// Joins pairs of gaussians, cheapest first, until the wanted number is left. A pair
-// becomes the gaussian with the same first and second moments, each weighted by opacity
-// times surface area, and the same area times opacity as far as an opacity of 1 allows.
-// The cost of a pair grows with the differences of its members in position and colour.
+// Joins pairs of gaussians, cheapest first, until the wanted number is left. The cost
+// of a pair grows with the distance of the two in position and in colour. The joined
+// gaussian has the first and second moments of the pair, weighted by opacity times
+// surface area. It has the pair's total of area times opacity, as far as an opacity of
+// 1 allows.
 void merge(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
            Span<const int64_t> out_offset, const GaussianRows<float>& out);
 }  // namespace cpu
 
-// As cpu::, with rows and `kept` on the device; offsets stay on the host. Work is
-// queued on the stream. Throws std::runtime_error if CUDA reports an error.
+// Like the functions of cpu::, with rows and `kept` on the device, and offsets in host
+// memory. Work is enqueued on the stream. Throws std::runtime_error if CUDA reports an
+// error.
 namespace cuda {
 void prune(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
            Span<const int64_t> out_offset, Span<int64_t> kept, Stream stream);

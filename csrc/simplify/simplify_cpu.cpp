@@ -1,4 +1,4 @@
-// Each thread prunes or merges one group at a time.
+// Pruning and merging on the CPU. A thread processes one group at a time.
 
 #include "simplify/simplify.h"
 
@@ -13,7 +13,7 @@ namespace v3dg {
 
 namespace {
 
-// Finds the median position of rows first .. last along each axis.
+// Computes the median of rows `first` to `last` along each axis.
 void find_medians(const float* means, int64_t first, int64_t last, std::vector<float>& scratch,
                   float median[3]) {
     const int64_t count = last - first;
@@ -26,7 +26,8 @@ void find_medians(const float* means, int64_t first, int64_t last, std::vector<f
     }
 }
 
-// Writes the rows of the group first .. last that are kept, in ascending order.
+// Chooses the rows that a group keeps, in ascending order. The group has the rows
+// `first` to `last`.
 void prune_group(const GaussianRows<const float>& in, int64_t first, int64_t last, int64_t wanted,
                  int64_t* out) {
     const int64_t count = last - first;
@@ -70,11 +71,11 @@ void cpu::prune(const GaussianRows<const float>& in, Span<const int64_t> in_offs
 
 namespace {
 
-// Merges rows first .. first + count to `wanted` rows, which are written from row `to`
-// on.
+// Merges `count` rows, from `first` on, to `wanted` rows. The result is written from
+// row `to` on.
 void merge_segment(const GaussianRows<const float>& in, int64_t first, int count, int64_t wanted,
                    const GaussianRows<float>& out, int64_t to) {
-    // A node is identified by its first row; its other rows follow in a linked list.
+    // A node has the number of its first row; its other rows follow in a linked list.
     std::vector<MergeNode> nodes(count);
     std::vector<double> row_weight(count);
     std::vector<int> alive(count), next(count, -1), last(count);
@@ -91,7 +92,7 @@ void merge_segment(const GaussianRows<const float>& in, int64_t first, int count
     }
     const double inverse_spacing2 = inverse_spacing2_of(low, high, wanted);
 
-    // In each round every node finds its cheapest partner, and the cheapest disjoint
+    // In each round, every node finds its cheapest partner; then the cheapest disjoint
     // pairs join.
     std::vector<MergeFeature> features(count);
     std::vector<MergePair> pairs;

@@ -1,8 +1,8 @@
 #pragma once
 
-// Formulas of pruning and merging. They are compiled without contraction and use no
-// function whose last bits differ between libraries, so that the CPU and CUDA get the
-// same bits.
+// Formulas of pruning and merging, for the CPU and CUDA. They are compiled without
+// floating-point contraction, and use only functions whose results are exactly rounded.
+// So the CPU and CUDA compute the same bits.
 
 #include <cmath>
 #include <cstdint>
@@ -14,45 +14,44 @@
 
 namespace v3dg {
 
-// Returns the importance that pruning compares: the cube of opacity * (s1 s2 s3)^(2/3)
-// (V3DG, section 3.2: product of scale and opacity). The cube gives the same order and
-// needs no roots, whose last bits differ between libraries. Squared volumes of float32
-// scales do not overflow float64; those that underflow are invisibly small.
+// Returns the importance of a gaussian for pruning: the cube of opacity * (s1 s2
+// s3)^(2/3) (V3DG, section 3.2: product of scale and opacity). The cube has the same
+// order, but needs no roots, whose last bits differ between libraries. Squared volumes
+// of float32 scales do not overflow float64. Those that underflow are invisibly small.
 V3DG_HD inline double prune_score(const float scale[3], float opacity) {
     const double volume = static_cast<double>(scale[0]) * scale[1] * scale[2];
     const double o = opacity;
     return o * o * o * (volume * volume);
 }
 
-// Pruning keeps the same share of each octant of a group, so that no side of it is left
-// empty. The octants meet at the median of each axis, as in the published code of V3DG:
-// halving the longest axis again and again makes other cells for long groups, and
-// levels that are visibly worse.
+// Pruning keeps the same share of each octant of a group, so that no part of the group
+// becomes empty. The octants meet at the median of each axis, as in the published code
+// of V3DG. Repeated halving of the longest axis was visibly worse for elongated groups.
 constexpr int kOctants = 8;
 
-// Returns the octant of a position around the medians of its group. A coordinate at the
-// median lies in the upper half.
+// Returns the octant of a position around the medians of its group. A coordinate equal
+// to the median is in the upper half.
 V3DG_HD inline int octant_of(const float mean[3], const float median[3]) {
     return 4 * (mean[0] >= median[0]) + 2 * (mean[1] >= median[1]) + (mean[2] >= median[2]);
 }
 
-// Returns the place, in ascending order, of the median among `count` coordinates: of
-// two in the middle, the lower one.
+// Returns the rank of the median of `count` values; of two in the middle, the lower
+// one.
 V3DG_HD inline int64_t median_rank(int64_t count) { return (count - 1) / 2; }
 
-// Returns how many gaussians of an octant are kept when a group of `count` keeps
-// `wanted`. The octants before this one hold `num_before` gaussians, this one
-// `num_here`. The shares are rounded so that they add up to `wanted`.
+// Returns how many gaussians of an octant are kept, if a group of `count` keeps
+// `wanted`. The octant has `num_here` gaussians, the octants before it have
+// `num_before`. The results of all octants add up to `wanted`.
 V3DG_HD inline int64_t octant_share(int64_t num_before, int64_t num_here, int64_t count,
                                     int64_t wanted) {
     return (num_before + num_here) * wanted / count - num_before * wanted / count;
 }
 
-// Returns the surface area of an ellipsoid over 4 pi, within 1.2 %. It averages the
-// area of the ellipsoid's shadow, sqrt(b2c2 x2 + a2c2 y2 + a2b2 z2), over directions
-// along axes, between two axes and between all three; the weights minimise the largest
-// error of any shape. The only functions used are square roots, whose bits are the same
-// in every library.
+// Returns the surface area of an ellipsoid divided by 4 pi, with an error of at most
+// 1.2 %. The area of the ellipsoid's shadow, sqrt(b²c² x² + a²c² y² + a²b² z²), is
+// averaged over the directions along the axes and along their diagonals. The weights
+// minimise the largest error over all shapes. Square roots are exactly rounded in every
+// library.
 V3DG_HD inline double ellipsoid_area(double a, double b, double c) {
     constexpr double kAlongOne = 0.0604247, kBetweenTwo = 0.1013528, kBetweenThree = 0.5029995;
     const double bc = b * c, ac = a * c, ab = a * b;
@@ -62,7 +61,7 @@ V3DG_HD inline double ellipsoid_area(double a, double b, double c) {
            kBetweenThree * sqrt((bc2 + ac2 + ab2) / 3);
 }
 
-// Computes the upper triangle xx xy xz yy yz zz of R diag(s²) Rᵀ.
+// Computes the covariance R diag(s²) Rᵀ: its upper triangle xx, xy, xz, yy, yz, zz.
 V3DG_HD inline void covariance_of(const double quat[4], const double scale[3], double cov[6]) {
     double r[9];
     rotation_of_quat(quat, r);
@@ -76,8 +75,8 @@ V3DG_HD inline void covariance_of(const double quat[4], const double scale[3], d
         }
 }
 
-// Computes the scales of a covariance and the rotation to its axes, whose columns
-// belong to the scales, by cyclic Jacobi rotations.
+// Computes the scales of a covariance and its axes, by cyclic Jacobi rotations. The
+// axes are the columns of `e`, in the order of the scales.
 V3DG_HD inline void scale_and_axes_of(const double cov[6], double scale[3], double e[3][3]) {
     double a[3][3] = {{cov[0], cov[1], cov[2]}, {cov[1], cov[3], cov[4]}, {cov[2], cov[4], cov[5]}};
     for (int i = 0; i < 3; ++i)
@@ -119,8 +118,8 @@ V3DG_HD inline void scale_and_axes_of(const double cov[6], double scale[3], doub
 
 // Computes the quaternion of a rotation matrix.
 V3DG_HD inline void quat_of_axes(const double e[3][3], double quat[4]) {
-    // The component with the largest magnitude is computed first, so that there is no
-    // division by a small number.
+    // Begin with the component of largest magnitude, so that no small number is a
+    // divisor.
     const double four[4] = {1 + e[0][0] + e[1][1] + e[2][2], 1 + e[0][0] - e[1][1] - e[2][2],
                             1 - e[0][0] + e[1][1] - e[2][2], 1 - e[0][0] - e[1][1] + e[2][2]};
     int largest = 0;
@@ -136,12 +135,12 @@ V3DG_HD inline void quat_of_axes(const double e[3][3], double quat[4]) {
     for (int k = 0; k < 4; ++k) quat[k] = by_largest[largest][k];
 }
 
-// The features of a gaussian that merging compares. Weights are area * opacity.
+// The properties of a gaussian that merging compares. `weight` is area * opacity.
 struct MergeFeature {
     double mean[3], color[3], weight;
 };
 
-// A gaussian while it is being merged.
+// A gaussian, or several joined gaussians, during merging.
 struct MergeNode {
     MergeFeature feature;
     double cov[6], opacity;
@@ -163,9 +162,9 @@ V3DG_HD inline MergeNode merge_node_of(const GaussianRows<const float>& in, int6
     return node;
 }
 
-// Returns the cost of joining a pair: the increase of the variance in position
-// (relative to the area per remaining gaussian) and in colour. This is Ward's
-// criterion, weighted by covered area.
+// Returns the cost of joining a pair: the increase of the variance of positions
+// (relative to the spacing of the remaining gaussians) and of colours. This is Ward's
+// criterion, weighted by area * opacity.
 V3DG_HD inline double merge_cost(const MergeFeature& a, const MergeFeature& b,
                                  double inverse_spacing2) {
     constexpr double kColorWeight = 6;
@@ -178,7 +177,8 @@ V3DG_HD inline double merge_cost(const MergeFeature& a, const MergeFeature& b,
            (place * inverse_spacing2 + kColorWeight * color);
 }
 
-// Returns one over the squared size of the box around the means, per wanted gaussian.
+// Returns `wanted` divided by the squared diagonal of the box of the means. It
+// normalises squared distances.
 V3DG_HD inline double inverse_spacing2_of(const double low[3], const double high[3],
                                           int64_t wanted) {
     double extent2 = 0;
@@ -186,8 +186,8 @@ V3DG_HD inline double inverse_spacing2_of(const double low[3], const double high
     return extent2 > 0 ? static_cast<double>(wanted) / extent2 : 0;
 }
 
-// Two gaussians, a before b, and the cost of joining them. Cheaper pairs come first;
-// ties are ordered by index.
+// Two gaussians, a before b, and the cost of joining them. Pairs are ordered by cost,
+// then by index.
 struct MergePair {
     double cost;
     int a, b;
@@ -196,8 +196,8 @@ V3DG_HD inline bool is_before(const MergePair& x, const MergePair& y) {
     return x.cost != y.cost ? x.cost < y.cost : (x.a != y.a ? x.a < y.a : x.b < y.b);
 }
 
-// Returns the largest number of pairs among `count` gaussians that one round joins:
-// half of the remaining joins, so that costs are updated in between.
+// Returns how many pairs of `count` gaussians one round joins: half of the joins that
+// remain, so that costs are updated in between.
 V3DG_HD inline int64_t pairs_in_round(int64_t count, int64_t wanted) {
     return (count - wanted + 1) / 2;
 }
@@ -226,7 +226,7 @@ V3DG_HD inline void join(MergeNode& a, const MergeNode& b) {
     a.opacity = opacity < 1 ? opacity : 1;
 }
 
-// Writes position, shape and opacity of a joined gaussian.
+// Writes the position, shape and opacity of a joined gaussian.
 V3DG_HD inline void write_joined(const MergeNode& node, const GaussianRows<float>& out,
                                  int64_t to) {
     double scale[3], axes[3][3], quat[4];

@@ -1,7 +1,7 @@
 #pragma once
 
-// The lists of records from which the tiles of a picture are blended: sorted tile by
-// tile on the CPU, unsorted on CUDA.
+// Binning: makes the lists of records from which the tiles of a picture are blended. On
+// the CPU, sort_tile() then sorts a list; on CUDA, the blend stage sorts it.
 
 #include <atomic>
 #include <cstddef>
@@ -17,7 +17,8 @@
 
 namespace v3dg {
 
-// The tiles of kTileSize pixels of an image that cover a window of it, row by row.
+// The tiles that cover a window of an image, row by row. Tiles are aligned to the
+// image.
 struct TileGrid {
     int first_column, first_row, columns, rows;
     explicit TileGrid(const Window& w)
@@ -26,26 +27,29 @@ struct TileGrid {
           columns((w.x1 + kTileSize - 1) / kTileSize - first_column),
           rows((w.y1 + kTileSize - 1) / kTileSize - first_row) {}
     size_t size() const { return static_cast<size_t>(columns) * rows; }
-    // Return the column and the row of a tile in the image.
+    // Return the column and the row of a tile in the image's grid of tiles.
     int column(size_t tile) const { return first_column + static_cast<int>(tile % columns); }
     int row(size_t tile) const { return first_row + static_cast<int>(tile / columns); }
 };
 
-// The records that touch tile t are entries offset[t] to offset[t + 1], in the order of
-// the chunks.
+// The lists of all tiles. Tile t has entries offset[t] to offset[t + 1], ordered by
+// chunk.
 struct TileLists {
     EntryFormat format;
     Buffer<uint64_t> offset;
     Buffer<uint64_t> entry;
     uint64_t num_entries = 0;
-    // The lists of a single chunk, whose records are [first, first + count).
+    // The list of one chunk: entries of records [first, first + count), ordered by
+    // tile.
     struct Chunk {
         uint64_t first, count;
-        uint32_t least_depth, most_depth;  // bits of the records' depths
-        // Entries with the record's index in the chunk and all bits of a depth.
+        uint32_t least_depth, most_depth;  // range of the bits of the records' depths
+        // In the chunk's format: the index of the record in the chunk, and all depth
+        // bits.
         Buffer<uint64_t> entry;
     };
-    Buffer<uint32_t> chunk_offset;  // (chunk, tile + 1)
+    // [chunk][tile + 1] first entry of the tile in the chunk
+    Buffer<uint32_t> chunk_offset;
     std::vector<Chunk> chunk;
 
     void start(size_t num_chunks, const TileGrid& grid) {
@@ -54,55 +58,56 @@ struct TileLists {
     }
 };
 
-// A chunk has at most this many records.
+// The largest number of records in a chunk.
 constexpr uint64_t kMostChunkRecords = uint64_t(1) << 21;
 
-// Bins the records of one chunk, which are records[first .. first + count). It is
-// fastest while they are in the cache. Chunks may be binned concurrently.
+// Bins the records of one chunk: records[first] to records[first + count]. It is
+// fastest while the records are in the cache. Chunks may be binned concurrently.
 template <class T>
 void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const TileGrid& grid,
                size_t chunk, TileLists& out);
 
-// Joins the lists of the chunks into one list per tile. Once `stop` is true, it returns
-// soon and leaves the lists unfinished.
+// Joins the lists of all chunks into one list per tile. If `stop` becomes true, it
+// returns soon, and the lists are incomplete.
 void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out,
                  const std::atomic<bool>* stop = nullptr);
 
-// Sorts the entries of one tile by the depths of their records; equal depths keep their
-// order. `scratch` has room for as many entries.
+// Sorts the entries of one tile by the depths of their records. The sort is stable.
+// `scratch` must have room for `count` entries.
 template <class T>
 void sort_tile(const Record<T>* records, EntryFormat format, uint64_t* entry, size_t count,
                uint64_t* scratch);
 
 namespace cuda {
 
-// The input of tile_bin(), all on the device.
+// The input of tile_bin(), in device memory.
 struct TileBinInput {
     const ItemTiles* items;
-    const FewTiles* few;  // tiles of each record, or kManyTiles if it is in `large`
+    // the tiles of each record; kManyTiles for records that are in `large`
+    const FewTiles* few;
     RecordPlanes records;
     const FrameImage* images;
     uint32_t num_images, num_tiles;
     Capacity capacity;
     const LargeRecord* large;
     TileCounts counts;
-    // This function sets `entries` of the counters. If there was too little room for
-    // the large records, these are not counted.
+    // The function sets counters->entries. Large records beyond their capacity are not
+    // counted there.
     FrameCounters* counters;
 };
 
-// The output lists: tile t has entries tile_first[t] to tile_first[t + 1].
+// The output of tile_bin(): tile t has entries tile_first[t] to tile_first[t + 1].
 struct TileBinOutput {
     unsigned long long* tile_first;  // [num_tiles + 1]
-    uint32_t* image_of_tile;         // [num_tiles]
+    uint32_t* image_of_tile;         // [num_tiles] index of the image of each tile
     TileEntry* entries;
 };
 
-// Returns the number of elements of TileCounts::state.
+// Returns the required number of elements of TileCounts::state.
 size_t tile_bin_parts(size_t num_tiles);
 
-// Adds a frame's records to the lists of the tiles that they may touch. Work is queued
-// on the stream. Throws std::runtime_error if CUDA reports an error.
+// Enqueues the binning of a frame: adds each record to the lists of the tiles that it
+// may touch. Throws std::runtime_error if CUDA reports an error.
 void tile_bin(const TileBinInput& in, const TileBinOutput& out, Stream stream);
 
 }  // namespace cuda

@@ -1,6 +1,6 @@
-// Each chunk is counted, scanned and scattered separately; most chunks reach few tiles.
-// Then each tile collects its entries chunk by chunk, so the order of the entries does
-// not depend on the assignment of chunks to threads.
+// Binning on the CPU. The entries of each chunk are counted, scanned and scattered;
+// most chunks reach few tiles. Then each tile collects its entries chunk by chunk, so
+// that the order of entries does not depend on which thread processes which chunk.
 
 #include "tile_bin/tile_bin.h"
 
@@ -12,11 +12,11 @@
 
 namespace v3dg {
 
-// Entries of a chunk have all bits of a depth, and the index in the chunk.
+// The format of a chunk's entries: all bits of a depth, and the index in the chunk.
 static constexpr EntryFormat kChunkFormat = EntryFormat::of(kMostChunkRecords, 0, INT32_MAX);
 
-// Calls visit(tile, box in the tile) for the tiles that a record's box meets; most
-// boxes meet one.
+// Calls visit(tile, box in the tile) for the tiles that a record's box touches. Most
+// boxes touch one tile.
 template <class T, class Visit>
 static V3DG_INLINE void for_each_tile(const Record<T>& r, const TileGrid& grid,
                                       const Visit& visit) {
@@ -40,8 +40,9 @@ template <class T>
 void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const TileGrid& grid,
                size_t chunk, TileLists& out) {
     const size_t num_tiles = grid.size();
-    // The offsets are first counts, then the beginnings of tiles, then the positions of
-    // the next entries. The last position of a tile is the beginning of the next tile.
+    // offset[t + 1] is first the number of entries of tile t, then the index of its
+    // first entry, then the index of its next free entry. In the end, it is thus the
+    // first entry of tile t + 1.
     uint32_t* offset = out.chunk_offset.data() + chunk * (num_tiles + 1);
     std::memset(offset, 0, (num_tiles + 1) * sizeof *offset);
     const Record<T>* record = records + first;
@@ -70,7 +71,7 @@ void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const T
     out.chunk[chunk].most_depth = most;
 }
 
-// Returns the format of the joined entries of these chunks.
+// Returns the format for the entries of all these chunks.
 static EntryFormat format_of(const TileLists::Chunk* chunk, size_t num_chunks) {
     uint64_t end = 0;
     uint32_t least = UINT32_MAX, most = 0;
@@ -96,7 +97,8 @@ void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out,
     out.num_entries = offset[num_tiles];
     const EntryFormat format = out.format = format_of(out.chunk.data(), num_chunks);
     uint64_t* entry = out.entry.reserve(out.num_entries);
-    constexpr size_t kTogether = 16;  // tiles whose offsets in a chunk share a cache line
+    // the offsets of 16 tiles in a chunk fill a cache line
+    constexpr size_t kTogether = 16;
     parallel_for((num_tiles + kTogether - 1) / kTogether, 1, [&](size_t group) {
         const size_t first = group * kTogether, last = std::min(first + kTogether, num_tiles);
         uint64_t next[kTogether];
@@ -121,7 +123,7 @@ void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out,
     });
 }
 
-// Sorts entries by the depth bits that they contain; equal entries keep their order.
+// Sorts entries by their depth bits. The sort is stable.
 static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_t* scratch) {
     constexpr size_t kSmall = 256;
     if (count <= kSmall) {
@@ -134,10 +136,11 @@ static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_
         for (size_t i = 0; i < count; ++i) entry[i] = (entry[i] & ~low) | scratch[entry[i] & low];
         return;
     }
-    // This is a stable radix sort, least significant digit first, over the bits that
-    // differ after the smallest depth is subtracted.
+    // A radix sort from the least significant digit. It sorts only the bits that differ
+    // after the smallest depth is subtracted.
     constexpr int kMostBits = 12;
-    const int most_bits = count < 1024 ? 8 : kMostBits;  // few counters for few entries
+    // fewer counters for few entries
+    const int most_bits = count < 1024 ? 8 : kMostBits;
     uint64_t least = ~uint64_t(0), most = 0;
     for (size_t i = 0; i < count; ++i) {
         least = std::min(least, entry[i]);
@@ -167,7 +170,7 @@ static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_
     if (from != entry) std::memcpy(entry, from, count * sizeof *entry);
 }
 
-// Sorts entries by their records' depths; equal ones keep their order.
+// Sorts entries by the depths of their records. The sort is stable.
 template <class T>
 static void sort_by_records(const Record<T>* records, EntryFormat format, uint64_t* first,
                             uint64_t* last) {
@@ -190,7 +193,7 @@ void sort_tile<float>(const Record<float>* records, EntryFormat format, uint64_t
     }
 }
 
-// Entries contain fewer depth bits than a double has.
+// Compares the records, because an entry cannot hold all bits of a double.
 template <>
 void sort_tile<double>(const Record<double>* records, EntryFormat format, uint64_t* entry,
                        size_t count, uint64_t*) {

@@ -1,7 +1,8 @@
-// Binning counts, scans and scatters. project() has counted records over few tiles;
-// here records over many tiles are counted, with their rows of tiles distributed over a
-// warp. The file is compiled without contraction, so that the counting and the
-// scattering kernel compute the same ellipses.
+// Binning on CUDA: counts the records per tile, scans the counts, and scatters entries.
+// project() has counted the records over few tiles already. Records over many tiles
+// (large records) are counted here, and a warp shares their rows of tiles. The file is
+// compiled without floating-point contraction, so that counting and scattering compute
+// the same ellipses.
 
 #include "tile_bin/tile_bin.h"
 
@@ -18,23 +19,26 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kThreads = 256, kWarps = kThreads / 32;
-constexpr unsigned kBlocks = 5;  // blocks per multiprocessor with 164 KiB of shared memory
+// resident blocks per multiprocessor with 164 KiB of shared memory
+constexpr unsigned kBlocks = 5;
 
-// The shape of the kernel that counts large records.
+// The block size, and the blocks per multiprocessor, of count_large_kernel.
 constexpr unsigned kCountThreads = 512, kCountBlocks = 3;
-// The number of large records per tile from which blocks count in their shared memory.
+// Blocks count in shared memory if there are at least this many large records per tile.
 constexpr unsigned kLeastLarge = 16;
 
-// Large records that a warp processes together; lanes 16 apart have the same record.
+// The large records that a warp processes together. Lane i and lane i + 16 have the
+// same record.
 struct LargeBatch {
     uint32_t image;
-    uint32_t record;  // the record of this lane
-    RecordBox box;    // the box of that record
-    int rows;         // number of tile rows of this lane's record; 0 without a record
-    int rows_after;   // number of rows of all records up to this one
+    uint32_t record;  // index of this lane's record
+    RecordBox box;    // pixel box of this lane's record
+    int rows;         // tile rows of this lane's record; 0 if there is none
+    int rows_after;   // prefix sum: tile rows of all records up to this one
 };
 
-// A warp's part of the rows of a batch, which is divided into 2^log2_parts parts.
+// The part of a batch's tile rows that a warp processes. A batch is divided into
+// 2^log2_parts parts.
 struct LargePart {
     int number, log2_parts;
 };
@@ -48,7 +52,7 @@ __device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long firs
     return batch;
 }
 
-// Returns the box of another lane of the warp.
+// Returns the pixel box of the record in another lane.
 __device__ RecordBox box_of_lane(const RecordBox& box, int lane) {
     const uint32_t columns = __shfl_sync(kAllLanes, box.x0 | uint32_t(box.x1) << 16, lane),
                    rows = __shfl_sync(kAllLanes, box.y0 | uint32_t(box.y1) << 16, lane);
@@ -56,8 +60,8 @@ __device__ RecordBox box_of_lane(const RecordBox& box, int lane) {
             static_cast<uint16_t>(rows), static_cast<uint16_t>(rows >> 16)};
 }
 
-// Returns the first of `kCount` lanes whose number is above `at`; the last lane if
-// there is none. The numbers do not decrease from lane to lane.
+// Returns the first of the lanes 0 to kCount - 1 whose `number` is above `at`, or the
+// last of these lanes if there is none. Numbers must not decrease from lane to lane.
 template <int kCount>
 __device__ int first_lane_above(int number, int at) {
     int lane = 0;
@@ -67,9 +71,10 @@ __device__ int first_lane_above(int number, int at) {
     return lane;
 }
 
-// Calls begin_row(number, record) for 32 rows of a batch's records, one per lane, and
-// then visit(from, row, column) for each 32 tiles of those rows: each lane has a tile
-// in the row of lane `from`. A column below 0 means no tile.
+// Visits the tiles that a batch's records may reach, 32 tile rows at a time. First it
+// calls begin_row(number, record) in each lane, with the record of that lane's row.
+// Then it calls visit(from, row, column) for 32 tiles at a time, one per lane; `from`
+// is the lane whose row contains the tile. A negative column means no tile.
 template <class BeginRow, class Visit>
 __device__ void for_each_tile(const TileBinInput& in, const LargeBatch& batch,
                               const LargePart& part, const BeginRow& begin_row,
@@ -98,8 +103,8 @@ __device__ void for_each_tile(const TileBinInput& in, const LargeBatch& batch,
     }
 }
 
-// Calls visit(batch, part) for all large records, batch by batch, with all warps of the
-// grid. If there are few batches, several warps process parts of each.
+// Calls visit(batch, part) for all batches of large records. All warps of the grid take
+// part. If there are few batches, several warps process parts of the same batch.
 template <class Visit>
 __device__ void for_each_part(const TileBinInput& in, const Visit& visit) {
     constexpr int kLog2MostParts = 2;
@@ -107,15 +112,15 @@ __device__ void for_each_part(const TileBinInput& in, const Visit& visit) {
     const unsigned num_batches = static_cast<unsigned>(in.counters->large / kLargeAtOnce);
     const unsigned warps_each = num_batches == 0 ? 0 : 8 * num_warps / num_batches;
     const int log2_parts = min(max(31 - __clz(static_cast<int>(warps_each)), 0), kLog2MostParts);
-    // Neighbours cost about the same, so they go to different blocks.
+    // Adjacent batches cost about the same, so they are distributed over the blocks.
     for (unsigned at = blockIdx.x + threadIdx.x / 32 * gridDim.x; at < num_batches << log2_parts;
          at += num_warps)
         visit(load_batch(in, static_cast<unsigned long long>(at >> log2_parts) * kLargeAtOnce),
               LargePart{static_cast<int>(at & ((1u << log2_parts) - 1)), log2_parts});
 }
 
-// Calls visit(tile) for the tiles of all large records, one per lane; kNoTile means
-// none.
+// Calls visit(tile) for the tiles of all large records, one tile per lane. A lane
+// without a tile gets kNoTile.
 template <class Visit>
 __device__ void for_each_large_tile(const TileBinInput& in, const Visit& visit) {
     for_each_part(in, [&](const LargeBatch& batch, const LargePart& part) {
@@ -128,8 +133,8 @@ __device__ void for_each_large_tile(const TileBinInput& in, const Visit& visit) 
     });
 }
 
-// Counts large records. If there are many, a block first counts in its shared memory,
-// provided that the tiles fit.
+// Adds large records to the counts of their tiles. If there are many large records, and
+// shared memory has room for a counter per tile, a block counts there first.
 __global__ void __launch_bounds__(kCountThreads, kCountBlocks)
     count_large_kernel(TileBinInput in, bool has_room) {
     await_kernel_before();
@@ -145,8 +150,7 @@ __global__ void __launch_bounds__(kCountThreads, kCountBlocks)
         if (tile != kNoTile) atomicAdd(counts + tile, 1u);
     });
     __syncthreads();
-    // Each block starts at a different tile, so that blocks do not access the same one
-    // at once.
+    // Each block starts at a different tile, so that atomic operations rarely collide.
     const uint32_t first = static_cast<uint32_t>(size_t(in.num_tiles) * blockIdx.x / gridDim.x);
     for (uint32_t i = threadIdx.x; i < in.num_tiles; i += kCountThreads) {
         const uint32_t tile = first + i < in.num_tiles ? first + i : first + i - in.num_tiles;
@@ -155,7 +159,7 @@ __global__ void __launch_bounds__(kCountThreads, kCountBlocks)
 }
 
 __device__ uint32_t image_of(const TileBinInput& in, uint32_t tile) {
-    // Finds the last image that begins at or before the tile.
+    // Find the last image whose first tile is at or before this tile.
     uint32_t first = 0, count = in.num_images;
     while (count > 1) {
         const uint32_t half = count / 2;
@@ -166,7 +170,7 @@ __device__ uint32_t image_of(const TileBinInput& in, uint32_t tile) {
     return first;
 }
 
-// Scans the counts, one thread per tile.
+// Computes the first entry of each tile from the counts. One thread per tile.
 __global__ void scan_kernel(TileBinInput in, TileBinOutput out) {
     await_kernel_before();
     __shared__ unsigned long long before_block;
@@ -189,54 +193,55 @@ __global__ void scan_kernel(TileBinInput in, TileBinOutput out) {
     }
 }
 
-// The destination of entries. A tile's list is filled from its end backwards, while its
-// count decreases to 0.
+// Where entries are written. A tile's list is filled from its end to its beginning.
 struct Scatter {
     const unsigned long long* tile_first;
-    uint32_t* left;  // [num_tiles] free positions
+    // [num_tiles] number of free entries, initially the count of the tile
+    uint32_t* left;
     TileEntry* entries;
 };
 
-// The positions of a warp's lanes in the lists of their tiles. Lanes with the same tile
-// share one atomic operation.
+// The positions of the lanes' entries in the lists of their tiles. Lanes with the same
+// tile share one atomic operation.
 struct Places {
     unsigned peers;
-    uint32_t left;  // free positions before those of the peers
+    uint32_t left;  // free entries before those of the lane's tile were taken
 
-    // Called by a whole warp; kNoTile gets no position.
+    // A lane with kNoTile gets no position. All lanes of the warp must call it.
     __device__ Places(const Scatter& to, uint32_t tile)
         : peers(__match_any_sync(kAllLanes, tile)), left(0) {
         if (tile != kNoTile && threadIdx.x % 32 + 1 == unsigned(__ffs(peers)))
             left = atomicSub(to.left + tile, unsigned(__popc(peers)));
     }
-    // Returns the position of this lane, relative to the beginning of its tile's list.
-    // Called by a whole warp.
+    // Returns the position of this lane's entry in its tile's list. All lanes of the
+    // warp must call it.
     __device__ uint32_t own() const {
         const uint32_t of_peers = __shfl_sync(kAllLanes, left, __ffs(peers) - 1);
         return of_peers - 1 - __popc(peers & ((1u << threadIdx.x % 32) - 1));
     }
 };
 
-// Entries of records over few tiles that a warp scatters at once: two per lane, because
-// the atomic operation for a position has a long latency.
+// The number of entries that a warp scatters at once: two per lane, to hide the latency
+// of the atomic operation.
 constexpr unsigned kAtOnce = 2, kFewAtOnce = 32 * kAtOnce;
 
-// A record over few tiles, and one of its tiles.
+// A record over few tiles, and the number of one of these tiles.
 struct FewPlace {
-    FewTiles few;  // kManyTiles: no record
+    FewTiles few;  // kManyTiles if there is no record
     uint32_t record;
     unsigned tile;
 };
 
-// Records and their tiles beyond the first; collected until there are kFewAtOnce.
+// A queue of records and tile numbers. It receives the tiles of a record beyond the
+// first; the warp scatters entries when there are kFewAtOnce.
 struct WaitingPlaces {
     static constexpr unsigned kMost = kFewAtOnce - 1 + kFewAtOnce * (kFewTiles - 1);
     FewTiles few[kMost];
-    uint32_t record[kMost];  // the highest bits contain the tile
+    uint32_t record[kMost];  // the upper bits contain the number of the tile
 };
 static_assert(kFewTiles <= 1u << (32 - kMostRecordBits), "a tile fits above a record");
 
-// Writes the entries of these records. Called by a whole warp.
+// Writes one entry per record of `places`. All lanes of the warp must call it.
 __device__ void scatter_few(const Scatter& to, const ItemTiles& item,
                             const FewPlace (&places)[kAtOnce]) {
     EntryBox box[kAtOnce];
@@ -263,7 +268,8 @@ __device__ void scatter_few(const Scatter& to, const ItemTiles& item,
     }
 }
 
-// Scatters an item's records over few tiles. Called by a whole warp.
+// Scatters the records of an item over few tiles each. All lanes of the warp must call
+// it.
 __device__ void scatter_item(const TileBinInput& in, const Scatter& to, const ItemTiles& item,
                              WaitingPlaces& waiting) {
     const unsigned lane = threadIdx.x % 32;
@@ -310,7 +316,7 @@ __device__ void scatter_item(const TileBinInput& in, const Scatter& to, const It
     __syncwarp();
 }
 
-// Scatters a part of a batch of records over many tiles. Called by a whole warp.
+// Scatters a part of a batch of large records. All lanes of the warp must call it.
 __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const LargeBatch& batch,
                               const LargePart& part) {
     const FrameImage& image = in.images[batch.image];
@@ -338,8 +344,8 @@ __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const L
         });
 }
 
-// Scatters all records. A warp claims its next item when it starts with one; records
-// over many tiles come last.
+// Scatters all records, large records last. A warp claims its next item when it starts
+// the current one, to hide the latency of the atomic operation.
 __global__ void __launch_bounds__(kThreads, kBlocks)
     scatter_kernel(TileBinInput in, TileBinOutput out) {
     await_kernel_before();

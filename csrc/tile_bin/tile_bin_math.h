@@ -1,21 +1,22 @@
 #pragma once
 
-// The tiles in a row of tiles that a record may touch.
+// Computes which tiles a record may touch in one row of tiles.
 
 #include "frame/tile_list.h"
 
 namespace v3dg {
 namespace cuda {
 
-// The columns [first, first + count) of one row of tiles that a record's ellipse may
-// reach.
+// The tiles that a record's ellipse may reach in one row: columns [first, first +
+// count).
 struct TileRun {
     int row, first, count;
 };
 
-// Returns the tiles of one row, counted from the record's first row of tiles. It does
-// not round to pixel centres, and NaN keeps the whole box: counting and scattering use
-// the same comparisons, and a superfluous tile only costs an entry.
+// Returns the tiles that a record may reach in one row of tiles; `row` is relative to
+// the first tile row of its box. The result may contain extra tiles, which only cost
+// entries, because nothing is rounded to pixel centres. If a number is NaN, it contains
+// the whole box. Counting and scattering call this function and thus agree.
 V3DG_HD inline TileRun tile_run(const Record<float>& r, int row) {
     row += r.y0 / kFrameTileHeight;
     const int top = max_of(static_cast<int>(r.y0), row * kFrameTileHeight);
@@ -25,7 +26,7 @@ V3DG_HD inline TileRun tile_run(const Record<float>& r, int row) {
     float low, high;
     row_extent(ellipse, static_cast<float>(top) + 0.5f - r.v,
                static_cast<float>(bottom) + 0.5f - r.v, low, high);
-    // These are the pixels whose centres lie in between, clipped to the box.
+    // From the ellipse's extent to pixels whose centres are inside, clipped to the box.
     const float x0 = r.u + low - 0.5f, x1 = r.u + high - 0.5f;
     const int first = x0 > static_cast<float>(r.x0) ? static_cast<int>(min_of(x0, 65536.0f)) : r.x0;
     const int last = x1 < static_cast<float>(r.x1) ? static_cast<int>(max_of(x1, -1.0f)) : r.x1;

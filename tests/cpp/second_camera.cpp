@@ -1,6 +1,6 @@
-// A second camera model, orthographic, that goes through projection as Pinhole does. It shows what
-// a model supplies, and that the formulas of projection name none. Prints what is wrong, if
-// anything.
+// Projects gaussians with a second camera model, an orthographic one. The test shows
+// what a camera model has to supply, and that projection works with any model. Prints
+// what is wrong, if anything.
 
 #include <cmath>
 #include <cstdio>
@@ -17,7 +17,8 @@ struct Edges {
     double half_width, half_height;
 };
 
-// A point (x, y, z) has its image at (scale x + cx, scale y + cy), in px.
+// An orthographic camera. The point (x, y, z) in view space is drawn at pixel
+// (zoom x + cx, zoom y + cy).
 template <class T>
 struct Orthographic {
     using Scalar = T;
@@ -27,13 +28,22 @@ struct Orthographic {
     using Point = NoPoint<V>;
     static constexpr int kNumPlanes = 1;
 
-    T scale, cx, cy;
+    T zoom, cx, cy;
     T width, height;
     T near_depth;
 
     template <class U>
     Orthographic<U> rounded_to() const {
-        return {U(scale), U(cx), U(cy), U(width), U(height), U(near_depth)};
+        return {U(zoom), U(cx), U(cy), U(width), U(height), U(near_depth)};
+    }
+    void scale(T factor) {
+        for (T* px : {&zoom, &cx, &cy, &width, &height}) *px *= factor;
+    }
+    void crop(T left, T top, T new_width, T new_height) {
+        cx -= left;
+        cy -= top;
+        width = new_width;
+        height = new_height;
     }
     template <class V>
     V depth_of(const V p[3]) const {
@@ -46,35 +56,35 @@ struct Orthographic {
     }
     template <class V>
     void to_pixel(const NoPoint<V>&, const V p[3], V& u, V& v) const {
-        u = scale * p[0] + cx;
-        v = scale * p[1] + cy;
+        u = zoom * p[0] + cx;
+        v = zoom * p[1] + cy;
     }
     template <class V, class W>
     void times_jacobian(const NoPoint<V>&, const W& x, const W& y, const W&, V& a1, V& a2) const {
-        a1 = scale * x;
-        a2 = scale * y;
+        a1 = zoom * x;
+        a2 = zoom * y;
     }
     template <class V>
     void linearized_vjp(const NoPoint<V>&, const V*, const V*, const V*, const V*,
                         const LinearImage<V>& d, V d_p[3], V d_m[9]) const {
         for (int k = 0; k < 3; ++k) {
-            d_m[k] = scale * d.a1[k];
-            d_m[3 + k] = scale * d.a2[k];
+            d_m[k] = zoom * d.a1[k];
+            d_m[3 + k] = zoom * d.a2[k];
             d_m[6 + k] = V{};
         }
-        d_p[0] = scale * d.u;
-        d_p[1] = scale * d.v;
+        d_p[0] = zoom * d.u;
+        d_p[1] = zoom * d.v;
         d_p[2] = d.depth;
     }
     T sphere_scale(const NoLimits&, T squared_model_scale) const {
-        return scale * std::sqrt(squared_model_scale);
+        return zoom * std::sqrt(squared_model_scale);
     }
     SphereImage<T> image_of_sphere(const T p[3], T radius, T sphere_scale, T filter_px2) const {
         const T reach = sphere_scale * radius;
-        return {scale * p[0] + cx, scale * p[1] + cy,
+        return {zoom * p[0] + cx, zoom * p[1] + cy,
                 std::sqrt(reach * reach + T(kReachSigmas * kReachSigmas) * filter_px2)};
     }
-    T px2_per_steradian() const { return scale * scale; }
+    T px2_per_steradian() const { return zoom * zoom; }
     template <class Eye>
     static Edges sides_of(const Eye eyes[2], int, double pad_px) {
         return {eyes[0].width / 2 + pad_px, eyes[0].height / 2 + pad_px};
@@ -92,7 +102,7 @@ struct Orthographic {
 
 static_assert(CameraModel<Orthographic<float>> && CameraModel<Orthographic<double>>);
 
-// A model that cannot tell where a point is on the image.
+// An incomplete camera model: it has no to_pixel().
 struct Blind : Orthographic<float> {
     void to_pixel() = delete;
 };
@@ -121,7 +131,7 @@ static Ellipse<double> projected(const Gaussian3d<double>& g, Projection<double,
     return project_gaussian(g, view, camera, kFilter, true, s);
 }
 
-// A loss that depends on every number of the ellipse.
+// Returns a loss that depends on every value of the ellipse.
 static double loss_of(const Gaussian3d<double>& g, const Camera2& camera) {
     Projection<double, Camera2> s;
     const Ellipse<double> e = projected(g, s, camera);
@@ -144,7 +154,7 @@ int main() {
     expect_close("u", e.u, 20 * (0.8 * 0.5 + 0.6 * 0.3) + 64);
     expect_close("v", e.v, 20 * (0.6 * 0.5 - 0.8 * 0.3) + 48);
     expect_close("depth", e.depth, 4.7);
-    // The determinant of the covariance, from that of L.
+    // The determinant of the covariance follows from the determinant of L.
     const double det_l = e.l11 * e.l22;
     expect_close("det", s.det * det_l * det_l, std::pow(kFalloffScale, 4));
 

@@ -68,3 +68,9 @@ def test_durations_are_summed_up(tmp_path):
         ("tests.system.test_pool::test_b", "400.0"),
         ("tests.unit.core.test_select::test_a[1]", "2.5"),
     ]
+
+
+def test_the_citation_has_the_version():
+    version = re.search(r'"(.*)"', (ROOT / "v3dg" / "_version.py").read_text(encoding="utf-8"))[1]
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {version}\n" in citation

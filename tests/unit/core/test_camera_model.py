@@ -2,6 +2,7 @@
 does."""
 
 import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -12,7 +13,7 @@ ROOT = Path(__file__).parents[3]
 CSRC = ROOT / "csrc"
 PROGRAM = ROOT / "tests" / "cpp" / "second_camera.cpp"
 # Folders that make pictures of their own, by a pinhole that they choose themselves.
-MAKERS_OF_PINHOLES = {"camera", "fit_group"}
+MAKERS_OF_PINHOLES = {"camera", "fit_group", "levels"}
 
 
 def compiler() -> str | None:
@@ -37,3 +38,15 @@ def test_pinholes_are_named_by_those_who_make_them_alone() -> None:
     sources = [p for p in CSRC.rglob("*") if p.suffix in {".h", ".cuh", ".cpp", ".cu"}]
     users = {p.parent.name for p in sources if "Pinhole<" in p.read_text(encoding="utf-8")}
     assert users == MAKERS_OF_PINHOLES
+
+
+def test_fields_of_a_pinhole_are_known_to_its_folder_alone() -> None:
+    """Others make a pinhole as a whole, and scale and crop any camera."""
+    field = re.compile(r"\bcamera\.(fx|fy|cx|cy)\b|[;{] *(camera|window)\.(width|height) =")
+    sources = [p for p in CSRC.rglob("*") if p.suffix in {".h", ".cuh", ".cpp", ".cu"}]
+    users = {
+        str(path.relative_to(CSRC))
+        for path in sources
+        if path.parent.name != "camera" and field.search(path.read_text(encoding="utf-8"))
+    }
+    assert users == {"bindings/bind_types.cpp"}

@@ -149,6 +149,13 @@ BROKEN = {
         "bindings/drawing.h",
         "mutex 'mutex' is not held on every path",
     ),
+    "models that are set while a frame is drawn": (
+        "bindings/cuda_frame.cpp",
+        "        const Turn turn(*turns_);\n        frame_.set_models(",
+        "        frame_.set_models(",
+        "bindings/cuda_frame.cpp",
+        "requires holding mutex 'turns_",
+    ),
     "a frame on the host": (
         "bindings/host_frame.cpp",
         "        const MutexLock lock(busy_);\n",
@@ -158,6 +165,8 @@ BROKEN = {
     ),
 }
 
+USERS_OF_CUDA = ("base/device.cpp", "bindings/cuda_frame.cpp")
+
 
 @needs_clang
 @pytest.mark.parametrize("name", BROKEN)
@@ -165,7 +174,7 @@ def test_missing_lock_is_found(tmp_path, name):
     changed, text, replacement, source, message = BROKEN[name]
     if source.startswith("bindings/") and importlib.util.find_spec("pybind11") is None:
         pytest.skip("pybind11 is not installed, without which bindings cannot be read")
-    if source == "base/device.cpp" and not has_cuda_headers():
+    if source in USERS_OF_CUDA and not has_cuda_headers():
         pytest.skip("CUDA's headers are not installed, without which its sources cannot be read")
     shutil.copytree(CSRC, tmp_path / "csrc")
     path = tmp_path / "csrc" / changed
