@@ -180,6 +180,7 @@ struct FrameLists {
     // The same for all images; kStopsByCut for a cut by a budget, whose tolerance is in
     // the counters.
     float min_transmittance;
+    // The destinations of the first and second image, if FrameImage has none.
     PicturePlanes planes[2] = {};
     bool has_depth = true;  // must be true if any image has a depth plane
     // Host memory that receives a copy of the counters; may be null.
