@@ -532,7 +532,7 @@ def _outer_share(grid: _Grid) -> float:
     all voxels that are closed on nearly all sides."""
     is_blocked = np.isfinite(grid.distances)
     is_closed = ~grid.is_solid & (is_blocked.mean(axis=0) > _CLOSED)
-    is_inner = _grown(is_closed, _WALL_VOXELS, beyond=False)
+    is_inner = _grown(is_closed, _WALL_VOXELS, includes_rim=False)
     visible = np.where(grid.is_solid & ~is_blocked.all(axis=0), grid.density, 0.0)
     return float(visible[~is_inner].sum() / max(visible.sum(), 1e-300))
 
@@ -558,7 +558,7 @@ def _free_places(
         return np.zeros((0, 3))
     middle = np.prod(np.ptp(solid, axis=0) + 1) * 0.343
     is_open = ~is_solid & (blocked <= _CLOSED)
-    near_outside = _grown(is_open, _WALL_VOXELS, beyond=True)
+    near_outside = _grown(is_open, _WALL_VOXELS, includes_rim=True)
     weight = np.where(is_solid, grid.density, 0.0)
     content = weight[~near_outside].sum() / max(weight.sum(), 1e-12)
     if len(places) < _LEAST_FREE * middle or content < _LEAST_CONTENT:
@@ -615,10 +615,10 @@ def _shifted(step: int) -> slice:
     return slice(max(step, 0), _VOXELS + min(step, 0))
 
 
-def _grown(mask: npt.NDArray[np.bool_], count: int, *, beyond: bool) -> npt.NDArray[np.bool_]:
-    """Return a mask that is grown by `count` voxels; `beyond` says whether the voxels
-    outside of the grid belong to it."""
-    grown = np.pad(mask, count, constant_values=beyond)
+def _grown(mask: npt.NDArray[np.bool_], count: int, *, includes_rim: bool) -> npt.NDArray[np.bool_]:
+    """Return a mask that is grown by `count` voxels; `includes_rim` says whether the
+    voxels outside of the grid belong to it."""
+    grown = np.pad(mask, count, constant_values=includes_rim)
     for _ in range(count):
         wider = grown.copy()
         for axis in range(3):

@@ -11,8 +11,8 @@ def box(rng, low, high, density=100.0, sides="xXyYzZ"):
     points = []
     for side in sides:
         axis = "xyz".index(side.lower())
-        others = [other for other in range(3) if other != axis]
-        count = int(density * np.prod((borders[1] - borders[0])[others])) + 4
+        side_axes = [number for number in range(3) if number != axis]
+        count = int(density * np.prod((borders[1] - borders[0])[side_axes])) + 4
         of_side = rng.uniform(*borders, (count, 3))
         of_side[:, axis] = borders[int(side.isupper()), axis]
         points.append(of_side)
@@ -44,8 +44,8 @@ def house(density=25.0):
     """A room in a garden of twice its area."""
     rng = np.random.default_rng(1)
     garden = box(rng, (-3.8, 0, -3.8), (3.8, 0.05, 3.8), density, sides="y")
-    inside = room(density).means.astype(float)
-    return asset_of(np.concatenate([inside, garden]), 0.6 * density**-0.5)
+    rooms = room(density).means.astype(float)
+    return asset_of(np.concatenate([rooms, garden]), 0.6 * density**-0.5)
 
 
 def street(density=12.0):
@@ -58,7 +58,8 @@ def street(density=12.0):
             high = (5 * number + 4.8, 0, max(4 * side, 8 * side))
             points.append(box(rng, low, high, density, sides="xXyzZ"))
     for number in range(8):
-        x, z = 2 + 3.5 * number, 2.6 * (-1) ** number
+        x = 2 + 3.5 * number
+        z = 2.6 * (-1) ** number
         points.append(box(rng, (x, -1.5, z - 0.4), (x + 1.5, 0, z + 0.4), density, "xXyzZ"))
     return asset_of(np.concatenate(points), 0.6 * density**-0.5)
 

@@ -26,7 +26,8 @@ from v3dg.cli._views import ask_up, is_at_terminal
 from v3dg.gaussians import Gaussians
 from v3dg.io import SUFFIXES, open_asset, run_files, subject_name
 from v3dg.levels import BuildConfig, DraftWarning, build_file, levels_path
-from v3dg.levels.quality import Quality, estimated_seconds
+from v3dg.levels.memory import free_bytes
+from v3dg.levels.quality import Quality, estimated_seconds, refine_bytes
 from v3dg.levels.scheduler import SchedulerError
 from v3dg.levels.viewpoints import SeenFrom, text_of
 from v3dg.upright import ASSUMED, up_of
@@ -325,6 +326,7 @@ def _build(
     start = time.perf_counter()
     with _resume_advised(output):
         bundle, is_built = _build_file(options, paths, output, executor)
+    seconds = time.perf_counter() - start
     notes = _notes(options, paths)
     for note in notes:
         _common.tell(note)
@@ -347,7 +349,7 @@ def _build(
         "refined": bundle.config.get("refined"),
         "estimated_seconds": _estimated_seconds(options, bundle, is_built=is_built),
         "bytes": output.stat().st_size,
-        "seconds": time.perf_counter() - start,
+        "seconds": seconds,
         "notes": notes,
     }
 
@@ -452,10 +454,12 @@ def _quality_of(options: Build, bundle: Bundle) -> Quality:
 
 def _estimated_seconds(options: Build, bundle: Bundle, *, is_built: bool) -> float | None:
     """Return about how long a refinement of a new draft takes on this CPU; None for
-    other bundles, and on a GPU."""
+    other bundles, on a GPU, and where there is too little memory to measure it."""
     is_draft = is_built and bundle.num_levels > 1 and "refined" not in bundle.config
     device = _device.resolve(options.device)
     if not is_draft or device.is_cuda or options.quiet or options.quality == "draft":
+        return None
+    if refine_bytes("standard", bundle.config["asset_gaussians"], bundle.sh_degree) > free_bytes():
         return None
     return estimated_seconds(bundle, device)
 

@@ -58,9 +58,9 @@ class Refinement:
             return settings
         record: JsonObject = {"steps": self.steps, "drop": DROP, "seed": self.seed}
         record |= request_of(self.seen_from)
-        made = bundle.config.get("refined")
-        if isinstance(made, dict):
-            record |= {name: made[name] for name in RECORDED if name in made}
+        record_of_bundle = bundle.config.get("refined")
+        if isinstance(record_of_bundle, dict):
+            record |= {n: record_of_bundle[n] for n in RECORDED if n in record_of_bundle}
         return {**settings, "refined": record}
 
 
@@ -106,9 +106,9 @@ def estimated_seconds(bundle: Bundle, device: Device) -> float:
         count = [0]
         start = time.perf_counter()
 
-        def stop(done: int, *_: object) -> None:
-            count[0] = done
-            if done > 0 and time.perf_counter() - start > _SECONDS_OF_TRIAL:
+        def stop(num_done: int, *_: object) -> None:
+            count[0] = num_done
+            if num_done > 0 and time.perf_counter() - start > _SECONDS_OF_TRIAL:
                 raise _Enough
 
         with contextlib.suppress(_Enough):

@@ -109,7 +109,7 @@ def viewpoints_of(bundle: Bundle, seen_from: SeenFrom) -> Viewpoints:
         )
     middle, radius = _ball(bundle)
     eyes = _spread(places)
-    inside = tuple(
+    inside_cameras = tuple(
         camera
         for number, eye in enumerate(eyes)
         for camera in _cameras_at(eye, up, number * _TURN, radius)
@@ -119,9 +119,9 @@ def viewpoints_of(bundle: Bundle, seen_from: SeenFrom) -> Viewpoints:
         if is_open or framing.outer_share > _LEAST_OUTER:
             seen_from = "both"
     if seen_from == "inside":
-        return Viewpoints(inside, len(eyes))
-    around = _cameras_around(middle, radius, len(inside))
-    return Viewpoints((*inside, *around), len(eyes))
+        return Viewpoints(inside_cameras, len(eyes))
+    outer_cameras = _cameras_around(middle, radius, len(inside_cameras))
+    return Viewpoints((*inside_cameras, *outer_cameras), len(eyes))
 
 
 def _ball(bundle: Bundle) -> tuple[Floats, float]:
@@ -136,13 +136,13 @@ def _spread(places: Floats) -> Floats:
     """Return at most `_NUM_EYES` of the places, each the farthest from those before
     it, from the one in the middle on."""
     middle = places.mean(axis=0)
-    chosen = int(np.square(places - middle).sum(axis=1).argmin())
-    numbers = [chosen]
-    distances = np.square(places - places[chosen]).sum(axis=1)
+    number = int(np.square(places - middle).sum(axis=1).argmin())
+    numbers = [number]
+    distances = np.square(places - places[number]).sum(axis=1)
     while len(numbers) < min(_NUM_EYES, len(places)):
-        chosen = int(distances.argmax())
-        numbers.append(chosen)
-        distances = np.minimum(distances, np.square(places - places[chosen]).sum(axis=1))
+        number = int(distances.argmax())
+        numbers.append(number)
+        distances = np.minimum(distances, np.square(places - places[number]).sum(axis=1))
     return places[numbers]
 
 

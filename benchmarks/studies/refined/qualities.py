@@ -154,10 +154,10 @@ def compare_scenes(
             row[name] = statistics.fmean(of_camera[name] for of_camera in of_cameras)
         rows.setdefault(quality, []).append(row)
         yield row
-    wanted = next(row["flip"] for row in rows["draft"] if row["tolerance"] == _TOLERANCE)
+    flip = next(row["flip"] for row in rows["draft"] if row["tolerance"] == _TOLERANCE)
     for quality, of_quality in rows.items():
-        count = round(count_at(wanted, of_quality))
-        yield {"layout": layout.name, "quality": quality, "flip": wanted, "gaussians": count}
+        count = round(count_at(flip, of_quality))
+        yield {"layout": layout.name, "quality": quality, "flip": flip, "gaussians": count}
 
 
 def frame_times(config: Config, layout: Path, bundle: v3dg.Bundle) -> Iterator[Row]:
@@ -191,10 +191,10 @@ def measure(config: Config, folder: Path, judges: Judges) -> None:
             results.add(row)
         for row in compare_scenes(config, config.layout, bundles, judges):
             results.add(row)
-    others = {path.stem: v3dg.read_asset(path) for path in config.assets}
+    assets = {path.stem: v3dg.read_asset(path) for path in config.assets}
     for count in config.heaps:
-        others[f"heap of {count}"] = steps.heap_of(donut, count)
-    for name, asset in others.items():
+        assets[f"heap of {count}"] = steps.heap_of(donut, count)
+    for name, asset in assets.items():
         if results.is_over():
             return
         measured(config, name, asset, folder, judges, results)
