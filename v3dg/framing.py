@@ -80,6 +80,19 @@ class _Sample(NamedTuple):
     weights: Floats
 
 
+class Surroundings(NamedTuple):
+    """The places inside a subject.
+
+    Attributes:
+        places: (N, 3) free places that are closed on nearly all sides, but for the sky.
+        outer_share: The share of what is seen from outside that stands far from all
+            closed places, such as a roof and a garden; 1 if they are open above.
+    """
+
+    places: Floats
+    outer_share: float
+
+
 @dataclass(frozen=True)
 class Framing:
     """The place and extent of a subject, which determine its first views.
@@ -94,23 +107,6 @@ class Framing:
     radius: float
     points: Floats
     _places: "_Places | None" = None
-
-    @property
-    def places(self) -> Floats:
-        """(N, 3) places inside a subject that surrounds its viewer; none for other
-        subjects."""
-        if self._places is None:
-            return np.zeros((0, 3))
-        return self._places.places
-
-    @property
-    def outer_share(self) -> float:
-        """Of a subject that surrounds its viewer: the share of what is seen of it from
-        outside that stands far from all places inside, such as a roof and a garden; 0
-        for other subjects."""
-        if self._places is None:
-            return 0.0
-        return self._places.outer_share
 
     @property
     def is_inside(self) -> bool:
@@ -246,17 +242,24 @@ def frame_subject(subject: Subject) -> Framing:
     return Framing(center, radius, points, _places(sample))
 
 
-def open_places(subject: Subject, up: Axis) -> Floats:
-    """Return the (N, 3) places with a ground, a free sky and walls around, such as in a
-    street or a yard; none if there are no such places."""
+def surroundings(subject: Subject, up: Axis) -> Surroundings | None:
+    """Return the places that a subject surrounds: those inside of a room, else those
+    with a ground, a free sky and walls around, as in a street or a yard; None if there
+    are none."""
     grid = _grid(_sample(subject))
     if grid is None:
-        return np.zeros((0, 3))
+        return None
+    places = _free_places(grid, grid.distances, ~grid.is_solid)
+    if len(places):
+        return Surroundings(places, _outer_share(grid))
     zenith = np.array(direction_of(up))
     heights = np.array([zenith @ step / np.linalg.norm(step) for step in _DIRECTIONS])
     is_blocked = np.isfinite(grid.distances)
     has_ground = is_blocked[heights.argmin()] & ~is_blocked[heights.argmax()]
-    return _free_places(grid, grid.distances[heights < _SKYWARD], has_ground)
+    places = _free_places(grid, grid.distances[heights < _SKYWARD], has_ground)
+    if len(places):
+        return Surroundings(places, 1.0)
+    return None
 
 
 def _sample(subject: Subject) -> _Sample:
@@ -459,13 +462,12 @@ class _Grid(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class _Places:
     """Places inside a room: (N, 3), with gaussians (M, 3) that are to be seen from
-    them, the size of the room, and its `Framing.outer_share`."""
+    them, and the size of the room."""
 
     places: Floats
     means: Floats
     weights: Floats
     size: float
-    outer_share: float
     _best: dict[tuple[float, ...], tuple[Floats, float]] = field(default_factory=dict)
 
     def best(self, up: Floats) -> tuple[Floats, float]:
@@ -524,7 +526,7 @@ def _places(sample: _Sample) -> _Places | None:
     low = grid.origin
     is_inside = ((sample.means >= low) & (sample.means <= low + size)).all(axis=1)
     rows = np.flatnonzero(is_inside)[:: max(int(is_inside.sum()) // 5000, 1)]
-    return _Places(places, sample.means[rows], sample.weights[rows], size, _outer_share(grid))
+    return _Places(places, sample.means[rows], sample.weights[rows], size)
 
 
 def _outer_share(grid: _Grid) -> float:

@@ -17,7 +17,7 @@ from v3dg._json import JsonObject
 from v3dg._numbers import Floats, one_of
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
-from v3dg.framing import frame_subject, open_places
+from v3dg.framing import surroundings
 from v3dg.upright import direction_of, up_of
 
 SeenFrom = Literal["auto", "outside", "inside", "both"]
@@ -95,12 +95,8 @@ def viewpoints_of(bundle: Bundle, seen_from: SeenFrom) -> Viewpoints:
         return Viewpoints()
     axis, _ = up_of(bundle)
     up = np.array(direction_of(axis))
-    framing = frame_subject(bundle)
-    places = framing.places
-    is_open = not len(places)
-    if is_open:
-        places = open_places(bundle, axis)
-    if not len(places):
+    room = surroundings(bundle, axis)
+    if room is None:
         if seen_from == "auto":
             return Viewpoints()
         raise ValueError(
@@ -108,7 +104,7 @@ def viewpoints_of(bundle: Bundle, seen_from: SeenFrom) -> Viewpoints:
             "place from which it can be seen; give cameras instead"
         )
     middle, radius = _ball(bundle)
-    eyes = _spread(places)
+    eyes = _spread(room.places)
     inside_cameras = tuple(
         camera
         for number, eye in enumerate(eyes)
@@ -116,7 +112,7 @@ def viewpoints_of(bundle: Bundle, seen_from: SeenFrom) -> Viewpoints:
     )
     if seen_from == "auto":
         seen_from = "inside"
-        if is_open or framing.outer_share > _LEAST_OUTER:
+        if room.outer_share > _LEAST_OUTER:
             seen_from = "both"
     if seen_from == "inside":
         return Viewpoints(inside_cameras, len(eyes))
