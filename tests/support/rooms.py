@@ -43,7 +43,7 @@ def room(density=25.0):
 def house(density=25.0):
     """A room in a garden of twice its area."""
     rng = np.random.default_rng(1)
-    garden = box(rng, (-3.8, 0, -3.8), (3.8, 0.05, 3.8), density, sides="y")
+    garden = box(rng, (-4, 0, -4), (4, 0.05, 4), density, sides="y")
     rooms = room(density).means.astype(float)
     return asset_of(np.concatenate([rooms, garden]), 0.6 * density**-0.5)
 

@@ -80,10 +80,10 @@ def names_in(folder):
 @pytest.mark.parametrize(
     ("quality", "num_gaussians", "steps"),
     [
-        ("standard", 1000, 20_020),
-        ("standard", 500_000, 30_000),
+        ("standard", 1000, 18_010),
+        ("standard", 500_000, 23_000),
         ("standard", 10_000_000, 100_000),
-        ("best", 500_000, 150_000),
+        ("best", 500_000, 115_000),
         ("best", 10_000_000, 500_000),
     ],
 )
@@ -178,7 +178,7 @@ def test_a_refinement_that_is_interrupted_begins_again(
 
 
 def test_a_build_that_is_killed_leaves_its_levels(file, device, tmp_path):
-    """The refinement of 20,020 pictures is far from its end."""
+    """The refinement of 18,010 pictures is far from its end."""
     output = tmp_path / "out.v3dg"
     roots = [str(Path(path).parents[1]) for path in (v3dg.__file__, Path(__file__).parent)]
     roots.append(os.environ.get("PYTHONPATH", ""))

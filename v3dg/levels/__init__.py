@@ -80,8 +80,8 @@ def build_bundle(
         codec: The codec of the bundle, see `v3dg.Bundle`. With a lossy codec, levels
             are fitted to the rounded gaussians of the levels below them.
         quality: "draft" leaves the levels as they are built. "standard" then refines
-            them together (`v3dg.refine_bundle`) with 20,000 pictures and one more for
-            every 50 gaussians, at most 100,000: seconds on a GPU, minutes on a CPU.
+            them together (`v3dg.refine_bundle`) with 18,000 pictures and one more for
+            every 100 gaussians, at most 100,000: seconds on a GPU, minutes on a CPU.
             "best" uses five times as many. docs/levels.md has the time and the gain of
             each. None means "standard" on a GPU and "draft" on a CPU, and for a config
             without steps. An asset of more than 4,000,000 gaussians, or whose

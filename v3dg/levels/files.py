@@ -76,12 +76,11 @@ def build_file(
         ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: See
             `read_asset` and `build_bundle`.
     """
-    config = _checked_config(config)
     _check_output(Path(bundle_path))
     build = _FileBuild(
         paths=_paths_of(asset_path),
         bundle_path=Path(bundle_path),
-        config=config,
+        config=_checked_config(config),
         seed=seed,
         progress=progress,
         devices=devices_for(device, asset),

@@ -20,8 +20,8 @@ Quality = Literal["draft", "standard", "best"]
 
 # Pictures of a standard refinement: some for every asset, and more for large ones,
 # whose gaussians are in fewer of them.
-_LEAST_PICTURES = 20_000
-_GAUSSIANS_PER_PICTURE = 50
+_LEAST_PICTURES = 18_000
+_GAUSSIANS_PER_PICTURE = 100
 _MOST_PICTURES = 100_000
 # The factor of a best one.
 _BEST = 5

@@ -97,8 +97,6 @@ def build_into(
             with Bar(plan, num_finished, progress) as bar:
                 build = _Build(config, file.config["seed"], plan, units, parts, file, store, bar)
                 tables, hashes = build.all_levels(leaves, devices, most_units, executor)
-                if config.smooth == "yes" and len(tables) > 1:
-                    tables = build.grown(tables, devices[0])
             store.finish(*assemble(plan, tables, config), hashes)
         if refinement is None:
             return store.bundle()
@@ -186,9 +184,10 @@ class _Build:
                 hashes = pages.write(runs[number], level.gaussians)
                 self.store.save(top, number, FinishedLevel(level.tables, hashes))
             finished.append(levels[top, number])
-        return [level.tables for level in finished], np.concatenate(
-            [level.hashes for level in finished]
-        )
+        tables = [level.tables for level in finished]
+        if self.config.smooth == "yes" and len(tables) > 1:
+            tables = self.grown(tables, devices[0])
+        return tables, np.concatenate([level.hashes for level in finished])
 
     def grown(self, tables: Sequence[LevelTables], device: Device) -> list[LevelTables]:
         """Return the tables with larger balls; the growth of level 1 is measured if the

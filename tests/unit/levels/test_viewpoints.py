@@ -82,7 +82,7 @@ def test_the_cameras_of_an_eye_look_all_around(inside):
 def test_no_camera_of_a_room_is_behind_its_walls(inside):
     for camera in inside.cameras[::50]:
         small = v3dg.Camera(camera.viewmat, camera.K * [[0.125], [0.125], [1]], 64, 64, camera.near)
-        assert v3dg.rasterize(room(), small).alpha.mean() > 0.95
+        assert v3dg.rasterize(room(), small).alpha.mean() > 0.9
     assert len(inside.cameras) == 4 * inside.num_eyes
 
 
