@@ -362,4 +362,5 @@ def test_the_command_builds_each_quality(short, file, tmp_path, capsys):
         if advice:
             assert re.search(r"in about \d+ (s|minutes|hours) on this CPU", advice[0])
             words = shlex.split(advice[0].split("`")[1])
-            assert words == ["v3dg", "refine", str(output), str(tmp_path / "a scene_refined.v3dg")]
+            refined = str(tmp_path / "a scene_refined.v3dg")
+            assert words == ["v3dg", "refine", str(output), refined, "--steps", str(STEPS)]

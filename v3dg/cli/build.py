@@ -27,7 +27,7 @@ from v3dg.gaussians import Gaussians
 from v3dg.io import SUFFIXES, open_asset, run_files, subject_name
 from v3dg.levels import BuildConfig, DraftWarning, build_file, levels_path
 from v3dg.levels.memory import free_bytes
-from v3dg.levels.quality import Quality, estimated_seconds, refine_bytes
+from v3dg.levels.quality import Quality, estimated_seconds, pictures_of, refine_bytes
 from v3dg.levels.scheduler import SchedulerError
 from v3dg.levels.viewpoints import SeenFrom, text_of
 from v3dg.upright import ASSUMED, up_of
@@ -61,9 +61,9 @@ class Build(_common.OnDevice):
     (docs/format.md has the error)."""
     quality: Annotated[Quality | None, _common.option("{draft,standard,best}")] = None
     """How close levels come to the asset: `draft` as they are built; `standard` also
-    refined together, which takes 3 s more for 45,000 gaussians and 5 s for 500,000 on
+    refined together, which takes 2 s more for 45,000 gaussians and 5 s for 500,000 on
     an H100, and minutes on a CPU; `best` with five times as many pictures. By default
-    `standard` on a GPU, for up to 4,000,000 gaussians, else `draft`."""
+    `standard` on a GPU, for up to 4 million gaussians, else `draft`."""
     seen_from: Annotated[SeenFrom, _common.option("{auto,outside,inside,both}")] = "auto"
     """From where pictures of a refinement are taken; by default what free space the
     asset surrounds decides. With photographs, `v3dg refine --cameras` is better."""
@@ -464,13 +464,16 @@ def _estimated_seconds(options: Build, bundle: Bundle, *, is_built: bool) -> flo
     return estimated_seconds(bundle, device)
 
 
-def _refine_advice(output: Path, seconds: float) -> str:
+def _refine_advice(result: JsonObject) -> str:
     """The command that refines a draft, and what it takes."""
+    output = Path(result["output"])
     refined = output.with_name(f"{output.stem}_refined.v3dg")
-    command = shlex.join(["v3dg", "refine", str(output), str(refined)])
+    num_leaves = result["asset_gaussians"] - sum(result["dropped"].values())
+    pictures = str(pictures_of("standard", num_leaves))
+    command = shlex.join(["v3dg", "refine", str(output), str(refined), "--steps", pictures])
     return (
         f"draft: `{command}` brings its levels closer to the asset, in about "
-        f"{_duration_text(seconds)} on this CPU, or seconds on a GPU"
+        f"{_duration_text(result['estimated_seconds'])} on this CPU, or seconds on a GPU"
     )
 
 
@@ -506,5 +509,5 @@ def _lines(result: JsonObject) -> list[str]:
     if result["refined"] is not None:
         lines.append(_refined_text(result["refined"]))
     if result["estimated_seconds"] is not None:
-        lines.append(_refine_advice(Path(result["output"]), result["estimated_seconds"]))
+        lines.append(_refine_advice(result))
     return lines

@@ -74,7 +74,7 @@ def refinement_of(
         check(
             "seen_from",
             seen_from == "auto",
-            f"auto for levels that are not refined, got {seen_from}",
+            f"auto for levels that are not refined, got {seen_from}; name the quality standard",
         )
         return None
     return Refinement(pictures_of(quality, num_gaussians), seed, seen_from)
