@@ -73,17 +73,17 @@ struct Entered {
     void* stream;
 };
 
-// What a backend can do.
+// The capabilities of a backend.
 struct BackendTraits {
-    // the host can read the arrays, so the bindings check their values
+    // The host can read the arrays, so the bindings check their values.
     bool host_reads_arrays;
     bool computes_doubles;  // can draw and differentiate float64 gaussians
     size_t row_alignment;   // alignment of quaternions and SH coefficients, bytes
-    // supports only plain requests (FrameRequest::is_plain), and no picking
+    // Supports only plain requests (FrameRequest::is_plain), and no picking.
     bool draws_only_plainly;
 };
 
-// What a pool needs of a device.
+// The requirements of a device on a page pool.
 struct PoolDemands {
     // The most bytes of pages that are copied while a few frames are drawn.
     size_t most_block_bytes;
@@ -162,9 +162,9 @@ struct FrameInput {
     const Scene& scene;
     std::shared_ptr<const SceneState> state;
     Pool* pool;  // null: draw the frame's own models
-    // the state of a sequence of pictures; null for a single picture
+    // The state of a sequence of pictures; null for a single picture.
     BudgetSteps* steps;
-    // set to end the picture early, if possible; may be null
+    // A flag that asks to end the picture early, if possible. May be null.
     const std::atomic<bool>* stop;
 };
 
@@ -205,11 +205,11 @@ class AssetFrame {
 class Target {
   public:
     virtual ~Target() = default;
-    // See levels/fit_level.h. `error` is in host memory.
+    // Fits groups of one level (levels/fit_level.h). `error` is in host memory.
     virtual void fit_level(const FitConfig& config, Span<const FitGroup> groups,
                            const GaussianRows<float>& gaussians, float* error,
                            FitProgress& progress, const Work& work) const = 0;
-    // See levels/refine_cuts.h.
+    // Refines all levels together (levels/refine_cuts.h).
     virtual void refine_cuts(const FitConfig& config, const CutComparison& comparison,
                              const CutRows& levels, const CutPictures& pictures,
                              FitProgress& progress, const Work& work) const = 0;
@@ -254,7 +254,7 @@ class Backend {
 
     // Waits, because `leaf_offset` is in host memory.
     virtual void median_split(Span<const Point> points, Span<const int64_t> offset, int depth,
-                              Span<int64_t> order, Span<int64_t> leaf_offset,
+                              size_t unit, Span<int64_t> order, Span<int64_t> leaf_offset,
                               const Work& work) const = 0;
     virtual void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double margin,
                                Span<Ball> out, const Work& work) const = 0;
@@ -269,7 +269,7 @@ class Backend {
                         const Work& work) const = 0;
     virtual void ellipses(const EllipsesInput<float>& in, const Ellipses<float>& out,
                           const Work& work) const = 0;
-    // Called only if computes_doubles is true.
+    // The version for float64. Called only if computes_doubles is true.
     virtual void ellipses(const EllipsesInput<double>& in, const Ellipses<double>& out,
                           const Work& work) const = 0;
     // Waits, because the sums are in host memory.
@@ -315,8 +315,8 @@ class Backend {
 // Returns the backend of a device. Throws RuntimeError if it was not compiled.
 const Backend& backend_of(Device device);
 
-// Return the backend of the host, and that of devices. The latter is null if no
-// device's backend was compiled.
+// Return the backend of the host and the backend of devices. The backend of devices is
+// null if none was compiled.
 const Backend& host_backend();
 const Backend* device_backend();
 

@@ -64,7 +64,7 @@ struct Torch {
           int32_(py::module_::import("torch").attr("int32")),
           uint8_(py::module_::import("torch").attr("uint8")) {}
 
-    // Returns the module torch after initialising CUDA. For callers that do not
+    // Returns the module torch after initialising CUDA. It is for callers that do not
     // initialise CUDA otherwise.
     static py::module_ initialised_cuda() {
         py::module_::import("torch.cuda").attr("init")();
@@ -191,10 +191,10 @@ class CudaBackend final : public Backend {
             cudaGetLastError();
     }
 
-    void median_split(Span<const Point> points, Span<const int64_t> offset, int depth,
+    void median_split(Span<const Point> points, Span<const int64_t> offset, int depth, size_t unit,
                       Span<int64_t> order, Span<int64_t> leaf_offset,
                       const Work& work) const override {
-        cuda::median_split(points, offset, depth, order, leaf_offset, stream_of(work));
+        cuda::median_split(points, offset, depth, unit, order, leaf_offset, stream_of(work));
     }
     void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double margin,
                        Span<Ball> out, const Work& work) const override {
@@ -223,7 +223,7 @@ class CudaBackend final : public Backend {
     }
     void ellipses(const EllipsesInput<double>&, const Ellipses<double>&,
                   const Work&) const override {
-        throw std::invalid_argument("gaussians: float64 is computed on the CPU only");
+        throw std::invalid_argument("gaussians: float64 is supported only on the CPU; use float32");
     }
     void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& gaussians,
                     const CutPictures& pictures, const SeenOfGaussians& seen, FitProgress& progress,
@@ -284,7 +284,7 @@ class CudaBackend final : public Backend {
 }  // namespace
 }  // namespace cuda
 
-// Never destroyed, because Python may end before the process.
+// The backend is never destroyed, because Python may end before the process.
 const Backend& cuda_backend() {
     static const Backend& backend = *new cuda::CudaBackend;
     return backend;

@@ -161,7 +161,7 @@ class EnqueuedDrawing final : public BoundDrawing {
   private:
     const Device device_;
     const std::shared_ptr<Mutex> turns_;  // shared with the frame
-    // destroyed before the objects that it uses
+    // The drawing is destroyed before the objects that it uses.
     const std::unique_ptr<Drawing> drawing_;
     DevicePages* const pages_;  // the pool that provides the gaussians; may be null
     const SelectRule rule_;
@@ -193,8 +193,8 @@ EyeImages new_images(const Eyes& eyes, const Shade& shade, NewPictures& pictures
                         : EyeImages{{image[0], {}}, 1, stop};
 }
 
-// Returns a function that allocates the pictures through torch. It is called after the
-// first kernels are enqueued, because it is slow.
+// Returns a function that allocates the pictures through torch. The frame calls it
+// after the first kernels are enqueued, because allocating is slow.
 cuda::Frame::Place place_of(NewPictures& pictures, Device device) {
     return [&pictures, device](PicturePlanes planes[2]) {
         for (size_t k = 0; k < pictures.size(); ++k) planes[k] = planes_of(pictures[k], device);
@@ -252,8 +252,8 @@ class BackendFrame final : public backend::Frame {
         std::unique_ptr<Drawing> drawing =
             frame_.draw(tables_of(input.scene), pages, request, used, images, stream_of(work),
                         place_of(pictures, device_));
-        // The tolerance to report: without a pool, that of the request; with a pool,
-        // the one that the pool may have raised.
+        // Report the tolerance of the request. With a pool, report the tolerance that
+        // the pool may have raised.
         const SelectRule& reported = pages == nullptr ? request.rule : used;
         return std::make_unique<EnqueuedDrawing>(std::move(pictures), device_, turns_,
                                                  std::move(drawing), reported, pages);
@@ -267,7 +267,7 @@ class BackendFrame final : public backend::Frame {
     const Device device_;
     // Shared with drawings, which may be finished after the frame is destroyed.
     const std::shared_ptr<Mutex> turns_ = std::make_shared<Mutex>();
-    // Own the memory that the frame reads.
+    // The members below own the memory that the frame reads.
     std::vector<std::shared_ptr<const backend::Model>> models_ V3DG_GUARDED_BY(*turns_);
     SceneFrame frame_ V3DG_GUARDED_BY(*turns_);
 };

@@ -7,7 +7,7 @@
 namespace v3dg {
 
 BoundModel::BoundModel(const Rows& rows) : device_(rows.device()), size_(rows.size()) {
-    static_cast<void>(rows.read<float>());  // checks that they are float32
+    static_cast<void>(rows.read<float>());  // checks that the gaussians are float32
     const Work work(device_);
     model_ = work.backend().make_model(rows, work);
 }
@@ -30,9 +30,9 @@ py::tuple BoundModel::decode(const py::array& cluster_ids) const {
     std::vector<int64_t> offset{0};
     for (const int32_t c : cluster) {
         if (c < 0 || static_cast<size_t>(c) >= num_gaussians_.size())
-            throw std::out_of_range("cluster_ids: expected ids below " +
-                                    std::to_string(num_gaussians_.size()) +
-                                    " and none negative, got " + std::to_string(c));
+            throw std::out_of_range("cluster_ids: expected ids of at least 0 and below " +
+                                    std::to_string(num_gaussians_.size()) + ", got " +
+                                    std::to_string(c));
         offset.push_back(offset.back() + num_gaussians_[c]);
     }
     const Work work(device_);

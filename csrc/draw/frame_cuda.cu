@@ -35,7 +35,7 @@ struct Frame::Slot {
             check(cudaEventCreate(event), "cudaEventCreate");
     }
     ~Slot() {
-        // Ignore errors: at exit, the driver may be unloaded before this object is
+        // Ignore errors. At exit the driver may be unloaded before this object is
         // destroyed.
         for (const cudaEvent_t event : {begun, prepared, counted, done})
             if (event != nullptr) cudaEventDestroy(event);
@@ -49,8 +49,8 @@ constexpr size_t kEllipseFloats = 8,
                  // together.
     kRecordFloats = 10;
 
-// The number of slots that are allocated in advance. So many frames can be in flight or
-// captured before more are allocated.
+// The number of slots that are allocated in advance. More slots are allocated when more
+// frames are in flight or captured.
 constexpr size_t kSlots = 8;
 
 Frame::Frame(Keeps keeps) : keeps_(keeps) {
@@ -74,8 +74,9 @@ Frame::Slot* Frame::take_slot(bool capturing) {
     if (free_slots_.empty() || waits) {
         cudaGetLastError();
         if (capturing)
-            throw std::runtime_error("frame: expected at most " + std::to_string(kSlots) +
-                                     " frames in flight or captured");
+            throw std::runtime_error(
+                "frame: expected at most " + std::to_string(kSlots) +
+                " captured frames and frames in flight, got one more; finish one first");
         slots_.push_back(std::make_unique<Slot>());
         return slots_.back().get();
     }
@@ -104,8 +105,8 @@ void Frame::enlarge(const FrameCounters& counters) {
     const auto grow = [is_full](unsigned long long& capacity, unsigned long long count) {
         if (is_full(capacity, count, 8)) capacity = std::max(capacity, count + count / 8);
     };
-    // If gaussians exceed their capacity, entries were not counted. Most scenes have
-    // one or two entries per gaussian.
+    // If the gaussians exceed their capacity, no entries were counted, so estimate
+    // their number: most scenes have one or two entries per gaussian.
     if (counters.gaussians > capacity_.records) grow(capacity_.entries, counters.gaussians);
     grow(capacity_.items, counters.items);
     grow(capacity_.records, counters.gaussians);
@@ -134,8 +135,8 @@ std::unique_ptr<Drawing> Frame::draw(const FrameBatch& batch, Prepare prepare, c
     drawing->is_captured_ = is_capturing(stream);
     was_captured_ = was_captured_ || drawing->is_captured_;
     drawing->slot_ = take_slot(drawing->is_captured_);
-    // If the last frame exceeded or nearly filled a buffer, this one is likely to do
-    // so, too. So enlarge the buffers first, if the last frame's counts are known.
+    // If the last frame exceeded or nearly filled a buffer, the next frame is likely to
+    // exceed it, too. So enlarge the buffers now, if the last frame's counts are known.
     if (last_ != nullptr && !last_->is_captured_ && !drawing->is_captured_) {
         const cudaError_t over = cudaEventQuery(last_->slot_->done);
         if (over == cudaSuccess) enlarge(*last_->slot_->counters);

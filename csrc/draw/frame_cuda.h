@@ -23,24 +23,25 @@ struct FrameBatch {
     const Placement* placements;
     const FrameImage* images;
     uint32_t num_images, num_tiles;  // `num_tiles`: total over all images
-    // See ProjectInput for these two.
+    // Packed and coded models (see ProjectInput).
     const PackedPlanes* packed = nullptr;
     const CodedGaussians* coded = nullptr;
-    // whether any item may be shared; must be false with a tape
+    // Whether any item may be shared; must be false with a tape.
     bool has_shared_items = false;
     // The same for all images; kStopsByCut only with a budget.
     float min_transmittance = kStopsBefore;
-    // Whether any item may have a weight below 1. Only the items of scenes can; those
-    // that do are not shared.
+    // Whether any item may have a weight below 1. Such items occur only in scenes, and
+    // are never shared.
     bool has_faded_items = false;
-    // [num_factors], see ProjectInput; or null
+    // [num_factors] as in ProjectInput; may be null
     const InstanceFactors* factors = nullptr;
     uint32_t num_factors = 0;
     // The mutex that guards the models, if they change between frames; else null. The
     // caller must hold it during draw().
     StreamMutex* guards_models = nullptr;
     size_t num_zeros = 0;  // size of ItemList::zeros
-    // Whether depth is drawn in any image that gets its destination later.
+    // Whether depth is drawn in any of the images that get their destination from a
+    // Place.
     bool has_depth = true;
 };
 
@@ -54,7 +55,7 @@ struct FrameTape {
     const DrawItem* items;         // counters->items elements
     const uint32_t* item_records;  // number of records of each item
     const uint32_t* source;        // index of each record's gaussian in the model
-    // first gradient slot of each record, set by place_slots()
+    // First gradient slot of each record, set by place_slots().
     const uint32_t* first_slot;
 };
 
@@ -81,8 +82,8 @@ class Frame {
     Frame& operator=(const Frame&) = delete;
 
     // A function that enqueues the work to write the batch's items and the tables that
-    // do not exist yet. It is called again if the frame is drawn again. All counters
-    // are zero before that work runs.
+    // do not exist yet. If the frame is drawn again, the function is called again. All
+    // counters are zero before that work runs.
     using Prepare = std::function<void(const ItemList& items, cudaStream_t stream)>;
 
     // A function that sets the destinations of images that have none. It is called
@@ -129,13 +130,13 @@ class Frame {
     uint32_t num_plans_ = 0;
     // State, scan state, zeros for items, tile counts
     DeviceBuffer<unsigned char> cleared_;
-    // the first bytes of `cleared_` that are zero when the next frame starts
+    // The first bytes of `cleared_` that are zero when the next frame starts.
     size_t num_zero_bytes_ = 0;
 
     std::vector<std::unique_ptr<Slot>> slots_;
-    // may belong to frames that are still drawn on the device
+    // The device may still be drawing frames of free slots.
     std::deque<Slot*> free_slots_;
-    // buffers that captured graphs may still use
+    // Buffers that captured graphs may still use.
     std::vector<std::shared_ptr<void>> retired_;
     bool was_captured_ = false;
     Drawing* last_ = nullptr;
@@ -180,7 +181,7 @@ class Drawing {
     Frame::Prepare prepare_;
     cudaStream_t stream_;
     Frame::Slot* slot_ = nullptr;
-    Capacity capacity_{};  // capacity of the buffers when it was enqueued
+    Capacity capacity_{};  // capacity of the buffers when the frame was enqueued
     PicturePlanes planes_[2]{};
     bool is_captured_ = false, is_settled_ = false;
     int num_draws_ = 1;

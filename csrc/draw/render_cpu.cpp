@@ -81,8 +81,8 @@ class RecordRoom {
             longest_ = std::max(longest_, end - pieces[c.first].first);
             total = end;
         }
-        // A thread takes a new strip when the longest chunk does not fit in its current
-        // one. So the gaps are at most an eighth of the strips.
+        // A thread takes a new strip when its current strip has no room for the longest
+        // chunk. So the gaps are at most an eighth of the strips.
         strip_ = 8 * longest_;
         size_ = total + total / 7 + (mine_.size() + 1) * strip_;
         if (size_ > UINT32_MAX)
@@ -114,8 +114,8 @@ class RecordRoom {
     std::vector<Strip> mine_;
 };
 
-// Returns the tiles, those with the longest lists first, so that no thread starts a
-// long list at the end.
+// Returns the tiles in falling order of the length of their lists, so that no thread
+// starts a long list at the end.
 static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_tiles) {
     std::vector<uint32_t> order(num_tiles);
     std::iota(order.begin(), order.end(), 0);
@@ -135,8 +135,8 @@ static double band_bytes_of(const std::atomic<bool>* stop) {
     if (stop != nullptr) return kLeastBandBytes;
     return std::clamp(kThreadBandBytes * most_threads(), kLeastBandBytes, kMostBandBytes);
 }
-// The number of gaussians up to which a picture is drawn in a single band, without an
-// estimate.
+// Pictures with at most this many gaussians are drawn in a single band, because they
+// need little memory.
 constexpr uint64_t kFewGaussians = 65536;
 
 // Divides a window into bands of tile rows with about equally many bytes of records and

@@ -35,18 +35,18 @@ struct FrameRequest {
     Shade shade;
     FrameLook look = FrameLook::appearance;
     std::optional<GivenCut> cut = {};  // a cut to draw instead of selecting one
-    // eyes for which the cut is selected; default: `eyes`
+    // Eyes for which the cut is selected; default: `eyes`.
     std::optional<Eyes> chooser = {};
-    // With a pool: draw with the pages that are resident, without loading or requesting
-    // any.
+    // Whether a frame with a pool draws only the pages that are resident, and neither
+    // brings in nor requests any pages.
     bool is_aside = false;
     // Per bundle: the colours of clusters in host memory, as SH coefficients of degree
     // 0, [C][3]. An empty vector keeps the gaussians' colours.
     std::vector<const float*> cluster_colors = {};
 
     const Eyes& choosing_eyes() const { return chooser ? *chooser : eyes; }
-    // Whether every backend can draw the request. Other requests are drawn on the host
-    // only.
+    // Returns whether every backend can draw the request. Other requests are drawn on
+    // the host only.
     bool is_plain() const {
         return look == FrameLook::appearance && !is_aside && !chooser && cluster_colors.empty();
     }

@@ -26,20 +26,20 @@ struct HostScene {
     Span<const ClusterTable> tables;
     Span<const SceneModel> models;  // one per table
     InstanceTable instances;
-    // See SelectInput for these two.
+    // Optional outputs of selection (see SelectInput).
     Span<const Span<uint32_t>> needs = {};
     uint32_t* last_bin = nullptr;
 };
 
 // The counts of one frame.
 struct SceneFrameCounts {
-    // selected gaussians; if exceeds_budget, those of the coarsest cut
+    // Selected gaussians. If exceeds_budget, the gaussians of the coarsest cut.
     int64_t gaussians;
     float tolerance_px2;  // tolerance of the cut
     bool exceeds_budget;  // if true, nothing was drawn
     double select_seconds, draw_seconds;
     RenderCounts render;  // sums over both pictures of a stereo frame
-    // selected gaussians of each level; not set by draw_model()
+    // Selected gaussians of each level; not set by draw_model().
     std::vector<int64_t> levels;
 
     // Adds the counts of the second picture of a stereo frame.
@@ -78,7 +78,7 @@ SceneFrameCounts draw_model(const GaussianPlanes<float>& model, size_t count,
                             const Picture<float>& picture, const std::atomic<bool>* stop = nullptr);
 
 // Finds the gaussian with the largest blend weight in the first pixel of the first
-// eye's window. The cut is that of draw_scene(). Returns whether any gaussian is drawn
+// eye's window, in the cut of draw_scene(). Returns whether any gaussian is drawn
 // there.
 bool pick_scene(const HostScene& scene, const FrameRequest& request, const SelectRule& rule,
                 ScenePick& picked);

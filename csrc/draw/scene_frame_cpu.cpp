@@ -21,7 +21,8 @@ namespace {
 // stay locked in the child of a fork().
 class SharedWorkspace {
   public:
-    // Exchanged atomically: threads may still be drawing when the process exits.
+    // The exchange is atomic, because threads may still be drawing when the process
+    // exits.
     ~SharedWorkspace() { delete kept_.exchange(nullptr); }
     std::unique_ptr<Workspace<float>> take() {
         std::unique_ptr<Workspace<float>> kept(kept_.exchange(nullptr));
@@ -186,8 +187,9 @@ std::vector<float> tint_of(const HostScene& scene, const FrameRequest& request,
     // Metrics depend on the eye that views the picture; missing pages on the eye for
     // which the cut was selected.
     const Camera& judge = is_metric ? request.eyes.camera[0] : request.choosing_eyes().camera[0];
-    // Compare with the requested tolerance: the pool may have raised the tolerance of
-    // the cut. With a budget, there is no requested tolerance, so use that of the cut.
+    // The tolerance that the tints show. For missing pages without a budget, it is the
+    // requested tolerance, because the pool may have raised the tolerance of the cut.
+    // Otherwise, it is the tolerance of the cut.
     const bool wants_used = is_metric || rule.budget != kNoBudget;
     const float wanted = wants_used ? tolerance_px2 : request.rule.tolerance_px2;
     std::vector<float> tint(3 * given.instance.size);
@@ -197,7 +199,7 @@ std::vector<float> tint_of(const HostScene& scene, const FrameRequest& request,
         const ClusterTable& table = scene.tables[scene.instances.bundle[given.instance[s]]];
         const bool is_finest = level_of(table, given.cluster[s]) <= rule.min_level;
         const float grey = std::min(share[s], cpu::kMostShare);
-        // 1.0001: a margin for the rounding of metrics.
+        // 1.0001 is a margin for the rounding of metrics.
         const Rgb rgb =
             is_metric ? Rgb{grey, grey, grey}
                       : missing_color(is_finest ? 0.0f : share[s], 1.0001f * rule.fade.factor);

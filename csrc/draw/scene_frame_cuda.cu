@@ -180,8 +180,8 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
             cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items,
                            on, &resident);
             next = drawn_again(next);
-            // When a frame is drawn again, another frame may already be reporting page
-            // requests; so this one must not.
+            // A frame that is drawn again reports no page requests, because the next
+            // frame may already be reporting its own.
             if (resident.needs.report != nullptr) pages.end_frame(on);
             resident.needs = {};
         },

@@ -1,7 +1,7 @@
 #pragma once
 
-// Frames of a scene on a CUDA device. They enqueue the drawing of a request. Also the
-// models that they draw.
+// Frames of a scene on a CUDA device, which enqueue the drawing of a request, and the
+// models that frames draw.
 
 #include "draw/device_pages.h"
 #include "draw/frame_cuda.h"
@@ -72,7 +72,7 @@ class DevicePalette {
 // Combines the pictures of two eyes into one frame.
 EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_transmittance);
 
-// Draws a scene that is on the device: selects a cut, then draws it.
+// Draws a scene whose tables are on the device: selects a cut, then draws the cut.
 class SceneFrame {
   public:
     // Sets the gaussians of each bundle of the scene and, unless `palettes` is empty,

@@ -92,7 +92,7 @@ constexpr int kFrameTileWidth = 32, kFrameTileHeight = 16;
 // The destination of a picture on CUDA (see Picture<float>). A frame may obtain it
 // after its first stages are enqueued.
 struct PicturePlanes {
-    float *color, *alpha, *depth;  // null: all three, or depth only
+    float *color, *alpha, *depth;  // may be null: either all three, or only depth
 };
 
 // One picture of a batch.
@@ -111,7 +111,7 @@ V3DG_HD inline uint32_t num_tiles_of(const FrameImage& image) {
 }
 
 // The pictures of the one or two eyes of a scene's frame. The tiles of the second
-// picture follow those of the first one.
+// picture follow the tiles of the first picture.
 struct EyeImages {
     FrameImage image[2];
     uint32_t count;

@@ -37,8 +37,8 @@ constexpr unsigned kManySmall = 4;
 constexpr unsigned kNearlyAll = 22, kMany = 12;
 
 // Projects the item whose tables the warp has loaded, and returns its number of
-// records. `factors` are those of the item's placement or, in a shared item, of all its
-// placements. `factors` is null if the source has no factors.
+// records. `factors` points to the factors of the item's placement or, in a shared
+// item, of all its placements. It is null if the source has no factors.
 template <class Source, bool kIsShared>
 __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const Placement* sharers,
                                  const InstanceFactors* factors, FrameCounters& counters,
@@ -136,7 +136,7 @@ __device__ void report_item(const ItemTables<Model>& tables, unsigned item, unsi
 __device__ void report_counts(FrameCounters& counters, unsigned num_in_frustum,
                               unsigned num_records) {
     num_in_frustum = warp_sum(num_in_frustum);
-    // A record is always in the frustum, so without in_frustum there are no records.
+    // Without gaussians in the frustum there are no records.
     if (threadIdx.x % 32 != 0 || num_in_frustum == 0) return;
     atomicAdd(&counters.in_frustum, static_cast<unsigned long long>(num_in_frustum));
     atomicAdd(&counters.records, static_cast<unsigned long long>(num_records));
@@ -231,8 +231,8 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
 
 }  // namespace
 
-// `SharedSource` reads the models of shared items. It never fades, because shared items
-// have weight 1.
+// Launches the kernels for one source. `SharedSource` reads the models of shared items;
+// it has no fades, because shared items have weight 1.
 template <class Source, class SharedSource>
 static void project_from(const typename Source::Model* models, const ProjectInput& in,
                          const ProjectOutput& out, int taken, cudaStream_t stream) {

@@ -45,7 +45,7 @@ struct ProjectInput {
 
 struct ProjectOutput {
     RecordPlanes records;
-    FewTiles* few;           // small records' tiles, one element per record (see TileBinInput)
+    FewTiles* few;           // tiles of each small record (see TileBinInput)
     uint32_t* item_records;  // [items] number of records of each item
     ItemTiles* item_tiles;   // [items] the tiles of each item
     // The index of each record's gaussian in its model. Null if records.box is null.

@@ -19,14 +19,14 @@ namespace v3dg {
 namespace cuda {
 namespace {
 
-// resident blocks per multiprocessor with 228 KiB of shared memory, without depth
+// Resident blocks per multiprocessor with 228 KiB of shared memory, without depth.
 constexpr int kBlocks = 8;
-// From this average number of blocks per record on, a lane blends two pixels. Values of
-// 4, 7 and 10 differ by 1 % of the time.
+// The average number of blocks per record from which on a lane blends two pixels. The
+// values 4, 7 and 10 differ by 1 % in time.
 constexpr int kBlocksForPairs = 5;
 
 static_assert(kBlocks * (offsetof(BlendShared, depth) + 1024) <= 228 << 10,
-              "the driver keeps 1024 of each");
+              "the driver reserves 1024 bytes of shared memory per block");
 
 // Returns a mask of the blocks in a part of a tile: all of it, a half or a quarter.
 __device__ uint32_t blocks_of_part(int part, int log2_parts) {
@@ -128,7 +128,7 @@ __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, 
                 held = taken.y;
                 continue;
             }
-            // Not even one bucket fits: spread it again.
+            // If not even one bucket fits, spread that bucket again.
             const uint32_t end = end_of_bucket(from, done, level.end, level.buckets);
             const Buckets buckets =
                 find_buckets<kBlendThreads>(from, done, end, false, false, s.spreading);

@@ -15,7 +15,7 @@ void SceneTables::set_bundles(std::vector<std::shared_ptr<const BundleTables>> b
         if (bundle->device() != device_)
             throw std::invalid_argument(
                 "bundles: expected tables on device " + std::to_string(device_) +
-                ", where the scene is, got tables on device " + std::to_string(bundle->device()));
+                " like the scene, got tables on device " + std::to_string(bundle->device()));
         on_device.push_back(bundle->on_device());
     }
     const DeviceGuard guard(device_);

@@ -27,8 +27,8 @@ struct SceneOnDevice {
 // The bundles and instances of a scene, on the device that is current at construction.
 //
 // Work is enqueued on the stream that is passed, which must belong to the device. A
-// thread that enqueues work which reads the scene must hold lock(stream) meanwhile.
-// This orders the work of several threads and streams.
+// thread that enqueues work which reads the scene must hold lock(stream) meanwhile. The
+// lock orders the work of several threads and streams.
 class SceneTables {
   public:
     SceneTables() = default;

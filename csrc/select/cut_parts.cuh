@@ -11,11 +11,11 @@ namespace cuda {
 
 using Count = unsigned long long;
 
-// clusters per lane in a part of a table
+// Clusters per lane in a part of a table.
 constexpr unsigned kLaneClusters = kClustersOfBounds;
 constexpr unsigned kPartSize = 32 * kLaneClusters;
 constexpr unsigned kCutThreads = 256, kCutWarps = kCutThreads / 32;
-static_assert(kLaneClusters == 8, "a byte says which of them are drawn");
+static_assert(kLaneClusters == 8, "a byte has one bit per cluster of a lane");
 
 // The work of one warp. If `lanes` is 0, the part is clusters [first, first +
 // kPartSize) of one instance. Otherwise each set bit k of `lanes` means that lane k
@@ -24,8 +24,8 @@ struct CutPart {
     uint32_t instance, first, lanes;
 };
 
-// Returns the index of the first of a table's last clusters: the coarsest ones, which a
-// single lane can test.
+// Returns where the last clusters of a table begin: the coarsest ones, which are few
+// enough for one lane to test.
 __device__ inline uint32_t last_of_table(const ClusterTable& table) {
     return static_cast<uint32_t>(table.num_clusters() - 1) / kLaneClusters * kLaneClusters;
 }
@@ -35,8 +35,8 @@ struct PlacedScene {
     const BundleOnDevice* bundles;
     InstanceTable instances;
     InstanceView* views;  // set for instances whose tables are tested
-    // For an instance that a single lane processes: one bit per drawn top cluster; or 0
-    // if the lane tests the last clusters of the table.
+    // One byte per instance that a single lane processes: one bit per drawn top
+    // cluster, or 0 if the lane tests the last clusters of the table.
     uint8_t* tops;
     CutPart* parts;
 };
@@ -83,7 +83,7 @@ struct alignas(16) LaneWeights {
         return static_cast<int32_t>((k < 4 ? low : high) >> 16 * (k % 4) & 0xffff);
     }
 };
-static_assert(kLaneClusters == 8 && kWhole < 1 << 16, "two words hold the weights of a lane");
+static_assert(kLaneClusters == 8 && kWhole < 1 << 16, "LaneWeights holds eight weights of 16 bits");
 
 // The clusters of a part that one lane processes. All belong to one instance. Bit k of
 // `drawn` is set if the k-th cluster is drawn. Weights are set only in cuts with a
@@ -92,7 +92,9 @@ struct LaneClusters {
     const BundleOnDevice* bundle;
     uint32_t instance;
     uint32_t first;  // index of the first cluster in the table
-    bool is_alone;   // each lane has another instance; else the warp has a single one
+    // True if each lane has its own instance; false if all lanes have the same
+    // instance.
+    bool is_alone;
     bool are_tops;
     unsigned drawn;
     LaneWeights weights;
@@ -134,7 +136,7 @@ __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const 
 // Tests the clusters of a block's parts that come from tables. All threads of the block
 // must call it. A lane is an owner if the bounds of its clusters do not exclude all of
 // them. The warps share the tests of all owners, a lane per cluster and four owners at
-// a time, so that no warp waits long for one with more owners.
+// a time, so that no warp waits long for a warp with more owners.
 //
 // Sets bit k of an owner's `drawn` if ask(bundle, view, cluster) is positive for its
 // k-th cluster. With `kKeepsWeights`, it also stores the values in `weights`.
@@ -143,7 +145,7 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
                              Tolerances tolerances, LaneClusters& mine, const Ask& ask) {
     struct Table {
         const BundleOnDevice* bundle;  // null if each lane has another instance
-        // first cluster; if `bundle` is null, instance of the first lane
+        // First cluster; if `bundle` is null, instance of the first lane.
         uint32_t first;
     };
     __shared__ InstanceView views[kCutWarps];
@@ -152,10 +154,10 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
     __shared__ uint8_t owners[kCutThreads];  // indices of threads that own clusters
     __shared__ uint8_t drawn[kCutThreads];   // [thread] one bit per drawn cluster
     __shared__ LaneWeights weights[kKeepsWeights ? kCutThreads : 1];
-    static_assert(kCutThreads <= 256, "a byte says which thread");
+    static_assert(kCutThreads <= 256, "`owners` stores the index of a thread in a byte");
     const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
     bool is_owner = false;
-    // the condition is equal in all lanes of the warp
+    // The condition is equal in all lanes of the warp.
     if (!mine.is_alone && mine.bundle != nullptr) {
         const auto* view = reinterpret_cast<const uint32_t*>(scene.views + mine.instance);
         for (unsigned w = lane; w < sizeof(InstanceView) / sizeof *view; w += 32)
@@ -190,7 +192,7 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
         if (is_one) {
             const Table& of = tables[owner / 32];
             const bool is_alone = of.bundle == nullptr;
-            // used only if the owner's lane has its own instance
+            // `instance` is used only if the owner's lane has its own instance.
             const uint32_t instance = of.first + owner % 32;
             const BundleOnDevice* bundle =
                 is_alone ? &scene.bundles[scene.instances.bundle[instance]] : of.bundle;

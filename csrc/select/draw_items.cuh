@@ -1,14 +1,14 @@
 #pragma once
 
 // The output lists of a cut: pairs, or the items of a frame. A lane counts its elements
-// first. It writes them after a prefix sum over all lanes has given their position.
+// first. A prefix sum over all lanes then gives the position at which it writes them.
 
 #include "select/cut_parts.cuh"
 
 namespace v3dg {
 namespace cuda {
 
-// What a lane will write.
+// The amount that a lane will write.
 struct WriteCount {
     unsigned units, gaussians;  // `units`: number of list elements
 };
@@ -85,7 +85,8 @@ __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
         }
         return;
     }
-    static_assert(alignof(BundleOnDevice) > 1, "a bit of its address is free");
+    static_assert(alignof(BundleOnDevice) > 1,
+                  "the lowest bit of the address must be 0, because are_tops uses it");
     const auto same_clusters = reinterpret_cast<unsigned long long>(mine.bundle) | mine.are_tops;
     const unsigned same = __match_any_sync(kAllLanes, same_clusters);
     for (unsigned k = 0; __any_sync(kAllLanes, mine.drawn >> k != 0); ++k) {
@@ -120,7 +121,8 @@ struct ItemOutput {
     }
     __device__ void write(const LaneClusters& mine, Count first, Count record) const {
         for_each_drawn<kFades>(mine, [&](const DrawnRun& run) {
-            static_assert(kLaneClusters <= kItemClusters, "a run may be as long");
+            static_assert(kLaneClusters <= kItemClusters,
+                          "all clusters of a lane may be in one item");
             const int32_t cluster = mine.cluster(run.k);
             const unsigned size = mine.size(run.k, run.num_clusters),
                            step = run.gaussians_an_item();

@@ -48,7 +48,7 @@ struct RecordRow {
     __device__ void write(bool has_one, Record* first) const {
         constexpr unsigned kVectors = sizeof(Record) / sizeof(uint4);
         static_assert(sizeof(Record) % sizeof(uint4) == 0 && alignof(Record) % sizeof(uint4) == 0,
-                      "records are whole vectors");
+                      "records are copied as vectors of 16 bytes");
         const unsigned writers = __ballot_sync(kAllLanes, has_one);
         __syncwarp();
         if (writers == 0) return;
@@ -76,7 +76,8 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
                                         const BundleSides& sides, const SelectRule& rule,
                                         Placement* placements) {
     __shared__ InstanceView space[kPlaceThreads];
-    static_assert(sizeof(Placement) <= sizeof(InstanceView), "rows of both use the same memory");
+    static_assert(sizeof(Placement) <= sizeof(InstanceView),
+                  "placements are stored in the memory of views");
     InstanceView* of_warp = space + threadIdx.x / 32 * 32;
     const RecordRow<Placement> placement_row{reinterpret_cast<Placement*>(of_warp)};
     const RecordRow<InstanceView> view_row{of_warp};
@@ -135,13 +136,13 @@ __device__ inline Placed place_instance(const PlacedScene& scene, size_t i, cons
     return {.source = source, .asked = asked, .is_alone = is_alone};
 }
 
-// Writes the parts of a block's instances behind those of earlier blocks, and clears
-// the states of cut_kernel. All threads of the block must call it. Returns the number
-// of parts up to and including this block.
+// Writes the parts of a block's instances behind the parts of earlier blocks, and
+// clears the states of cut_kernel. All threads of the block must call it. Returns the
+// number of parts up to and including this block.
 //
-// Consecutive instances that a single lane each can process form one part, unless an
-// instance with a full table is between them. The thread of the first instance writes
-// it.
+// Consecutive instances form one part if a single lane can process each of them, unless
+// an instance with a full table is between them. The thread of the first instance
+// writes the part.
 __device__ inline unsigned write_parts(const PlacedScene& scene, const Placed& placed, size_t block,
                                        size_t i, const CutScratch& scratch) {
     const unsigned lane = threadIdx.x % 32, below = (1u << lane) - 1;
@@ -179,10 +180,10 @@ __device__ inline unsigned write_parts(const PlacedScene& scene, const Placed& p
                        .first = placed.asked.first + p * kPartSize,
                        .lanes = 0};
     }
-    // Clear the states of all tickets that cut_kernel may use. If tickets have
-    // kCutWarps parts, each block clears the tickets that begin with one of its parts.
-    // If tickets have fewer, there are at most num_places tickets, which all blocks
-    // clear together.
+    // Clear the states of all tickets that cut_kernel may use. If a ticket has
+    // kCutWarps parts, each block clears the tickets whose first part belongs to the
+    // block. If a ticket has fewer parts, there are at most num_places tickets, and all
+    // blocks together clear them.
     const auto clear = [&](unsigned first, unsigned end, unsigned step) {
         for (unsigned t = first; t < end; t += step)
             scratch.unit_state[t] = scratch.count_state[t] = 0;

@@ -16,7 +16,7 @@ struct BudgetState;
 
 // The head of a cut's report to the host about needed pages.
 struct NeedsReport {
-    // number of needed pages, including those for which the list has no room
+    // Number of needed pages, including those for which the list has no room.
     unsigned count;
     float tolerance_px2;
 };
@@ -30,7 +30,7 @@ struct NeedList {
     size_t num_words = 0;
     uint32_t* const* need = nullptr;  // per bundle: its elements in `words`
     PageRequest* list = nullptr;
-    unsigned capacity = 0;  // of `list` and `reported`
+    unsigned capacity = 0;  // largest length of `list` and of `reported`
     NeedsReport* report = nullptr;
     PageRequest* reported = nullptr;
 };
@@ -69,7 +69,7 @@ class Cut {
                      const ItemList& items, cudaStream_t stream);
 
     // Selects clusters, waits, and returns them as pairs in host memory. `last_bin` is
-    // as in SelectInput; if it is null, that state is kept on the device.
+    // as in SelectInput; if it is null, the state is kept on the device.
     void select(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
                 SelectOutput& out, cudaStream_t stream, const PartlyResident* resident = nullptr,
                 uint32_t* last_bin = nullptr);

@@ -1,5 +1,5 @@
-"""Build a bundle from an asset: split the asset into clusters, then halve and fit them
-level after level."""
+"""Build a bundle from an asset: divide the asset into clusters, then make coarser
+levels by repeatedly halving the number of gaussians and fitting the result."""
 
 import os
 from concurrent.futures import Executor
@@ -82,9 +82,9 @@ def build_bundle(
         quality: "draft" leaves the levels as they are built. "standard" then refines
             them together (`v3dg.refine_bundle`) with 18,000 pictures and one more for
             every 100 gaussians, at most 100,000: seconds on a GPU, minutes on a CPU.
-            "best" uses five times as many. docs/levels.md has the time and the gain of
-            each. None means "standard" on a GPU and "draft" on a CPU, and for a config
-            without steps. An asset of more than 4,000,000 gaussians, or whose
+            "best" uses five times as many pictures. docs/levels.md has the time and the
+            gain of each. None means "standard" on a GPU and "draft" on a CPU, and for a
+            config without steps. An asset of more than 4,000,000 gaussians, or whose
             refinement does not fit in the free memory, is then a draft, too, with a
             `v3dg.levels.DraftWarning`. The levels at `resume_path` stay unrefined, and
             the refined bundle is in memory.
@@ -108,7 +108,12 @@ def build_bundle(
     devices = devices_for(device, asset)
     leaves = MemoryLeaves(asset, config, unusable, devices[0])
     has_place = executor is None or resume_path is not None
-    check("resume_path", has_place, "a file that all workers of the executor reach, got None")
+    check(
+        "resume_path",
+        has_place,
+        "a file on a disk that all workers of the executor share, got None; give the path of the "
+        "bundle",
+    )
     config = leaves.settings(config)
     quality = chosen_quality(quality, config, leaves, devices[0], free_bytes())
     return build_into(

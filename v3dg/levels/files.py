@@ -167,7 +167,8 @@ class _FileBuild:
             config = leaves.settings(self.config)
             quality = chosen_quality(self.quality, config, leaves, self.devices[0], self.num_bytes)
             if resume and self._is_finished(leaves, config, quality):
-                with suppress(RuntimeError):  # another build is writing there
+                # A RuntimeError means that another build is writing this file.
+                with suppress(RuntimeError):
                     discard_levels(self.levels_path)
                 return Bundle.open(self.bundle_path), False
             self._check_memory(leaves, quality)
@@ -189,14 +190,15 @@ class _FileBuild:
             return bundle, True
 
     def _check_memory(self, leaves: Leaves, quality: Quality) -> None:
-        """Refuse, before the build, an asset that is too large to be refined."""
+        """Raise ValueError before the build if its refinement would need too much
+        memory."""
         count = leaves.num_gaussians
         required = refine_bytes(quality, count, leaves.sh_degree)
         check(
             "memory",
             self.num_bytes >= required,
-            f"at least {in_mib(required)} to refine an asset of {count:,} gaussians, "
-            f"got {in_mib(self.num_bytes)}; give more, or build with the quality draft",
+            f"at least {in_mib(required)} to refine an asset of {count:,} gaussians, got "
+            f"{in_mib(self.num_bytes)}; allow more memory, or build with quality 'draft'",
         )
 
     def _is_finished(self, leaves: Leaves, config: BuildConfig, quality: Quality) -> bool:
@@ -226,9 +228,11 @@ def _naming_asset(path: AssetPath) -> Iterator[None]:
 
 
 def levels_path(bundle_path: str | os.PathLike[str]) -> Path:
-    """Return the file in which `build_file` builds the bundle, and from which an
-    interrupted build continues."""
+    """Return the path of the unfinished bundle, which `build_file` writes and from
+    which an interrupted build continues."""
     path = Path(bundle_path)
-    if path.is_symlink():  # the file is beside the link's target, which it will replace
+    # The finished bundle replaces the target of a link, so the unfinished one is beside
+    # the target.
+    if path.is_symlink():
         path = Path(os.path.realpath(path))
     return path.with_name(path.name + ".partial")

@@ -18,15 +18,16 @@ from v3dg.levels.viewpoints import RECORDED, SeenFrom
 
 Quality = Literal["draft", "standard", "best"]
 
-# Pictures of a standard refinement: some for every asset, and more for large ones,
-# whose gaussians are in fewer of them.
+# Number of pictures of a "standard" refinement: at least the first number, plus one for
+# every 100 gaussians, up to the last number. A large asset needs more because each
+# picture shows a smaller part of it.
 _LEAST_PICTURES = 18_000
 _GAUSSIANS_PER_PICTURE = 100
 _MOST_PICTURES = 100_000
-# The factor of a best one.
+# "best" uses this many times the pictures of "standard".
 _BEST = 5
-# Copies of the gaussians of all levels, twice as many as the asset has, that a
-# refinement needs.
+# A refinement needs memory for this many copies of all levels. All levels together have
+# about twice as many gaussians as the asset.
 _COPIES = 6
 # The time for which each of two kinds of pictures is measured, for an estimate.
 _SECONDS_OF_TRIAL = 0.25
@@ -41,7 +42,7 @@ class Refinement:
     seen_from: SeenFrom = "auto"
 
     def refined(self, bundle: Bundle, device: Device, progress: Progress) -> Bundle:
-        """The bundle with refined levels; level 0 stays."""
+        """Return the bundle with refined levels; level 0 is unchanged."""
         return refined_bundle(
             bundle,
             seen_from=self.seen_from,
@@ -52,8 +53,8 @@ class Refinement:
         )
 
     def settings_of(self, bundle: Bundle, settings: JsonObject) -> JsonObject:
-        """The config of a bundle that was built with these settings and refined. The
-        eyes, which follow from its gaussians, are those that it has."""
+        """Return the config of a bundle that was built with these settings and then
+        refined. The eyes, which follow from its gaussians, are those that it has."""
         if bundle.num_levels < 2:
             return settings
         record: JsonObject = {"steps": self.steps, "drop": DROP, "seed": self.seed}
@@ -67,7 +68,7 @@ class Refinement:
 def refinement_of(
     quality: Quality, num_gaussians: int, seed: int, seen_from: SeenFrom = "auto"
 ) -> Refinement | None:
-    """The refinement of an asset of this many gaussians; None for a draft."""
+    """Return the refinement for an asset of this many gaussians; None for a draft."""
     one_of(quality, "quality", get_args(Quality))
     one_of(seen_from, "seen_from", get_args(SeenFrom))
     if quality == "draft":
@@ -89,8 +90,8 @@ def pictures_of(quality: Literal["standard", "best"], num_gaussians: int) -> int
 
 
 def refine_bytes(quality: Quality, num_gaussians: int, sh_degree: int) -> int:
-    """Memory that the refinement of an asset needs, in bytes: of the host, and as much
-    of a GPU."""
+    """Return the memory, in bytes, that the refinement of an asset needs: of the host,
+    and as much of a GPU."""
     if quality == "draft":
         return 0
     return 2 * _COPIES * num_gaussians * gaussian_bytes(sh_degree)

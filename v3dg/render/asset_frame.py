@@ -1,5 +1,4 @@
-"""The frame of an asset, which is drawn completely: it has no levels to choose from,
-and no pages."""
+"""The frame of an asset. An asset has no levels and no pages, so all of it is drawn."""
 
 from __future__ import annotations
 
@@ -27,7 +26,7 @@ class AssetFrame:
 
     Attributes:
         device: The device that draws.
-        memory: None, because it has no pool.
+        memory: None, because an asset needs no pool.
     """
 
     def __init__(self, asset: Gaussians, color_by: ColorBy, device: Device) -> None:
@@ -57,7 +56,7 @@ class AssetFrame:
     ) -> Picture:
         """Draw the asset; raise ValueError if the request needs levels."""
         is_selected = request.selection is None
-        check("cut", is_selected, "a scene or a bundle to choose from, got an asset")
+        check("cut", is_selected, "no cut for an asset, which has no levels, got one; leave it out")
         check_request(request.cut)
         camera = request.camera
         if isinstance(camera, StereoCamera):
@@ -96,8 +95,8 @@ def check_request(request: CutRequest) -> None:
 
 def _check(tolerance: float | None, budget: int | None, min_level: int, fade: float | None) -> None:
     for name, value in (("budget", budget), ("min_level", min_level)):
-        check(name, not value, "a scene or a bundle to choose from, got an asset")
-    CutRequest(tolerance=tolerance, fade=fade).rule  # noqa: B018 - which checks them
+        check(name, not value, "no value for an asset, which has no levels, got one; leave it out")
+    CutRequest(tolerance=tolerance, fade=fade).rule  # noqa: B018 - the property checks the values
 
 
 _check_known = lru_cache(64, typed=True)(_check)

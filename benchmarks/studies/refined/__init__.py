@@ -1,5 +1,5 @@
-"""Cuts of levels before and after refinement.
+"""Errors of cuts before and after a refinement of the levels.
 
-`measure` uses single assets, `worlds` composed scenes; `steps` compares ways to refine,
-and `qualities` the qualities of a build.
+`measure` uses single assets, `worlds` uses composed scenes, `steps` compares ways to
+refine, and `qualities` compares the qualities of a build.
 """

@@ -324,7 +324,8 @@ def test_frame_refuses_a_scene_of_other_bundles():
             assert not frame.draw(*arguments).alpha.any()
             continue
         with pytest.raises(
-            ValueError, match="scene: expected a scene of the bundles whose gaussians the frame has"
+            ValueError,
+            match="scene: expected a scene of the bundles that the frame draws, got other",
         ):
             frame.draw(*arguments)
 
