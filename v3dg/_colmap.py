@@ -206,7 +206,8 @@ def _count(path: Path, file: IO[bytes], least_bytes: int) -> int:
     check(
         path,
         count <= num_bytes // least_bytes,
-        f"{count} entries, got a file of {num_bytes} bytes; is it complete?",
+        f"at least {count * least_bytes} bytes for {count} entries, got a file of "
+        f"{num_bytes} bytes; the file is incomplete or damaged",
     )
     return int(count)
 

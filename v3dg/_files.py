@@ -84,8 +84,8 @@ def file_mode_mask(status_path: str = "/proc/self/status") -> int:
         match = re.search(r"^Umask:\s*([0-7]+)$", status, re.MULTILINE)
         if match:
             return int(match[1], 8)
-    # Without /proc, the umask can be read only by setting it. Meanwhile, files that
-    # other threads create are private.
+    # Without /proc, the umask can be read only by setting it. Files that other threads
+    # create at that moment are private.
     with _MASK_LOCK:
         mask = os.umask(0o077)
         os.umask(mask)

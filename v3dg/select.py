@@ -217,8 +217,8 @@ class Selection:
     def _per_gaussian(
         self, column: Callable[[Clusters], npt.NDArray[_Value]], dtype: type[_Value]
     ) -> npt.NDArray[_Value]:
-        # The dtype is explicit because a scene without bundles has no column to take it
-        # from.
+        # The dtype is explicit, because a scene without bundles has no column with a
+        # dtype.
         return np.repeat(self.per_pair(column).astype(dtype), np.diff(self._first()))
 
 

@@ -44,6 +44,7 @@
 #include <utility>
 #include <vector>
 
+#include "bindings/batch.h"
 #include "bindings/codes.h"
 #include "bindings/drawing.h"
 #include "bindings/tape.h"
@@ -168,6 +169,14 @@ struct FrameInput {
     const std::atomic<bool>* stop;
 };
 
+// The inputs of a batch. The bindings check them like the inputs of a picture.
+struct BatchInput {
+    const BatchRequest& request;
+    const BoundCameras& cameras;
+    const Scene& scene;
+    std::shared_ptr<const SceneState> state;
+};
+
 // Draws scenes of the same bundles.
 class Frame {
   public:
@@ -182,6 +191,10 @@ class Frame {
     // before it is finished or destroyed. A backend whose frames share buffers uses a
     // Turn. A request with a given cut has one eye.
     virtual std::unique_ptr<BoundDrawing> draw(const FrameInput& input) = 0;
+    // Draws a batch of pictures with the frame's own models. Like draw(), but the
+    // caller owns the planes, which exist until the drawing is finished. A batch that
+    // does not fit into memory is drawn in parts.
+    virtual std::unique_ptr<BoundBatch> draw_batch(const BatchInput& input) = 0;
     // Finds the gaussian with the largest blend weight in the first pixel of the
     // window. Returns false if no gaussian is drawn there. Waits. Called only if
     // draws_only_plainly is false.

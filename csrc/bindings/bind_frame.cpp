@@ -168,6 +168,34 @@ class BoundSceneFrame {
         return drawing;
     }
 
+    // Draws a picture for each camera with the models that were set, into planes of the
+    // caller or into new planes.
+    std::unique_ptr<BoundBatch> draw_batch(const py::object& scene_object,
+                                           const py::object& cameras_object, const SelectRule& rule,
+                                           const Shade& shade, const BoundPlanes* planes) {
+        const BoundScene& scene = checked(scene_object);
+        const auto& cameras = held<BoundCameras>(cameras_object, "cameras");
+        if (cameras.device() != device_)
+            throw py::value_error("cameras: expected arrays on the frame's device");
+        if (rule.budget != kNoBudget)
+            throw py::value_error(
+                "budget: a batch has no budget; leave it out, or draw the cameras one by one");
+        const std::shared_ptr<const SceneState> state = scene.state();
+        check_environments(cameras, state->environments->table());
+        std::optional<BoundPlanes> new_planes;
+        if (planes == nullptr) planes = &new_planes.emplace(cameras, device_, shade.with_depth);
+        planes->check(cameras, device_);
+        const BatchRequest request{.rule = rule,
+                                   .shade = shade,
+                                   .width = cameras.width(),
+                                   .height = cameras.height(),
+                                   .planes = planes->planes()};
+        std::unique_ptr<BoundBatch> batch = frame_->draw_batch(
+            {.request = request, .cameras = cameras, .scene = scene.handle(), .state = state});
+        batch->keep(py::make_tuple(py::cast(this), scene_object, cameras_object), *planes);
+        return batch;
+    }
+
     // Returns the gaussian with the largest blend weight in the first pixel of the
     // window, or None.
     std::optional<ScenePick> pick(const py::object& scene_object, const py::object& request_object,
@@ -192,6 +220,18 @@ class BoundSceneFrame {
     }
 
   private:
+    // Throws ValueError if a camera on the host has an environment that the scene does
+    // not have.
+    static void check_environments(const BoundCameras& cameras, const EnvironmentTable& table) {
+        if (cameras.device() != kHost || cameras.environments() == nullptr) return;
+        const auto* environment = static_cast<const int32_t*>(cameras.environments());
+        for (size_t b = 0; b < cameras.size(); ++b)
+            if (environment[b] < kShared || environment[b] >= table.num_environments())
+                throw py::value_error("environments[" + std::to_string(b) + "]: expected -1 to " +
+                                      std::to_string(table.num_environments() - 1) +
+                                      ", as the scene has, got " + std::to_string(environment[b]));
+    }
+
     // Checks that the scene, the request and the pool fit each other, then calls
     // body(input).
     template <class Body>
@@ -307,7 +347,8 @@ void bind_frame(py::module_& m) {
         .def(py::init(
                  [](const std::array<double, 3>& background, float min_transmittance,
                     bool with_depth) { return Shade{background, min_transmittance, with_depth}; }),
-             py::kw_only(), "background"_a, "min_transmittance"_a, "with_depth"_a);
+             py::kw_only(), "background"_a, "min_transmittance"_a, "with_depth"_a)
+        .def_readonly("with_depth", &Shade::with_depth);
     py::class_<NewPicture>(m, "Picture", "A drawn picture: arrays of colour, alpha and depth.")
         .def_readonly("color", &NewPicture::color)
         .def_readonly("alpha", &NewPicture::alpha)
@@ -353,6 +394,8 @@ void bind_frame(py::module_& m) {
         .def("set_models", &BoundSceneFrame::set_models, "models"_a, "palettes"_a)
         .def("draw", &BoundSceneFrame::draw, "scene"_a, "request"_a, "pool"_a = py::none(),
              "steps"_a = nullptr, "stop"_a = nullptr)
+        .def("draw_batch", &BoundSceneFrame::draw_batch, "scene"_a, "cameras"_a, "rule"_a,
+             "shade"_a, "planes"_a = nullptr)
         .def("pick", &BoundSceneFrame::pick, "scene"_a, "request"_a, "pool"_a = py::none())
         .def("memory", &BoundSceneFrame::memory,
              "Returns the bytes of the frame on a CUDA device, by part, and the bytes of the "

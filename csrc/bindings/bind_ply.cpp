@@ -140,7 +140,7 @@ void ply_write(const py::object& path, const py::array& means, const py::array& 
     const py::ssize_t n = means.ndim() > 0 ? means.shape(0) : 0;
     const py::ssize_t k = sh.ndim() > 1 ? sh.shape(1) : 0;
     if (k != 1 && k != 4 && k != 9 && k != 16)
-        throw py::value_error("sh: expected shape (N, K, 3) with K 1, 4, 9 or 16, got " +
+        throw py::value_error("sh: expected shape (N, K, 3) with K = 1, 4, 9 or 16, got " +
                               shape_text(sh));
     const PlyGaussians<const float> in = {span_of<const float>(means, "means", {n, 3}),
                                           span_of<const float>(quats, "quats", {n, 4}),

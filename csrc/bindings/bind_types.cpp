@@ -5,6 +5,7 @@
 
 #include "bindings/backend.h"
 #include "bindings/operations.h"
+#include "camera/camera_arrays.h"
 #include "math/sh.h"
 
 namespace v3dg {
@@ -27,27 +28,12 @@ void set_window(const Corners& w, Camera& camera) {
 
 BoundCamera make_camera(const py::array& viewmat, const py::array& K, int width, int height,
                         double near) {
-    if (width < 1 || height < 1 || width > UINT16_MAX || height > UINT16_MAX)
-        throw py::value_error("width, height: expected 1 to 65535 px, got " +
-                              std::to_string(width) + " x " + std::to_string(height));
+    check_image_size(width, height);
     const Span<const double> view = span_of<const double>(viewmat, "viewmat", {4, 4});
     const Span<const double> k = span_of<const double>(K, "K", {3, 3});
     BoundCamera out;
     std::copy(view.begin(), view.end(), out.viewmat.begin());
-    Camera& camera = out.camera;
-    for (int row = 0; row < 3; ++row) {
-        for (int a = 0; a < 3; ++a) camera.rotation[3 * row + a] = view[4 * row + a];
-        camera.translation[row] = view[4 * row + 3];
-    }
-    eye_of(view.data, camera.eye);
-    camera.fx = k[0];
-    camera.fy = k[4];
-    camera.cx = k[2];
-    camera.cy = k[5];
-    camera.width = width;
-    camera.height = height;
-    camera.near_depth = near;
-    set_window({0, 0, width, height}, camera);
+    out.camera = camera_of(view.data, k.data, width, height, near);
     return out;
 }
 
@@ -99,11 +85,17 @@ SelectRule make_rule(double tolerance_px2, std::optional<uint64_t> budget, int32
 
 }  // namespace
 
+void check_image_size(int width, int height) {
+    if (width < 1 || height < 1 || width > UINT16_MAX || height > UINT16_MAX)
+        throw py::value_error("width, height: expected 1 to 65535 px, got " +
+                              std::to_string(width) + " x " + std::to_string(height));
+}
+
 int degree_of_bases(py::ssize_t bases, const std::string& shape) {
     int degree = 0;
     while (degree <= 3 && num_sh_bases(degree) != bases) ++degree;
     if (degree > 3)
-        throw py::value_error("sh: expected shape (N, K, 3) with K of 1, 4, 9 or 16, got " + shape);
+        throw py::value_error("sh: expected shape (N, K, 3) with K = 1, 4, 9 or 16, got " + shape);
     return degree;
 }
 

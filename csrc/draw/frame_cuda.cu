@@ -82,6 +82,7 @@ Frame::Slot* Frame::take_slot(bool capturing) {
     }
     Slot* slot = free_slots_.front();
     free_slots_.pop_front();
+    std::erase(unchecked_, slot);
     return slot;
 }
 
@@ -129,22 +130,45 @@ void Frame::enlarge(const FrameCounters& counters) {
     trim_pool(last_stream_);
 }
 
+void Frame::release_buffers() {
+    if (was_captured_) return;
+    capacity_ = kFirstCapacity;
+    items_ = {};
+    item_records_ = {};
+    item_tiles_ = {};
+    records_ = {};
+    boxes_ = {};
+    large_ = {};
+    entries_ = {};
+    scratch_ = {};
+    trim_pool(last_stream_);
+}
+
 std::unique_ptr<Drawing> Frame::draw(const FrameBatch& batch, Prepare prepare, cudaStream_t stream,
                                      const Place& place) {
     std::unique_ptr<Drawing> drawing(new Drawing(*this, batch, std::move(prepare), stream));
     drawing->is_captured_ = is_capturing(stream);
     was_captured_ = was_captured_ || drawing->is_captured_;
+    if (!drawing->is_captured_) check_counts();
     drawing->slot_ = take_slot(drawing->is_captured_);
-    // If the last frame exceeded or nearly filled a buffer, the next frame is likely to
-    // exceed it, too. So enlarge the buffers now, if the last frame's counts are known.
-    if (last_ != nullptr && !last_->is_captured_ && !drawing->is_captured_) {
-        const cudaError_t over = cudaEventQuery(last_->slot_->done);
-        if (over == cudaSuccess) enlarge(*last_->slot_->counters);
-        if (over != cudaSuccess && over != cudaErrorNotReady) check(over, "a frame");
-    }
     enqueue(*drawing, place);
-    last_ = drawing.get();
+    if (!drawing->is_captured_) unchecked_.push_back(drawing->slot_);
     return drawing;
+}
+
+void Frame::check_counts() {
+    std::vector<const Slot*> done;
+    std::erase_if(unchecked_, [&done](const Slot* slot) {
+        const cudaError_t over = cudaEventQuery(slot->done);
+        if (over == cudaErrorNotReady) {
+            cudaGetLastError();
+            return false;
+        }
+        check(over, "a frame");
+        done.push_back(slot);
+        return true;
+    });
+    for (const Slot* slot : done) enlarge(*slot->counters);
 }
 
 void Frame::enqueue(Drawing& drawing, const Place& place) {
@@ -204,7 +228,8 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
              .has_shared_items = batch.has_shared_items,
              .has_faded_items = batch.has_faded_items,
              .factors = batch.factors,
-             .num_factors = batch.num_factors},
+             .num_factors = batch.num_factors,
+             .image_counts = batch.image_counts},
             {.records = planes,
              .few = few,
              .item_records = item_records,
@@ -246,6 +271,7 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     }
     if (place) place(drawing.planes_);
     of_frame.has_depth = batch.has_depth;
+    of_frame.num_marked = batch.marks_undrawn ? batch.num_images : 0;
     for (int k = 0; k < 2; ++k) {
         of_frame.planes[k] = drawing.planes_[k];
         of_frame.has_depth = of_frame.has_depth || drawing.planes_[k].depth != nullptr;
@@ -309,7 +335,6 @@ Drawing::Drawing(Frame& frame, const FrameBatch& batch, Frame::Prepare prepare, 
     : frame_(frame), batch_(batch), prepare_(std::move(prepare)), stream_(stream) {}
 
 Drawing::~Drawing() {
-    if (frame_.last_ == this) frame_.last_ = nullptr;
     // A captured graph continues to write to its slot.
     if (slot_ != nullptr && !is_captured_) frame_.free_slots_.push_back(slot_);
 }
@@ -346,6 +371,12 @@ const FrameCounters& Drawing::settle() {
         ++num_draws_;
     }
     return *slot_->counters;
+}
+
+bool Drawing::finish_or_enlarge() {
+    wait();
+    if (!was_drawn()) frame_.enlarge(*slot_->counters);
+    return was_drawn();
 }
 
 FrameTimes Drawing::times() const {

@@ -43,6 +43,10 @@ struct FrameBatch {
     // Whether depth is drawn in any of the images that get their destination from a
     // Place.
     bool has_depth = true;
+    ImageCounts* image_counts = nullptr;  // as in ProjectInput
+    // Whether images become NaN if they are not drawn because a buffer is too small.
+    // All of them have planes.
+    bool marks_undrawn = false;
 };
 
 // The results of a frame that its backward pass needs. Valid until the next frame is
@@ -99,6 +103,10 @@ class Frame {
     // Returns the device memory in bytes, by part.
     std::vector<std::pair<const char*, size_t>> bytes() const;
 
+    // Frees the buffers, so that a smaller frame fits. Does nothing if a graph was
+    // captured, because the graph may still use the buffers.
+    void release_buffers();
+
     // Returns the tape of the last frame. Precondition: the frame keeps a tape.
     FrameTape tape() const;
 
@@ -110,13 +118,18 @@ class Frame {
     // Returns the lists in the current buffers.
     FrameLists lists(const FrameBatch& batch) const;
     RecordPlanes records() const;
+    // Enlarges the buffers if an earlier, finished frame exceeded or nearly filled one.
+    // The next frame is then likely to exceed it, too. The drawing of the earlier frame
+    // may have been destroyed.
+    void check_counts();
     void enlarge(const FrameCounters& counters);
     Slot* take_slot(bool capturing);
     template <class T>
     T* room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing);
 
     const Keeps keeps_;
-    Capacity capacity_{64, 4096, 4096, 4096, 4096};
+    static constexpr Capacity kFirstCapacity{64, 4096, 4096, 4096, 4096};
+    Capacity capacity_ = kFirstCapacity;
     DeviceBuffer<DrawItem> items_;
     DeviceBuffer<uint32_t> item_records_, source_, first_slot_, image_of_tile_, order_, blended_;
     DeviceBuffer<float> records_;
@@ -139,7 +152,8 @@ class Frame {
     // Buffers that captured graphs may still use.
     std::vector<std::shared_ptr<void>> retired_;
     bool was_captured_ = false;
-    Drawing* last_ = nullptr;
+    // Slots of frames whose counts were not compared with the buffers.
+    std::vector<Slot*> unchecked_;
     FrameBatch last_batch_{};
     cudaStream_t last_stream_ = nullptr;
     StreamMutex busy_;
@@ -166,6 +180,11 @@ class Drawing {
     // For a captured frame, it returns the counters of the last replay, which must have
     // ended. It throws std::runtime_error if a buffer was too small for that replay.
     const FrameCounters& finish();
+    // Waits for the drawing, and returns whether it was drawn. If a buffer was too
+    // small, enlarges the buffer, so that the caller can draw a new frame instead.
+    // Throws like finish(). Not allowed for a captured frame.
+    bool finish_or_enlarge();
+    bool is_captured() const { return is_captured_; }
     FrameTimes times() const;
     // Returns how often the frame was drawn; more than once if a buffer was too small.
     // Valid after finish().

@@ -127,12 +127,12 @@ static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_ti
 
 // The approximate bytes of the records and entries of one band. Records are accessed
 // randomly, so smaller bands use caches better; but a band must have tiles for all
-// threads. If there is a `stop` flag, bands have the smallest size, because the flag is
-// rarely checked within a band.
+// threads. Bands have the smallest size in two cases: if there is a `stop` flag,
+// because the flag is rarely checked within a band, and if each thread draws a picture.
 constexpr double kLeastBandBytes = 96 << 20, kMostBandBytes = 768 << 20,
                  kThreadBandBytes = 48 << 20;
 static double band_bytes_of(const std::atomic<bool>* stop) {
-    if (stop != nullptr) return kLeastBandBytes;
+    if (stop != nullptr || omp_in_parallel() != 0) return kLeastBandBytes;
     return std::clamp(kThreadBandBytes * most_threads(), kLeastBandBytes, kMostBandBytes);
 }
 // Pictures with at most this many gaussians are drawn in a single band, because they
@@ -258,8 +258,8 @@ static Picture<T> band_of(const Picture<T>& picture, const Window& band) {
                         static_cast<size_t>(picture.window.width());
     Picture<T> part = picture;
     part.window = band;
-    part.color += 3 * skip;
-    part.alpha += skip;
+    part.color += picture.color_step * skip;
+    if (part.alpha != nullptr) part.alpha += picture.alpha_step * skip;
     if (part.depth != nullptr) part.depth += skip;
     if (part.count != nullptr) part.count += skip;
     return part;

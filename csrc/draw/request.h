@@ -30,8 +30,9 @@ struct Shade {
 };
 
 struct FrameRequest {
-    Eyes eyes;        // the camera of each picture
-    SelectRule rule;  // rule of the cut; with `cut`, only the tolerance
+    Eyes eyes;  // the camera of each picture
+    // The rule of the cut. With a given `cut`, only its tolerance matters.
+    SelectRule rule;
     Shade shade;
     FrameLook look = FrameLook::appearance;
     std::optional<GivenCut> cut = {};  // a cut to draw instead of selecting one
@@ -50,6 +51,15 @@ struct FrameRequest {
     bool is_plain() const {
         return look == FrameLook::appearance && !is_aside && !chooser && cluster_colors.empty();
     }
+};
+
+// The request for pictures of one size, each with a cut for its own camera. The rule
+// has no budget.
+struct BatchRequest {
+    SelectRule rule;
+    Shade shade;  // ignores `with_depth`: depth is drawn if there are planes for it
+    int width, height;
+    BatchPlanes planes;
 };
 
 }  // namespace v3dg

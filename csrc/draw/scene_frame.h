@@ -7,6 +7,7 @@
 
 #include "draw/render.h"
 #include "draw/request.h"
+#include "residency/environments.h"
 
 namespace v3dg {
 
@@ -29,6 +30,15 @@ struct HostScene {
     // Optional outputs of selection (see SelectInput).
     Span<const Span<uint32_t>> needs = {};
     uint32_t* last_bin = nullptr;
+    Span<const ClusterRuns> runs = {};
+};
+
+// The cameras of a batch on the host. They have the size of the request, and belong to
+// environments of the scene.
+struct HostCameras {
+    Span<const Camera> camera;        // [B]
+    Span<const int32_t> environment;  // [B] as in EnvironmentTable
+    EnvironmentTable environments;    // the environments of the scene's instances
 };
 
 // The counts of one frame.
@@ -71,6 +81,13 @@ constexpr float kMostShare = 2.0f;
 SceneFrameCounts draw_scene(const HostScene& scene, const FrameRequest& request,
                             const SelectRule& rule, Span<const Picture<float>> pictures,
                             const std::atomic<bool>* stop = nullptr);
+
+// Draws a picture for each camera. The decisions and the pixels are equal to those of
+// draw_scene() for the instances that the camera sees. Each thread draws the pictures
+// of some cameras. If the remaining cameras are fewer than the threads, all threads
+// together draw one picture after another.
+void draw_batch(const HostScene& scene, const BatchRequest& request, const HostCameras& cameras,
+                Span<SceneFrameCounts> counts);
 
 // Draws all gaussians of one model, in world coordinates.
 SceneFrameCounts draw_model(const GaussianPlanes<float>& model, size_t count,

@@ -208,7 +208,7 @@ std::unique_ptr<Drawing> SceneFrame::draw_given(const SceneTables& scene,
 std::vector<std::pair<const char*, size_t>> SceneFrame::bytes() const {
     auto parts = frame_.bytes();
     const size_t tables = rows_.bytes() + packed_.bytes() + coded_.bytes() + images_.bytes();
-    parts.emplace_back("placements", placements_.bytes() + tables);
+    parts.emplace_back("placements", placements_.bytes() + factors_.bytes() + tables);
     parts.emplace_back("cut", cut_.bytes());
     return parts;
 }

@@ -27,6 +27,11 @@ struct FrameCounters {
     CutChoice choice;           // valid if the cut has a budget
 };
 
+// The counts of one image, for frames that report counts of images.
+struct ImageCounts {
+    unsigned long long gaussians, in_frustum;
+};
+
 // The capacities of a frame's buffers, in elements.
 struct Capacity {
     unsigned long long items, records, large, entries, spread;

@@ -186,6 +186,9 @@ struct FrameLists {
     bool has_depth = true;  // must be true if any image has a depth plane
     // Host memory that receives a copy of the counters; may be null.
     FrameCounters* report = nullptr;
+    // The number of images that become NaN if the counters exceed a capacity. All of
+    // these images have planes. 0 leaves the images unchanged.
+    uint32_t num_marked = 0;
 };
 
 // Records over more tiles than this are large: they are processed by rows of tiles.

@@ -18,7 +18,8 @@ namespace v3dg {
 namespace {
 
 constexpr double kNarrowestPx = 8, kMostPx = 1 << 15;  // limits of a picture's side, px
-// The px² per gaussian of a cut that is selected at the default tolerance: native size.
+// The px² per gaussian at the native size of a cut. At this size, the default tolerance
+// selects the cut.
 constexpr double kNativePx2 = 2;
 // The range of a picture's side, relative to the native size of its cut.
 constexpr double kLeastSize = 0.18, kOctavesOfSize = 5.75;

@@ -133,6 +133,21 @@ __device__ void report_item(const ItemTables<Model>& tables, unsigned item, unsi
                             .columns = static_cast<uint32_t>(tables.image.tile_columns)};
 }
 
+// Adds the counts of an item to the counts of its image. `num_in_frustum` is the number
+// of this lane. All lanes of the warp must call it.
+template <class Model>
+__device__ void report_image(const ItemTables<Model>& tables, unsigned num_in_frustum,
+                             ImageCounts* image_counts) {
+    num_in_frustum = warp_sum(num_in_frustum);
+    if (threadIdx.x % 32 != 0) return;
+    const unsigned num_instances = max(__popc(tables.item.sharers), 1);
+    ImageCounts& counts = image_counts[tables.placement.image];
+    atomicAdd(&counts.gaussians,
+              static_cast<unsigned long long>(num_instances * tables.item.count));
+    if (num_in_frustum > 0)
+        atomicAdd(&counts.in_frustum, static_cast<unsigned long long>(num_in_frustum));
+}
+
 __device__ void report_counts(FrameCounters& counters, unsigned num_in_frustum,
                               unsigned num_records) {
     num_in_frustum = warp_sum(num_in_frustum);
@@ -176,11 +191,14 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
         __syncwarp();
         store_tables(space.tables, item_word, placement_word, in, models, loaded);
         if (space.tables.item.sharers == 0 && Source::has(space.tables.model)) {
+            const unsigned before = num_in_frustum;
             const unsigned written = project_item<Source, false>(
                 space, nullptr, factors_for<Source>(in, space.tables.item), *in.items.counters, out,
                 num_in_frustum);
             num_records += written;
             report_item(space.tables, i, written, out);
+            if (in.image_counts != nullptr)
+                report_image(space.tables, num_in_frustum - before, in.image_counts);
         }
         i = __shfl_sync(kAllLanes, next, 0);
     }
@@ -218,11 +236,14 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
             store_tables(space.tables, load_word(item), load_word(sharers[__ffs(item.sharers) - 1]),
                          in, models, loaded);
             if (!Source::has(space.tables.model)) continue;
+            const unsigned before = num_in_frustum;
             const unsigned written =
                 project_item<Source, true>(space, sharers, factors_for<Source>(in, item),
                                            *in.items.counters, out, num_in_frustum);
             num_records += written;
             report_item(space.tables, i, written, out);
+            if (in.image_counts != nullptr)
+                report_image(space.tables, num_in_frustum - before, in.image_counts);
         }
     }
     count_waiting(out.tiles.count, space.tiles);

@@ -35,6 +35,8 @@ struct ProjectInput {
     // the factors at index p modulo num_factors.
     const InstanceFactors* factors;
     uint32_t num_factors;
+    // [images] counts to which the kernel adds; null if not requested
+    ImageCounts* image_counts;
 
     // Returns the factors of an item's first placement. In a shared item, the factors
     // of the next placements follow. Precondition: `factors` is not null.

@@ -89,14 +89,14 @@ struct PoolShared {
 
     // Any thread may read the fields below without the mutex. Their comments name the
     // writers.
-    std::atomic<size_t> most_bytes_a_frame;  // the caller
-    std::atomic<size_t> needed{0};           // the decider
-    std::atomic<size_t> missing;             // the decider
-    std::atomic<size_t> failed{0};           // readers and forget_failures()
-    std::atomic<size_t> num_resident{0};     // frames; they also write the next two fields
+    std::atomic<size_t> most_bytes_a_frame;  // written by the caller
+    std::atomic<size_t> needed{0};           // written by the decider
+    std::atomic<size_t> missing;             // written by the decider
+    std::atomic<size_t> failed{0};           // written by readers and forget_failures()
+    std::atomic<size_t> num_resident{0};     // written by frames, like the next two fields
     std::atomic<size_t> pages_in{0};
     std::atomic<size_t> bytes_in{0};
-    // The decider, or a caller that holds the mutex.
+    // Written by the decider, or by a caller that holds the mutex.
     std::atomic<float> least_tolerance{0};
 
     // Throws std::runtime_error in a child of fork(). There the mutex could stay locked

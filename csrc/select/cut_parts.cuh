@@ -16,12 +16,14 @@ constexpr unsigned kLaneClusters = kClustersOfBounds;
 constexpr unsigned kPartSize = 32 * kLaneClusters;
 constexpr unsigned kCutThreads = 256, kCutWarps = kCutThreads / 32;
 static_assert(kLaneClusters == 8, "a byte has one bit per cluster of a lane");
+static_assert(kPartSize == kClustersOfPart, "scenes bound the number of parts");
 
 // The work of one warp. If `lanes` is 0, the part is clusters [first, first +
 // kPartSize) of one instance. Otherwise each set bit k of `lanes` means that lane k
-// processes instance + k: its top clusters, or the last clusters of its table.
+// processes the instance at place + k: its top clusters, or the last clusters of its
+// table.
 struct CutPart {
-    uint32_t instance, first, lanes;
+    uint32_t place, first, lanes;
 };
 
 // Returns where the last clusters of a table begin: the coarsest ones, which are few
@@ -30,10 +32,13 @@ __device__ inline uint32_t last_of_table(const ClusterTable& table) {
     return static_cast<uint32_t>(table.num_clusters() - 1) / kLaneClusters * kLaneClusters;
 }
 
-// A scene, and what place_kernel writes about its instances.
+// A scene, and what place_kernel writes about its instances. With one viewpoint, the
+// place of an instance is its index. A batch has a place for each instance of each
+// camera.
 struct PlacedScene {
     const BundleOnDevice* bundles;
     InstanceTable instances;
+    const int32_t* bundle_of_place;
     InstanceView* views;  // set for instances whose tables are tested
     // One byte per instance that a single lane processes: one bit per drawn top
     // cluster, or 0 if the lane tests the last clusters of the table.
@@ -90,7 +95,7 @@ static_assert(kLaneClusters == 8 && kWhole < 1 << 16, "LaneWeights holds eight w
 // fade.
 struct LaneClusters {
     const BundleOnDevice* bundle;
-    uint32_t instance;
+    uint32_t place;  // place of the instance
     uint32_t first;  // index of the first cluster in the table
     // True if each lane has its own instance; false if all lanes have the same
     // instance.
@@ -115,7 +120,7 @@ __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const 
     const unsigned lane = threadIdx.x % 32;
     const bool is_alone = part.lanes != 0;
     LaneClusters mine{.bundle = nullptr,
-                      .instance = part.instance,
+                      .place = part.place,
                       .first = part.first + kLaneClusters * lane,
                       .is_alone = is_alone,
                       .are_tops = false,
@@ -123,12 +128,12 @@ __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const 
                       .weights = {}};
     if (is_alone) {
         if ((part.lanes >> lane & 1) == 0) return mine;
-        mine.instance += lane;
-        mine.drawn = scene.tops[mine.instance];
+        mine.place += lane;
+        mine.drawn = scene.tops[mine.place];
         mine.are_tops = mine.drawn != 0;
         mine.weights = LaneWeights::all(kWhole);
     }
-    mine.bundle = &scene.bundles[scene.instances.bundle[mine.instance]];
+    mine.bundle = &scene.bundles[scene.bundle_of_place[mine.place]];
     if (is_alone && !mine.are_tops) mine.first = last_of_table(mine.bundle->table);
     return mine;
 }
@@ -145,7 +150,7 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
                              Tolerances tolerances, LaneClusters& mine, const Ask& ask) {
     struct Table {
         const BundleOnDevice* bundle;  // null if each lane has another instance
-        // First cluster; if `bundle` is null, instance of the first lane.
+        // First cluster; if `bundle` is null, place of the instance of the first lane.
         uint32_t first;
     };
     __shared__ InstanceView views[kCutWarps];
@@ -159,16 +164,16 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
     bool is_owner = false;
     // The condition is equal in all lanes of the warp.
     if (!mine.is_alone && mine.bundle != nullptr) {
-        const auto* view = reinterpret_cast<const uint32_t*>(scene.views + mine.instance);
+        const auto* view = reinterpret_cast<const uint32_t*>(scene.views + mine.place);
         for (unsigned w = lane; w < sizeof(InstanceView) / sizeof *view; w += 32)
             reinterpret_cast<uint32_t*>(views + warp)[w] = view[w];
         if (lane == 0) tables[warp] = {mine.bundle, mine.first};
     }
-    if (mine.is_alone && lane == 0) tables[warp] = {nullptr, mine.instance};
+    if (mine.is_alone && lane == 0) tables[warp] = {nullptr, mine.place};
     __syncwarp();
     if (mine.bundle != nullptr && !mine.are_tops) {
         const ClusterTable& table = mine.bundle->table;
-        const InstanceView& view = mine.is_alone ? scene.views[mine.instance] : views[warp];
+        const InstanceView& view = mine.is_alone ? scene.views[mine.place] : views[warp];
         is_owner = mine.first < table.num_clusters() &&
                    may_draw(table, mine.bounds(), view, rule, tolerances);
     }
@@ -192,11 +197,11 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule,
         if (is_one) {
             const Table& of = tables[owner / 32];
             const bool is_alone = of.bundle == nullptr;
-            // `instance` is used only if the owner's lane has its own instance.
-            const uint32_t instance = of.first + owner % 32;
+            // `lane_place` is used only if the owner's lane has its own instance.
+            const uint32_t lane_place = of.first + owner % 32;
             const BundleOnDevice* bundle =
-                is_alone ? &scene.bundles[scene.instances.bundle[instance]] : of.bundle;
-            const InstanceView& view = is_alone ? scene.views[instance] : views[owner / 32];
+                is_alone ? &scene.bundles[scene.bundle_of_place[lane_place]] : of.bundle;
+            const InstanceView& view = is_alone ? scene.views[lane_place] : views[owner / 32];
             const uint32_t c = k + (is_alone ? last_of_table(bundle->table)
                                              : of.first + kLaneClusters * (owner % 32));
             if (c < bundle->table.num_clusters())

@@ -35,7 +35,7 @@ struct PairOutput {
         for (unsigned k = 0; k < kLaneClusters; ++k)
             if (mine.drawn >> k & 1) {
                 if (first >= capacity) return;
-                instance[first] = static_cast<int32_t>(mine.instance);
+                instance[first] = static_cast<int32_t>(mine.place);
                 if (kFades) weight[first] = share_of(mine.weights[k]);
                 cluster[first++] = mine.cluster(k);
             }
@@ -127,7 +127,7 @@ struct ItemOutput {
             const unsigned size = mine.size(run.k, run.num_clusters),
                            step = run.gaussians_an_item();
             const uint32_t placement =
-                run.sharers == 0 ? mine.instance : mine.instance - threadIdx.x % 32;
+                run.sharers == 0 ? mine.place : mine.place - threadIdx.x % 32;
             const uint32_t gaussian = static_cast<uint32_t>(mine.bundle->table.first_row(cluster));
             const uint32_t place = mine.bundle->table.place_of(cluster);
             const ClusterAppearance& appearances = mine.bundle->appearance;

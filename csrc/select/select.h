@@ -46,6 +46,9 @@ struct SelectInput {
     Span<const Span<uint32_t>> needs = {};
     // State of tolerance_of_budget(), for BudgetPace::in_steps.
     uint32_t* last_bin = nullptr;
+    // The result of runs_of_bundles(), for callers that select many cuts. If empty,
+    // each cut computes the runs.
+    Span<const ClusterRuns> runs = {};
 };
 
 struct SelectOutput {
@@ -70,6 +73,11 @@ struct BudgetCut {
     bool fits;              // false if even the coarsest cut exceeds the budget
     int64_t num_gaussians;  // with all pages resident; of the coarsest cut if none fits
 };
+
+// Returns the runs of each bundle for `num_cuts` cuts. The runs of a bundle are empty
+// if it has few instances in all cuts together.
+std::vector<ClusterRuns> runs_of_bundles(Span<const ClusterTable> bundles,
+                                         const InstanceTable& instances, size_t num_cuts);
 
 namespace cpu {
 void select(const SelectInput& in, SelectOutput& out);

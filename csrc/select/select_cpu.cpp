@@ -42,8 +42,9 @@ struct KnownBins {
 struct View {
     const SelectInput& in;
     std::vector<CameraSides> sides;  // one per bundle
+    std::vector<ClusterRuns> own_runs;
     // One per bundle, set by find_runs(); empty if there are few instances.
-    std::vector<ClusterRuns> runs;
+    Span<const ClusterRuns> runs;
     size_t most_groups = 0, most_clusters = 0;  // largest numbers in any bundle
 
     explicit View(const SelectInput& input) : in(input) {
@@ -55,12 +56,9 @@ struct View {
     }
 
     void find_runs() {
-        std::vector<size_t> count(in.bundles.size, 0);
-        for (const int32_t b : in.instances.bundle) ++count[b];
-        runs.resize(in.bundles.size);
-        parallel_for(runs.size(), 1, [&](size_t b) {
-            if (count[b] >= kManyInstances) runs[b] = runs_of_clusters(in.bundles[b]);
-        });
+        if (in.runs.empty()) own_runs = runs_of_bundles(in.bundles, in.instances, 1);
+        runs = in.runs;
+        if (in.runs.empty()) runs = {own_runs.data(), own_runs.size()};
     }
 };
 
@@ -298,6 +296,17 @@ bool meet_budget(const View& view, SelectRule& rule, int64_t& least_count) {
 }
 
 }  // namespace
+
+std::vector<ClusterRuns> runs_of_bundles(Span<const ClusterTable> bundles,
+                                         const InstanceTable& instances, size_t num_cuts) {
+    std::vector<size_t> count(bundles.size, 0);
+    for (const int32_t b : instances.bundle) count[b] += num_cuts;
+    std::vector<ClusterRuns> runs(bundles.size);
+    parallel_for(runs.size(), 1, [&](size_t b) {
+        if (count[b] >= kManyInstances) runs[b] = runs_of_clusters(bundles[b]);
+    });
+    return runs;
+}
 
 void cpu::select(const SelectInput& in, SelectOutput& out) {
     View view(in);

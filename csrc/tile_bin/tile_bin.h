@@ -48,7 +48,8 @@ struct TileLists {
         // bits.
         Buffer<uint64_t> entry;
     };
-    // [chunk][tile + 1] first entry of the tile in the chunk
+    // For each chunk, the first entry of each tile in the chunk, and the end:
+    // [num_chunks][num_tiles + 1].
     Buffer<uint32_t> chunk_offset;
     std::vector<Chunk> chunk;
 

@@ -302,7 +302,8 @@ class Bundle:
 
     def read_page(self, page: int) -> Gaussians:
         """Return the gaussians of a page, after verifying its hash. Page g contains the
-        clusters that group g replaces; the last page contains the last level."""
+        clusters that group g replaces; the last page contains the coarsest level, which
+        no group replaces."""
         check_index("page", page, self.num_pages)
         return self._pages.read(page, page + 1)
 

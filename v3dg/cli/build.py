@@ -393,7 +393,8 @@ def _build_file(
     if quality is None and options.config == "paper":
         quality = "draft"
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("ignore", AssetWarning)  # the result reports them
+        # The result reports these warnings.
+        warnings.simplefilter("ignore", AssetWarning)
         warnings.simplefilter("always", DraftWarning)
         bundle, is_built = build_file(
             paths,

@@ -26,8 +26,7 @@ DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
 
 # Number of gaussians that are decoded together. A block of doubles fits into the cache.
 _BLOCK = 1 << 16
-# The logarithm of 2e-9. It replaces that of a scale of 0, which no quantised format can
-# store.
+# Minimum logarithm of a scale, that of 2e-9. A scale of 0 has no finite logarithm.
 _MIN_LOG_SCALE = -20.0
 _LEAST_VISIBLE_OPACITY = np.float32(_core.min_alpha)
 

@@ -117,7 +117,7 @@ class _Named(NamedTuple):
 
 
 class _Tensor(NamedTuple):
-    kind: str  # the type of the numbers in its storage
+    kind: str  # the type of the stored numbers
     key: str
     num_stored: int
     offset: int

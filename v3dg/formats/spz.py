@@ -55,7 +55,8 @@ _MOST_POINTS = 100_000  # number of points that are used to detect a ground
 # The type of an extension and the number of bytes that follow.
 _EXTENSION = struct.Struct("<II")
 _AXES_EXTENSION = 0xADBE0003  # SPZ_ADOBE_coordinate_system
-# The axes by their number in that extension, as defined by version 4 of the library.
+# The axes by their number in SPZ_ADOBE_coordinate_system, as defined by version 4 of
+# Niantic's library.
 _AXES = (
     *("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
     *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),

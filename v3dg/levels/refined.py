@@ -24,8 +24,8 @@ from v3dg.levels.viewpoints import SeenFrom, viewpoints_of
 from v3dg.residency import residency
 
 _T = TypeVar("_T", covariant=True)
-# Step sizes of a refinement as a fraction of those of a fit. It is small because
-# refinement starts from fitted levels.
+# Step sizes of a refinement as a fraction of those of a fit. The fraction is small,
+# because a refinement starts from fitted levels.
 _RATE = 0.2
 # Default share of a level's visibility that may be lost by dropping its least visible
 # gaussians.
