@@ -22,6 +22,8 @@ fade_filter_px2: float
 has_cuda: bool
 min_alpha: float
 sh_base0: float
+stops_before: float
+stops_by_cut: float
 
 def isa() -> str: ...
 def num_cuda_devices() -> int: ...
@@ -569,9 +571,16 @@ class Palette:
 
     def __init__(self, table: ClusterTable, sh: NDArray[np.float32], device: int) -> None: ...
 
+def stop_of_tolerance(tolerance_px2: float) -> float: ...
+
 class Shade:
     """The background of a picture, the transmittance at which its pixels stop, and
-    whether depth is drawn."""
+    whether depth is drawn.
+
+    Args:
+        min_transmittance: 0 or more; or `stops_before`, as in `v3dg.rasterize`; or
+            `stops_by_cut`, by the tolerance of the cut.
+    """
 
     def __init__(
         self, *, background: Sequence[float], min_transmittance: float, with_depth: bool

@@ -18,11 +18,12 @@ import numpy.typing as npt
 
 from v3dg._numbers import Floats
 from v3dg.bundle import Bundle
-from v3dg.cameras import Camera, VectorLike
+from v3dg.cameras import Axis, Camera, VectorLike
 from v3dg.cleaning import examine
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import rotation_from_quaternion
 from v3dg.scene import Scene, Subject
+from v3dg.upright import direction_of
 
 DEFAULT_ELEVATION = math.radians(20)
 """Elevation of the first camera above the horizon, in radians, for an object."""
@@ -60,6 +61,9 @@ _DIRECTIONS = [step for step in itertools.product((-1, 0, 1), repeat=3) if any(s
 _CLOSED = 0.75
 _CLEARANCE = 0.1 * _VOXELS
 _LEAST_FREE = 0.1
+# Cosine of the angle to the zenith below which a direction counts if a place is open
+# above.
+_SKYWARD = 0.5
 # Minimum share of the content that is away from the outer walls.
 _LEAST_CONTENT = 0.02
 _WALL_VOXELS = 3
@@ -79,6 +83,19 @@ class _Sample(NamedTuple):
     first_axes: Floats
     second_axes: Floats
     weights: Floats
+
+
+class Surroundings(NamedTuple):
+    """The places inside a subject.
+
+    Attributes:
+        places: (N, 3) free places that are closed on nearly all sides, but for the sky.
+        outer_share: The share of what is seen from outside that stands far from all
+            closed places, such as a roof and a garden; 1 if they are open above.
+    """
+
+    places: Floats
+    outer_share: float
 
 
 @dataclass(frozen=True)
@@ -230,6 +247,26 @@ def frame_subject(subject: Subject) -> Framing:
     center = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = max(float(np.linalg.norm(np.ptp(points, axis=0))) / 2, 1e-6)
     return Framing(center, radius, points, _places(sample))
+
+
+def surroundings(subject: Subject, up: Axis) -> Surroundings | None:
+    """Return the places that a subject surrounds: those inside of a room, else those
+    with a ground, a free sky and walls around, as in a street or a yard; None if there
+    are none."""
+    grid = _grid(_sample(subject))
+    if grid is None:
+        return None
+    places = _free_places(grid, grid.distances, ~grid.is_solid)
+    if len(places):
+        return Surroundings(places, _outer_share(grid))
+    zenith = np.array(direction_of(up))
+    heights = np.array([zenith @ step / np.linalg.norm(step) for step in _DIRECTIONS])
+    is_blocked = np.isfinite(grid.distances)
+    has_ground = is_blocked[heights.argmin()] & ~is_blocked[heights.argmax()]
+    places = _free_places(grid, grid.distances[heights < _SKYWARD], has_ground)
+    if len(places):
+        return Surroundings(places, 1.0)
+    return None
 
 
 def _sample(subject: Subject) -> _Sample:
@@ -490,26 +527,53 @@ def _places(sample: _Sample) -> _Places | None:
     grid = _grid(sample)
     if grid is None:
         return None
-    is_blocked = np.isfinite(grid.distances)
-    blocked = is_blocked.mean(axis=0)
-    clearance = np.where(is_blocked, grid.distances, _VOXELS).min(axis=0)
-    is_solid = grid.is_solid
-    places = np.argwhere(~is_solid & (blocked > _CLOSED) & (clearance >= _CLEARANCE))
-    solid = np.argwhere(is_solid)
-    if not len(places) or not len(solid):
-        return None
-    middle = np.prod(np.ptp(solid, axis=0) + 1) * 0.343
-    is_open = ~is_solid & (blocked < 0.6)
-    near_outside = _grown(is_open, _WALL_VOXELS)
-    weight = np.where(is_solid, grid.density, 0.0)
-    content = weight[~near_outside].sum() / max(weight.sum(), 1e-12)
-    if len(places) < _LEAST_FREE * middle or content < _LEAST_CONTENT:
+    places = _free_places(grid, grid.distances, ~grid.is_solid)
+    if not len(places):
         return None
     size = grid.side * _VOXELS
     low = grid.origin
     is_inside = ((sample.means >= low) & (sample.means <= low + size)).all(axis=1)
     rows = np.flatnonzero(is_inside)[:: max(int(is_inside.sum()) // 5000, 1)]
-    return _Places(grid.center(places), sample.means[rows], sample.weights[rows], size)
+    return _Places(places, sample.means[rows], sample.weights[rows], size)
+
+
+def _outer_share(grid: _Grid) -> float:
+    """Return the share of what is seen from outside that is farther than a wall from
+    all voxels that are closed on nearly all sides."""
+    is_blocked = np.isfinite(grid.distances)
+    is_closed = ~grid.is_solid & (is_blocked.mean(axis=0) > _CLOSED)
+    is_inner = _grown(is_closed, _WALL_VOXELS, includes_rim=False)
+    visible = np.where(grid.is_solid & ~is_blocked.all(axis=0), grid.density, 0.0)
+    return float(visible[~is_inner].sum() / max(visible.sum(), 1e-300))
+
+
+def _free_places(
+    grid: _Grid, distances: npt.NDArray[np.float32], is_possible: npt.NDArray[np.bool_]
+) -> Floats:
+    """Return the (N, 3) free places that are closed on nearly all sides; none if they
+    have too small a share of the middle, or nothing stands among them.
+
+    Args:
+        distances: (D, V, V, V) those of the grid in the directions that count.
+        is_possible: (V, V, V) whether a voxel may be such a place.
+    """
+    is_blocked = np.isfinite(distances)
+    blocked = is_blocked.mean(axis=0)
+    clearance = np.where(is_blocked, distances, _VOXELS).min(axis=0)
+    is_solid = grid.is_solid
+    is_place = is_possible & ~is_solid & (blocked > _CLOSED) & (clearance >= _CLEARANCE)
+    places = np.argwhere(is_place)
+    solid = np.argwhere(is_solid)
+    if not len(places) or not len(solid):
+        return np.zeros((0, 3))
+    middle = np.prod(np.ptp(solid, axis=0) + 1) * 0.343
+    is_open = ~is_solid & (blocked <= _CLOSED)
+    near_outside = _grown(is_open, _WALL_VOXELS, includes_rim=True)
+    weight = np.where(is_solid, grid.density, 0.0)
+    content = weight[~near_outside].sum() / max(weight.sum(), 1e-12)
+    if len(places) < _LEAST_FREE * middle or content < _LEAST_CONTENT:
+        return np.zeros((0, 3))
+    return grid.center(places)
 
 
 def _grid(sample: _Sample) -> _Grid | None:
@@ -562,10 +626,10 @@ def _shifted(step: int) -> slice:
     return slice(max(step, 0), _VOXELS + min(step, 0))
 
 
-def _grown(mask: npt.NDArray[np.bool_], count: int) -> npt.NDArray[np.bool_]:
-    """Return a mask that is dilated by `count` voxels. Voxels outside the grid count as
-    part of the mask."""
-    grown = np.pad(mask, count, constant_values=True)
+def _grown(mask: npt.NDArray[np.bool_], count: int, *, includes_rim: bool) -> npt.NDArray[np.bool_]:
+    """Return a mask that is dilated by `count` voxels; `includes_rim` says whether the
+    voxels outside the grid count as part of the mask."""
+    grown = np.pad(mask, count, constant_values=includes_rim)
     for _ in range(count):
         wider = grown.copy()
         for axis in range(3):

@@ -4,26 +4,16 @@ import threading
 import time
 from collections.abc import Sequence
 
-from v3dg import _core, _device
+from v3dg import _core
 from v3dg._device import Device
 from v3dg.bundle import Bundle
-from v3dg.levels.memory import free_bytes
+from v3dg.levels.memory import free_on
 from v3dg.residency import ResidentScene, residency
 
 # Maximum amount of memory that stays free for frames, tables and other data.
 _RESERVE_BYTES = 1 << 30
 NUM_THREADS = 8  # threads that read pages; disks process several requests at once
 _WAIT_SECONDS = 0.05  # maximum delay before Ctrl-C is handled
-
-
-def free_on(device: Device) -> int:
-    """Return the free memory of a device in bytes."""
-    if not device.is_cuda:
-        return free_bytes()
-    import torch
-
-    _device.spare_memory(device)
-    return int(torch.cuda.mem_get_info(device.number)[0])
 
 
 def chosen_bytes(bundles: Sequence[Bundle], device: Device) -> int | None:

@@ -3,14 +3,16 @@ of the asset."""
 
 import os
 from collections.abc import Iterable, Mapping
+from typing import get_args
 
 from v3dg import _device
 from v3dg._device import Device
-from v3dg._numbers import check_type, real, whole
+from v3dg._numbers import check_type, one_of, real, refuse, whole
 from v3dg._progress import Progress
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.levels.refined import DROP, refined_bundle
+from v3dg.levels.viewpoints import SeenFrom
 from v3dg.opening import File
 
 
@@ -18,6 +20,7 @@ def refine_bundle(
     bundle: Bundle | File,
     *,
     cameras: Iterable[Camera] | Mapping[str, Camera] = (),
+    seen_from: SeenFrom = "auto",
     steps: int = 30_000,
     drop: float = DROP,
     seed: int = 0,
@@ -40,9 +43,14 @@ def refine_bundle(
     Args:
         bundle: A bundle of `build_bundle`, or the path of its file. The function needs
             about six times the memory of the bundle.
-        cameras: Cameras of the pictures, in a sequence or by name. For a room, use
-            those of its photographs; views from other places may get worse. Without
-            cameras, pictures show the asset from all directions.
+        cameras: Cameras of the pictures, in a sequence or by name, such as those of the
+            asset's photographs. Views from other places may get worse.
+        seen_from: Where pictures are taken without cameras. "outside": from all around.
+            "inside": from up to 96 eyes in the free space that the asset surrounds.
+            "both": half of them each. "auto" finds out: inside if the asset surrounds a
+            free place with something in it, as a room does; both if that place is open
+            above, as a street is, or if more is seen from outside than its walls; else
+            outside. The config of the result says which.
         steps: Number of pictures that are compared. A GPU uses sixteen of them for each
             optimisation step, so the number is rounded up.
         drop: Share of a level's visibility, 0 to 0.5, that may be lost by dropping its
@@ -55,7 +63,8 @@ def refine_bundle(
     Raises:
         TypeError: ``bundle`` is not a Bundle, or an element of ``cameras`` is not a
             Camera.
-        ValueError: ``steps``, ``drop`` or ``seed`` is out of range.
+        ValueError: ``steps``, ``drop`` or ``seed`` is out of range, or ``seen_from`` is
+            inside or both and the asset surrounds no place.
         RuntimeError: The device is "cuda" and cannot be used.
         KeyboardInterrupt: Ctrl-C was pressed; threads have stopped.
     """
@@ -67,6 +76,9 @@ def refine_bundle(
     cameras = list(cameras)
     for number, camera in enumerate(cameras):
         check_type(f"cameras[{number}]", camera, Camera, "a Camera")
+    one_of(seen_from, "seen_from", get_args(SeenFrom))
+    if seen_from != "auto" and cameras:
+        refuse("seen_from", f"auto with cameras, got {seen_from}")
     steps = whole(steps, "steps", "at least 1 step", 1, 1_000_000)
     drop = real(drop, "drop", "a share from 0 to 0.5", 0, 0.5)
     seed = whole(seed, "seed", "a whole number from 0 to 2^58 - 1", 0, (1 << 58) - 1)
@@ -74,6 +86,7 @@ def refine_bundle(
     return refined_bundle(
         bundle,
         cameras=cameras,
+        seen_from=seen_from,
         steps=steps,
         drop=drop,
         seed=seed,

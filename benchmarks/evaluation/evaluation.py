@@ -175,7 +175,7 @@ class Evaluation:
         part's time includes loading."""
         tiny = make_asset(1000)
         bundle = build_bundle(
-            tiny, config=BuildConfig(steps=2), progress=False, device=self._device
+            tiny, config=BuildConfig(steps=2), progress=False, device=self._device, quality="draft"
         )
         render(bundle, orbit_view(0, 45, 5, (64, 64)).camera, device=self.device).stats  # noqa: B018
 
@@ -197,6 +197,7 @@ class Evaluation:
             seed=self.seed,
             progress=False,
             device=self._device,
+            quality="draft",
         )
         built = Built(bundle, time.perf_counter() - start)
         if asset is None:

@@ -68,7 +68,7 @@ def main(config: Config) -> None:
     asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
     with gpu.PeakMemory():  # records the memory of an idle process
         torch.zeros(1, device=gpu.DEVICE)
-    bundle = build_bundle(asset, progress=False, device=gpu.DEVICE)
+    bundle = build_bundle(asset, progress=False, device=gpu.DEVICE, quality="draft")
     result: dict[str, Any] = {"repeats": config.repeats, "refine": config.refine}
     if config.refine > 0:
         bundle = v3dg.refine_bundle(bundle, steps=config.refine, device=gpu.DEVICE, progress=False)

@@ -53,7 +53,7 @@ def memory():
 def kinds_of(gaussians):
     """Return three bundles by name: float32 as built, its quantised codes, and the
     decoded codes as float32."""
-    built = v3dg.build_bundle(gaussians, device=DEVICE, progress=False)
+    built = v3dg.build_bundle(gaussians, device=DEVICE, progress=False, quality="draft")
     codes = Bundle(built.clusters, built.groups, built.gaussians, codec="quantized")
     rows = Bundle(codes.clusters, codes.groups, codes.gaussians)
     return {"float32": built, "quantized": codes, "decoded": rows}

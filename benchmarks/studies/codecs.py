@@ -91,7 +91,9 @@ def measure(asset: v3dg.Gaussians, options: Config, folder: Path) -> dict[str, A
     config = v3dg.BuildConfig(steps=options.steps, first_steps=min(options.steps, 150))
     bundles, bytes_a_leaf = {}, {}
     for codec in CODECS:
-        bundle = v3dg.build_bundle(asset, config=config, progress=False, codec=codec)
+        bundle = v3dg.build_bundle(
+            asset, config=config, progress=False, codec=codec, quality="draft"
+        )
         bundle.write(folder / codec)
         leaves = len(bundle.level_gaussians(0))
         bundles[codec] = bundle

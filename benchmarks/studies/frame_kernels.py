@@ -72,7 +72,9 @@ def frames(config: Config) -> Iterator[Frame]:
             yield from _sized(
                 config, f"{name}, whole", v3dg.Renderer(subject.gaussians), subject.cameras, None
             )
-            bundle = v3dg.build_bundle(subject.gaussians.numpy(), device="cuda", progress=False)
+            bundle = v3dg.build_bundle(
+                subject.gaussians.numpy(), device="cuda", progress=False, quality="draft"
+            )
             yield from _sized(
                 config,
                 f"{name}, levels",
@@ -88,7 +90,7 @@ def frames(config: Config) -> Iterator[Frame]:
     if config.layout is not None:
         asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
         scene, views = read_layout(
-            config.layout, v3dg.build_bundle(asset, device="cuda", progress=False)
+            config.layout, v3dg.build_bundle(asset, device="cuda", progress=False, quality="draft")
         )
         renderer = v3dg.Renderer(scene, device="cuda")
         for tolerance in (*_TOLERANCES, 0.0):

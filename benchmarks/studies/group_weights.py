@@ -517,7 +517,9 @@ def main(config: Config) -> None:
     with ProcessPoolExecutor(config.workers, mp_context=get_context("spawn")) as pool:
         for number, path in enumerate(config.assets):
             for steps in config.refine:
-                bundle = v3dg.build_bundle(path, device=config.device, progress=False)
+                bundle = v3dg.build_bundle(
+                    path, device=config.device, progress=False, quality="draft"
+                )
                 if steps > 0:
                     bundle = v3dg.refine_bundle(
                         bundle, steps=steps, device=config.device, progress=False

@@ -64,7 +64,10 @@ def main(config: Config) -> None:
     for change in config.only or tuple(CHANGES):
         start = time.process_time()
         bundle = v3dg.build_bundle(
-            asset, config=replace(v3dg.BuildConfig(), **CHANGES[change]), progress=False
+            asset,
+            config=replace(v3dg.BuildConfig(), **CHANGES[change]),
+            progress=False,
+            quality="draft",
         )
         row: dict[str, Any] = {
             "change": change,

@@ -89,7 +89,9 @@ def _values(picture: Picture) -> npt.NDArray[np.float32]:
 def main(config: Config) -> None:
     asset = v3dg.read_asset(config.asset)
     truth = read_picture(config.truth)
-    bundle = v3dg.build_bundle(asset, config=BuildConfig.paper(), device=config.device)
+    bundle = v3dg.build_bundle(
+        asset, config=BuildConfig.paper(), device=config.device, quality="draft"
+    )
     levels = [("v3dg", n, bundle.level_gaussians(n)) for n in range(bundle.num_levels)]
     for number, folder in enumerate(config.published):
         levels += [(f"published {number}", n, level) for n, level in published_levels(folder)]

@@ -64,7 +64,7 @@ def built(asset: Gaussians, device: str, *, is_ordered: bool) -> v3dg.Bundle:
     if is_ordered:
         order = in_runs
     with mock.patch.object(simplify, "in_runs", order):
-        return v3dg.build_bundle(asset, device=device, progress=False)
+        return v3dg.build_bundle(asset, device=device, progress=False, quality="draft")
 
 
 def ordered(bundle: v3dg.Bundle) -> v3dg.Bundle:

@@ -70,7 +70,7 @@ def measure(config: Config, subject: Subject, judges: Judges) -> list[Row]:
 
 def _drawn(config: Config, subject: Subject) -> Iterator[tuple[Row, Picture, Picture]]:
     device = "cuda" if _device.resolve(config.device).is_cuda else "cpu"
-    bundle = v3dg.build_bundle(subject.asset, device=device, progress=False)
+    bundle = v3dg.build_bundle(subject.asset, device=device, progress=False, quality="draft")
     if config.refine > 0:
         bundle = v3dg.refine_bundle(bundle, steps=config.refine, device=device, progress=False)
     for width in config.widths:

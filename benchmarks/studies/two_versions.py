@@ -90,12 +90,19 @@ class Run:
         ):
             asset = random_gaussians(6000, sh_degree, seed=sh_degree)
             bundle = v3dg.build_bundle(
-                asset, config=config, seed=5, device=self.device, progress=False
+                asset, config=config, seed=5, device=self.device, progress=False, quality="draft"
             )
             self.digests[f"build sh {sh_degree}"] = self.digest_of(bundle)
         asset = random_gaussians(40_000, 1)
         config = v3dg.BuildConfig(steps=100 if self.device == "cpu" else 800)
-        build = lambda: v3dg.build_bundle(asset, config=config, device=self.device, progress=False)  # noqa: E731
+        build = partial(
+            v3dg.build_bundle,
+            asset,
+            config=config,
+            device=self.device,
+            progress=False,
+            quality="draft",
+        )
         bundle = self.time("build 40 k", build, 1 if self.device == "cpu" else 5)
         self.digests["build 40 k"] = self.digest_of(bundle)
         return bundle
@@ -268,7 +275,9 @@ def main() -> None:
         )
         config = v3dg.BuildConfig(steps=20)
         name = json.loads(arguments.layout.read_text())["asset"]
-        donut = v3dg.build_bundle(asset, config=config, device=arguments.device, progress=False)
+        donut = v3dg.build_bundle(
+            asset, config=config, device=arguments.device, progress=False, quality="draft"
+        )
         scene, cameras = read_scene(arguments.layout, bundles={name: donut})
         some = [list(cameras.items())[k] for k in arguments.cameras]
         run.frames(

@@ -207,7 +207,7 @@ def measure(config: Config, subject: Subject) -> list[Row]:
         if part in config.refit:
             add(refitted(kept, asset, others, config), part, config.steps)
         if config.tolerances:
-            bundle = v3dg.build_bundle(kept, device=config.device, progress=False)
+            bundle = v3dg.build_bundle(kept, device=config.device, progress=False, quality="draft")
             for tolerance in config.tolerances:
                 add(bundle, part, 0, tolerance)
     return rows

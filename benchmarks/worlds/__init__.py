@@ -363,6 +363,7 @@ def write_world(
             device=device,
             resume=resume,
             progress=progress,
+            quality="draft",
         )
     path = folder / f"{world.name}.json"
     paths = [f"{name}.v3dg" for name in world.placements]

@@ -339,6 +339,8 @@ void bind_frame(py::module_& m) {
         .def_readonly("draw_ms", &FrameStats::draw_ms)
         .def_readonly("levels", &FrameStats::levels)
         .def_readonly("num_draws", &FrameStats::num_draws);
+    m.def("stop_of_tolerance", &stop_of_tolerance, "tolerance_px2"_a,
+          "The transmittance behind which pixels of a cut stop.");
     py::class_<Shade>(m, "Shade",
                       "The background of a picture, the transmittance at which pixels stop, and "
                       "whether depth is drawn.")

@@ -54,6 +54,8 @@ PYBIND11_MODULE(_core, m) {
     v3dg::watch_end_of_python();
     m.doc() = "The compiled operations of v3dg. The package v3dg is the public interface.";
     m.attr("min_alpha") = v3dg::kMinAlpha;
+    m.attr("stops_before") = v3dg::kStopsBefore;
+    m.attr("stops_by_cut") = v3dg::kStopsByCut;
     m.attr("fade_filter_px2") = v3dg::kFadeFilterPx2;
     m.attr("sh_base0") = v3dg::kShBase0;
     m.attr("has_cuda") = v3dg::device_backend() != nullptr;

@@ -28,7 +28,8 @@ struct FrameBatch {
     const CodedGaussians* coded = nullptr;
     // Whether any item may be shared; must be false with a tape.
     bool has_shared_items = false;
-    float min_transmittance = kStopsBefore;  // the same for all images
+    // The same for all images; kStopsByCut only with a budget.
+    float min_transmittance = kStopsBefore;
     // Whether any item may have a weight below 1. Such items occur only in scenes, and
     // are never shared.
     bool has_faded_items = false;

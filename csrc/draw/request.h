@@ -31,7 +31,7 @@ struct Shade {
 
 struct FrameRequest {
     Eyes eyes;  // the camera of each picture
-    // The rule of the cut. With a given `cut`, only false colours use the rule.
+    // The rule of the cut. With a given `cut`, only its tolerance matters.
     SelectRule rule;
     Shade shade;
     FrameLook look = FrameLook::appearance;

@@ -155,10 +155,12 @@ void set_tint(const Rgb& rgb, float* tint) {
     for (int a = 0; a < 3; ++a) tint[a] = (rgb[a] - 0.5f) / static_cast<float>(kShBase0);
 }
 
+// `tolerance_px2` is the tolerance of the cut.
 SceneFrameCounts draw_pairs(const HostScene& scene, const Camera& camera, const GivenCut& given,
-                            const float* tint, const Picture<float>& picture,
+                            float tolerance_px2, const float* tint, Picture<float> picture,
                             Workspace<float>& workspace, const std::atomic<bool>* stop) {
     const double start = now();
+    picture.min_transmittance = stop_of_cut(picture.min_transmittance, tolerance_px2);
     const CutDraws cut(scene, camera, given, tint);
     SceneFrameCounts counts{};
     counts.render =
@@ -245,8 +247,8 @@ SceneFrameCounts draw_given(const HostScene& scene, const FrameRequest& request,
         tint = tint_of(scene, request, rule, given, rule.tolerance_px2);
     }
     const LentWorkspace workspace;
-    return draw_pairs(scene, camera, given, tint.empty() ? nullptr : tint.data(), picture,
-                      *workspace, stop);
+    return draw_pairs(scene, camera, given, rule.tolerance_px2,
+                      tint.empty() ? nullptr : tint.data(), picture, *workspace, stop);
 }
 
 SceneFrameCounts draw_selected(const HostScene& scene, const FrameRequest& request,
@@ -261,7 +263,7 @@ SceneFrameCounts draw_selected(const HostScene& scene, const FrameRequest& reque
     if (cut.fits_budget) tint = tint_of(scene, request, rule, given, cut.tolerance_px2);
     SceneFrameCounts counts{};
     for (size_t k = 0; k < pictures.size && cut.fits_budget; ++k)
-        counts.add_picture(draw_pairs(scene, request.eyes.camera[k], given,
+        counts.add_picture(draw_pairs(scene, request.eyes.camera[k], given, cut.tolerance_px2,
                                       tint.empty() ? nullptr : tint.data(), pictures[k], workspace,
                                       stop));
     counts.gaussians = cut.num_gaussians;
@@ -316,7 +318,8 @@ Picture<float> picture_of(const BatchRequest& request, size_t k) {
             .alpha = planes.alpha_plane(),
             .depth = planes.depth,
             .count = nullptr,
-            .min_transmittance = request.shade.min_transmittance,
+            .min_transmittance =
+                stop_of_cut(request.shade.min_transmittance, request.rule.tolerance_px2),
             .color_step = planes.channels,
             .alpha_step = planes.alpha_step()};
 }

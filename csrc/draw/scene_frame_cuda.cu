@@ -121,7 +121,9 @@ FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures
             .packed = has_packed_ ? packed_.data() : nullptr,
             .coded = has_coded_ ? coded_.data() : nullptr,
             .has_shared_items = scene.num_instances() > 1,
-            .min_transmittance = pictures.min_transmittance,
+            .min_transmittance = rule.budget == kNoBudget
+                                     ? stop_of_cut(pictures.min_transmittance, rule.tolerance_px2)
+                                     : pictures.min_transmittance,
             .has_faded_items = rule.fade.is_on(),
             .factors = factors.empty() ? nullptr : factors.data,
             .num_factors = static_cast<uint32_t>(factors.size),
@@ -141,8 +143,7 @@ std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, DevicePages*
                                           const EyeImages& pictures, cudaStream_t stream,
                                           const Frame::Place& place) {
     const Eyes& eyes = request.eyes;
-    if (request.cut)
-        return draw_given(scene, eyes.camera[0], *request.cut, pictures, stream, place);
+    if (request.cut) return draw_given(scene, request, pictures, stream, place);
     if (pages != nullptr) return draw_resident(scene, *pages, eyes, rule, pictures, stream, place);
     return draw_selected(scene, eyes, rule, pictures, stream, place);
 }
@@ -187,14 +188,17 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
         stream, place);
 }
 
-std::unique_ptr<Drawing> SceneFrame::draw_given(const SceneTables& scene, const Camera& camera,
-                                                const GivenCut& given, const EyeImages& pictures,
-                                                cudaStream_t stream, const Frame::Place& place) {
-    FrameBatch of_cut = batch(scene, pictures, SelectRule{}, stream);
+std::unique_ptr<Drawing> SceneFrame::draw_given(const SceneTables& scene,
+                                                const FrameRequest& request,
+                                                const EyeImages& pictures, cudaStream_t stream,
+                                                const Frame::Place& place) {
+    const GivenCut given = *request.cut;
+    const float tolerance_px2 = request.rule.tolerance_px2;
+    FrameBatch of_cut = batch(scene, pictures, SelectRule{.tolerance_px2 = tolerance_px2}, stream);
     of_cut.has_faded_items = given.weight.size > 0;
     return frame_.draw(
         of_cut,
-        [=, this, &scene](const ItemList& items, cudaStream_t on) {
+        [=, this, &scene, camera = request.eyes.camera[0]](const ItemList& items, cudaStream_t on) {
             cut_.given_items(scene, camera, given, pictures.image[0], images_.data(),
                              placements_.data(), items, on);
         },

@@ -133,9 +133,9 @@ class SceneFrame {
                                            const Eyes& eyes, SelectRule& rule,
                                            const EyeImages& pictures, cudaStream_t stream,
                                            const Frame::Place& place);
-    std::unique_ptr<Drawing> draw_given(const SceneTables& scene, const Camera& camera,
-                                        const GivenCut& given, const EyeImages& pictures,
-                                        cudaStream_t stream, const Frame::Place& place);
+    std::unique_ptr<Drawing> draw_given(const SceneTables& scene, const FrameRequest& request,
+                                        const EyeImages& pictures, cudaStream_t stream,
+                                        const Frame::Place& place);
     // Returns the batch that draws the models.
     FrameBatch batch(const SceneTables& scene, const EyeImages& pictures, const SelectRule& rule,
                      cudaStream_t stream);

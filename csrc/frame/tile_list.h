@@ -177,9 +177,10 @@ struct FrameLists {
     // Work counter: plans that blocks of spread_kernel claimed beyond their first one.
     // Initially zero.
     unsigned* taken;
-    // num_tiles; or most_plans(), if tiles may be divided into parts
-    uint32_t num_plans;
-    float min_transmittance;  // the same for all images
+    uint32_t num_plans;  // num_tiles, or most_plans() if tiles may be in parts
+    // The same for all images; kStopsByCut for a cut by a budget, whose tolerance is in
+    // the counters.
+    float min_transmittance;
     // The destinations of the first and second image, if FrameImage has none.
     PicturePlanes planes[2] = {};
     bool has_depth = true;  // must be true if any image has a depth plane

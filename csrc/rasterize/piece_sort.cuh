@@ -94,7 +94,7 @@ struct BlendShared {
     ListWindow window[3];
     uint32_t lowest, highest;  // range of key_depth() in the piece
     uint32_t crowded;          // number of sampled entries in crowded buckets
-    float stops_behind;        // StopsBehind::transmittance
+    float stops_behind;        // StopsBehind::transmittance, or kStopsBefore
     SpreadLevel level[kMostSpreadLevels];
     // Sums of weight * depth, in the order of TilePixels. This member must be the last
     // one: frames without depth do not allocate it.

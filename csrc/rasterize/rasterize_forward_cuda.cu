@@ -180,7 +180,7 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
         s.lowest = ~0u;
         s.highest = 0;
         s.crowded = 0;
-        s.stops_behind = lists.min_transmittance;
+        s.stops_behind = stop_of_cut(lists.min_transmittance, lists.counters->choice.tolerance_px2);
         s.reached[0] = s.reached[1] = s.num_covered[0] = s.num_covered[1] = 0;
     }
     __syncthreads();
@@ -212,7 +212,7 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
         for (int k = 0; k < 2 && x + k < image.width && y < image.height; ++k) {
             const size_t out = static_cast<size_t>(y) * image.width + x + k;
             const Finished<float> pixel =
-                finished(s.pixels.transmittance[place + k], lists.min_transmittance);
+                finished(s.pixels.transmittance[place + k], s.stops_behind);
             const float alpha = 1 - pixel.transmittance;
             for (int c = 0; c < 3; ++c)
                 planes.color[num_channels * out + c] = pixel.gain * s.pixels.color[c][place + k] +

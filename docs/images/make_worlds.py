@@ -50,7 +50,7 @@ def main(config: Config) -> None:
         # Level 0 is drawn, so the levels need no fit.
         build = v3dg.BuildConfig(steps=0)
         bundles = {
-            key: v3dg.build_bundle(asset.make(), config=build, progress=False)
+            key: v3dg.build_bundle(asset.make(), config=build, progress=False, quality="draft")
             for key, asset in world.assets.items()
         }
         cameras = world.cameras(width=WIDTH, height=HEIGHT)

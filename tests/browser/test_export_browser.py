@@ -48,7 +48,9 @@ class Handler(http.server.SimpleHTTPRequestHandler):
 @pytest.fixture(scope="module")
 def bundle():
     config = v3dg.BuildConfig(steps=60)
-    return v3dg.build_bundle(make_donut(20_000, sh_degree=2), config=config, progress=False)
+    return v3dg.build_bundle(
+        make_donut(20_000, sh_degree=2), config=config, progress=False, quality="draft"
+    )
 
 
 @pytest.fixture(scope="module")

@@ -43,7 +43,7 @@ TABLES = {"clusters": v3dg.Clusters, "groups": v3dg.Groups}
 
 
 def build(asset, config=SMALL, **options):
-    return build_bundle(asset, config=config, progress=False, **options)
+    return build_bundle(asset, config=config, progress=False, **options, quality="draft")
 
 
 @pytest.fixture(scope="module")
@@ -675,7 +675,7 @@ def test_wrong_options_are_named(asset):
     ):
         build(asset, device="gpu")
     with pytest.raises(TypeError, match="progress: expected True, False or a function, got 'yes'"):
-        build_bundle(asset, progress="yes")
+        build_bundle(asset, progress="yes", quality="draft")
     with pytest.raises(TypeError):
         build(asset, seed=0.5)
 
@@ -760,7 +760,11 @@ def test_progress_counts_all_levels_ahead(asset, device):
     told = []
     config = replace(SMALL, group_size=4)
     bundle = build_bundle(
-        asset, config=config, progress=lambda *state: told.append(state), device=device
+        asset,
+        config=config,
+        progress=lambda *state: told.append(state),
+        device=device,
+        quality="draft",
     )
     done, total, text = told[-1]
     assert done == total == bundle.num_gaussians - len(asset)
@@ -773,7 +777,7 @@ def test_progress_counts_all_levels_ahead(asset, device):
 
 def test_progress_is_four_lines_where_there_is_no_terminal(asset, capfd, device, caplog):
     with caplog.at_level("INFO"):
-        build_bundle(asset, config=SMALL, progress=True, device=device)
+        build_bundle(asset, config=SMALL, progress=True, device=device, quality="draft")
     out, err = capfd.readouterr()
     assert out == ""
     lines = err.splitlines()
@@ -783,7 +787,7 @@ def test_progress_is_four_lines_where_there_is_no_terminal(asset, capfd, device,
 
 
 def test_no_progress_unless_wanted(asset, capfd, device):
-    build_bundle(asset, config=SMALL, progress=False, device=device)
+    build_bundle(asset, config=SMALL, progress=False, device=device, quality="draft")
     assert capfd.readouterr() == ("", "")
 
 
@@ -792,4 +796,4 @@ def test_what_progress_raises_ends_the_build(asset, device, tmp_path):
         raise InterruptedError("enough")
 
     with pytest.raises(InterruptedError, match="enough"):
-        build_bundle(asset, config=SMALL, progress=give_up, device=device)
+        build_bundle(asset, config=SMALL, progress=give_up, device=device, quality="draft")

@@ -2,23 +2,29 @@
 leaves."""
 
 import os
+import re
 import shlex
 import signal
 import subprocess
 import sys
 import time
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import v3dg
 from benchmarks.worlds.procedural import make_asset
+from rooms import room
 from v3dg import BuildConfig, build_bundle
+from v3dg._device import CPU
 from v3dg.cli import build as command
-from v3dg.levels import build_file, levels_path
+from v3dg.levels import DraftWarning, build_file, levels_path
+from v3dg.levels.default_quality import chosen_quality
 from v3dg.levels.quality import refinement_of
 
 QUICK = BuildConfig(cluster_size=64, steps=0)
@@ -74,10 +80,10 @@ def names_in(folder):
 @pytest.mark.parametrize(
     ("quality", "num_gaussians", "steps"),
     [
-        ("standard", 1000, 20_020),
-        ("standard", 500_000, 30_000),
+        ("standard", 1000, 18_010),
+        ("standard", 500_000, 23_000),
         ("standard", 10_000_000, 100_000),
-        ("best", 500_000, 150_000),
+        ("best", 500_000, 115_000),
         ("best", 10_000_000, 500_000),
     ],
 )
@@ -172,7 +178,7 @@ def test_a_refinement_that_is_interrupted_begins_again(
 
 
 def test_a_build_that_is_killed_leaves_its_levels(file, device, tmp_path):
-    """The refinement of 20,020 pictures is far from its end."""
+    """The refinement of 18,010 pictures is far from its end."""
     output = tmp_path / "out.v3dg"
     roots = [str(Path(path).parents[1]) for path in (v3dg.__file__, Path(__file__).parent)]
     roots.append(os.environ.get("PYTHONPATH", ""))
@@ -214,7 +220,7 @@ def test_levels_at_a_path_stay_as_they_are_built(short, asset, device, tmp_path)
     bundle = build_bundle(asset, quality="standard", **options)
     assert bundle.path is None
     assert bytes_of(bundle, tmp_path) == bytes_of(refined_by_hand(asset, device), tmp_path)
-    draft = build_bundle(asset, **options)
+    draft = build_bundle(asset, **options, quality="draft")
     assert draft.path == str(levels)
     assert "refined" not in draft.config
 
@@ -252,7 +258,7 @@ def test_an_asset_that_is_too_large_to_be_refined_is_refused_before(file, tmp_pa
     with pytest.raises(ValueError, match=message):
         build_file(file, tmp_path / "out.v3dg", quality="standard", **options)
     assert names_in(tmp_path) == ["asset.ply"]
-    build_file(file, tmp_path / "out.v3dg", **options)
+    build_file(file, tmp_path / "out.v3dg", **options, quality="draft")
 
 
 def test_a_wrong_quality_is_refused(asset):
@@ -260,10 +266,85 @@ def test_a_wrong_quality_is_refused(asset):
         build_bundle(asset, config=QUICK, progress=False, quality="good")
 
 
+class SmallGpu:
+    """A device that says that it is a GPU, for choices that are made before it is
+    used."""
+
+    is_cuda = True
+
+
+@pytest.mark.parametrize(
+    ("config", "is_gpu", "num_gaussians", "memory", "expected"),
+    [
+        (BuildConfig(), True, 1000, 1 << 30, "standard"),
+        (BuildConfig(), False, 1000, 1 << 30, "draft"),
+        (QUICK, True, 1000, 1 << 30, "draft"),
+        (BuildConfig(), True, 4_000_001, 1 << 60, "4,000,001 gaussians take minutes"),
+        (BuildConfig(), True, 100_000, 1 << 20, "100,000 gaussians takes .* MiB of the host"),
+        (BuildConfig(), True, 2_000_000, 1 << 40, "2,000,000 gaussians takes .* MiB of the GPU"),
+    ],
+)
+def test_a_build_is_refined_by_default_where_that_is_quick(
+    monkeypatch, config, is_gpu, num_gaussians, memory, expected
+):
+    """On a GPU with room for it; large assets say why they are not."""
+    monkeypatch.setattr("v3dg.levels.default_quality.free_on", lambda _: 1 << 30)
+    device = SmallGpu() if is_gpu else CPU
+    leaves = SimpleNamespace(num_gaussians=num_gaussians, sh_degree=0)
+    if expected in ("standard", "draft"):
+        assert chosen_quality(None, config, leaves, device, memory) == expected
+    else:
+        with pytest.warns(DraftWarning, match=expected):
+            assert chosen_quality(None, config, leaves, device, memory) == "draft"
+    for named in ("draft", "standard", "best"):
+        assert chosen_quality(named, config, leaves, device, memory) == named
+
+
+def test_the_command_says_why_a_large_asset_stays_a_draft(file, tmp_path, monkeypatch, capsys):
+    def choose(*_):
+        warnings.warn("quality: 5,000,000 gaussians take minutes", DraftWarning, stacklevel=1)
+        return "draft"
+
+    monkeypatch.setattr("v3dg.levels.files.chosen_quality", choose)
+    options = {"cluster_size": 64, "up": "z", "device": "cpu", "quiet": True}
+    command.run(command.Build(assets=(file,), output=tmp_path / "a.v3dg", **options))
+    assert "quality: 5,000,000 gaussians take minutes" in capsys.readouterr().err
+
+
+def test_viewpoints_of_a_draft_are_refused(asset):
+    with pytest.raises(ValueError, match="seen_from: expected auto for levels that are not"):
+        build_bundle(
+            asset, config=QUICK, progress=False, device="cpu", seen_from="inside", quality="draft"
+        )
+
+
+@pytest.mark.parametrize("seen_from", ["auto", "both"])
+def test_a_build_of_a_room_says_from_where_it_is_seen(
+    short, tmp_path, monkeypatch, capsys, seen_from
+):
+    """And is kept when it goes on."""
+    monkeypatch.setattr("v3dg.cli.build.BuildConfig", lambda: QUICK)
+    file = tmp_path / "room.ply"
+    v3dg.write_asset(file, room())
+    options = {"up": "-y", "device": "cpu", "quality": "standard", "seen_from": seen_from}
+    options |= {"assets": (file,), "output": tmp_path / "room.v3dg", "quiet": True}
+    command.run(command.Build(**options))
+    eyes = v3dg.Bundle.open(tmp_path / "room.v3dg").config["refined"]["eyes"]
+    where = "from inside" if seen_from == "auto" else "from outside and from inside"
+    line = f"refined by {STEPS} pictures, seen {where}: {eyes} eyes"
+    assert line in capsys.readouterr().out.splitlines()
+    command.run(command.Build(**options, resume=True))
+    assert "kept as it was" in capsys.readouterr().out
+    other = {"auto": "both", "both": "auto"}[seen_from]
+    command.run(command.Build(**(options | {"seen_from": other}), resume=True))
+    assert "kept as it was" not in capsys.readouterr().out
+
+
 def test_the_command_builds_each_quality(short, file, tmp_path, capsys):
-    """And says of a draft which command refines it."""
+    """And says of a draft that nobody asked for which command refines it, and how long
+    that takes."""
     output = tmp_path / "a scene.v3dg"
-    for quality in ("draft", "standard"):
+    for quality in (None, "draft", "standard"):
         command.run(
             command.Build(
                 assets=(file,),
@@ -271,14 +352,15 @@ def test_the_command_builds_each_quality(short, file, tmp_path, capsys):
                 cluster_size=64,
                 up="z",
                 device="cpu",
-                quiet=True,
                 quality=quality,
             )
         )
         lines = capsys.readouterr().out.splitlines()
         advice = [line for line in lines if line.startswith("draft: ")]
         assert ("refined" in v3dg.Bundle.open(output).config) == (quality == "standard")
-        assert len(advice) == (quality == "draft")
+        assert len(advice) == (quality is None)
         if advice:
+            assert re.search(r"in about \d+ (s|minutes|hours) on this CPU", advice[0])
             words = shlex.split(advice[0].split("`")[1])
-            assert words == ["v3dg", "refine", str(output), str(tmp_path / "a scene_refined.v3dg")]
+            refined = str(tmp_path / "a scene_refined.v3dg")
+            assert words == ["v3dg", "refine", str(output), refined, "--steps", str(STEPS)]

@@ -41,7 +41,8 @@ if sys.argv[4] == "cuda":
 print("ready", flush=True)
 try:
     bundle = v3dg.build_bundle(
-        asset, config=config, seed=7, progress=False, device=sys.argv[4], resume_path=sys.argv[2]
+        asset, config=config, seed=7, progress=False, device=sys.argv[4], resume_path=sys.argv[2],
+        quality="draft",
     )
 except KeyboardInterrupt:
     sys.exit(130)
@@ -67,7 +68,9 @@ def bytes_of(bundle, folder):
 @pytest.fixture(scope="module")
 def whole(asset, device, tmp_path_factory):
     """The bundle of a build that nothing interrupts."""
-    bundle = build_bundle(asset, config=CONFIG, seed=7, progress=False, device=device)
+    bundle = build_bundle(
+        asset, config=CONFIG, seed=7, progress=False, device=device, quality="draft"
+    )
     return bytes_of(bundle, tmp_path_factory.mktemp("whole"))
 
 
@@ -126,7 +129,13 @@ def test_interrupted_build_resumes_to_the_same_bytes(asset, whole, tmp_path, dev
         assert process.wait(PATIENCE) == 130
     assert names_in(tmp_path) == ["levels"]
     bundle = build_bundle(
-        asset, config=CONFIG, seed=7, progress=False, device=device, resume_path=tmp_path / "levels"
+        asset,
+        config=CONFIG,
+        seed=7,
+        progress=False,
+        device=device,
+        resume_path=tmp_path / "levels",
+        quality="draft",
     )
     assert names_in(tmp_path) == ["levels"]
     assert bytes_of(bundle, tmp_path) == whole
@@ -142,7 +151,13 @@ def test_killed_builds_resume_to_the_same_bytes(asset, whole, tmp_path, device):
             process.wait()
         assert names_in(tmp_path) == ["levels"]
     bundle = build_bundle(
-        asset, config=CONFIG, seed=7, progress=False, device=device, resume_path=levels
+        asset,
+        config=CONFIG,
+        seed=7,
+        progress=False,
+        device=device,
+        resume_path=levels,
+        quality="draft",
     )
     assert names_in(tmp_path) == ["levels"]
     assert bytes_of(bundle, tmp_path) == whole
@@ -256,7 +271,9 @@ def test_checkpoint_of_another_build_is_refused(asset, checkpoint, changed, monk
     with pytest.raises(
         ValueError, match="another asset, config, seed, device or version; remove it"
     ):
-        build_bundle(asset, config=config, seed=seed, progress=False, resume_path=checkpoint)
+        build_bundle(
+            asset, config=config, seed=seed, progress=False, resume_path=checkpoint, quality="draft"
+        )
     assert checkpoint.read_bytes() == before
 
 
@@ -379,10 +396,12 @@ def test_a_lock_on_a_file_that_was_removed_is_none(tmp_path, monkeypatch):
 def test_levels_that_a_kill_left_beside_a_bundle_are_removed(asset, tmp_path):
     v3dg.write_asset(tmp_path / "asset.ply", asset)
     options = {"config": QUICK, "progress": False}
-    v3dg.levels.build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", **options)
+    v3dg.levels.build_file(
+        tmp_path / "asset.ply", tmp_path / "out.v3dg", **options, quality="draft"
+    )
     (tmp_path / "out.v3dg.partial").touch()
     _, is_built = v3dg.levels.build_file(
-        tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options
+        tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options, quality="draft"
     )
     assert not is_built
     assert names_in(tmp_path) == ["asset.ply", "out.v3dg"]

@@ -127,7 +127,11 @@ def lies(config):
 
 def test_resume_builds_over_a_bundle_whose_config_lies(folder):
     output = folder / "a.v3dg"
-    options = {"config": v3dg.BuildConfig(cluster_size=64, steps=1), "progress": False}
+    options = {
+        "config": v3dg.BuildConfig(cluster_size=64, steps=1),
+        "progress": False,
+        "quality": "draft",
+    }
     bundle, _ = build_file(folder / "a.ply", output, **options)
     whole = output.read_bytes()
     for config in lies(bundle.config):

@@ -69,7 +69,9 @@ def frame_and_cut(scene, device):
 
 def bundle_of(gaussians, device="cpu"):
     config = v3dg.BuildConfig(cluster_size=64, steps=3, num_views=4, image_size=16)
-    bundle = v3dg.build_bundle(gaussians, config=config, device=device, progress=False)
+    bundle = v3dg.build_bundle(
+        gaussians, config=config, device=device, progress=False, quality="draft"
+    )
     return digest(bundle.gaussians.means, bundle.gaussians.sh, bundle.groups.ball)
 
 

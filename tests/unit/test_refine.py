@@ -355,7 +355,7 @@ def levels_inside_a_shell():
 
 def test_what_nobody_sees_is_dropped_of_all_levels_but_the_first(device, tmp_path):
     bundle = levels_inside_a_shell()
-    refined = refine_bundle(bundle, steps=3, device=device, progress=False)
+    refined = refine_bundle(bundle, seen_from="outside", steps=3, device=device, progress=False)
     assert len(refined.level_gaussians(0)) == len(bundle.level_gaussians(0))
     for level in (1, 2):
         before, after = (

@@ -18,6 +18,7 @@ from v3dg.cameras import Camera
 from v3dg.cli import _common
 from v3dg.cli._views import CameraFile
 from v3dg.framing import frame_subject
+from v3dg.levels.viewpoints import SeenFrom, text_of
 from v3dg.metrics import MIN_TRANSMITTANCE, draw_truth
 from v3dg.pictures import to_8bit
 from v3dg.refine import refine_bundle
@@ -43,8 +44,11 @@ class Refine(CameraFile, _common.OnDevice):
     steps: Annotated[int, tyro.conf.arg(metavar="N")] = 30_000
     """Number of pictures of cuts that are compared with pictures of the asset."""
     cameras: Annotated[Path | None, _common.option("PATH")] = None
-    """File or folder of cameras, as for `v3dg render`. Use it for assets that are seen
-    from inside, such as a room. By default, the asset is seen from all directions."""
+    """File or folder of cameras, as for `v3dg render`, such as those of the asset's
+    photographs. By default, cameras are found, see --seen-from."""
+    seen_from: Annotated[SeenFrom, _common.option("{auto,outside,inside,both}")] = "auto"
+    """From where pictures are taken without cameras; by default, the free space that
+    the asset surrounds decides."""
     drop: Annotated[float, tyro.conf.arg(metavar="SHARE")] = 0.02
     """Share of a level's visibility that may be lost by dropping its least visible
     gaussians; 0 keeps all."""
@@ -66,6 +70,7 @@ def run(options: Refine) -> None:
     refined = refine_bundle(
         bundle,
         cameras=cameras,
+        seen_from=options.seen_from,
         steps=options.steps,
         drop=options.drop,
         seed=options.seed,
@@ -82,6 +87,9 @@ def run(options: Refine) -> None:
         "psnr": rows,
     }
     line = f"{options.output}: {options.steps:,} steps, {seconds:.1f} s"
+    viewpoints = text_of(refined.config.get("refined", {}))
+    if viewpoints:
+        line += f", {viewpoints}"
     columns = [
         _common.Column("picture", "{width} x {width}"),
         _common.Column("PSNR before", "{before:.2f}"),

@@ -12,13 +12,23 @@ from v3dg.bundle import Bundle
 from v3dg.gaussians import Gaussians
 from v3dg.io import loaded
 from v3dg.levels.config import BuildConfig
+from v3dg.levels.default_quality import DraftWarning, chosen_quality
 from v3dg.levels.files import build_file, levels_path
 from v3dg.levels.leaves import MemoryLeaves
+from v3dg.levels.memory import free_bytes
 from v3dg.levels.quality import Quality
 from v3dg.levels.unfinished import discard_levels
+from v3dg.levels.viewpoints import SeenFrom
 from v3dg.levels.whole import build_into, devices_for
 
-__all__ = ["BuildConfig", "build_bundle", "build_file", "discard_levels", "levels_path"]
+__all__ = [
+    "BuildConfig",
+    "DraftWarning",
+    "build_bundle",
+    "build_file",
+    "discard_levels",
+    "levels_path",
+]
 
 
 def build_bundle(
@@ -32,7 +42,8 @@ def build_bundle(
     unusable: Literal["drop", "refuse"] = "drop",
     executor: Executor | None = None,
     codec: Literal["float32", "quantized"] = "float32",
-    quality: Quality = "draft",
+    quality: Quality | None = None,
+    seen_from: SeenFrom = "auto",
 ) -> Bundle:
     """Build all levels of one asset (V3DG, algorithm 1; docs/levels.md lists the
     differences).
@@ -69,11 +80,15 @@ def build_bundle(
         codec: The codec of the bundle, see `v3dg.Bundle`. With a lossy codec, levels
             are fitted to the rounded gaussians of the levels below them.
         quality: "draft" leaves the levels as they are built. "standard" then refines
-            them together (`v3dg.refine_bundle`) with 20,000 pictures and one more for
-            every 50 gaussians, at most 100,000: seconds on a GPU, minutes on a CPU.
-            "best" uses five times as many pictures. The levels at `resume_path` stay
-            unrefined, and the refined bundle is in memory. For a place that is seen
-            from inside, such as a room, use `v3dg.refine_bundle` with cameras instead.
+            them together (`v3dg.refine_bundle`) with 18,000 pictures and one more for
+            every 100 gaussians, at most 100,000: seconds on a GPU, minutes on a CPU.
+            "best" uses five times as many pictures. docs/levels.md has the time and the
+            gain of each. None means "standard" on a GPU and "draft" on a CPU, and for a
+            config without steps. An asset of more than 4,000,000 gaussians, or whose
+            refinement does not fit in the free memory, is then a draft, too, with a
+            `v3dg.levels.DraftWarning`. The levels at `resume_path` stay unrefined, and
+            the refined bundle is in memory.
+        seen_from: From where a refinement takes its pictures, see `v3dg.refine_bundle`.
 
     Raises:
         ValueError: The asset has no gaussian that can be drawn, or a setting is wrong.
@@ -100,6 +115,7 @@ def build_bundle(
         "bundle",
     )
     config = leaves.settings(config)
+    quality = chosen_quality(quality, config, leaves, devices[0], free_bytes())
     return build_into(
         resume_path,
         leaves,
@@ -109,5 +125,6 @@ def build_bundle(
         progress,
         codec=codec,
         quality=quality,
+        seen_from=seen_from,
         executor=executor,
     )

@@ -18,11 +18,13 @@ from v3dg.bundle import Bundle
 from v3dg.cameras import Axis
 from v3dg.gaussians import Gaussians
 from v3dg.levels.config import BuildConfig
+from v3dg.levels.default_quality import chosen_quality
 from v3dg.levels.leaves import Leaves, MemoryLeaves, made_with
 from v3dg.levels.leaves_on_disk import MOST_GAUSSIANS, leaves_on_disk
 from v3dg.levels.memory import in_bytes, in_mib, most_units, unit_bytes
 from v3dg.levels.quality import Quality, refine_bytes, refinement_of
 from v3dg.levels.unfinished import discard_levels
+from v3dg.levels.viewpoints import SeenFrom
 from v3dg.levels.whole import build_into, devices_for
 
 AssetPath = str | os.PathLike[str]
@@ -42,7 +44,8 @@ def build_file(
     memory: int | str | None = None,
     executor: Executor | None = None,
     codec: Literal["float32", "quantized"] = "float32",
-    quality: Quality = "draft",
+    quality: Quality | None = None,
+    seen_from: SeenFrom = "auto",
     up: Axis | None = None,
 ) -> tuple[Bundle, bool]:
     """Build the bundle of an asset from its file, or from several files that form one
@@ -60,9 +63,9 @@ def build_file(
             process: bytes, or text like "8GiB". Default: half of the free memory.
         up: The axis of the asset that points up, which the bundle stores for viewers
             and exports.
-        config, seed, progress, device, unusable, executor, codec, quality: See
-            `build_bundle`. A build that is interrupted during the refinement leaves the
-            levels as they are built.
+        config, seed, progress, device, unusable, executor, codec, quality, seen_from:
+            See `build_bundle`. A build that is interrupted during the refinement leaves
+            the levels as they are built.
 
     Returns:
         The bundle, opened from its file, and whether it was built.
@@ -73,12 +76,11 @@ def build_file(
         ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: See
             `read_asset` and `build_bundle`.
     """
-    config = _checked_config(config)
     _check_output(Path(bundle_path))
     build = _FileBuild(
         paths=_paths_of(asset_path),
         bundle_path=Path(bundle_path),
-        config=config,
+        config=_checked_config(config),
         seed=seed,
         progress=progress,
         devices=devices_for(device, asset),
@@ -87,6 +89,7 @@ def build_file(
         executor=executor,
         codec=codec,
         quality=quality,
+        seen_from=seen_from,
         up=up,
     )
     if not resume:
@@ -131,7 +134,8 @@ class _FileBuild:
     num_bytes: int  # host memory
     executor: Executor | None
     codec: str
-    quality: Quality
+    quality: Quality | None
+    seen_from: SeenFrom
     up: Axis | None
 
     @property
@@ -161,12 +165,13 @@ class _FileBuild:
         """Keep or build the bundle; return it, and whether it was built."""
         with source as leaves:
             config = leaves.settings(self.config)
-            if resume and self._is_finished(leaves, config):
+            quality = chosen_quality(self.quality, config, leaves, self.devices[0], self.num_bytes)
+            if resume and self._is_finished(leaves, config, quality):
                 # A RuntimeError means that another build is writing this file.
                 with suppress(RuntimeError):
                     discard_levels(self.levels_path)
                 return Bundle.open(self.bundle_path), False
-            self._check_memory(leaves)
+            self._check_memory(leaves, quality)
             bundle = build_into(
                 self.levels_path,
                 leaves,
@@ -175,7 +180,8 @@ class _FileBuild:
                 self.devices,
                 self.progress,
                 codec=self.codec,
-                quality=self.quality,
+                quality=quality,
+                seen_from=self.seen_from,
                 bundle_path=self.bundle_path,
                 most_units=most_units(self.num_bytes, leaves),
                 executor=self.executor,
@@ -183,11 +189,11 @@ class _FileBuild:
             )
             return bundle, True
 
-    def _check_memory(self, leaves: Leaves) -> None:
+    def _check_memory(self, leaves: Leaves, quality: Quality) -> None:
         """Raise ValueError before the build if its refinement would need too much
         memory."""
         count = leaves.num_gaussians
-        required = refine_bytes(self.quality, count, leaves.sh_degree)
+        required = refine_bytes(quality, count, leaves.sh_degree)
         check(
             "memory",
             self.num_bytes >= required,
@@ -195,11 +201,11 @@ class _FileBuild:
             f"{in_mib(self.num_bytes)}; allow more memory, or build with quality 'draft'",
         )
 
-    def _is_finished(self, leaves: Leaves, config: BuildConfig) -> bool:
+    def _is_finished(self, leaves: Leaves, config: BuildConfig, quality: Quality) -> bool:
         """Return whether the bundle exists, was built from these leaves with these
         settings, and has not been converted to another codec."""
         settings = made_with(leaves, config, self.seed, self.codec, self.up)
-        refinement = refinement_of(self.quality, leaves.num_gaussians, settings["seed"])
+        refinement = refinement_of(quality, leaves.num_gaussians, settings["seed"], self.seen_from)
         try:
             bundle = Bundle.open(self.bundle_path)
             if refinement is not None:

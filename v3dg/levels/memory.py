@@ -8,6 +8,8 @@ from typing import Literal
 
 import numpy as np
 
+from v3dg import _device
+from v3dg._device import Device
 from v3dg._numbers import refuse, value_text
 from v3dg.gaussians import gaussian_bytes
 from v3dg.levels.leaves import Leaves
@@ -68,6 +70,16 @@ def unit_bytes(num_gaussians: int, sh_degree: int) -> int:
 def in_mib(num_bytes: int) -> str:
     """Return a number of bytes as text for messages, rounded up."""
     return f"{-(-num_bytes >> 20):,} MiB"
+
+
+def free_on(device: Device) -> int:
+    """Return the bytes of memory that a device has available."""
+    if not device.is_cuda:
+        return free_bytes()
+    import torch
+
+    _device.spare_memory(device)
+    return int(torch.cuda.mem_get_info(device.number)[0])
 
 
 def free_bytes() -> int:

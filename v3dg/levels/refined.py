@@ -20,6 +20,7 @@ from v3dg.gaussians import Gaussians
 from v3dg.levels.config import BuildConfig
 from v3dg.levels.fit import fit_config, run_fit
 from v3dg.levels.rows import RUN_ROWS, in_runs
+from v3dg.levels.viewpoints import SeenFrom, viewpoints_of
 from v3dg.residency import residency
 
 _T = TypeVar("_T", covariant=True)
@@ -41,6 +42,7 @@ def refined_bundle(
     bundle: Bundle,
     *,
     cameras: Sequence[Camera] = (),
+    seen_from: SeenFrom = "auto",
     steps: int,
     drop: float = DROP,
     seed: int,
@@ -50,22 +52,29 @@ def refined_bundle(
     """Return a copy of a bundle with refined levels; see `v3dg.refine_bundle`."""
     if bundle.num_levels < 2 or bundle.clusters.offset[bundle.level_range(0).stop] == 0:
         return bundle
+    record: JsonObject = {"steps": steps, "drop": drop, "seed": seed}
+    text = ""
+    if cameras:
+        record["cameras"] = len(cameras)
+    else:
+        viewpoints = viewpoints_of(bundle, seen_from)
+        cameras = viewpoints.cameras
+        record |= request_of(seen_from) | viewpoints.record
+        text = viewpoints.text
     if drop > 0:
         bundle = without_unseen(bundle, cameras, drop, seed, device, progress)
     cuts = Cuts(bundle, cameras, seed, device, progress)
-    moved = cuts.refined(steps, default_steps(device))
+    moved = cuts.refined(steps, default_steps(device), text)
     refined = in_runs(moved, bundle.clusters.offset)
-    record = record_of(steps, drop, seed, len(cameras))
     config = {**bundle.config, "refined": record, "run_rows": RUN_ROWS}
     return Bundle(bundle.clusters.around(refined), bundle.groups, refined, config, bundle.codec)
 
 
-def record_of(steps: int, drop: float, seed: int, num_cameras: int = 0) -> JsonObject:
-    """Return the entry about a refinement in the config of a bundle."""
-    record: JsonObject = {"steps": steps, "drop": drop, "seed": seed}
-    if num_cameras > 0:
-        record["cameras"] = num_cameras
-    return record
+def request_of(seen_from: SeenFrom) -> JsonObject:
+    """Return the entry about from where a user has said that a bundle is seen."""
+    if seen_from == "auto":
+        return {}
+    return {"seen_from": seen_from}
 
 
 def without_unseen(
@@ -152,9 +161,9 @@ class Cuts:
             seed=seed,
         )
 
-    def refined(self, num_pictures: int, settings: RefineSteps) -> Gaussians:
+    def refined(self, num_pictures: int, settings: RefineSteps, text: str = "") -> Gaussians:
         """Refine the gaussians with this number of pictures, rounded up to whole steps,
-        and return them."""
+        and return them; the progress bar shows the text."""
         clusters = self._bundle.clusters
         ball = self._bundle.groups.ball
         radius = np.where(clusters.own_group < 0, np.float32(1), ball[clusters.own_group, 3])
@@ -173,7 +182,7 @@ class Cuts:
             target=target,
             radius=radius,
         )
-        self._run("refine", num_steps * settings.windows, move)
+        self._run("refine", num_steps * settings.windows, move, text)
         return self._gaussians.numpy()
 
     def weights(self, num_pictures: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]:
@@ -196,12 +205,14 @@ class Cuts:
         )
         return fit_config(config, self._seed, 1)
 
-    def _run(self, name: str, num_pictures: int, operation: _CutOperation[_T]) -> _T:
+    def _run(
+        self, name: str, num_pictures: int, operation: _CutOperation[_T], text: str = ""
+    ) -> _T:
         work = partial(operation, gaussians=self._gaussians.rows, pictures=self._pictures)
         with Bar(num_pictures, name, self._progress) as bar:
 
             def show(state: _core.FitProgress) -> None:
-                bar.update(state.groups_done - bar.num_done)
+                bar.update(state.groups_done - bar.num_done, text)
 
             return run_fit(lambda state: work(progress=state), self._device, show)
 

@@ -34,6 +34,7 @@ from v3dg.levels.scheduler import Watch, completed, watch_over
 from v3dg.levels.simplify import Level, LevelBuilder, LevelTables, Show
 from v3dg.levels.smooth import measured_config
 from v3dg.levels.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
+from v3dg.levels.viewpoints import SeenFrom
 
 # Number of leaves in a unit: enough to keep a GPU busy, with little memory. The last
 # bits of a bundle depend on this number.
@@ -68,7 +69,8 @@ def build_into(
     progress: Progress,
     *,
     codec: str,
-    quality: Quality = "draft",
+    quality: Quality,
+    seen_from: SeenFrom = "auto",
     bundle_path: Path | None = None,
     most_units: int | None = None,
     executor: Executor | None = None,
@@ -83,7 +85,7 @@ def build_into(
     units = plan.units(UNIT_LEAVES)
     page_codec = codec_of(codec, leaves.sh_degree)
     file = BundlePlan(plan.layout, page_codec, made_with(leaves, config, seed, codec, up))
-    refinement = refinement_of(quality, leaves.num_gaussians, file.config["seed"])
+    refinement = refinement_of(quality, leaves.num_gaussians, file.config["seed"], seen_from)
     parts = _parts(plan, units, file)
     opened = _opened(path, file, parts, devices[0], bundle_path)
     with _device.memory_errors(), opened as store:
@@ -95,8 +97,6 @@ def build_into(
             with Bar(plan, num_finished, progress) as bar:
                 build = _Build(config, file.config["seed"], plan, units, parts, file, store, bar)
                 tables, hashes = build.all_levels(leaves, devices, most_units, executor)
-                if config.smooth == "yes" and len(tables) > 1:
-                    tables = build.grown(tables, devices[0])
             store.finish(*assemble(plan, tables, config), hashes)
         if refinement is None:
             return store.bundle()
@@ -186,9 +186,10 @@ class _Build:
                 hashes = pages.write(runs[number], level.gaussians)
                 self.store.save(top, number, FinishedLevel(level.tables, hashes))
             finished.append(levels[top, number])
-        return [level.tables for level in finished], np.concatenate(
-            [level.hashes for level in finished]
-        )
+        tables = [level.tables for level in finished]
+        if self.config.smooth == "yes" and len(tables) > 1:
+            tables = self.grown(tables, devices[0])
+        return tables, np.concatenate([level.hashes for level in finished])
 
     def grown(self, tables: Sequence[LevelTables], device: Device) -> list[LevelTables]:
         """Return the tables with larger balls; the growth of level 1 is measured if the

@@ -12,7 +12,6 @@ from v3dg.render.frame import Frame, FrameSource, frame_of
 from v3dg.render.pool_frame import PoolFrame
 from v3dg.render.renderer import Renderer
 from v3dg.render.request import (
-    DEFAULT_MIN_TRANSMITTANCE,
     CutRequest,
     FrameRequest,
     Look,
@@ -20,7 +19,6 @@ from v3dg.render.request import (
 )
 
 __all__ = [
-    "DEFAULT_MIN_TRANSMITTANCE",
     "BatchPlanes",
     "CutRequest",
     "Frame",

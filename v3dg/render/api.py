@@ -106,8 +106,10 @@ def render(
         min_transmittance: A pixel stops behind the gaussian that leaves this
             transmittance or less, 0 to 0.99, and distributes the rest over the
             gaussians that it has blended. So the error of a channel is at most this
-            fraction of the difference to the colour behind that gaussian. None means
-            0.001 for scenes and bundles; assets are then drawn as by `v3dg.rasterize`.
+            fraction of the difference to the colour behind that gaussian. None means,
+            for scenes and bundles, 0.0001 up to a tolerance of 3 px², then more, up to
+            0.001 from 9.5 px² on, where levels differ by more; with a budget, by the
+            tolerance that meets it. Assets are then drawn as by `v3dg.rasterize`.
         depth: Whether to draw the expected depth, too.
         device: "cpu" draws NumPy arrays. "cuda", or one device such as "cuda:1", draws
             torch tensors there on torch's current stream, and keeps on the device what

@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from v3dg.false_color import ColorBy
     from v3dg.select import Selection
 
-# The default for scenes and bundles, whose levels have a far larger error; docs/cuda.md
-# states how much time it saves.
-DEFAULT_MIN_TRANSMITTANCE = 1e-3
+
 BLACK = (0.0, 0.0, 0.0)
 _PLAIN_TYPES = frozenset({float, int, type(None)})
 
@@ -136,8 +134,8 @@ def shade_of(
     """Return the shade of a picture for the core; the arguments are those of
     `v3dg.render`.
 
-    A negative transmittance makes pixels stop as in `v3dg.rasterize`, which is the
-    default for assets.
+    By default pixels of assets stop as in `v3dg.rasterize`, and those of cuts by the
+    tolerance of the cut.
     """
     if background is BLACK and min_transmittance is None:
         return _known_shade(is_asset=is_asset, depth=bool(depth))
@@ -152,9 +150,9 @@ def _shade(
             min_transmittance, "min_transmittance", "a transmittance from 0 to 0.99", 0, 0.99
         )
     elif is_asset:
-        stop = -1.0
+        stop = _core.stops_before
     else:
-        stop = DEFAULT_MIN_TRANSMITTANCE
+        stop = _core.stops_by_cut
     checked_background = list(BLACK)
     if background is not BLACK:
         checked_background = color(background, "background")

@@ -133,7 +133,8 @@ class SceneFrame:
             pairs = _core.GivenCut(
                 self._on_device(cut.instance_ids), self._on_device(cut.cluster_ids), weights
             )
-            core_request = _core.FrameRequest(eye.core, None, request.shade, pairs)
+            rule = CutRequest(cut.tolerance).rule
+            core_request = _core.FrameRequest(eye.core, rule, request.shade, pairs)
             drawing = self.core.draw(resident.core, core_request, None, None, stop)
             resident.add_drawing(drawing)
 

@@ -235,7 +235,7 @@ class Study:
             bundle = ours
         else:
             bundle = v3dg.build_bundle(
-                subject.asset, config=config, device=self.device, progress=False
+                subject.asset, config=config, device=self.device, progress=False, quality="draft"
             )
         if name == "refined":
             options: Row = {"steps": self._config.refine, "device": self.device, "progress": False}

@@ -110,7 +110,7 @@ def sheet(config: Config, asset: v3dg.Gaussians, bundles: dict[str, v3dg.Bundle]
 
 def main(config: Config) -> None:
     asset = v3dg.read_asset(config.asset)
-    built = v3dg.build_bundle(asset, device=config.device, progress=False)
+    built = v3dg.build_bundle(asset, device=config.device, progress=False, quality="draft")
     start = time.perf_counter()
     refined = v3dg.refine_bundle(built, steps=config.steps, device=config.device, progress=False)
     result: Row = {"steps": config.steps, "refine_seconds": round(time.perf_counter() - start, 1)}

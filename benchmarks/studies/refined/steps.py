@@ -115,15 +115,21 @@ _WAYS = (
 )
 
 
-def heap_of(donut: v3dg.Gaussians) -> v3dg.Gaussians:
+def heap_of(donut: v3dg.Gaussians, count: int = _DONUTS) -> v3dg.Gaussians:
     """Return donuts at random positions in a ball, with random rotations."""
     rng = np.random.default_rng(0)
     center = np.median(donut.means, axis=0)
     radius = float(np.quantile(np.linalg.norm(donut.means - center, axis=1), 0.99))
     parts = []
-    for _ in range(_DONUTS):
+    for _ in range(count):
         outwards = rng.normal(size=3)
-        outwards *= 2 * radius * rng.random() ** (1 / 3) / np.linalg.norm(outwards)
+        outwards *= (
+            2
+            * radius
+            * (count / _DONUTS) ** (1 / 3)
+            * rng.random() ** (1 / 3)
+            / np.linalg.norm(outwards)
+        )
         parts.append(donut.transform(rng.normal(size=4), outwards, 1.0))
     return v3dg.Gaussians.concatenate(parts)
 
@@ -148,7 +154,7 @@ class Study:
         v3dg.write_asset(folder / f"{name}.ply", asset)
         subject = Subject(folder, name, {"file": f"{name}.ply", "up": (0, 0, 1)}, config.views)
         start = time.perf_counter()
-        self.built = v3dg.build_bundle(asset, device=config.device, progress=False)
+        self.built = v3dg.build_bundle(asset, device=config.device, progress=False, quality="draft")
         self.build_seconds = time.perf_counter() - start
         self.path = folder / f"{name}.v3dg"
         self.built.write(self.path)

@@ -86,7 +86,7 @@ def pictures(config: Config, about: Row) -> Iterator[tuple[Row, Picture, Picture
                 zip(world.assets, pool.map(make_asset, world.assets.values(), 1), strict=True)
             )
         built = {
-            key: v3dg.build_bundle(asset, config=config.build, **how)
+            key: v3dg.build_bundle(asset, config=config.build, **how, quality="draft")
             for key, asset in assets.items()
         }
         scenes = {"built": (worlds.scene_of(world, built), (0.0, *config.built))}

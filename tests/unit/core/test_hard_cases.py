@@ -23,7 +23,7 @@ from hard_cases import (
     relative_changes,
 )
 from reference import rasterize as reference_rasterize
-from v3dg.render import DEFAULT_MIN_TRANSMITTANCE
+from v3dg import _core
 
 CASES = pytest.mark.parametrize("name", hard_cases())
 # What a chain of torch operations differentiates in a moment, and without 0 / 0.
@@ -114,7 +114,7 @@ def test_maps_keep_their_detail(device):
     got = v3dg.render(scene, far, tolerance=0.0, depth=True, device=device)
     raster = v3dg.Image(*host((got.color, got.alpha, got.depth)))
     expected = reference_rasterize.rasterize(
-        asset, near, min_transmittance=DEFAULT_MIN_TRANSMITTANCE
+        asset, near, min_transmittance=_core.stop_of_tolerance(0.0)
     )
     assert (expected.alpha > 0.5).mean() > 0.3
     assert_pictures_agree(raster, expected, PICTURE_FLOAT)
@@ -141,7 +141,7 @@ def test_assets_far_from_their_zero_keep_their_detail(device, distance):
     got = v3dg.render(scene, camera, tolerance=0.0, depth=True, device=device)
     raster = v3dg.Image(*host((got.color, got.alpha, got.depth / scale)))
     expected = reference_rasterize.rasterize(
-        asset, own, min_transmittance=DEFAULT_MIN_TRANSMITTANCE
+        asset, own, min_transmittance=_core.stop_of_tolerance(0.0)
     )
     assert (expected.alpha > 0.5).mean() > 0.1
     assert_pictures_agree(raster, expected, PICTURE_FLOAT)

@@ -1,13 +1,15 @@
 """What is asked for, as it goes to the core: cuts, and what pixels show."""
 
+import itertools
+
 import numpy as np
 import pytest
 
 import v3dg
+from devices import host
 from random_bundle import random_gaussians
 from scenes_lod import lod_bundle
-from v3dg import Camera
-from v3dg.render import DEFAULT_MIN_TRANSMITTANCE
+from v3dg import Camera, StereoCamera, _core
 from v3dg.render.request import BLACK, CutRequest, shade_of
 
 
@@ -51,18 +53,75 @@ def test_wrong_shades_are_named():
         shade_of(BLACK, 1.0, is_asset=False, depth=True)
 
 
-@pytest.mark.parametrize("is_asset", [True, False])
-def test_a_transmittance_that_is_not_given_is_the_default(is_asset):
-    """Of assets that of `v3dg.rasterize`, which is a decision of the core."""
-    rng = np.random.default_rng(5)
-    asset = random_gaussians(rng, 400)
-    camera = Camera.look_at((0, -6, 0), (0, 0, 0), width=48, height=40)
-    subject = asset if is_asset else lod_bundle(rng, asset, 32)
-    default = v3dg.render(subject, camera, tolerance=0.0, device="cpu")
-    if is_asset:
-        expected = v3dg.rasterize(asset, camera)
-    else:
-        stop = DEFAULT_MIN_TRANSMITTANCE
-        expected = v3dg.render(subject, camera, tolerance=0.0, min_transmittance=stop, device="cpu")
-        assert default.alpha.max() > 1 - 2 * stop  # the stop matters somewhere
-    np.testing.assert_array_equal(default.color, expected.color)
+EYE = Camera.look_at((0, -6, 0), (0, 0, 0), width=48, height=40)
+TOLERANCES = [0.0, 3.0, 5.0, 9.4, 20.0]
+
+
+@pytest.fixture(scope="module")
+def asset():
+    """Gaussians that leave less than a ten-thousandth of the light in most pixels."""
+    return random_gaussians(np.random.default_rng(5), 2000)
+
+
+@pytest.fixture(scope="module")
+def bundle(asset):
+    return lod_bundle(np.random.default_rng(5), asset, 32)
+
+
+def assert_same(picture, expected):
+    for name in ("color", "alpha"):
+        got, wanted = (host([getattr(side, name)])[0] for side in (picture, expected))
+        np.testing.assert_array_equal(got, wanted)
+
+
+def test_pixels_of_assets_stop_as_in_rasterize(asset):
+    assert_same(v3dg.render(asset, EYE, device="cpu"), v3dg.rasterize(asset, EYE))
+
+
+def test_the_stop_grows_with_the_tolerance_of_the_cut():
+    stops = [_core.stop_of_tolerance(tolerance) for tolerance in np.linspace(0, 40, 401)]
+    assert all(a <= b for a, b in itertools.pairwise(stops))
+    for tolerance, stop in ((0, 1e-4), (3, 1e-4), (6, 4e-4), (9.5, 1e-3), (float("inf"), 1e-3)):
+        assert _core.stop_of_tolerance(tolerance) == pytest.approx(stop)
+
+
+@pytest.mark.parametrize("tolerance", TOLERANCES)
+def test_pixels_of_cuts_stop_by_their_tolerance(bundle, device, tolerance):
+    """Also of both eyes, of a cut that was selected before, and with a pool."""
+    stop = _core.stop_of_tolerance(tolerance)
+    options = {"tolerance": tolerance, "device": device}
+    expected = v3dg.render(bundle, EYE, min_transmittance=stop, **options)
+    assert_same(v3dg.render(bundle, EYE, **options), expected)
+    assert_same(v3dg.render(bundle, EYE, memory="1GiB", **options), expected)
+    cut = v3dg.select(bundle, EYE, **options)
+    assert_same(v3dg.render(bundle, EYE, cut=cut, device=device), expected)
+    for default, eye in zip(
+        v3dg.render(bundle, StereoCamera.of(EYE, 0.1), **options),
+        v3dg.render(bundle, StereoCamera.of(EYE, 0.1), min_transmittance=stop, **options),
+        strict=True,
+    ):
+        assert_same(default, eye)
+    other = 1e-3 if stop < 5e-4 else 1e-4
+    changed = v3dg.render(bundle, EYE, min_transmittance=other, **options)
+    assert (host([changed.color])[0] != host([expected.color])[0]).any()
+
+
+@pytest.mark.parametrize("budget", [2000, 1200, 700, 300])
+def test_pixels_of_a_budget_stop_by_the_tolerance_that_meets_it(bundle, device, budget):
+    default = v3dg.render(bundle, EYE, budget=budget, device=device)
+    stop = _core.stop_of_tolerance(default.stats.tolerance)
+    expected = v3dg.render(bundle, EYE, budget=budget, min_transmittance=stop, device=device)
+    assert_same(default, expected)
+
+
+def test_a_cut_of_level_0_is_no_worse_than_its_asset(asset, bundle, device):
+    """At the default tolerance, from near by, where all of it is level 0."""
+    near = Camera.look_at((0, -1.5, 0), (0, 0, 0), width=480, height=400)
+    truth = v3dg.rasterize(asset, near)
+    picture = v3dg.render(bundle, near, device=device)
+    whole = v3dg.render(bundle, near, tolerance=0.0, min_transmittance=0.0, device=device)
+    cut = v3dg.select(bundle, near, device=device)
+    assert (cut.per_pair(lambda clusters: clusters.level) == 0).all()
+    exact = host([whole.color])[0]
+    error = np.abs(host([picture.color])[0] - exact).mean()
+    assert error <= 1.001 * np.abs(truth.color - exact).mean()

@@ -1,0 +1,52 @@
+"""The quality of a build for which none is named."""
+
+import warnings
+
+from v3dg._device import Device
+from v3dg.levels.config import BuildConfig
+from v3dg.levels.leaves import Leaves
+from v3dg.levels.memory import free_on, in_mib
+from v3dg.levels.quality import Quality, refine_bytes
+
+# The most gaussians of an asset that is refined by default: more would take minutes.
+_MOST_GAUSSIANS = 4_000_000
+
+
+class DraftWarning(UserWarning):
+    """The levels of a build stay as they are built, where those of a smaller asset
+    would be refined."""
+
+
+def chosen_quality(
+    quality: Quality | None, config: BuildConfig, leaves: Leaves, device: Device, memory: int
+) -> Quality:
+    """Return the quality of a build: the named one; else "standard" on a GPU that fits
+    levels, and "draft" elsewhere.
+
+    Args:
+        memory: Bytes of the host that the build may use.
+
+    Warns:
+        DraftWarning: The asset is too large to be refined without being told to.
+    """
+    if quality is not None:
+        return quality
+    if not device.is_cuda or config.steps == 0:
+        return "draft"
+    count = leaves.num_gaussians
+    problem = ""
+    if count > _MOST_GAUSSIANS:
+        problem = f"{count:,} gaussians take minutes to refine"
+    else:
+        required = refine_bytes("standard", count, leaves.sh_degree)
+        for name, free in (("host", memory), ("GPU", free_on(device))):
+            if required > free and not problem:
+                problem = (
+                    f"refining {count:,} gaussians takes {in_mib(required)} of the {name}, "
+                    f"which has {in_mib(free)}"
+                )
+    if not problem:
+        return "standard"
+    advice = "levels stay as they are built, unless the quality standard is named"
+    warnings.warn(f"quality: {problem}; {advice}", DraftWarning, stacklevel=3)
+    return "draft"

@@ -1,0 +1,192 @@
+"""Cameras of a refinement, found without photographs: around an object, at eyes inside
+a place, or both.
+
+A camera outside of a room would look at its walls from behind, which nobody sees; and
+one inside of an object would look at nothing. So the places that a subject surrounds
+(`v3dg.framing`) decide. A house in a garden has such places and is seen from both
+sides: then much that is seen from outside stands far from all places inside.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from v3dg._json import JsonObject
+from v3dg._numbers import Floats, one_of
+from v3dg.bundle import Bundle
+from v3dg.cameras import Camera
+from v3dg.framing import surroundings
+from v3dg.upright import direction_of, up_of
+
+SeenFrom = Literal["auto", "outside", "inside", "both"]
+"""From where a subject is seen; "auto" finds out."""
+
+RECORDED = ("eyes", "outside")
+"""The names that `Viewpoints.record` has."""
+
+_NUM_EYES = 96
+# Cameras at an eye, a quarter turn apart, alternately up and down by this angle, with
+# this field of view: together they see all but a cone at the poles.
+_CAMERAS_PER_EYE = 4
+_PITCH = math.radians(15)
+_FIELD = math.radians(90)
+# The angle between the cameras of one eye and those of the next: the golden one, so
+# that no direction repeats.
+_TURN = math.pi * (3 - math.sqrt(5))
+# Only the shape of the picture counts.
+_PIXELS = 512
+# The distance of cameras around a subject from its centre, in radii; the ball with this
+# share of the gaussians fills their pictures.
+_DISTANCE = 2.5
+_SHARE = 0.99
+# The nearest depth that is drawn, in radii.
+_NEAR = 0.002
+# The share of what is seen from outside of a surrounding subject that is not its walls,
+# above which it is seen from outside, too.
+_LEAST_OUTER = 0.08
+
+
+@dataclass(frozen=True)
+class Viewpoints:
+    """From where pictures of a refinement are taken.
+
+    Attributes:
+        cameras: The cameras; none for pictures from all around.
+        num_eyes: The number of eyes inside.
+    """
+
+    cameras: tuple[Camera, ...] = ()
+    num_eyes: int = 0
+
+    @property
+    def record(self) -> JsonObject:
+        """What the config of a bundle says; empty for pictures from all around."""
+        if self.num_eyes == 0:
+            return {}
+        is_outside_too = len(self.cameras) > self.num_eyes * _CAMERAS_PER_EYE
+        return {"eyes": self.num_eyes, "outside": is_outside_too}
+
+    @property
+    def text(self) -> str:
+        """What a user reads; empty for pictures from all around."""
+        return text_of(self.record)
+
+
+def text_of(record: JsonObject) -> str:
+    """Return what a user reads of the record of a refinement."""
+    if "eyes" not in record:
+        return ""
+    if record["outside"]:
+        return f"seen from outside and from inside: {record['eyes']} eyes"
+    return f"seen from inside: {record['eyes']} eyes"
+
+
+def viewpoints_of(bundle: Bundle, seen_from: SeenFrom) -> Viewpoints:
+    """Return the viewpoints of a bundle.
+
+    Raises:
+        ValueError: `seen_from` is unknown; or it is "inside" or "both", and no place is
+            found inside.
+    """
+    one_of(seen_from, "seen_from", get_args(SeenFrom))
+    if seen_from == "outside":
+        return Viewpoints()
+    axis, _ = up_of(bundle)
+    up = np.array(direction_of(axis))
+    room = surroundings(bundle, axis)
+    if room is None:
+        if seen_from == "auto":
+            return Viewpoints()
+        raise ValueError(
+            f"seen_from: expected outside or auto, got {seen_from}: this subject surrounds no "
+            "place from which it can be seen; give cameras instead"
+        )
+    middle, radius = _ball(bundle)
+    eyes = _spread(room.places)
+    inside_cameras = tuple(
+        camera
+        for number, eye in enumerate(eyes)
+        for camera in _cameras_at(eye, up, number * _TURN, radius)
+    )
+    if seen_from == "auto":
+        seen_from = "inside"
+        if room.outer_share > _LEAST_OUTER:
+            seen_from = "both"
+    if seen_from == "inside":
+        return Viewpoints(inside_cameras, len(eyes))
+    outer_cameras = _cameras_around(middle, radius, len(inside_cameras))
+    return Viewpoints((*inside_cameras, *outer_cameras), len(eyes))
+
+
+def _ball(bundle: Bundle) -> tuple[Floats, float]:
+    """Return the centre and the radius of a ball around nearly all gaussians."""
+    means = np.asarray(bundle.level_gaussians(0).means, np.float64)
+    middle = np.median(means, axis=0)
+    radius = float(np.quantile(np.linalg.norm(means - middle, axis=1), _SHARE))
+    return middle, radius
+
+
+def _spread(places: Floats) -> Floats:
+    """Return at most `_NUM_EYES` of the places, each the farthest from those before
+    it, from the one in the middle on."""
+    middle = places.mean(axis=0)
+    number = int(np.square(places - middle).sum(axis=1).argmin())
+    numbers = [number]
+    distances = np.square(places - places[number]).sum(axis=1)
+    while len(numbers) < min(_NUM_EYES, len(places)):
+        number = int(distances.argmax())
+        numbers.append(number)
+        distances = np.minimum(distances, np.square(places - places[number]).sum(axis=1))
+    return places[numbers]
+
+
+def _cameras_at(eye: Floats, up: Floats, azimuth: float, radius: float) -> list[Camera]:
+    """Return the cameras of an eye, which look in all directions."""
+    front = np.eye(3)[int(np.abs(up).argmin())]
+    front = front - up * (up @ front)
+    front /= np.linalg.norm(front)
+    aside = np.cross(up, front)
+    cameras = []
+    for number in range(_CAMERAS_PER_EYE):
+        angle = azimuth + 2 * math.pi * number / _CAMERAS_PER_EYE
+        level = math.cos(angle) * front + math.sin(angle) * aside
+        pitch = _PITCH * (1 - 2 * (number % 2))
+        forward = math.cos(pitch) * level + math.sin(pitch) * up
+        cameras.append(
+            Camera.look_at(
+                eye,
+                eye + radius * forward,
+                up,
+                _FIELD,
+                width=_PIXELS,
+                height=_PIXELS,
+                near=_NEAR * radius,
+            )
+        )
+    return cameras
+
+
+def _cameras_around(middle: Floats, radius: float, count: int) -> list[Camera]:
+    """Return cameras that see all of a ball from evenly spread directions."""
+    field = 2 * math.atan(1 / math.sqrt(_DISTANCE**2 - 1))
+    cameras = []
+    for number in range(count):
+        height = 1 - (2 * number + 1) / count
+        flat = math.sqrt(1 - height**2)
+        angle = number * _TURN
+        outwards = np.array([flat * math.cos(angle), flat * math.sin(angle), height])
+        top = np.eye(3)[int(np.abs(outwards).argmin())]
+        cameras.append(
+            Camera.look_at(
+                middle + _DISTANCE * radius * outwards,
+                middle,
+                top,
+                field,
+                width=_PIXELS,
+                height=_PIXELS,
+                near=_NEAR * radius,
+            )
+        )
+    return cameras
