@@ -14,12 +14,15 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from v3dg import _files
-from v3dg._colmap import IMAGE_FILES, LENS_FILES, read_model
+from v3dg._colmap import IMAGE_FILES, LENS_FILES, Image, read_model
 from v3dg._json import Node, read_json, write_json
 from v3dg._numbers import check, one_of, refuse
 from v3dg.cameras import (
+    FISHEYE_TERMS,
+    OPENCV_TERMS,
     Camera,
     Floats,
+    LensModel,
     check_cameras,
     intrinsics,
     is_rotation,
@@ -27,13 +30,12 @@ from v3dg.cameras import (
     viewmat_from_blender,
 )
 
-# COLMAP's camera models that are pinholes apart from distortion, which is checked
-# separately.
+# COLMAP's names of cameras that OpenCV's models describe.
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-_UNDISTORT = (
-    "undistort the pictures first, or leave it out: distortion='ignore', or --distortion ignore"
-)
+_FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+# The coefficients in a file of nerfstudio. Its k4 of a pinhole is not that of OpenCV,
+# but the factor of r⁸.
+_PINHOLE_TERMS = ("k1", "k2", "p1", "p2", "k3")
 _MOST_NAMED = 8  # images in a warning
 _RUN = "config.yml"  # identifies a run of nerfstudio
 _TRAINING = "dataparser_transforms.json"  # from a run's data to its training
@@ -54,7 +56,7 @@ def read_cameras(
     path: str | os.PathLike[str],
     *,
     size: tuple[int, int] | None = None,
-    distortion: Literal["refuse", "ignore"] = "refuse",
+    distortion: Literal["draw", "ignore"] = "draw",
     applied_transform: Literal["keep", "undo"] = "keep",
 ) -> dict[str, Camera]:
     """Read the cameras of a nerfstudio `transforms.json`, in file order
@@ -80,18 +82,18 @@ def read_cameras(
     Args:
         size: Width and height in px for a file that has neither `w` and `h` nor focal
             lengths in px.
-        distortion: Whether lens distortion is an error, or left out: cameras are
-            pinholes.
+        distortion: Whether cameras have the lens distortion of the file, or it is left
+            out and they are pinholes; a fisheye is an error then.
         applied_transform: Whether cameras stay in the frame of the file, or
             `applied_transform` and `applied_scale` are undone, for assets in the frame
             that the data had before.
 
     Raises:
-        ValueError: The content is not valid, or has cameras that are not pinholes; the
-            message names the place in it.
+        ValueError: The content is not valid, or has cameras of another model than those
+            of `Camera`; the message names the place in it.
         OSError: The file cannot be read.
     """
-    one_of(distortion, "distortion", ("refuse", "ignore"))
+    one_of(distortion, "distortion", ("draw", "ignore"))
     one_of(applied_transform, "applied_transform", ("keep", "undo"))
     place = _place_of(Path(path))
     if place.file.name in IMAGE_FILES:
@@ -252,7 +254,7 @@ def _read_frame(
     """Return the camera of a frame; fields that the frame lacks are read from the top
     of the file."""
     fields = {**top, **frame}
-    _check_is_pinhole(fields, distortion)
+    lens_model, coefficients = _lens(fields, distortion)
     focal = top
     if "fl_x" in frame or "camera_angle_x" in frame:
         focal = frame
@@ -266,7 +268,7 @@ def _read_frame(
         with np.errstate(over="ignore", invalid="ignore"):
             viewmat = viewmat @ (np.diag([scale, scale, scale, 1.0]) @ transform)
             viewmat[:3] /= scale  # the camera keeps a scale of 1
-    return node.attempt(partial(Camera, viewmat, K, width, height, near))
+    return node.attempt(partial(Camera, viewmat, K, width, height, near, coefficients, lens_model))
 
 
 def _data_of(run: Path) -> Path:
@@ -318,18 +320,32 @@ def _read_colmap(images: Path, distortion: str) -> dict[str, Camera]:
         warnings.warn(f"{images}: {text}", CameraWarning, stacklevel=3)
     named = []
     for image in finite:
-        lens = image.lens
-        place = f"{images}: {image.name}"
-        is_plain = distortion == "ignore" or not lens.is_distorted
-        is_right = lens.model.projection == "pinhole" and is_plain
-        expected = "a pinhole without lens distortion"
-        check(place, is_right, f"{expected}, got {lens.model.name}; {_UNDISTORT}")
-        K = np.diag([lens.focal_lengths[0], lens.focal_lengths[-1], 1.0])
-        K[:2, 2] = lens.center
-        with _files.value_errors(place, "a camera"):
-            camera = Camera(image.viewmat, K, lens.width, lens.height)
-        named.append((image.name, camera))
+        named.append((image.name, _camera_of(image, f"{images}: {image.name}", distortion)))
     return _named(named)
+
+
+def _camera_of(image: Image, place: str, distortion: str) -> Camera:
+    """Return the camera of an image of a COLMAP model."""
+    lens = image.lens
+    model: LensModel = "PINHOLE"
+    coefficients: tuple[float, ...] = ()
+    if distortion == "ignore":
+        is_pinhole = lens.model.projection == "pinhole"
+        expected = "a pinhole apart from lens distortion"
+        check(place, is_pinhole, f"{expected}, got {lens.model.name}; draw its distortion")
+    elif lens.opencv is None:
+        refuse(
+            place,
+            f"a lens of one of OpenCV's models, got {lens.model.name}; undistort the pictures",
+        )
+    else:
+        model, coefficients = lens.opencv
+    K = np.diag([lens.focal_lengths[0], lens.focal_lengths[-1], 1.0])
+    K[:2, 2] = lens.center
+    with _files.value_errors(place, "a camera"):
+        return Camera(
+            image.viewmat, K, lens.width, lens.height, distortion=coefficients, model=model
+        )
 
 
 def write_cameras(path: str | os.PathLike[str], cameras: Mapping[str, Camera]) -> None:
@@ -351,25 +367,67 @@ def write_cameras(path: str | os.PathLike[str], cameras: Mapping[str, Camera]) -
             "cy": camera.cy,
             "near": camera.near,
             "transform_matrix": to_world.tolist(),
+            **_lens_as_json(name, camera),
         }
         frames.append(frame)
     write_json(path, {"camera_model": "PINHOLE", "frames": frames})
 
 
-def _check_is_pinhole(fields: Mapping[str, Node], distortion: str) -> None:
-    model = fields.get("camera_model")
-    if model is not None and model.value not in _PINHOLES:
-        raise model.error(
-            f"a pinhole camera ({', '.join(_PINHOLES)})", "undistort the pictures first"
-        )
-    fisheye = fields.get("is_fisheye")
-    if fisheye is not None and fisheye.value not in (False, 0):
-        raise fisheye.error("a pinhole camera", "undistort the pictures first")
+def _lens_as_json(name: str, camera: Camera) -> dict[str, object]:
+    """Return the fields of nerfstudio for the lens of a camera.
+
+    Raises:
+        ValueError: The lens has coefficients that nerfstudio has no fields for.
+    """
+    if not camera.is_distorted:
+        return {}
+    terms = OPENCV_TERMS
+    if camera.model == "OPENCV_FISHEYE":
+        terms = FISHEYE_TERMS
+    coefficients = dict(zip(terms, camera.distortion, strict=False))
+    if camera.model == "OPENCV":
+        is_known = not any(coefficients.get(term) for term in ("k4", "k5", "k6"))
+        check(f"cameras[{name!r}]", is_known, "a lens without k4 to k6 of OPENCV, got one with")
+        coefficients = {term: coefficients.get(term, 0.0) for term in _PINHOLE_TERMS}
+    return {"camera_model": camera.model, **coefficients}
+
+
+def _lens(fields: Mapping[str, Node], distortion: str) -> tuple[LensModel, tuple[float, ...]]:
+    """Return the camera model and the distortion in a file of nerfstudio."""
+    if _is_fisheye(fields, distortion):
+        return "OPENCV_FISHEYE", tuple(_term(fields, name) for name in FISHEYE_TERMS)
+    coefficients = tuple(_term(fields, name) for name in _PINHOLE_TERMS)
     if distortion == "ignore":
-        return
-    for name in _DISTORTION:
-        if name in fields and fields[name].number() != 0:
-            raise fields[name].error("no lens distortion", _UNDISTORT)
+        return "PINHOLE", ()
+    if _term(fields, "k4") != 0:
+        raise fields["k4"].error(
+            "0 for a camera that is no fisheye", "leave it out: distortion='ignore'"
+        )
+    if any(coefficients):
+        return "OPENCV", coefficients
+    return "PINHOLE", ()
+
+
+def _is_fisheye(fields: Mapping[str, Node], distortion: str) -> bool:
+    model = fields.get("camera_model")
+    if model is not None and model.value not in (*_PINHOLES, *_FISHEYES):
+        names = ", ".join((*_PINHOLES, *_FISHEYES))
+        raise model.error(f"a camera model of OpenCV ({names})", "undistort the pictures first")
+    signs = []
+    if model is not None and model.value in _FISHEYES:
+        signs.append(model)
+    flag = fields.get("is_fisheye")
+    if flag is not None and flag.value not in (False, 0):
+        signs.append(flag)
+    if signs and distortion == "ignore":
+        raise signs[0].error("a pinhole camera", "draw the distortion of a fisheye")
+    return bool(signs)
+
+
+def _term(fields: Mapping[str, Node], name: str) -> float:
+    if name not in fields:
+        return 0.0
+    return fields[name].number()
 
 
 def _rows(node: Node) -> Floats:

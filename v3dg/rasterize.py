@@ -46,7 +46,7 @@ def rasterize(
 
     Args:
         gaussians: N gaussians in world space; or the file of an asset.
-        camera: Pinhole camera.
+        camera: Its model may be any.
         filter_px2: Variance of the low-pass filter in screen space, px²; 0.3 is the
             value that the original 3DGS code trains with.
         antialiased: Multiply opacities by sqrt(det before / det after the filter)

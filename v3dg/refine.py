@@ -9,9 +9,13 @@ from v3dg._device import Device
 from v3dg._numbers import check_type, real, whole
 from v3dg._progress import Progress
 from v3dg.bundle import Bundle
-from v3dg.cameras import Camera
+from v3dg.cameras import Camera, check_pinhole
 from v3dg.levels.refined import DROP, refined_bundle
 from v3dg.opening import File
+
+_UNDISTORT = (
+    "undistort the pictures first, or leave it out: distortion='ignore', or --distortion ignore"
+)
 
 
 def refine_bundle(
@@ -67,6 +71,7 @@ def refine_bundle(
     cameras = list(cameras)
     for number, camera in enumerate(cameras):
         check_type(f"cameras[{number}]", camera, Camera, "a Camera")
+        check_pinhole(f"cameras[{number}]", camera, _UNDISTORT)
     steps = whole(steps, "steps", "1 step or more", 1, 1_000_000)
     drop = real(drop, "drop", "a share of 0 to 0.5", 0, 0.5)
     seed = whole(seed, "seed", "0 to 2^58 - 1", 0, (1 << 58) - 1)

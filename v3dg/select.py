@@ -256,9 +256,9 @@ def select(
 
     Args:
         subject: A scene or a bundle, or its file, which every call opens again.
-        camera: Pinhole camera. For a stereo camera, the cut is detailed enough for the
-            nearer eye and includes everything that either eye may see; this excludes
-            the paper's footprint.
+        camera: Its model may be any, but the paper's footprint needs a pinhole. For a
+            stereo camera, the cut is detailed enough for the nearer eye and includes
+            everything that either eye may see; this excludes the paper's footprint.
         tolerance: Screen area in px² per gaussian of a coarser cluster. 0 chooses full
             detail wherever it covers any area, infinity the coarsest clusters. None
             means `DEFAULT_TOLERANCE`, or 0 with a budget.

@@ -32,6 +32,7 @@ struct FrameBatch {
     // Whether any item may have a weight below 1. Only the items of scenes can; those
     // that do are not shared.
     bool has_faded_items = false;
+    bool has_lenses = false;  // whether the camera of any image is not a pinhole
     // [num_factors], see ProjectInput; or null
     const InstanceFactors* factors = nullptr;
     uint32_t num_factors = 0;

@@ -87,6 +87,8 @@ struct FrameImage {
     PicturePlanes planes;
 };
 
+static_assert(sizeof(FrameImage) <= 128, "a warp loads it at once");
+
 V3DG_HD inline uint32_t num_tiles_of(const FrameImage& image) {
     return static_cast<uint32_t>(image.tile_columns) * static_cast<uint32_t>(image.tile_rows);
 }

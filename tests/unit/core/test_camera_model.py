@@ -32,6 +32,19 @@ def test_second_camera_model_goes_through_projection(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (0, "")
 
 
+@pytest.mark.skipif(compiler() is None, reason="needs a C++ compiler")
+def test_distorted_models_agree_with_finite_differences_and_cull_nothing_drawn(
+    tmp_path: Path,
+) -> None:
+    program = tmp_path / "distorted_cameras"
+    source = ROOT / "tests" / "cpp" / "distorted_cameras.cpp"
+    command = [compiler(), "-std=c++20", "-O1", "-I", CSRC, source, "-o", program]
+    compiled = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert compiled.returncode == 0, compiled.stderr
+    done = subprocess.run([program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "")
+
+
 def test_pinholes_are_named_by_those_who_make_them_alone() -> None:
     """All others name the model in use, Intrinsics, so that a second one is a file and
     its place in camera/camera.h."""
